@@ -1,0 +1,87 @@
+"""Files that are either whole or absent, and weights that cannot execute code."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from ganlane.errors import UserError
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``; on success sync it and rename it into place.
+
+    A process killed at any instant leaves either the old file or the new one, never a part of one.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    os.close(handle)
+    part = Path(name)
+    try:
+        yield part
+        with part.open("rb+") as written:
+            os.fsync(written.fileno())
+        part.chmod(0o644)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write ``content`` to ``path`` atomically."""
+    with atomic_path(path) as part:
+        part.write_bytes(content)
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write ``content`` to ``path`` as indented JSON, atomically."""
+    write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+
+
+def save_weights(path: str | Path, kind: str, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+    """Save ``tensors`` and plain ``metadata`` as safetensors, atomically.
+
+    Args:
+        path: where to write.
+        kind: what the file holds (``"agent"``, ``"generator"``); :func:`load_weights` checks it.
+        tensors: flat name to tensor.
+        metadata: JSON-serialisable description (config, data, metrics, code version).
+    """
+    flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    header = {"ganlane": json.dumps({"kind": kind, **metadata})}
+    write_bytes(path, save(flat, metadata=header))
+
+
+def load_weights(path: str | Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Load what :func:`save_weights` wrote: ``(tensors, metadata)``.
+
+    Raises:
+        UserError: the file is absent, not safetensors, not written by ganlane, or of another kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; a {kind} checkpoint (.safetensors) was expected there.")
+    try:
+        with safe_open(str(path), framework="pt") as opened:
+            header = (opened.metadata() or {}).get("ganlane")
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise UserError(
+            f"{path}: not a readable safetensors file ({error}); give a {kind} checkpoint that ganlane wrote."
+        ) from error
+    metadata = json.loads(header) if header else {}
+    if metadata.get("kind") != kind:
+        found = metadata.get("kind", "a file that ganlane did not write")
+        raise UserError(f"{path}: expected a ganlane {kind} checkpoint, found {found}; give a {kind} checkpoint.")
+    return tensors, metadata

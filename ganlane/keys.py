@@ -1,0 +1,63 @@
+"""Every TensorDict key, declared once.
+
+N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI units.
+
+=========================================  ==========  ==================================================
+``vehicles.x, y``                          [N, M]      centre of the body, m; x along the road, y to the left
+``vehicles.heading``                       [N, M]      rad, relative to the road, anticlockwise
+``vehicles.speed, acceleration``           [N, M]      m/s, m/s2
+``vehicles.length, width``                 [N, M]      m, fixed for an episode
+``vehicles.desired_speed``                 [N, M]      m/s, fixed for an episode
+``vehicles.target_lane``                   [N, M] i64  the lane it keeps or is moving to; 0 is the rightmost
+``vehicles.visibility``                    [N, M] i64  0 centre, 1 body, 2 signalled (:mod:`ganlane.sim.lanes`)
+``vehicles.valid``                         [N, M] b    false is padding: nowhere seen, hit or counted
+``ego.*``                                  [N]         what the environment remembers of the ego
+``traffic.*``                              free        the traffic module's own memory
+``seed, episode, step``                    [N] i64     what every random number follows from; step: 0.1 s each
+``events.*``                               [N, 1]      what the last decision led to
+``action``                                 [N] i64     0 keep, 1 left, 2 right
+=========================================  ==========  ==================================================
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+VEHICLES: Final = "vehicles"
+MOVED: Final = "moved"
+TRAFFIC: Final = "traffic"
+EGO: Final = "ego"
+EVENTS: Final = "events"
+REWARD_TERMS: Final = "reward_terms"
+SEED: Final = "seed"
+EPISODE: Final = "episode"
+STEP: Final = "step"
+ACTION: Final = "action"
+OBSERVATION: Final = "observation"
+REWARD: Final = "reward"
+
+#: Float fields of ``vehicles``.
+VEHICLE_FLOATS: Final = ("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed")
+#: Integer fields of ``vehicles``.
+VEHICLE_INTEGERS: Final = ("target_lane", "visibility")
+#: Boolean fields of ``vehicles``.
+VEHICLE_FLAGS: Final = ("valid",)
+VEHICLE_FIELDS: Final = VEHICLE_FLOATS + VEHICLE_INTEGERS + VEHICLE_FLAGS
+
+#: Boolean events; a decision ends for at most one of them.
+END_EVENTS: Final = ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")
+#: Terminal reasons that are outcomes of the driving, as against cut-offs.
+TERMINAL_EVENTS: Final = ("goal", "hard_crash", "out_of_road")
+TRUNCATING_EVENTS: Final = ("timeout", "scene_end")
+#: Number of soft-crash onsets in the decision, int64.
+SOFT_CRASH: Final = "soft_crash"
+#: The same behind the ego: reported, not penalised.
+SOFT_CRASH_BEHIND: Final = "soft_crash_behind"
+
+REWARD_TERM_NAMES: Final = ("speed", "lane_change", "out_of_road", "hard_crash", "soft_crash", "goal")
+
+KEEP: Final = 0
+LEFT: Final = 1
+RIGHT: Final = 2
+EGO_INDEX: Final = 0
+PHYSICS_STEP_S: Final = 0.1

@@ -1,0 +1,76 @@
+"""Intelligent Driver Model (Treiber et al. 2000) with the paper's Table V."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class IdmParameters:
+    """Table V. Lengths in metres, times in seconds, accelerations in m/s2.
+
+    The acceleration exponent is 4, written out as two squarings: a tensor power is not the same bit for bit
+    at every batch size.
+    """
+
+    min_gap_m: float = 2.0
+    headway_s: float = 1.6
+    comfortable_deceleration: float = 1.7
+    free_gap_m: float = 10_000.0
+    min_acceleration: float = -20.0
+    max_acceleration: float = 0.7
+
+
+TABLE_V = IdmParameters()
+#: A gap below this is treated as this one: the interaction term stays finite and asks for the hardest braking.
+SMALLEST_GAP_M = 0.1
+
+
+def desired_gap(
+    speed: Tensor, closing_speed: Tensor, parameters: IdmParameters = TABLE_V, headway_s: Tensor | float | None = None
+) -> Tensor:
+    """Gap in metres that a driver at ``speed`` wants to a leader it closes in on at ``closing_speed`` (m/s).
+
+    The dynamic part is never negative, so a leader that pulls away does not invite tailgating.
+    """
+    headway = parameters.headway_s if headway_s is None else headway_s
+    brake = 2.0 * math.sqrt(parameters.max_acceleration * parameters.comfortable_deceleration)
+    dynamic = speed * headway + speed * closing_speed / brake
+    return parameters.min_gap_m + dynamic.clamp_min(0.0)
+
+
+def idm_acceleration(
+    speed: Tensor,
+    desired_speed: Tensor | float,
+    gap: Tensor,
+    leader_speed: Tensor,
+    parameters: IdmParameters = TABLE_V,
+    headway_s: Tensor | float | None = None,
+) -> Tensor:
+    """Acceleration in m/s2, within Table V's bounds; all tensors broadcast against each other.
+
+    Args:
+        speed: own speed, m/s, at least 0.
+        desired_speed: own desired speed, m/s, above 0.
+        gap: net gap to the leader (bumper to bumper), m; ``parameters.free_gap_m`` where there is none.
+            A gap of 0 or less (an overlap) gives the hardest braking.
+        leader_speed: m/s; irrelevant where the gap is the free one, but for the approach term.
+        headway_s: a time headway per vehicle in place of Table V's.
+    """
+    ratio = speed / desired_speed
+    square = ratio * ratio
+    wanted = desired_gap(speed, speed - leader_speed, parameters, headway_s)
+    interaction = wanted / gap.clamp_min(SMALLEST_GAP_M)
+    acceleration = parameters.max_acceleration * (1.0 - square * square - interaction * interaction)
+    return acceleration.clamp(parameters.min_acceleration, parameters.max_acceleration)
+
+
+def equilibrium_gap(speed: Tensor, desired_speed: Tensor | float, parameters: IdmParameters = TABLE_V) -> Tensor:
+    """Gap in metres at which a platoon at constant ``speed`` neither closes up nor opens (below desired speed)."""
+    ratio = speed / desired_speed
+    square = ratio * ratio
+    return (parameters.min_gap_m + speed * parameters.headway_s) / torch.sqrt(1.0 - square * square)

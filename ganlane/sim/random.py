@@ -1,0 +1,98 @@
+"""Counter-based randomness: every number is a pure function of where it is used.
+
+A draw depends on (stream, seed, episode, vehicle, step, purpose) and on nothing else: not on the batch, the
+row, the device or what was drawn before. Each field is mixed into a 64-bit key on its own with the finaliser
+of splitmix64 (Steele et al. 2014), so no two fields can alias each other.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+_GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
+_MIX_A = -4658895280553007687  # 0xBF58476D1CE4E5B9
+_MIX_B = -7723592293110705685  # 0x94D049BB133111EB
+
+
+class Stream(IntEnum):
+    """Disjoint families of episodes: nobody is tested on what it was trained or chosen on."""
+
+    TRAIN = 0
+    SELECT = 1
+    REPORT = 2
+
+
+class Purpose(IntEnum):
+    """What a random number is for; each stands for a fixed column of draws."""
+
+    SPAWN_LANE = 0
+    SPAWN_POSITION = 1
+    SPAWN_SPEED = 2
+    SPAWN_DESIRED_SPEED = 3
+    RANDOM_ACTION = 4
+    LANE_CHANGE_HAZARD = 5
+    LANE_CHANGE_SIDE = 6
+    LANE_CHANGE_SPEED = 7
+    ACCELERATION = 8
+    TRAIT_HEADWAY = 9
+    TRAIT_DESIRED_SPEED = 10
+    FAULT = 11
+    NOISE = 16  # and the 47 purposes after it: the generator's latent vector, one per dimension
+    RECYCLE = 64
+
+
+def _shift(h: Tensor, bits: int) -> Tensor:
+    """Logical right shift of int64."""
+    return (h >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def _mix(h: Tensor) -> Tensor:
+    """The finaliser of splitmix64: a bijection of 64 bits in which every input bit flips half the output."""
+    h = (h ^ _shift(h, 30)) * _MIX_A
+    h = (h ^ _shift(h, 27)) * _MIX_B
+    return h ^ _shift(h, 31)
+
+
+def absorb(key: Tensor, field: Tensor | int) -> Tensor:
+    """Mix one more integer field into ``key`` (int64, broadcast)."""
+    return _mix((key ^ field) + _GOLDEN)
+
+
+def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
+    """Key of an episode, [N] int64, from the stream and the [N] int64 counters ``seed`` and ``episode``."""
+    start = torch.full_like(seed, int(stream))
+    return absorb(absorb(absorb(start, 0), seed), episode)
+
+
+def draw_keys(key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int]) -> Tensor:
+    """Keys [N, vehicles, len(purposes)] from episode keys [N] and physics steps [N] (or one int)."""
+    at_step = absorb(key, step)
+    vehicle = torch.arange(vehicles, device=key.device)
+    purpose = torch.tensor(purposes, device=key.device)
+    return absorb(absorb(at_step[:, None], vehicle)[..., None], purpose)
+
+
+def to_uniform(keys: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Uniform numbers in [0, 1), of the same shape as ``keys``, from their highest bits."""
+    bits = 53 if dtype == torch.float64 else 24
+    return _shift(keys, 64 - bits).to(dtype) * 2.0**-bits
+
+
+def uniform(
+    key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int], dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """Uniform numbers in [0, 1), [N, vehicles, len(purposes)]: all purposes of a step in one call."""
+    return to_uniform(draw_keys(key, step, vehicles, purposes), dtype)
+
+
+def normal(
+    key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int], dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """Standard normal numbers, [N, vehicles, len(purposes)], by Box and Muller's transform."""
+    keys = draw_keys(key, step, vehicles, purposes)
+    radius = torch.sqrt(-2.0 * torch.log(1.0 - to_uniform(keys, dtype)))
+    return radius * torch.cos(2.0 * math.pi * to_uniform(absorb(keys, 1), dtype))

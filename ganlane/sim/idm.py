@@ -31,7 +31,10 @@ SMALLEST_GAP_M = 0.1
 
 
 def desired_gap(
-    speed: Tensor, closing_speed: Tensor, parameters: IdmParameters = TABLE_V, headway_s: Tensor | float | None = None
+    speed: Tensor,
+    closing_speed: Tensor,
+    parameters: IdmParameters = TABLE_V,
+    headway_s: Tensor | float | None = None,
 ) -> Tensor:
     """Gap in metres that a driver at ``speed`` wants to a leader it closes in on at ``closing_speed`` (m/s).
 

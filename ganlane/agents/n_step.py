@@ -1,0 +1,92 @@
+"""n-step returns over a batch of environments, exact across ends.
+
+TorchRL's ``MultiStepTransform`` leaves ``terminated`` of the first step in place, and so bootstraps past a crash.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+
+class Step(NamedTuple):
+    """One decision of N environments; ``following`` is the observation after it, before any reset."""
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    following: Tensor
+    terminated: Tensor
+    done: Tensor
+
+
+class NStepWindow:
+    """The last ``n`` steps of N environments; each new one gives the transition of the oldest.
+
+    So every step but the first n - 1 gives one transition per environment, n - 1 steps late. Its return ends at the
+    first ``done`` among its n steps, and so do its next observation and its ``terminated``: a truncated episode
+    bootstraps from its true last observation, a terminated one not at all.
+    """
+
+    def __init__(self, n: int, gamma: float) -> None:
+        self.n, self.gamma = n, gamma
+        self.steps: list[Step] = []
+
+    def push(self, step: TensorDictBase) -> TensorDict | None:
+        """Add one step; return the transition of the oldest, batch [N], or None until there are n.
+
+        Args:
+            step: batch [N], with ``observation`` [N, D], ``action`` [N] and ``next``'s ``observation`` (before any
+                reset), ``reward``, ``terminated`` and ``done`` [N, 1].
+
+        Returns:
+            ``observation``, ``action``, ``steps_to_next_obs`` [N, 1] (the exponent of the discount), and ``next``'s
+            ``observation``, ``reward`` (the n-step return) and ``terminated``.
+        """
+        self.steps.append(_copy(step))
+        if len(self.steps) < self.n:
+            return None
+        transition = combine(self.steps, self.gamma)
+        del self.steps[0]
+        return transition
+
+    def state_dict(self) -> dict[str, Any]:
+        """The steps in the window, as plain dictionaries of tensors."""
+        return {"steps": [step._asdict() for step in self.steps]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        self.steps = [Step(**step) for step in state["steps"]]
+
+
+def combine(steps: list[Step], gamma: float) -> TensorDict:
+    """The transition of the oldest of ``steps``, cut at the first end (see :meth:`NStepWindow.push`)."""
+    first = steps[0]
+    reward, following, terminated = first.reward, first.following, first.terminated
+    length = torch.ones_like(reward)
+    running = ~first.done
+    for power, step in enumerate(steps[1:], start=1):
+        reward = reward + running * (gamma**power * step.reward)
+        following = torch.where(running, step.following, following)
+        terminated = torch.where(running, step.terminated, terminated)
+        length = length + running
+        running = running & ~step.done
+    after = TensorDict({"observation": following, "reward": reward, "terminated": terminated}, reward.shape[:1])
+    content = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length, "next": after}
+    return TensorDict(content, reward.shape[:1])
+
+
+def _copy(step: TensorDictBase) -> Step:
+    """The tensors of a step, copied: the environment may write into its own afterwards."""
+    after = step.get("next")
+    return Step(
+        step.get("observation").clone(),
+        step.get("action").clone(),
+        after.get("reward").clone(),
+        after.get("observation").clone(),
+        after.get("terminated").clone(),
+        after.get("done").clone(),
+    )

@@ -1,0 +1,77 @@
+"""Policies: a Q-network's best action, with and without exploration. TensorDictModules for any TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+
+from ganlane import keys
+from ganlane.agents.network import QNetwork, redraw_noise
+
+#: Gives the legal actions, [N, A] bool, of what the environment wrote.
+LegalActions = Callable[[TensorDictBase], Tensor]
+
+
+class GreedyPolicy(TensorDictModuleBase):
+    """Writes the best ``action`` [N] int64 for ``observation`` [N, D]; never any noise, whatever the context says."""
+
+    in_keys = [keys.OBSERVATION]  # noqa: RUF012
+    out_keys = [keys.ACTION]  # noqa: RUF012
+
+    def __init__(self, network: QNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            values = self.network.values(tensordict.get(keys.OBSERVATION))
+        return tensordict.set(keys.ACTION, values.argmax(-1))
+
+
+class ExploringPolicy(TensorDictModuleBase):
+    """The policy that collects: network noise drawn anew at every step, or random legal actions.
+
+    Under ``set_exploration_type`` of DETERMINISTIC, MODE or MEAN it does not explore; otherwise it does, so that
+    collecting outside any context (where TorchRL's noisy layers are silent) is not greedy by accident.
+
+    Args:
+        network: its noise is redrawn in place, in one draw for all environments of the batch.
+        generator: of the noise and of the random actions.
+        legal: which actions may be drawn at random; all, if None.
+    """
+
+    in_keys = [keys.OBSERVATION]  # noqa: RUF012
+    out_keys = [keys.ACTION]  # noqa: RUF012
+
+    def __init__(self, network: QNetwork, generator: torch.Generator, legal: LegalActions | None = None) -> None:
+        super().__init__()
+        self.network, self.generator, self.legal = network, generator, legal
+        #: Probability of a random action; the agent anneals it.
+        self.epsilon = 0.0
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        explore = exploration_type() in (None, ExplorationType.RANDOM)
+        if explore:
+            redraw_noise(self.network, self.generator)
+        with set_exploration_type(ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC):
+            values = self.network.values(tensordict.get(keys.OBSERVATION))
+        action = values.argmax(-1)
+        if explore and self.epsilon > 0.0:
+            action = self._mix(action, torch.ones_like(values) if self.legal is None else self.legal(tensordict))
+        return tensordict.set(keys.ACTION, action)
+
+    def _mix(self, action: Tensor, legal: Tensor) -> Tensor:
+        """Replace a fraction epsilon of the actions by legal ones, drawn uniformly."""
+        shape, device = legal.shape, self.generator.device
+        lottery = torch.rand(shape, generator=self.generator, device=device) * legal
+        explore = torch.rand(action.shape, generator=self.generator, device=device) < self.epsilon
+        return torch.where(explore, lottery.argmax(-1), action)

@@ -1,0 +1,228 @@
+"""Rainbow (Hessel et al. 2018), assembled; each of its six components can be switched off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss
+from ganlane.agents.n_step import NStepWindow
+from ganlane.agents.network import NetworkConfig, QNetwork, mean_sigma, redraw_noise
+from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
+from ganlane.agents.replay import annealed, load_replay_state, make_replay, replay_state
+from ganlane.errors import UserError
+
+
+@dataclass(frozen=True)
+class RainbowConfig:
+    """Hyperparameters; the values are for one update of 256 per 64 decisions.
+
+    Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
+    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon (the share of random
+    legal actions) is used without noisy layers only. ``adam_eps=None`` stands for 0.005 / ``batch_size``.
+    """
+
+    hidden: tuple[int, ...] = (256, 256)
+    noisy: bool = True
+    dueling: bool = True
+    distributional: bool = True
+    double: bool = True
+    prioritised: bool = True
+    n_step: int = 3
+    gamma: float = 0.99
+    atoms: int = 51
+    v_min: float = -120.0
+    v_max: float = 120.0
+    noisy_sigma: float = 0.5
+    batch_size: int = 256
+    capacity: int = 1_000_000
+    warmup: int = 20_000
+    decisions_per_update: int = 64
+    target_period: int = 500
+    learning_rate: float = 2.5e-4
+    adam_eps: float | None = None
+    gradient_clip: float = 10.0
+    alpha: float = 0.5
+    beta_start: float = 0.4
+    beta_updates: int = 100_000
+    kl_priority: bool = True
+    epsilon_start: float = 1.0
+    epsilon: float = 0.02
+    epsilon_decisions: int = 100_000
+
+    def __post_init__(self) -> None:
+        for name in ("n_step", "atoms", "batch_size", "capacity", "decisions_per_update", "target_period"):
+            if getattr(self, name) < 1:
+                raise UserError(f"agent.{name}={getattr(self, name)}: expected at least 1; give a positive number.")
+        if not 0.0 < self.gamma <= 1.0:
+            raise UserError(f"agent.gamma={self.gamma}: expected a discount above 0 and at most 1.")
+        if self.v_min >= self.v_max or (self.distributional and self.atoms < 2):
+            raise UserError(
+                f"agent.v_min={self.v_min}, agent.v_max={self.v_max}, agent.atoms={self.atoms}: expected v_min below "
+                "v_max and at least 2 atoms; widen the support."
+            )
+        if not self.batch_size <= self.warmup <= self.capacity:
+            raise UserError(
+                f"agent.warmup={self.warmup}: expected at least agent.batch_size={self.batch_size} and at most "
+                f"agent.capacity={self.capacity} transitions."
+            )
+
+    def network(self, observation_size: int, actions: int) -> NetworkConfig:
+        """The network's config for observations of size D and A actions."""
+        shared = {f.name: getattr(self, f.name) for f in fields(NetworkConfig) if hasattr(self, f.name)}
+        return NetworkConfig(observation_size=observation_size, actions=actions, **shared)
+
+
+class Rainbow:
+    """The agent: network, target, replay buffer, optimiser, and its own random generators.
+
+    Nothing it does reads or changes torch's global random state.
+
+    Args:
+        config: hyperparameters.
+        observation_size: D.
+        actions: A.
+        seed: of weights, noise, random actions and replay.
+        device: of everything.
+        legal: legal actions for random exploration, see :class:`~ganlane.agents.policy.ExploringPolicy`.
+    """
+
+    def __init__(
+        self,
+        config: RainbowConfig,
+        observation_size: int,
+        actions: int = 3,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        legal: LegalActions | None = None,
+    ) -> None:
+        self.config, self.device = config, torch.device(device)
+        self.generators = {
+            name: torch.Generator(self.device).manual_seed(seed * 3 + i)
+            for i, name in enumerate(("collect", "learn", "replay"))
+        }
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.network = QNetwork(config.network(observation_size, actions)).to(self.device)
+        self.loss = make_loss(self.network, config).to(self.device)
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(),
+            lr=config.learning_rate,
+            eps=0.005 / config.batch_size if config.adam_eps is None else config.adam_eps,
+            fused=True,
+        )
+        self.replay = make_replay(
+            config.capacity,
+            config.batch_size,
+            self.generators["replay"],
+            config.prioritised,
+            config.alpha,
+            config.beta_start,
+        )
+        self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
+        self.greedy = GreedyPolicy(self.network)
+        self.updates = 0
+        self.anneal(0)
+
+    @property
+    def ready(self) -> bool:
+        """Whether the buffer holds enough to learn from."""
+        return len(self.replay) >= self.config.warmup
+
+    def window(self) -> NStepWindow:
+        """A fresh n-step window for a batch of environments."""
+        return NStepWindow(self.config.n_step, self.config.gamma)
+
+    def anneal(self, decisions: int) -> None:
+        """Set the share of random actions after ``decisions``."""
+        config = self.config
+        share = annealed(config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions)
+        self.policy.epsilon = 0.0 if config.noisy else share
+
+    def store(self, transition: TensorDict | None) -> None:
+        """Add transitions, batch [N], with the keys of :meth:`NStepWindow.push`; None adds nothing."""
+        if transition is not None:
+            self.replay.extend(transition, update_priority=False)
+
+    def update(self) -> dict[str, Tensor]:
+        """One step of gradient descent; 0-dim tensors to log, read without a host synchronisation."""
+        batch = self._sample()
+        for module in (self.network, self.loss.target_network):
+            redraw_noise(module, self.generators["learn"])
+        terms = self.loss(batch)
+        weight = batch.get("priority_weight", None)
+        # Rainbow's mean of w * loss; TorchRL's own 'mean' divides by the sum of the weights.
+        objective = (terms["loss"] if weight is None else weight * terms["loss"]).mean()
+        gradient_norm = self._descend(objective)
+        if self.config.prioritised:
+            self.replay.update_priority(batch.get("index"), batch.get("td_error"))
+        self.updates += 1
+        if self.updates % self.config.target_period == 0:
+            self.loss.update_target()
+        return {
+            "loss": objective.detach(),
+            "mean_q": terms["mean_q"],
+            "clamped_fraction": terms["clamped_fraction"],
+            "priority": batch.get("td_error").mean(),
+            "gradient_norm": gradient_norm,
+        }
+
+    def _sample(self) -> TensorDict:
+        """A batch, with the exponent of its importance weights annealed."""
+        if self.config.prioritised:
+            config = self.config
+            self.replay.sampler.beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
+        return self.replay.sample()
+
+    def _descend(self, objective: Tensor) -> Tensor:
+        """Clip and apply the gradient; return its norm before clipping, 0-dim."""
+        self.optimizer.zero_grad(set_to_none=True)
+        objective.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
+        self.optimizer.step()
+        return norm
+
+    def sigma(self) -> Tensor:
+        """Mean noise parameter, 0-dim."""
+        return mean_sigma(self.network)
+
+    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """Start from trained ``weights`` (transfer): load them first, then let the target follow."""
+        self.network.load_state_dict(dict(weights))
+        self.loss.update_target()
+
+    def weights(self) -> dict[str, Tensor]:
+        """The online network's parameters, without its momentary noise."""
+        return {name: value.detach().clone() for name, value in self.network.named_parameters()}
+
+    def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
+        """Everything an exact resume needs, as tensors and plain data; noise is redrawn before use, so not here."""
+        target = {name: value.detach().clone() for name, value in self.loss.target_network.named_parameters()}
+        return {
+            "network": self.weights(),
+            "target": target,
+            "optimizer": self.optimizer.state_dict(),
+            "generators": {name: generator.get_state() for name, generator in self.generators.items()},
+            "updates": self.updates,
+            "replay": replay_state(self.replay) if with_replay else None,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore :meth:`state_dict`; without a saved buffer the present one is emptied."""
+        self.network.load_state_dict(state["network"], strict=False)
+        self.optimizer.load_state_dict(state["optimizer"])
+        for name, generator in self.generators.items():
+            generator.set_state(state["generators"][name])
+        self.updates = state["updates"]
+
+
+def make_loss(network: QNetwork, config: RainbowConfig) -> LeanDistributionalLoss | LeanDQNLoss:
+    """The loss that ``config`` asks for."""
+    if config.distributional:
+        return LeanDistributionalLoss(network, config.gamma, config.double, config.kl_priority)
+    return LeanDQNLoss(network, config.gamma, config.double)

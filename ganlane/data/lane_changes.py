@@ -1,0 +1,150 @@
+"""One lane-change detector for recordings and simulations, and equation 11's times.
+
+**What counts.** The nearest lane changes between two samples, and it was the old one for the 0.5 s before and is
+the new one for the 0.5 s after, without a break. A vehicle that flickers across the boundary has not changed.
+
+**How long it takes** (equation 11, after Thiemann et al. 2008, in our reading). Going back from the instant of
+the crossing, the change starts at the first sample at which the vehicle is within 0.3 m of the old lane's centre
+or moves towards the new lane at less than 0.1 m/s; ``tau_s`` is the time in between. ``tau_e`` runs on from the
+crossing to the first sample within 0.3 m of the new lane's centre or slower than 0.1 m/s. The lateral speed is
+taken over 1 s, centred, since recorded positions jitter. The offset alone would not do: a fitted road is good to
+some decimetres, and drivers follow lanes beside the centre. A side on which the track ends first is censored:
+its time is a lower bound.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import ArrayLike
+
+from ganlane.data.schema import FRAME_S
+from ganlane.data.tracks import Flags, Floats, Integers, Tracks, tracks_of_arrays, tracks_of_frame
+
+#: Both lanes must hold this long, s.
+HOLD_S: Final = 0.5
+#: Within this of the lane's centre, m, the change has not begun or is over.
+CENTRED_M: Final = 0.3
+#: Slower than this towards the new lane, m/s, likewise.
+STILL_MPS: Final = 0.1
+#: Half the time over which the lateral speed is taken, s.
+SPEED_HALF_WINDOW_S: Final = 0.5
+#: How far from the crossing the start and the end are looked for, s.
+SEARCH_S: Final = 20.0
+
+
+@dataclass(frozen=True)
+class LaneChanges:
+    """C lane changes, in the order of the samples.
+
+    Attributes:
+        sample: [C] index of the last sample in the old lane.
+        old_lane, new_lane: [C]; 0 is the rightmost.
+        tau_s, tau_e: [C] times from the start to the crossing and from there to the end, s (equation 11).
+        start_censored, end_censored: [C] the track begins or ends first; the time is a lower bound.
+        lateral_speed: [C] mean over the change (its visible part, where censored), m/s, positive.
+    """
+
+    sample: Integers
+    old_lane: Integers
+    new_lane: Integers
+    tau_s: Floats
+    tau_e: Floats
+    start_censored: Flags
+    end_censored: Flags
+    lateral_speed: Floats
+
+    @property
+    def duration_s(self) -> Floats:
+        """[C] equation 11: ``tau_s + tau_e``; a lower bound where censored."""
+        return self.tau_s + self.tau_e
+
+    @property
+    def complete(self) -> Flags:
+        """[C] both ends were seen."""
+        return ~(self.start_censored | self.end_censored)
+
+    def __len__(self) -> int:
+        return len(self.sample)
+
+
+def find_lane_changes(tracks: Tracks) -> LaneChanges:
+    """All lane changes of ``tracks``; see the module's text for what counts and how it is timed."""
+    lane = tracks.lane
+    sample = _crossings(lane, tracks)
+    old, new = lane[sample], lane[sample + 1]
+    side = np.sign(new - old)
+    boundary = (old + 0.5 * side) * tracks.lane_width[sample]
+    part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
+    start, starts = _settled(tracks, sample, side, old, -1)
+    end, ends = _settled(tracks, sample + 1, side, new, 1)
+    tau_s = (sample - start + part) * tracks.step_s
+    tau_e = (end - sample - part) * tracks.step_s
+    moved = side * (tracks.y[end] - tracks.y[start])
+    return LaneChanges(sample, old, new, tau_s, tau_e, ~starts, ~ends, moved / (tau_s + tau_e))
+
+
+def lane_changes_of_frame(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> LaneChanges:
+    """Lane changes of a frame in the schema, sorted; ``sample`` is the row."""
+    return find_lane_changes(tracks_of_frame(frame, lane_widths))
+
+
+def lane_changes_of_arrays(
+    y: ArrayLike,
+    lane_width: float,
+    valid: ArrayLike | None = None,
+    begins: ArrayLike | None = None,
+    step_s: float = FRAME_S,
+) -> tuple[LaneChanges, Integers]:
+    """Lane changes of a simulation's [T, K] arrays, and [C, 2] the (time, column) of each one's ``sample``.
+
+    The arguments are those of :func:`ganlane.data.tracks.tracks_of_arrays`.
+    """
+    tracks, where = tracks_of_arrays(y, lane_width, valid, begins, step_s)
+    changes = find_lane_changes(tracks)
+    return changes, where[changes.sample]
+
+
+def _crossings(lane: Integers, tracks: Tracks) -> Integers:
+    """Last samples in an old lane that was held long enough, before a new one that is."""
+    index = np.arange(len(lane))
+    fresh = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
+    starts = np.flatnonzero(fresh)
+    lengths = np.diff(starts, append=len(lane))
+    held = lengths >= round(HOLD_S / tracks.step_s)
+    run = np.cumsum(fresh) - 1
+    changes = fresh & ~tracks.begins & (index > 0)
+    after = np.flatnonzero(changes)
+    return after[held[run[after]] & held[run[after - 1]]] - 1
+
+
+def _settled(
+    tracks: Tracks, sample: Integers, side: Integers, lane: Integers, direction: int
+) -> tuple[Integers, Flags]:
+    """First samples, going ``direction`` in time, at which the vehicle is centred or has stopped moving aside.
+
+    Returns:
+        [C] the samples, or the track's last ones that way; and [C] whether it settled before the track's end.
+    """
+    reach = round(SEARCH_S / tracks.step_s)
+    limit = (tracks.first if direction < 0 else tracks.last)[sample]
+    path = sample[:, None] + direction * np.arange(reach + 1)
+    inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
+    path = np.where(inside, path, limit[:, None])
+    offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
+    settled = (np.abs(offset) < CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < STILL_MPS)
+    settled &= inside
+    found = settled.any(axis=1)
+    at = np.where(found, settled.argmax(axis=1), inside.sum(axis=1) - 1)
+    return sample + direction * at, found
+
+
+def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
+    """Mean lateral speed over 1 s about the samples ``at``, m/s; over what there is of it at a track's ends."""
+    half = round(SPEED_HALF_WINDOW_S / tracks.step_s)
+    before = np.maximum(at - half, tracks.first[at])
+    after = np.minimum(at + half, tracks.last[at])
+    return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * tracks.step_s)

@@ -1,0 +1,85 @@
+"""How wide the lanes of a recording are, told by positions and lane numbers alone."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ganlane.errors import UserError
+
+#: 12 feet, the standard lane of a US freeway: taken where a recording shows one lane only.
+STANDARD_LANE_WIDTH_M: Final = 3.66
+#: A lane counts for the first fit when it has this many rows (0.5 s of one vehicle or more).
+_FEWEST_ROWS = 5
+_PLAUSIBLE_M = (2.0, 6.0)
+
+
+def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
+    """Lane width in metres of every scene of a frame in the schema.
+
+    Raises:
+        UserError: a scene's lanes are less than 2 m or more than 6 m apart, or numbered from the left.
+    """
+    return {
+        str(name): lane_width(rows["y"].to_numpy(), rows["lane"].to_numpy(), str(name))
+        for (name,), rows in frame.group_by("scene", maintain_order=True)
+    }
+
+
+def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
+    """Number of lanes of every scene of a frame in the schema (its highest lane and one)."""
+    counts = frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1)
+    return {str(scene): int(lanes) for scene, lanes in counts.iter_rows()}
+
+
+def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> float:
+    """Width in metres at which 'the lane whose centre is nearest' agrees best with the lane numbers.
+
+    Args:
+        y: [R] lateral positions, m, with 0 at the centre of lane 0 and growing with the lane number.
+        lane: [R] lane numbers.
+        scene: name for messages.
+
+    The first guess is the median slope between the median positions of each two lanes (Theil and Sen), which
+    outlying vehicles do not move. It stands if, of the widths within 10 % of it, it puts as many rows into
+    their own lane as any other; else the middle of the best range is taken. Lane changes make that range
+    narrow, since a vehicle's number changes just where it crosses the boundary.
+    """
+    guess = _median_spacing(y, lane)
+    if guess is None:
+        return STANDARD_LANE_WIDTH_M
+    if not _PLAUSIBLE_M[0] <= guess <= _PLAUSIBLE_M[1]:
+        raise UserError(
+            f"{scene}: its lanes are {guess:.2f} m apart, expected {_PLAUSIBLE_M[0]:.0f} to {_PLAUSIBLE_M[1]:.0f} m; "
+            "check that y is in metres, grows to the left, and that lanes are numbered in order."
+        )
+    low, high = _best_range(y, lane, guess)
+    return guess if low <= guess <= high else 0.5 * (low + high)
+
+
+def _best_range(y: NDArray[np.float64], lane: NDArray[np.int64], guess: float) -> tuple[float, float]:
+    """Widths within 10 % of the guess that most rows agree with: the range nearest to the guess, if several."""
+    # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no upper end.
+    begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5))
+    end = np.where(lane == 0, np.inf, y / np.where(lane == 0, 1.0, lane - 0.5))
+    begin, end = np.clip(begin, 0.9 * guess, 1.1 * guess), np.clip(end, 0.9 * guess, 1.1 * guess)
+    edges = np.unique(np.concatenate((begin, end, [0.9 * guess, 1.1 * guess])))
+    inside = 0.5 * (edges[1:] + edges[:-1])
+    agreeing = np.searchsorted(np.sort(begin), inside) - np.searchsorted(np.sort(end), inside)
+    best = np.flatnonzero(agreeing == agreeing.max())
+    nearest = best[np.argmin(np.abs(inside[best] - guess))]
+    return float(edges[nearest]), float(edges[nearest + 1])
+
+
+def _median_spacing(y: NDArray[np.float64], lane: NDArray[np.int64]) -> float | None:
+    """Median slope between the lanes' median positions; None with fewer than two lanes."""
+    numbers, rows = np.unique(lane, return_counts=True)
+    numbers = numbers[rows >= _FEWEST_ROWS]
+    if len(numbers) < 2:
+        return None
+    centres = np.array([np.median(y[lane == number]) for number in numbers])
+    one, other = np.triu_indices(len(numbers), 1)
+    return float(np.median((centres[other] - centres[one]) / (numbers[other] - numbers[one])))

@@ -1,0 +1,57 @@
+"""Scene CSV: recordings that are straightened already, in metres, with lanes counted from the left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import polars as pl
+
+from ganlane.data.lane_widths import lane_width
+from ganlane.data.schema import SCHEMA, sort, validate
+from ganlane.data.tables import read_table
+from ganlane.errors import UserError
+
+#: Columns of the file; ``y`` is 0 at the centre of lane 1, which is the leftmost, and grows to the left.
+COLUMNS: Final = {
+    "scene": pl.String,
+    "vehicle": pl.Int64,
+    "frame": pl.Int64,
+    "x": pl.Float64,
+    "y": pl.Float64,
+    "v": pl.Float64,
+    "lane": pl.Int64,
+    "length": pl.Float64,
+    "width": pl.Float64,
+}
+
+
+def read_scenes(path: str | Path) -> pl.DataFrame:
+    """Read a scene CSV into the schema, sorted by scene, vehicle and frame.
+
+    Lanes are turned round (the highest number of a scene, its rightmost lane, becomes 0), and ``y`` is moved so
+    that it is 0 at the centre of that lane. Positions are the file's own: nothing is smoothed.
+
+    Args:
+        path: CSV with the columns ``scene, vehicle, frame, x, y, v, lane, length, width`` (others are ignored);
+            metres, m/s, 0.1 s a frame; lane 1 leftmost.
+
+    Raises:
+        UserError: a missing or damaged file; the message names file, line and column.
+    """
+    table = read_table(path, COLUMNS).rename({"v": "speed"})
+    below = table["lane"] < 1
+    if below.any():
+        row = int(below.arg_max() or 0)
+        raise UserError(f"{path}, line {row + 2}, column lane: {table['lane'][row]} is below 1, the leftmost lane.")
+    rows = validate(table, str(path))
+    turned = [_turn_round(scene, f"{path}, scene {name}") for (name,), scene in rows.group_by("scene")]
+    return sort(pl.concat(turned))
+
+
+def _turn_round(scene: pl.DataFrame, source: str) -> pl.DataFrame:
+    """One scene with lanes counted from the right and ``y`` measured from the rightmost lane's centre."""
+    from_left = scene["lane"].to_numpy() - 1
+    width = lane_width(-scene["y"].to_numpy(), from_left, source)
+    last = int(from_left.max())
+    return scene.with_columns(y=pl.col("y") + last * width, lane=last + 1 - pl.col("lane")).select(SCHEMA.names())

@@ -1,0 +1,45 @@
+"""Measuring drivers: given episodes, honest intervals, one table, and a record of where it came from.
+
+The path of a number: :func:`run_episodes` drives the episodes 0 to E - 1 and gives one row for each;
+:func:`evaluation_rows` turns the rows of several agents and traffics into the evaluation's table, with
+bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for crashes
+(:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
+:func:`text_table` and :func:`markdown_table` print it; :func:`write_results` and :func:`write_episodes` keep it.
+"""
+
+from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
+from ganlane.evaluation.episodes import run_episodes
+from ganlane.evaluation.layout import markdown_table, text_table
+from ganlane.evaluation.provenance import code_version, machine
+from ganlane.evaluation.results import results_record, write_episodes, write_results
+from ganlane.evaluation.score import NormalizedScore, normalized_percent
+from ganlane.evaluation.statistics import (
+    Estimate,
+    interquartile_mean,
+    mean_interval,
+    paired_difference,
+    probability_of_improvement,
+)
+from ganlane.evaluation.table import evaluation_rows
+
+__all__ = [
+    "Estimate",
+    "NormalizedScore",
+    "clopper_pearson",
+    "code_version",
+    "evaluation_rows",
+    "interquartile_mean",
+    "machine",
+    "markdown_table",
+    "mean_interval",
+    "normalized_percent",
+    "paired_difference",
+    "poisson_interval",
+    "probability_of_improvement",
+    "rate_per_1000_km",
+    "results_record",
+    "run_episodes",
+    "text_table",
+    "write_episodes",
+    "write_results",
+]

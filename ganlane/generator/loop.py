@@ -1,0 +1,189 @@
+"""The fitting loop that both presets share: updates, evaluations on held-out scenes, early stopping, resuming."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from ganlane.errors import UserError
+from ganlane.files import atomic_path
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How long to fit.
+
+    Attributes:
+        updates: updates at most; the learning rate falls to 0 over them.
+        evaluate_every: updates between two evaluations on the held-out scenes.
+        patience: evaluations without improvement before stopping.
+        learning_rate: of Adam, after the warm-up.
+        warmup: updates over which the learning rate rises.
+        largest_gradient: norm at which gradients are cut.
+        max_seconds: stop after this long; None is never.
+    """
+
+    updates: int = 3000
+    evaluate_every: int = 200
+    patience: int = 8
+    learning_rate: float = 2e-3
+    warmup: int = 100
+    largest_gradient: float = 1.0
+    max_seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress bar or a log shows.
+
+    Attributes:
+        update: updates done.
+        updates: updates at most.
+        losses: the last update's losses.
+        score: the last evaluation's score (lower is better), or None before the first.
+        best: the lowest score so far.
+        seconds: since the start of this call.
+    """
+
+    update: int
+    updates: int
+    losses: dict[str, float]
+    score: float | None
+    best: float
+    seconds: float
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class FitTask(Protocol):
+    """What is fitted: networks, their optimisers, one update, one evaluation."""
+
+    modules: dict[str, nn.Module]
+    optimisers: dict[str, torch.optim.Optimizer]
+    random: torch.Generator
+
+    def update(self, number: int) -> dict[str, float]:
+        """Do update ``number`` and return its losses."""
+
+    def evaluate(self) -> float:
+        """Score on the held-out scenes; lower is better."""
+
+
+def learning_rate(config: LoopConfig, number: int) -> float:
+    """Linear warm-up, then a half cosine to 0."""
+    rise = min(1.0, (number + 1) / max(1, config.warmup))
+    return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))
+
+
+class FitLoop:
+    """Runs a task until it stops improving; ``state_dict`` holds everything that a later run needs to go on.
+
+    Args:
+        task: what is fitted.
+        config: how long.
+        resume_path: file in which the state is kept after every evaluation, and from which it goes on.
+    """
+
+    def __init__(self, task: FitTask, config: LoopConfig, resume_path: str | Path | None = None):
+        self.task, self.config = task, config
+        self.path = None if resume_path is None else Path(resume_path)
+        self.done, self.waited, self.best_update, self.best = 0, 0, 0, math.inf
+        self.best_weights: dict[str, dict[str, Tensor]] = {}
+        if self.path is not None and self.path.exists():
+            self.load_state_dict(load_resume(self.path))
+
+    def run(self, on_progress: OnProgress | None = None) -> None:
+        """Fit, then put the best weights into the task's networks."""
+        begun, score = time.monotonic(), None
+        while self.done < self.config.updates and self.waited < self.config.patience:
+            self._set_learning_rate()
+            losses = self.task.update(self.done)
+            self.done += 1
+            seconds = time.monotonic() - begun
+            late = self.config.max_seconds is not None and seconds > self.config.max_seconds
+            if self.done % self.config.evaluate_every == 0 or self.done == self.config.updates or late:
+                score = self._evaluate()
+            if on_progress is not None:
+                on_progress(Progress(self.done, self.config.updates, losses, score, self.best, seconds))
+            if late:
+                break
+        for name, weights in self.best_weights.items():
+            self.task.modules[name].load_state_dict(weights)
+
+    def _evaluate(self) -> float:
+        score = self.task.evaluate()
+        self.waited += 1
+        if score < self.best:
+            self.best, self.best_update, self.waited = score, self.done, 0
+            self.best_weights = {name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()}
+        if self.path is not None:
+            with atomic_path(self.path) as part:
+                torch.save(self.state_dict(), part)
+        return score
+
+    def _set_learning_rate(self) -> None:
+        for optimiser in self.task.optimisers.values():
+            for group in optimiser.param_groups:
+                group["lr"] = learning_rate(self.config, self.done)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counters, weights, optimisers and the random generator: tensors and plain data."""
+        return {
+            "counters": [self.done, self.waited, self.best_update],
+            "best": self.best,
+            "best_weights": self.best_weights,
+            "modules": {name: module.state_dict() for name, module in self.task.modules.items()},
+            "optimisers": {name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()},
+            "random": self.task.random.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state_dict`.
+
+        Raises:
+            UserError: the state belongs to other networks.
+        """
+        try:
+            for name, module in self.task.modules.items():
+                module.load_state_dict(state["modules"][name])
+            for name, optimiser in self.task.optimisers.items():
+                optimiser.load_state_dict(state["optimisers"][name])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise UserError(
+                f"{self.path}: holds another fit than the one asked for; give the same preset and sizes, or remove it."
+            ) from error
+        self.done, self.waited, self.best_update = state["counters"]
+        self.best, self.best_weights = state["best"], state["best_weights"]
+        self.task.random.set_state(state["random"])
+
+
+def load_resume(path: Path) -> dict[str, Any]:
+    """Read what :class:`FitLoop` keeps; never executes code.
+
+    Raises:
+        UserError: not such a file.
+    """
+    try:
+        state = torch.load(path, weights_only=True)
+    except Exception as error:
+        raise UserError(f"{path}: not the state of a fit; give the file that a fit keeps, or remove it.") from error
+    if not isinstance(state, dict) or "counters" not in state:
+        raise UserError(f"{path}: not the state of a fit; give the file that a fit keeps, or remove it.")
+    return state
+
+
+def descend(optimiser: torch.optim.Optimizer, loss: Tensor, module: nn.Module, largest: float) -> None:
+    """One step of ``optimiser`` down ``loss``, with the gradient's norm cut at ``largest``."""
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    nn.utils.clip_grad_norm_(module.parameters(), largest)
+    optimiser.step()

@@ -1,0 +1,64 @@
+"""An LSTM over motions whose input projection can be kept, so that a window that moves on is not embedded anew."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+#: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the networks' units.
+DISPLACEMENT_SCALE_M = (1.0, 0.05)
+DIFFERENCE_SCALE_M = (0.04, 0.02)
+#: Changes of displacement are cut off here (in units of the scale): recorded positions jump now and then.
+LARGEST_DIFFERENCE = 5.0
+MOTION_FEATURES = 4
+
+
+def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
+    """Network inputs [..., 4] of displacements [..., 2] per 0.1 s and their differences to the step before, in m."""
+    scaled = displacement / displacement.new_tensor(DISPLACEMENT_SCALE_M)
+    change = difference / difference.new_tensor(DIFFERENCE_SCALE_M)
+    return torch.cat([scaled, change.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)], dim=-1)
+
+
+class MotionLSTM(nn.Module):
+    """Embedding with ReLU, then an LSTM cell in two parts: the projection of the input, and the recurrence.
+
+    Args:
+        embedding: width of the embedding.
+        hidden: width H of the LSTM's state.
+    """
+
+    def __init__(self, embedding: int, hidden: int):
+        super().__init__()
+        self.hidden = hidden
+        self.embed = nn.Linear(MOTION_FEATURES, embedding)
+        self.input = nn.Linear(embedding, 4 * hidden)
+        self.recurrent = nn.Parameter(torch.empty(4 * hidden, hidden))
+        bound = 1.0 / math.sqrt(hidden)
+        nn.init.uniform_(self.recurrent, -bound, bound)
+        with torch.no_grad():
+            self.input.bias[hidden : 2 * hidden].fill_(1.0)  # remember, until it has learnt to forget
+
+    def project(self, displacement: Tensor, difference: Tensor) -> Tensor:
+        """The input's share [..., 4H] in the gates; depends on this motion alone, so it can be kept."""
+        return self.input(torch.relu(self.embed(motion_features(displacement, difference))))
+
+    def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+        """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]); returns the new state."""
+        return self._update(projected + hidden @ self.recurrent.T, cell)
+
+    def encode(self, projections: Tensor) -> Tensor:
+        """Last hidden state [..., H] after the projections [..., T, 4H], from a state of zeros."""
+        steps = projections.unbind(dim=-2)
+        hidden, cell = self._update(steps[0], torch.zeros_like(steps[0][..., : self.hidden]))
+        for projected in steps[1:]:
+            hidden, cell = self.step(projected, hidden, cell)
+        return hidden
+
+    @staticmethod
+    def _update(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+        take, keep, new, show = gates.chunk(4, dim=-1)
+        cell = torch.sigmoid(keep) * cell + torch.sigmoid(take) * torch.tanh(new)
+        return torch.sigmoid(show) * torch.tanh(cell), cell

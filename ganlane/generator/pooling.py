@@ -1,0 +1,74 @@
+"""Social pooling over pairs of vehicles: masked, padded, the nearest only, the first layer split in two.
+
+The original (Gupta et al. 2018) loops over scenes and runs a layer on the concatenation of relative position
+and the other's state for every pair. That layer is linear, so it is the sum of a part per vehicle (computed
+once for each) and a part per pair (four numbers wide).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+#: Relative position and relative displacement, in these units (m, m per 0.1 s), along and across the road.
+_POSITION_SCALE_M = (20.0, 4.0)
+_MOTION_SCALE_M = (0.4, 0.05)
+#: Who is further away than this, along the road, has no influence.
+RANGE_M = 100.0
+_PAIR_FEATURES = 4
+
+
+def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
+    """The ``neighbours`` nearest other vehicles of each: indices [B, G, K] and whether each is one, [B, G, K].
+
+    ``position`` is [B, G, 2] in m, ``valid`` [B, G]. With too few vehicles to choose from K is G, in order of
+    memory. Padding, the vehicle itself and who is out of :data:`RANGE_M` are marked false.
+    """
+    count = position.shape[-2]
+    offset = position[..., None, :, :] - position[..., :, None, :]
+    alone = torch.eye(count, dtype=torch.bool, device=position.device)
+    seen = valid[..., None, :] & ~alone & (offset[..., 0].abs() <= RANGE_M)
+    if count - 1 <= neighbours:
+        return torch.arange(count, device=position.device).expand(offset.shape[:-1]), seen
+    distance = (offset * offset).sum(-1).masked_fill(~seen, torch.inf)
+    index = distance.topk(neighbours, dim=-1, largest=False).indices
+    return index, seen.gather(-1, index)
+
+
+def gather_vehicles(values: Tensor, index: Tensor) -> Tensor:
+    """Rows [B, G, K, F] of ``values`` [B, G, F] at ``index`` [B, G, K]."""
+    batch, count, chosen = index.shape
+    flat = index.reshape(batch, count * chosen, 1).expand(-1, -1, values.shape[-1])
+    return values.gather(1, flat).reshape(batch, count, chosen, values.shape[-1])
+
+
+class PairPooling(nn.Module):
+    """Max pooling of two layers over each vehicle's nearest neighbours; zeros where there is none.
+
+    Args:
+        hidden: width H of the vehicles' states.
+        inner: width of the first layer.
+        pooled: width P of the result.
+        neighbours: how many of the nearest count.
+    """
+
+    def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
+        super().__init__()
+        self.neighbours = neighbours
+        self.per_pair = nn.Linear(_PAIR_FEATURES, inner)
+        self.per_vehicle = nn.Linear(hidden, inner, bias=False)
+        self.second = nn.Linear(inner, pooled)
+
+    def forward(self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor) -> Tensor:
+        """Pooled states [B, G, P] of states [B, G, H], positions and displacements [B, G, 2] and mask [B, G]."""
+        index, seen = nearest(position, valid, self.neighbours)
+        pairs = self.pair_features(position, displacement, index)
+        first = torch.relu(self.per_pair(pairs) + gather_vehicles(self.per_vehicle(hidden), index))
+        return (torch.relu(self.second(first)) * seen[..., None]).amax(dim=-2)
+
+    @staticmethod
+    def pair_features(position: Tensor, displacement: Tensor, index: Tensor) -> Tensor:
+        """Relative position and relative displacement [B, G, K, 4] of the neighbours at ``index``, scaled."""
+        scale = position.new_tensor((*_POSITION_SCALE_M, *_MOTION_SCALE_M))
+        state = torch.cat([position, displacement], dim=-1)
+        return (gather_vehicles(state, index) - state[..., None, :]) / scale

@@ -1,0 +1,54 @@
+"""The simulator as pure functions on tensors (sections IV and V of the paper); no TorchRL in here.
+
+A scene is a record of [N, M] tensors (:class:`Vehicles`: N environments, M vehicles). From it follow, in this
+order, what each driver sees (:func:`perceive`, :mod:`~ganlane.sim.lanes`, :mod:`~ganlane.sim.neighbours`), how
+hard it accelerates (:mod:`~ganlane.sim.idm`, :mod:`~ganlane.sim.following`), whether it changes lanes
+(:mod:`~ganlane.sim.mobil`), how it turns the wheel (:mod:`~ganlane.sim.steering`), where the car goes
+(:mod:`~ganlane.sim.bicycle`) and whether it hits something (:mod:`~ganlane.sim.collisions`).
+:mod:`~ganlane.sim.spawn` makes the first scene of an episode, :mod:`~ganlane.sim.random` every random number.
+"""
+
+from ganlane.sim.bicycle import advance
+from ganlane.sim.collisions import boxes_overlap, dangerously_close, ego_overlaps, pair_overlaps
+from ganlane.sim.following import following_acceleration
+from ganlane.sim.idm import TABLE_V, IdmParameters, equilibrium_gap, idm_acceleration
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_changes, safe_change
+from ganlane.sim.neighbours import FREE_GAP_M, Scene, follower, leader, perceive
+from ganlane.sim.random import Purpose, Stream, episode_key
+from ganlane.sim.road import Road
+from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
+from ganlane.sim.steering import steer
+from ganlane.sim.vehicles import Vehicles
+
+__all__ = [
+    "FREE_GAP_M",
+    "TABLE_II",
+    "TABLE_IV",
+    "TABLE_V",
+    "IdmParameters",
+    "MobilParameters",
+    "Purpose",
+    "Road",
+    "Scene",
+    "SpawnParameters",
+    "Stream",
+    "Vehicles",
+    "Visibility",
+    "advance",
+    "boxes_overlap",
+    "dangerously_close",
+    "ego_overlaps",
+    "episode_key",
+    "equilibrium_gap",
+    "follower",
+    "following_acceleration",
+    "idm_acceleration",
+    "leader",
+    "mobil_changes",
+    "pair_overlaps",
+    "perceive",
+    "safe_change",
+    "spawn",
+    "steer",
+]

@@ -1,0 +1,90 @@
+"""Overlap of oriented boxes by the separating-axis theorem, and nearness before a crash."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ganlane.sim.vehicles import Vehicles
+
+
+def _separated(
+    along: Tensor,
+    across: Tensor,
+    half_length: Tensor,
+    half_width: Tensor,
+    other_length: Tensor,
+    other_width: Tensor,
+    cos: Tensor,
+    sin: Tensor,
+) -> Tensor:
+    """Whether an axis of the first box separates it from the other, whose axes are turned by (cos, sin)."""
+    reach_along = half_length + other_length * cos + other_width * sin
+    reach_across = half_width + other_length * sin + other_width * cos
+    return (along.abs() >= reach_along) | (across.abs() >= reach_across)
+
+
+def boxes_overlap(
+    dx: Tensor,
+    dy: Tensor,
+    heading: Tensor,
+    length: Tensor,
+    width: Tensor,
+    other_heading: Tensor,
+    other_length: Tensor,
+    other_width: Tensor,
+) -> Tensor:
+    """Whether two oriented boxes overlap (touching does not count), elementwise.
+
+    Args:
+        dx, dy: from the centre of the first box to the centre of the other, m.
+        heading, length, width: of the first box, rad and m; ``other_*``: of the other.
+    """
+    turn = other_heading - heading
+    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
+    c, s = torch.cos(heading), torch.sin(heading)
+    oc, os = torch.cos(other_heading), torch.sin(other_heading)
+    own = (0.5 * length, 0.5 * width)
+    other = (0.5 * other_length, 0.5 * other_width)
+    by_own = _separated(dx * c + dy * s, dy * c - dx * s, *own, *other, cos, sin)
+    by_other = _separated(dx * oc + dy * os, dy * oc - dx * os, *other, *own, cos, sin)
+    return ~(by_own | by_other)
+
+
+def ego_overlaps(vehicles: Vehicles) -> Tensor:
+    """Whether the ego (index 0) overlaps each of the others, bool [N, M - 1]."""
+    ego = {name: value[:, :1] for name, value in vehicles.as_dict().items()}
+    others = {name: value[:, 1:] for name, value in vehicles.as_dict().items()}
+    hit = boxes_overlap(
+        others["x"] - ego["x"],
+        others["y"] - ego["y"],
+        ego["heading"],
+        ego["length"],
+        ego["width"],
+        others["heading"],
+        others["length"],
+        others["width"],
+    )
+    return hit & others["valid"] & ego["valid"]
+
+
+def pair_overlaps(vehicles: Vehicles) -> Tensor:
+    """Whether vehicles i and j overlap, bool [N, M, M], false on the diagonal."""
+    v = vehicles
+    hit = boxes_overlap(
+        v.x[:, None] - v.x[:, :, None],
+        v.y[:, None] - v.y[:, :, None],
+        v.heading[:, :, None],
+        v.length[:, :, None],
+        v.width[:, :, None],
+        v.heading[:, None],
+        v.length[:, None],
+        v.width[:, None],
+    )
+    both = v.valid[:, None] & v.valid[:, :, None]
+    return hit & both & ~torch.eye(v.x.shape[1], dtype=torch.bool, device=v.x.device)
+
+
+def dangerously_close(gap: Tensor, closing_speed: Tensor, ttc_s: float = 1.5, gap_m: float = 2.0) -> Tensor:
+    """Soft crash: gap under ``gap_m`` or time to collision under ``ttc_s``; gap in m, closing speed in m/s."""
+    return (gap < gap_m) | (gap < ttc_s * closing_speed)

@@ -1,0 +1,106 @@
+"""The ego's lane changes, motion and dangers, one ego (vehicle 0) per environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ganlane.keys import EGO_INDEX, LEFT, RIGHT
+from ganlane.sim.bicycle import advance
+from ganlane.sim.collisions import dangerously_close
+from ganlane.sim.following import following_acceleration
+from ganlane.sim.idm import IdmParameters
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.neighbours import Scene, follower, leader, perceive
+from ganlane.sim.road import Road
+from ganlane.sim.steering import SteeringParameters, steer
+from ganlane.sim.vehicles import Vehicles
+
+
+@dataclass(frozen=True)
+class EgoParameters:
+    """How the ego takes commands and shows its lane changes; soft-crash limits in s and m."""
+
+    abort_lane_change: bool = False
+    visibility: Visibility = Visibility.BODY
+    soft_crash_ttc_s: float = 1.5
+    soft_crash_gap_m: float = 2.0
+
+
+class Command(NamedTuple):
+    """What a command leads to, each [N].
+
+    Target lane; direction of the change under way (-1 right, 0, +1 left); whether a change starts; whether the
+    command would leave the road.
+    """
+
+    target_lane: Tensor
+    direction: Tensor
+    starts: Tensor
+    off_road: Tensor
+
+
+def obey(action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool) -> Command:
+    """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose change under way has ``direction``; [N] int64.
+
+    While a change is under way commands are ignored and cost nothing; with ``abort`` the opposite command turns
+    back. A command that would leave the road changes nothing but says so.
+    """
+    wish = torch.where(action == LEFT, 1, torch.where(action == RIGHT, -1, 0))
+    heard = (direction == 0) | (wish == -direction) if abort else direction == 0
+    wish = torch.where(heard, wish, 0)
+    target = target_lane + wish
+    off_road = (target < 0) | (target > lanes - 1)
+    wish = torch.where(off_road, 0, wish)
+    starts = wish != 0
+    return Command(target_lane + wish, torch.where(starts, wish, direction), starts, off_road)
+
+
+def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
+    """What the ego sees: a scene with one observer."""
+    return perceive(vehicles, road, slice(EGO_INDEX, EGO_INDEX + 1))
+
+
+def move_ego(
+    scene: Scene, steering: Tensor, road: Road, idm: IdmParameters, wheel: SteeringParameters, dt: float
+) -> tuple[Vehicles, Tensor]:
+    """The ego after ``dt`` seconds (fields [N]) and its steering angle (rad, [N]).
+
+    Along the road it follows IDM, across it its target lane; its driver decides the lane alone.
+    """
+    ego = scene.observers.at(0)
+    acceleration = following_acceleration(scene, idm)[:, 0]
+    centre = road.centre_of(scene.observers.target_lane, ego.y.dtype)[:, 0]
+    steering = steer(steering, ego.y, ego.heading, ego.speed, centre, dt, wheel)
+    pose = advance(ego.x, ego.y, ego.heading, ego.speed, acceleration, steering, dt)
+    return ego.with_(**pose._asdict()), steering
+
+
+def soft_crash_ahead(scene: Scene, ego: EgoParameters) -> Tensor:
+    """Whether the ego is dangerously close to the leader in a lane that its body is in, bool [N]."""
+    close = []
+    for lane in scene.body:
+        ahead = leader(scene, lane)
+        closing = scene.observers.speed - ahead.speed
+        close.append(dangerously_close(ahead.gap, closing, ego.soft_crash_ttc_s, ego.soft_crash_gap_m))
+    return (close[0] | close[1])[:, 0]
+
+
+def soft_crash_behind(scene: Scene, ego: EgoParameters) -> Tensor:
+    """The same for the follower, bool [N]."""
+    close = []
+    for lane in scene.body:
+        behind = follower(scene, lane)
+        closing = torch.where(behind.exists, behind.speed - scene.observers.speed, 0.0)
+        close.append(dangerously_close(behind.gap, closing, ego.soft_crash_ttc_s, ego.soft_crash_gap_m))
+    return (close[0] | close[1])[:, 0]
+
+
+def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
+    """How far a change under way has come, 0 at its start to 1 on the target lane's centre; 0 without one; [N]."""
+    width = road.lane_width_m if not isinstance(road.lane_width_m, Tensor) else road.lane_width_m[:, 0]
+    remaining = (ego.y - ego.target_lane.to(ego.y.dtype) * width).abs() / width
+    return torch.where(direction != 0, (1.0 - remaining).clamp(0.0, 1.0), 0.0)

@@ -1,0 +1,74 @@
+"""Which lanes a vehicle is in: for others, and for its own driver.
+
+Who sees a vehicle that changes lanes decides how often drivers crash, so it is a property of each vehicle:
+
+- ``CENTRE``: only in the lane of its centre;
+- ``BODY``: in every lane that its body enters by more than :data:`ENTRY_M`;
+- ``SIGNALLED``: as ``BODY``, and in its target lane from the command on.
+
+The driver of a vehicle always attends to the lanes of its body *and* to its target lane.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+
+ENTRY_M = 0.1
+#: A lane change is complete, and the next one possible, within this distance of the target lane's centre.
+ARRIVED_M = 0.3
+
+
+class Visibility(IntEnum):
+    """When others see that a vehicle enters their lane."""
+
+    CENTRE = 0
+    BODY = 1
+    SIGNALLED = 2
+
+
+class LaneRange(NamedTuple):
+    """Lowest and highest lane of each vehicle, float tensors [N, M]."""
+
+    low: Tensor
+    high: Tensor
+
+
+def lateral_half_extent(vehicles: Vehicles) -> Tensor:
+    """Half of the lateral space that each body takes, m, its heading included."""
+    return 0.5 * (vehicles.width * torch.cos(vehicles.heading) + vehicles.length * torch.sin(vehicles.heading).abs())
+
+
+def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
+    """Lanes that each body enters by more than :data:`ENTRY_M`."""
+    reach = lateral_half_extent(vehicles) - ENTRY_M
+    return LaneRange(road.lane_of(vehicles.y - reach), road.lane_of(vehicles.y + reach))
+
+
+def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
+    """``lanes`` widened to the target lane: what the driver attends to."""
+    target = vehicles.target_lane.to(lanes.low.dtype)
+    return LaneRange(torch.minimum(lanes.low, target), torch.maximum(lanes.high, target))
+
+
+def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRange) -> LaneRange:
+    """Lanes in which the others see each vehicle, by its visibility; none for one that is not valid."""
+    centre = road.lane_of(vehicles.y)
+    signalled = vehicles.visibility == Visibility.SIGNALLED
+    by_body = vehicles.visibility == Visibility.BODY
+    low = torch.where(signalled, attention.low, torch.where(by_body, body.low, centre))
+    high = torch.where(signalled, attention.high, torch.where(by_body, body.high, centre))
+    nowhere = torch.inf
+    return LaneRange(torch.where(vehicles.valid, low, nowhere), torch.where(vehicles.valid, high, -nowhere))
+
+
+def settled(vehicles: Vehicles, road: Road) -> Tensor:
+    """Whether no lane change is under way: the centre within :data:`ARRIVED_M` of the target lane's, bool."""
+    centre = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
+    return (vehicles.y - centre).abs() < ARRIVED_M

@@ -1,0 +1,127 @@
+"""Initial scenes (section IV.A, Table II), built without a rejection loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ganlane.errors import UserError
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.random import Purpose, draw_keys, uniform
+from ganlane.sim.vehicles import Vehicles
+
+
+@dataclass(frozen=True)
+class SpawnParameters:
+    """Table II. Distances in m, speeds in m/s, (low, high) ranges; spacing is centre to centre in a lane."""
+
+    spread_m: float = 200.0
+    min_spacing_m: float = 25.0
+    front_speed_mps: tuple[float, float] = (10.0, 12.0)
+    rear_speed_mps: tuple[float, float] = (15.0, 25.0)
+    ego_speed_mps: tuple[float, float] = (10.0, 15.0)
+    desired_speed_mps: tuple[float, float] = (18.0, 26.0)
+    ego_desired_speed_mps: float = 25.0
+    length_m: float = 4.5
+    width_m: float = 2.5
+
+    def lane_capacity(self) -> int:
+        """Vehicles that fit into one lane."""
+        return int(self.spread_m / self.min_spacing_m) + 1
+
+    def check(self, vehicles: int, lanes: int) -> None:
+        """Raise :class:`UserError` where ``vehicles`` do not fit on ``lanes`` lanes, or overlap by design."""
+        if self.min_spacing_m <= self.length_m:
+            raise UserError(
+                f"env.min_spacing_m={self.min_spacing_m:g} is not above the vehicles' length of "
+                f"{self.length_m:g} m: they would overlap; choose a larger spacing."
+            )
+        capacity = self.lane_capacity()
+        if vehicles > lanes * capacity:
+            raise UserError(
+                f"env.vehicles={vehicles} do not fit: {lanes} lanes x {capacity} vehicles "
+                f"(env.spread_m={self.spread_m:g}, env.min_spacing_m={self.min_spacing_m:g}) hold "
+                f"{lanes * capacity}; use fewer vehicles, more lanes or a larger env.spread_m."
+            )
+
+
+TABLE_II = SpawnParameters()
+
+
+def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
+    """How many come before each, by ``value`` [N, M] and then index, among those for which ``same`` [N, M, M] holds."""
+    index = torch.arange(value.shape[1], device=value.device)
+    mine, other = value[:, :, None], value[:, None, :]
+    before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
+    return (before if same is None else before & same).sum(-1)
+
+
+def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
+    """A random lane for each vehicle, [N, vehicles] int64, at most ``capacity`` in each.
+
+    All places of all lanes are shuffled and the first ``vehicles`` of them taken.
+    """
+    places = _place_keys(key, lanes * capacity)
+    return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
+
+
+def _place_keys(key: Tensor, places: int) -> Tensor:
+    return draw_keys(key, 0, places, [int(Purpose.SPAWN_LANE)])[..., 0]
+
+
+def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
+    """Positions in m, [N, M]: in a lane of k, sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank."""
+    same = lane[:, :, None] == lane[:, None, :]
+    count = same.sum(-1)
+    room = spread_m - spacing_m * (count - 1)
+    return u * room + spacing_m * _rank(u, same)
+
+
+def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
+    """Order by position with the vehicle of rank (M - 1) // 2, the ego, in front; the ego at x = 0."""
+    rank = _rank(x)
+    order = torch.where(rank == (x.shape[1] - 1) // 2, -1, rank).argsort(dim=1)
+    x, lane = x.gather(1, order), lane.gather(1, order)
+    return x - x[:, :1], lane
+
+
+def _between(u: Tensor, bounds: tuple[float, float]) -> Tensor:
+    return bounds[0] + u * (bounds[1] - bounds[0])
+
+
+def spawn(
+    key: Tensor,
+    vehicles: int,
+    lanes: int,
+    lane_width_m: float,
+    parameters: SpawnParameters = TABLE_II,
+    dtype: torch.dtype = torch.float32,
+    ego_visibility: int = Visibility.BODY,
+    others_visibility: int = Visibility.SIGNALLED,
+) -> Vehicles:
+    """A random scene per episode key [N]; the ego is at index 0, the others follow by position."""
+    p = parameters
+    u = uniform(key, 0, vehicles, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED, Purpose.SPAWN_DESIRED_SPEED], dtype)
+    lane = draw_lanes(key, vehicles, lanes, p.lane_capacity())
+    x, lane = ego_first(place_in_lanes(lane, u[..., 0], p.spread_m, p.min_spacing_m), lane)
+    is_ego = torch.arange(vehicles, device=key.device) == 0
+    speed = torch.where(x > 0, _between(u[..., 1], p.front_speed_mps), _between(u[..., 1], p.rear_speed_mps))
+    speed = torch.where(is_ego, _between(u[..., 1], p.ego_speed_mps), speed)
+    desired = torch.where(is_ego, p.ego_desired_speed_mps, _between(u[..., 2], p.desired_speed_mps))
+    seen = torch.where(is_ego, int(ego_visibility), int(others_visibility))
+    zero = torch.zeros_like(x)
+    return Vehicles(
+        x=x,
+        y=lane.to(dtype) * lane_width_m,
+        heading=zero,
+        speed=speed,
+        acceleration=zero,
+        length=zero + p.length_m,
+        width=zero + p.width_m,
+        desired_speed=desired,
+        target_lane=lane,
+        visibility=seen.expand(x.shape).clone(),
+        valid=torch.ones_like(lane, dtype=torch.bool),
+    )

@@ -1,0 +1,99 @@
+"""What every traffic model is: a TensorDictModule that moves the other vehicles by 0.1 s."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from ganlane import keys
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.random import Stream, episode_key
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+
+#: Name to (trailing shape after [N, M], dtype); the dtype None stands for the run's float type.
+MemoryFields = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
+
+
+class TrafficModule(TensorDictModuleBase):
+    """Base of all traffic models.
+
+    In keys: ``vehicles`` (the state at t, never written), ``traffic`` (the module's memory), ``seed``,
+    ``episode``, ``step`` ([N] int64). Out keys: ``moved`` (the same fields as ``vehicles``, the others at
+    t + 0.1 s) and ``traffic``. Index 0 is the ego: what the module writes there is overwritten by the
+    environment. Randomness comes from :mod:`ganlane.sim.random` and the counters alone.
+
+    A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields` and
+    fills them in :meth:`fresh_memory`::
+
+        class Cruise(TrafficModule):
+            def move(self, vehicles, memory, key, step):
+                return vehicles.with_(x=vehicles.x + vehicles.speed * self.dt), memory
+
+    Args:
+        road: lanes and lane width, fixed for the module's life.
+        stream: family of episodes that the random numbers belong to (:class:`ganlane.sim.random.Stream`).
+    """
+
+    in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
+    out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
+
+    #: How the vehicles of this model show their lane changes to others.
+    visibility: Visibility = Visibility.SIGNALLED
+    #: Per-vehicle memory; empty for a model without any.
+    memory_fields: MemoryFields = {}  # noqa: RUF012
+
+    def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN) -> None:
+        super().__init__()
+        self.road = road or Road()
+        self.stream = int(stream)
+        self.dt = PHYSICS_STEP_S
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """The vehicles at t + 0.1 s, and the memory to keep.
+
+        Args:
+            vehicles: at t, fields [N, M].
+            memory: name to tensor [N, M, ...].
+            key: the episodes' keys [N] int64, for random numbers.
+            step: physics steps since the start of the episode, [N] int64.
+        """
+        raise NotImplementedError
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+        """Memory as if every vehicle had just entered; ``key`` [N] gives random traits."""
+        return {}
+
+    # Below: TensorDicts in and out, so that models can be chained and stored.
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``moved`` and ``traffic``."""
+        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+        memory = dict(tensordict.get(keys.TRAFFIC).items())
+        key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        moved, memory = self._call(tensordict, vehicles, memory, key)
+        batch = tensordict.batch_size
+        tensordict.set(keys.MOVED, TensorDict._new_unsafe(moved.as_dict(), batch_size=batch))
+        tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(memory, batch_size=batch))
+        return tensordict
+
+    def _call(
+        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor
+    ) -> tuple[Vehicles, dict[str, Tensor]]:
+        return self.move(vehicles, memory, key, tensordict.get(keys.STEP))
+
+    def init_memory(self, vehicles: Vehicles, who: Tensor, key: Tensor) -> TensorDict:
+        """Memory [N] with leaves [N, M, ...] for the vehicles that enter (``who`` [N, M] bool).
+
+        The environment keeps the old memory of the others, so a module may fill all entries.
+        """
+        return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])
+
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict:
+        """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
+        return {name: ((n, m, *shape), kind or dtype) for name, (shape, kind) in self.memory_fields.items()}

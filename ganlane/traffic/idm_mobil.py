@@ -1,0 +1,83 @@
+"""Rule-driven traffic: IDM along the road, MOBIL or nothing across, steered like the ego."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ganlane.sim.bicycle import advance
+from ganlane.sim.following import following_acceleration
+from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_changes
+from ganlane.sim.neighbours import Scene, perceive
+from ganlane.sim.random import Stream
+from ganlane.sim.road import Road
+from ganlane.sim.steering import STEERING, SteeringParameters, steer
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic.base import TrafficModule
+
+#: MOBIL decides once a second of simulated time, whatever the ego's decision period.
+MOBIL_PERIOD_STEPS = 10
+
+
+class IdmTraffic(TrafficModule):
+    """``traffic=idm``: everybody keeps its lane (the paper's Traffic_IDM, 'without complex decisions').
+
+    Memory: the steering angle of each vehicle, rad.
+    """
+
+    memory_fields = {"steering": ((), None)}  # noqa: RUF012
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        idm: IdmParameters = TABLE_V,
+        steering: SteeringParameters = STEERING,
+    ) -> None:
+        super().__init__(road, stream)
+        self.idm, self.steering = idm, steering
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+        """Wheels straight."""
+        return {"steering": torch.zeros_like(vehicles.x)}
+
+    def change_lanes(self, scene: Scene, step: Tensor) -> Tensor:
+        """Target lanes [N, M] int64 from now on."""
+        return scene.vehicles.target_lane
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """Decide, accelerate, steer, advance."""
+        scene = perceive(vehicles, self.road)
+        target = self.change_lanes(scene, step)
+        acceleration = following_acceleration(scene, self.idm)
+        centre = self.road.centre_of(target, vehicles.y.dtype)
+        v = vehicles
+        steering = steer(memory["steering"], v.y, v.heading, v.speed, centre, self.dt, self.steering)
+        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, self.dt)
+        return v.with_(target_lane=target, **pose._asdict()), {"steering": steering}
+
+
+class IdmMobilTraffic(IdmTraffic):
+    """``traffic=idm_mobil``: IDM with MOBIL's lane changes once a second (Tables IV and V)."""
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        idm: IdmParameters = TABLE_V,
+        steering: SteeringParameters = STEERING,
+        mobil: MobilParameters = TABLE_IV,
+    ) -> None:
+        super().__init__(road, stream, idm, steering)
+        self.mobil = mobil
+
+    def change_lanes(self, scene: Scene, step: Tensor) -> Tensor:
+        """MOBIL's changes in the rows where a second is full."""
+        due = step % MOBIL_PERIOD_STEPS == 0
+        target = scene.vehicles.target_lane
+        # On a CPU asking costs nothing and spares nine evaluations in ten; on a GPU it would stall the queue.
+        if due.device.type == "cpu" and not bool(due.any()):
+            return target
+        change = mobil_changes(scene, self.road, self.idm, self.mobil)
+        return torch.where(due[:, None], target + change, target)

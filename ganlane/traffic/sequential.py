@@ -1,0 +1,66 @@
+"""Traffic models in a chain: a base model, then overlays and guards that rewrite what it moved."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from ganlane import keys
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic.base import TrafficModule
+
+
+class Overlay(TrafficModule):
+    """A traffic module that does not move vehicles itself but rewrites ``moved``.
+
+    Subclasses implement :meth:`rewrite` in place of :meth:`TrafficModule.move`.
+    """
+
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+    ) -> tuple[Vehicles, dict[str, Tensor]]:
+        """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
+        raise NotImplementedError
+
+    def _call(
+        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor
+    ) -> tuple[Vehicles, dict[str, Tensor]]:
+        moved = Vehicles.of(tensordict.get(keys.MOVED))
+        return self.rewrite(vehicles, moved, memory, key, tensordict.get(keys.STEP))
+
+
+class TrafficSequential(TrafficModule):
+    """A base model followed by overlays, each with a memory of its own under its name.
+
+    Args:
+        parts: name to module, the base model first. Road, stream and visibility are the first one's.
+    """
+
+    def __init__(self, parts: dict[str, TrafficModule]) -> None:
+        base = next(iter(parts.values()))
+        super().__init__(base.road, base.stream)
+        self.parts = nn.ModuleDict(parts)
+        self.visibility = base.visibility
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Run the parts in order."""
+        memories = tensordict.get(keys.TRAFFIC)
+        kept = {}
+        for name, part in self.parts.items():
+            tensordict.set(keys.TRAFFIC, memories.get(name))
+            part(tensordict)
+            kept[name] = tensordict.get(keys.TRAFFIC)
+        tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
+        return tensordict
+
+    def init_memory(self, vehicles: Vehicles, who: Tensor, key: Tensor) -> TensorDict:
+        """The parts' memories, by name."""
+        memories = {name: part.init_memory(vehicles, who, key) for name, part in self.parts.items()}
+        return TensorDict(memories, batch_size=[vehicles.x.shape[0]])
+
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+        """The parts' specs, by name."""
+        return {name: part.memory_spec(n, m, dtype) for name, part in self.parts.items()}

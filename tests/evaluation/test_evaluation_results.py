@@ -1,0 +1,62 @@
+"""What stays in the run folder can be read back and says where it came from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+import ganlane
+from ganlane.evaluation import provenance, write_episodes, write_results
+
+
+@dataclass
+class Config:
+    agents: tuple[str, ...]
+    folder: Path
+
+
+def test_numbers_and_their_origin_are_kept(tmp_path):
+    numbers = {"rows": [{"mean_reward": np.float32(1.5), "ci": np.array([1.0, 2.0]), "score": float("nan")}]}
+    config = {"evaluate": Config(("mobil",), Path("a/b")), "weight": torch.tensor(2)}
+    path = write_results(tmp_path / "run", numbers, config, {"seed": 3, "episodes": range(3)})
+    read = json.loads(path.read_text())
+    assert path.name == "results.json"
+    assert read["rows"] == [{"mean_reward": 1.5, "ci": [1.0, 2.0], "score": None}]
+    assert read["config"] == {"evaluate": {"agents": ["mobil"], "folder": str(Path("a/b"))}, "weight": 2}
+    assert read["seeds"] == {"seed": 3, "episodes": [0, 1, 2]}
+    assert read["code"]["version"] == ganlane.__version__
+    assert read["machine"]["torch"] == torch.__version__
+    assert read["machine"]["cores"] >= 1
+    assert read["machine"]["threads"] == torch.get_num_threads()
+
+
+def test_episodes_come_back_as_they_were(tmp_path):
+    frame = pl.DataFrame({"episode": [0, 1], "reason": ["goal", "timeout"], "reward": [1.0, 2.0]})
+    path = write_episodes(tmp_path, frame)
+    assert pl.read_parquet(path).equals(frame)
+    assert [file.name for file in tmp_path.iterdir()] == ["episodes.parquet"]
+
+
+def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
+    path = write_results(tmp_path, {"rows": [1]}, {}, {})
+    before = path.read_bytes()
+
+    class Unwritable:
+        def __str__(self):
+            raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        write_results(tmp_path, {"rows": [Unwritable()]}, {}, {})
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_copy_in_somebody_elses_checkout_has_no_revision(monkeypatch, tmp_path):
+    monkeypatch.setattr(provenance, "_PACKAGE", tmp_path)
+    assert provenance.code_version() == {"version": ganlane.__version__, "revision": None, "modified": None}

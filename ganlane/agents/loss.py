@@ -53,6 +53,8 @@ class _TargetNetwork:
     network: QNetwork
 
     def _attach(self, network: QNetwork, actor: nn.Module) -> None:
+        # The target is updated here, by update_target: TorchRL need not warn that no updater is registered.
+        self._has_update_associated["value_network"] = True  # type: ignore[attr-defined]
         actor_copy = deepcopy(actor)
         self.target_value_network_params.to_module(actor_copy)  # type: ignore[attr-defined]
         # In __dict__, as TorchRL does with the online module, so that no parameter is listed twice.
@@ -121,7 +123,7 @@ class LeanDistributionalLoss(_TargetNetwork, DistributionalDQNLoss):
 
 
 class LeanDQNLoss(_TargetNetwork, DQNLoss):
-    """Plain DQN loss (Huber), double or not: Rainbow with ``distributional=False``. See the loss above for the keys."""
+    """Plain DQN loss (Huber), double or not: Rainbow with ``distributional=False``."""
 
     def __init__(self, network: QNetwork, gamma: float, double: bool = True) -> None:
         actor = QValueActor(network, in_keys=["observation"], action_space="categorical")
@@ -130,6 +132,7 @@ class LeanDQNLoss(_TargetNetwork, DQNLoss):
             loss_function="smooth_l1",
             delay_value=True,
             double_dqn=double,
+            action_space="categorical",
             reduction="none",
             use_prioritized_weights=False,
         )

@@ -8,11 +8,15 @@ convolution here, and a second hidden layer per stream would cost half as much a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import NoisyLinear
+
+from ganlane.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class QNetwork(nn.Module):
         super().__init__()
         self.config = config
         widths = (config.observation_size, *config.hidden)
-        self.trunk = nn.ModuleList(self._linear(*pair) for pair in zip(widths[:-1], widths[1:]))
+        self.trunk = nn.ModuleList(self._linear(*pair) for pair in pairwise(widths))
         rows = config.actions + int(config.dueling)
         self.head = self._linear(widths[-1], rows * config.outputs)
         self.register_buffer("support", torch.linspace(config.v_min, config.v_max, config.atoms), persistent=False)
@@ -123,3 +127,29 @@ def mean_sigma(module: nn.Module) -> Tensor:
     if not layers:
         return torch.zeros(())
     return torch.stack([layer.weight_sigma.detach().abs().mean() for layer in layers]).mean()
+
+
+def parameters_of(network: QNetwork) -> dict[str, Tensor]:
+    """Copies of the parameters by name; the momentary noise is not among them."""
+    return {name: value.detach().clone() for name, value in network.named_parameters()}
+
+
+@torch.no_grad()
+def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
+    """Copy ``weights`` into the parameters of ``network``, in place.
+
+    Raises:
+        UserError: names or shapes differ.
+    """
+    own = dict(network.named_parameters())
+    shapes = {name: tuple(value.shape) for name, value in own.items()}
+    given = {name: tuple(value.shape) for name, value in weights.items()}
+    if shapes != given:
+        differing = sorted(name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name))
+        name = differing[0]
+        raise UserError(
+            f"the weights do not fit the network: {name} is {given.get(name, 'absent')} in the checkpoint and "
+            f"{shapes.get(name, 'absent')} in the network; use the observation and agent options it was trained with."
+        )
+    for name, value in own.items():
+        value.copy_(weights[name])

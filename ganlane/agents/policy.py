@@ -1,4 +1,4 @@
-"""Policies: a Q-network's best action, with and without exploration. TensorDictModules for any TorchRL environment."""
+"""Policies: the best action of a Q-network, with and without exploration, as TensorDictModules."""
 
 from __future__ import annotations
 

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss
 from ganlane.agents.n_step import NStepWindow
-from ganlane.agents.network import NetworkConfig, QNetwork, mean_sigma, redraw_noise
+from ganlane.agents.network import (
+    NetworkConfig,
+    QNetwork,
+    load_parameters,
+    mean_sigma,
+    parameters_of,
+    redraw_noise,
+)
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
 from ganlane.agents.replay import annealed, load_replay_state, make_replay, replay_state
 from ganlane.errors import UserError
@@ -23,8 +30,9 @@ class RainbowConfig:
     """Hyperparameters; the values are for one update of 256 per 64 decisions.
 
     Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
-    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon (the share of random
-    legal actions) is used without noisy layers only. ``adam_eps=None`` stands for 0.005 / ``batch_size``.
+    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon (the share of
+    random legal actions) is used without noisy layers only. ``adam_eps=None`` stands for 0.005 / ``batch_size``.
+    ``warmup`` is the number of transitions before the first update.
     """
 
     hidden: tuple[int, ...] = (256, 256)
@@ -193,19 +201,18 @@ class Rainbow:
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
         """Start from trained ``weights`` (transfer): load them first, then let the target follow."""
-        self.network.load_state_dict(dict(weights))
+        load_parameters(self.network, weights)
         self.loss.update_target()
 
     def weights(self) -> dict[str, Tensor]:
         """The online network's parameters, without its momentary noise."""
-        return {name: value.detach().clone() for name, value in self.network.named_parameters()}
+        return parameters_of(self.network)
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Everything an exact resume needs, as tensors and plain data; noise is redrawn before use, so not here."""
-        target = {name: value.detach().clone() for name, value in self.loss.target_network.named_parameters()}
         return {
             "network": self.weights(),
-            "target": target,
+            "target": parameters_of(self.loss.target_network),
             "optimizer": self.optimizer.state_dict(),
             "generators": {name: generator.get_state() for name, generator in self.generators.items()},
             "updates": self.updates,
@@ -213,12 +220,16 @@ class Rainbow:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict`; without a saved buffer the present one is emptied."""
-        self.network.load_state_dict(state["network"], strict=False)
+        """Restore :meth:`state_dict`; if it was made without the buffer, the buffer is empty afterwards."""
+        load_parameters(self.network, state["network"])
+        load_parameters(self.loss.target_network, state["target"])
         self.optimizer.load_state_dict(state["optimizer"])
         for name, generator in self.generators.items():
-            generator.set_state(state["generators"][name])
+            generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]
+        self.replay.empty()
+        if state["replay"] is not None:
+            load_replay_state(self.replay, state["replay"])
 
 
 def make_loss(network: QNetwork, config: RainbowConfig) -> LeanDistributionalLoss | LeanDQNLoss:

@@ -43,7 +43,7 @@ def make_replay(
 
 def annealed(start: float, end: float, done: int, total: int) -> float:
     """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
-    return start + (end - start) * min(1.0, done / max(total, 1))
+    return end if done >= total else start + (end - start) * done / total
 
 
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:

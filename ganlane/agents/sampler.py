@@ -26,6 +26,15 @@ class RowSampler(PrioritizedSampler):
     generator of the replay buffer (``generator=`` at its construction) and from no other.
     """
 
+    def __init__(
+        self, max_capacity: int, alpha: float, beta: float, eps: float = 1e-8, device: torch.device | None = None
+    ) -> None:
+        # Not the parent's constructor: it warns of the missing C++ extension, which is not needed here.
+        self._max_capacity, self._alpha, self._beta, self._eps = max_capacity, alpha, beta, eps
+        self._device, self.dtype, self.reduction = device, torch.float32, "max"
+        self._max_priority_within_buffer = False
+        self._init()
+
     def _init(self) -> None:
         rows = -(-self._max_capacity // ROW)
         self.priorities = torch.zeros(rows, ROW, device=self._device)

@@ -9,7 +9,7 @@ import polars as pl
 
 from ganlane.data.lane_widths import lane_width
 from ganlane.data.schema import SCHEMA, sort, validate
-from ganlane.data.tables import read_table
+from ganlane.data.tables import FIRST_LINE, read_table
 from ganlane.errors import UserError
 
 #: Columns of the file; ``y`` is 0 at the centre of lane 1, which is the leftmost, and grows to the left.
@@ -43,7 +43,9 @@ def read_scenes(path: str | Path) -> pl.DataFrame:
     below = table["lane"] < 1
     if below.any():
         row = int(below.arg_max() or 0)
-        raise UserError(f"{path}, line {row + 2}, column lane: {table['lane'][row]} is below 1, the leftmost lane.")
+        raise UserError(
+            f"{path}, line {row + FIRST_LINE}, column lane: {table['lane'][row]} is below 1, the leftmost lane."
+        )
     rows = validate(table, str(path))
     turned = [_turn_round(scene, f"{path}, scene {name}") for (name,), scene in rows.group_by("scene")]
     return sort(pl.concat(turned))

@@ -7,7 +7,7 @@
 ``x``        Float64  centre of the body along the road, m, growing in the direction of travel
 ``y``        Float64  centre of the body across the road, m, to the left; 0 at the centre of lane 0
 ``speed``    Float64  m/s, as recorded
-``lane``     Int64    0 is the rightmost lane of the scene; its centre is at ``lane * lane_width``
+``lane``     Int64    as recorded; 0 is the scene's rightmost, and the centre is at ``lane * lane_width``
 ``length``   Float64  m
 ``width``    Float64  m
 ===========  =======  ==============================================================================
@@ -67,7 +67,7 @@ def validate(frame: pl.DataFrame, source: str, first_line: int = FIRST_LINE) -> 
         raise UserError(f"{source}: no column {', '.join(missing)}; expected {', '.join(SCHEMA)}.")
     if frame.is_empty():
         raise UserError(f"{source}: no rows; a recording with at least one vehicle was expected.")
-    frame = frame.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items())
+    frame = frame.select(_typed(frame[name], kind, source) for name, kind in SCHEMA.items())
     _check_rows(frame, source, first_line)
     _check_units(frame, source)
     return frame
@@ -76,6 +76,13 @@ def validate(frame: pl.DataFrame, source: str, first_line: int = FIRST_LINE) -> 
 def sort(frame: pl.DataFrame) -> pl.DataFrame:
     """Rows sorted by scene, vehicle and frame."""
     return frame.sort("scene", "vehicle", "frame")
+
+
+def _typed(column: pl.Series, kind: pl.DataType, source: str) -> pl.Series:
+    try:
+        return column.cast(kind)
+    except pl.exceptions.PolarsError as error:
+        raise UserError(f"{source}, column {column.name}: {column.dtype} found, {kind} expected.") from error
 
 
 def _check_rows(frame: pl.DataFrame, source: str, first_line: int) -> None:

@@ -6,59 +6,15 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
 import polars as pl
 
-from ganlane.data.distributions import Distribution, Durations, describe, describe_durations
+from ganlane.data.distributions import Distribution, Durations, describe
+from ganlane.data.exposure import Exposure, measure_exposure
 from ganlane.data.following import follower_headways
-from ganlane.data.lane_changes import LaneChanges, lane_changes_of_frame
-from ganlane.data.rates import poisson_interval, srlc, steps_between_changes
-from ganlane.data.schema import TRACK, TRACK_STRIDE
+from ganlane.data.lane_change_statistics import LaneChangeStatistics, lane_change_statistics
+from ganlane.data.lane_changes import lane_changes_of_frame
 from ganlane.data.smoothing import raw_accelerations, smoothed_accelerations
 from ganlane.errors import UserError
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """How much driving was seen.
-
-    ``cars`` counts a car once per scene, whatever its tracks; ``road_m`` is the mean length of the road over the
-    cars; ``vehicle_km`` is the distance driven.
-    """
-
-    scenes: int
-    tracks: int
-    cars: int
-    samples: int
-    road_m: float
-    vehicle_km: float
-
-
-@dataclass(frozen=True)
-class LaneChangeStatistics:
-    """How often, how long and how fast lanes are changed.
-
-    Attributes:
-        count: lane changes seen (:mod:`ganlane.data.lane_changes` says what counts).
-        srlc: equation 9, per vehicle and km of road.
-        per_vehicle_km, per_vehicle_km_low, per_vehicle_km_high: per driven km, with its exact 95 % interval.
-        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m`` from either rate and the mean speed, in steps
-            of 0.1 s; None where no change was seen.
-        duration: equation 11, s.
-        lateral_speed: mean lateral speed of each complete change, m/s; its ``mean`` and ``sd`` are the Gaussian.
-        lateral_speed_with_censored: the same of all changes, over what was seen of them.
-    """
-
-    count: int
-    srlc: float
-    per_vehicle_km: float
-    per_vehicle_km_low: float
-    per_vehicle_km_high: float
-    t_m_srlc_steps: float | None
-    t_m_vehicle_km_steps: float | None
-    duration: Durations
-    lateral_speed: Distribution
-    lateral_speed_with_censored: Distribution
 
 
 @dataclass(frozen=True)
@@ -131,42 +87,6 @@ def driving_statistics(frame: pl.DataFrame, lane_widths: dict[str, float] | None
         acceleration_raw=describe(raw_accelerations(frame).to_numpy()),
         acceleration_smoothed=describe(smoothed_accelerations(frame).to_numpy()),
         headway=describe(follower_headways(frame).to_numpy()),
-    )
-
-
-def measure_exposure(frame: pl.DataFrame) -> Exposure:
-    """Scenes, tracks, cars, length of road and distance driven of a frame in the schema."""
-    roads = frame.group_by("scene").agg(
-        road=pl.col("x").max() - pl.col("x").min(), cars=(pl.col("vehicle") % TRACK_STRIDE).n_unique()
-    )
-    driven = (pl.col(name).diff().over(TRACK) ** 2 for name in ("x", "y"))
-    return Exposure(
-        scenes=roads.height,
-        tracks=frame.select(TRACK).n_unique(),
-        cars=int(roads["cars"].sum()),
-        samples=frame.height,
-        road_m=float(np.average(roads["road"].to_numpy(), weights=roads["cars"].to_numpy())),
-        vehicle_km=float(frame.select(pl.sum_horizontal(*driven).sqrt().sum()).item()) / 1000.0,
-    )
-
-
-def lane_change_statistics(changes: LaneChanges, exposure: Exposure, speed_mps: float) -> LaneChangeStatistics:
-    """Rates, durations and lateral speeds of lane changes found in that much driving at that mean speed."""
-    n, km = len(changes), exposure.vehicle_km
-    low, high = poisson_interval(n)
-    by_road = srlc(n, exposure.cars, exposure.road_m)
-    by_distance = n / km
-    return LaneChangeStatistics(
-        count=n,
-        srlc=by_road,
-        per_vehicle_km=by_distance,
-        per_vehicle_km_low=low / km,
-        per_vehicle_km_high=high / km,
-        t_m_srlc_steps=steps_between_changes(by_road, speed_mps) if n else None,
-        t_m_vehicle_km_steps=steps_between_changes(by_distance, speed_mps) if n else None,
-        duration=describe_durations(changes.duration_s, changes.complete),
-        lateral_speed=describe(changes.lateral_speed[changes.complete]),
-        lateral_speed_with_censored=describe(changes.lateral_speed),
     )
 
 

@@ -123,9 +123,15 @@ def _episode_rows(measures: dict[str, Tensor], numbers: list[int], seed: int) ->
         pl.col("decisions").cast(integer),
         pl.col("duration_s"),
         pl.col("distance").cast(pl.Float64).alias("distance_m"),
-        (pl.col("distance") / pl.col("duration_s")).cast(pl.Float64).alias("mean_speed_mps"),
+        _mean_speed().alias("mean_speed_mps"),
         pl.col("lane_changes").cast(integer),
     )
+
+
+def _mean_speed() -> pl.Expr:
+    """Distance over time, m/s; null for an episode that ended before it drove (off the road at once)."""
+    speed = pl.col("distance").cast(pl.Float64) / pl.col("duration_s")
+    return pl.when(pl.col("duration_s") > 0).then(speed)
 
 
 def _named_where_true(event: str) -> pl.Expr:

@@ -1,0 +1,30 @@
+"""The agent: Rainbow (Hessel et al. 2018) from TorchRL parts.
+
+A decision flows through the files in this order: :mod:`~ganlane.agents.network` turns an observation into a
+distribution over returns for each action, :mod:`~ganlane.agents.policy` picks one, :mod:`~ganlane.agents.n_step`
+joins n decisions into a transition, :mod:`~ganlane.agents.replay` keeps it, :mod:`~ganlane.agents.sampler` draws it
+again by priority, :mod:`~ganlane.agents.loss` compares it with the target network, and
+:mod:`~ganlane.agents.rainbow` holds it all together. :mod:`~ganlane.agents.checkpoint` writes the trained network to
+a file and reads it back.
+"""
+
+from ganlane.agents.checkpoint import agent_file, load_agent, read_agent, save_agent, transfer
+from ganlane.agents.n_step import NStepWindow
+from ganlane.agents.network import NetworkConfig, QNetwork
+from ganlane.agents.policy import ExploringPolicy, GreedyPolicy
+from ganlane.agents.rainbow import Rainbow, RainbowConfig
+
+__all__ = [
+    "ExploringPolicy",
+    "GreedyPolicy",
+    "NStepWindow",
+    "NetworkConfig",
+    "QNetwork",
+    "Rainbow",
+    "RainbowConfig",
+    "agent_file",
+    "load_agent",
+    "read_agent",
+    "save_agent",
+    "transfer",
+]

@@ -1,0 +1,102 @@
+"""Drivers of the ego that need no learning: random, random but legal, keeping its lane, MOBIL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from ganlane import keys
+from ganlane.keys import EGO_INDEX, LEFT, RIGHT
+from ganlane.sim.ego import ego_scene
+from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_wishes
+from ganlane.sim.random import Purpose, Stream, episode_key, uniform
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+
+
+class Driver(TensorDictModuleBase):
+    """A rule-based policy: reads the raw state, writes ``action`` [N] int64 through :meth:`act`."""
+
+    in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
+    out_keys = [keys.ACTION]  # noqa: RUF012
+
+    def __init__(self, road: Road, stream: int = Stream.TRAIN) -> None:
+        super().__init__()
+        self.road, self.stream = road, int(stream)
+
+    def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
+        """The action of every row."""
+        raise NotImplementedError
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        return tensordict.set(keys.ACTION, self.act(Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict))
+
+
+class RandomDriver(Driver):
+    """Any of the three actions with equal probability; it soon drives off the road."""
+
+    def _uniform(self, tensordict: TensorDictBase) -> Tensor:
+        key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        return uniform(key, tensordict.get(keys.STEP), 1, [Purpose.RANDOM_ACTION])[:, 0, 0]
+
+    def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
+        """Floor of three times a uniform number."""
+        return (self._uniform(tensordict) * 3).long()
+
+
+class RandomLegalDriver(RandomDriver):
+    """As :class:`RandomDriver`, among the actions that stay on the road."""
+
+    def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
+        """The r-th legal action, r uniform."""
+        target = vehicles.target_lane[:, EGO_INDEX]
+        legal = torch.stack((target >= 0, target < self.road.lanes - 1, target > 0), dim=1)
+        wanted = (self._uniform(tensordict) * legal.sum(1)).long()
+        rank = legal.cumsum(1) - 1
+        chosen = legal & (rank == wanted[:, None])
+        return (chosen.long() * torch.arange(3, device=target.device)).amax(1)
+
+
+class KeepLaneDriver(Driver):
+    """Never changes lanes."""
+
+    def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
+        """Always 0."""
+        return torch.zeros_like(vehicles.target_lane[:, EGO_INDEX])
+
+
+class MobilDriver(Driver):
+    """The ego driven by MOBIL; with ``politeness_rear=politeness_side=0`` an egoistic one."""
+
+    def __init__(
+        self,
+        road: Road,
+        stream: int = Stream.TRAIN,
+        idm: IdmParameters = TABLE_V,
+        mobil: MobilParameters = TABLE_IV,
+    ) -> None:
+        super().__init__(road, stream)
+        self.idm, self.mobil = idm, mobil
+
+    def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
+        """MOBIL's wish as an action."""
+        wish = mobil_wishes(ego_scene(vehicles, self.road), self.road, self.idm, self.mobil)[:, 0]
+        return torch.where(wish > 0, LEFT, torch.where(wish < 0, RIGHT, keys.KEEP))
+
+
+EGOISTIC = MobilParameters(politeness_rear=0.0, politeness_side=0.0)
+
+#: Name to a constructor from (road, stream).
+DRIVERS: dict[str, Callable[[Road, int], Driver]] = {
+    "random": RandomDriver,
+    "random_legal": RandomLegalDriver,
+    "keep_lane": KeepLaneDriver,
+    "mobil": MobilDriver,
+    "mobil_egoistic": lambda road, stream: MobilDriver(road, stream, mobil=EGOISTIC),
+}

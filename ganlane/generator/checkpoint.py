@@ -1,0 +1,104 @@
+"""Saving and loading a generator: weights, and everything that says what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor
+
+import ganlane
+from ganlane.errors import UserError
+from ganlane.files import load_weights, save_weights
+from ganlane.generator.anchored import EXTRA_INPUTS
+from ganlane.generator.networks import Generator, GeneratorSizes
+
+KIND = "generator"
+Preset = Literal["paper", "calibrated"]
+#: Numbers beside the motion that each preset sees.
+PRESET_INPUTS: dict[str, int] = {"paper": 0, "calibrated": EXTRA_INPUTS}
+SHIPPED = Path(ganlane.__file__).parent / "checkpoints"
+
+
+def shipped_generator(preset: Preset) -> Path:
+    """Path of the weights that come with the package."""
+    return SHIPPED / f"generator_{preset}.safetensors"
+
+
+def save_generator(
+    path: str | Path,
+    generator: Generator,
+    preset: Preset,
+    *,
+    config: Mapping[str, Any],
+    data: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    driving_statistics: Mapping[str, Any],
+) -> None:
+    """Save the generator with its description, atomically.
+
+    Args:
+        path: where to write.
+        generator: what was fitted.
+        preset: for which closed loop.
+        config: what it was fitted with.
+        data: the recordings: file, scenes fitted and held out, counts.
+        metrics: on the held-out scenes.
+        driving_statistics: ``ganlane.data.DrivingStatistics.to_dict()`` of the recordings, for the overlays.
+    """
+    metadata = {
+        "preset": preset,
+        "sizes": asdict(generator.sizes),
+        "config": dict(config),
+        "data": dict(data),
+        "metrics": dict(metrics),
+        "driving_statistics": dict(driving_statistics),
+        "ganlane": ganlane.__version__,
+    }
+    save_weights(path, KIND, generator.state_dict(), metadata)
+
+
+def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Generator, dict[str, Any]]:
+    """The generator in evaluation mode, without gradients, and its metadata.
+
+    Args:
+        path: what :func:`save_generator` wrote.
+        preset: the one that is needed; None takes any.
+
+    Raises:
+        UserError: absent, foreign, of another preset, or its weights do not fit its own sizes.
+    """
+    tensors, metadata = load_weights(path, KIND)
+    found = metadata.get("preset")
+    if found not in get_args(Preset) or (preset is not None and found != preset):
+        raise UserError(f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one.")
+    generator = _build(path, metadata, tensors)
+    if generator.sizes.extra_inputs != PRESET_INPUTS[found]:
+        raise UserError(
+            f"{path}: takes {generator.sizes.extra_inputs} further inputs, expected {PRESET_INPUTS[found]} for the "
+            f"preset {found}; fit it again."
+        )
+    return generator.eval().requires_grad_(False), metadata
+
+
+def _build(path: str | Path, metadata: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Generator:
+    """Networks of the stored sizes with the stored weights."""
+    sizes = metadata.get("sizes")
+    names = {field.name for field in fields(GeneratorSizes)}
+    if not isinstance(sizes, dict) or set(sizes) != names or not all(_is_size(value) for value in sizes.values()):
+        raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(names)}); fit it again.")
+    try:
+        with torch.random.fork_rng(devices=[]):
+            generator = Generator(GeneratorSizes(**sizes))
+        generator.load_state_dict(dict(tensors))
+    except RuntimeError as error:
+        raise UserError(f"{path}: its weights do not have the shapes that its sizes {sizes} ask for; fit it again.") from error
+    return generator
+
+
+def _is_size(value: Any) -> bool:
+    """A whole number that a layer can have; bounded, so that a damaged file cannot ask for all memory."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 4096

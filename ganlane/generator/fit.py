@@ -1,0 +1,139 @@
+"""One call that fits a preset to recordings: data in, weights and held-out metrics out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from ganlane.data import driving_statistics, scene_lane_widths
+from ganlane.errors import UserError
+from ganlane.generator.calibrated import CalibratedConfig, CalibratedTask
+from ganlane.generator.checkpoint import Preset, save_generator
+from ganlane.generator.fitting import PaperConfig, PaperTask
+from ganlane.generator.loop import FitLoop, OnProgress
+from ganlane.generator.metrics import Metrics
+from ganlane.generator.networks import Generator
+from ganlane.generator.tracks import SceneTracks, scene_tracks, split_scenes
+
+#: Scenes that are not fitted to unless told otherwise.
+HELD_OUT = ("us101-b", "us101-e", "us101-h", "us101-i")
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What a fit gives.
+
+    Attributes:
+        preset: ``"paper"`` or ``"calibrated"``.
+        module: the generator with the weights that did best on the held-out scenes.
+        metrics: of these weights on the held-out scenes, for ``"all"`` and each scene; the paper's preset also
+            has ``"discriminator": {"held_out_accuracy"}``.
+        config: what it was fitted with, as plain data.
+        data: scenes fitted and held out, vehicles and rows.
+        statistics: of the recordings (``DrivingStatistics.to_dict()``).
+        updates: updates after which the weights were taken (early stopping).
+        seconds: time of the fit.
+    """
+
+    preset: Preset
+    module: Generator
+    metrics: Metrics
+    config: dict[str, Any]
+    data: dict[str, Any]
+    statistics: dict[str, Any]
+    updates: int
+    seconds: float
+
+    def save(self, path: str | Path) -> None:
+        """Write weights and metadata (:func:`ganlane.generator.checkpoint.save_generator`)."""
+        save_generator(
+            path,
+            self.module,
+            self.preset,
+            config=self.config,
+            data=self.data,
+            metrics={**self.metrics, "fit": {"updates": self.updates, "seconds": round(self.seconds, 1)}},
+            driving_statistics=self.statistics,
+        )
+
+
+def fit_generator(
+    preset: Preset,
+    frame: pl.DataFrame,
+    *,
+    held_out: tuple[str, ...] = HELD_OUT,
+    config: PaperConfig | CalibratedConfig | None = None,
+    source: str = "",
+    resume_path: str | Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> FitResult:
+    """Fit a generator to recorded trajectories.
+
+    The weights returned are those fitted to the scenes that are not held out, at the update at which they did
+    best on the held-out ones; the metrics are theirs, so anybody can check them.
+
+    Args:
+        preset: ``"paper"`` (positions only, open loop) or ``"calibrated"`` (anchored, closed-loop rollouts).
+        frame: recordings in ``ganlane.data``'s schema.
+        held_out: names of the scenes that are not fitted to.
+        config: :class:`PaperConfig` or :class:`CalibratedConfig`, by preset; its defaults if None.
+        source: name of the recordings, for the metadata.
+        resume_path: file to keep the state in, and to go on from.
+        on_progress: called after every update.
+
+    Raises:
+        UserError: unknown preset, a config of the other preset, unusable recordings or scene names.
+    """
+    begun = time.monotonic()
+    scenes = scene_tracks(frame)
+    fitted, kept = split_scenes(scenes, held_out)
+    widths = scene_lane_widths(frame)
+    task = _task(preset, fitted, kept, widths, config)
+    loop = FitLoop(task, task.config.loop, resume_path)
+    loop.run(on_progress)
+    metrics = task.metrics()
+    if isinstance(task, PaperTask):
+        metrics["discriminator"] = {"held_out_accuracy": task.held_out_accuracy()}
+    return FitResult(
+        preset=preset,
+        module=task.generator.eval().requires_grad_(False),
+        metrics=metrics,
+        config=asdict(task.config),
+        data=_describe(source, frame, fitted, kept),
+        statistics=driving_statistics(frame, widths).to_dict(),
+        updates=loop.best_update,
+        seconds=time.monotonic() - begun,
+    )
+
+
+def _task(
+    preset: str,
+    fitted: list[SceneTracks],
+    held_out: list[SceneTracks],
+    widths: dict[str, float],
+    config: PaperConfig | CalibratedConfig | None,
+) -> PaperTask | CalibratedTask:
+    kinds: dict[str, Callable[[], PaperConfig | CalibratedConfig]] = {"paper": PaperConfig, "calibrated": CalibratedConfig}
+    if preset not in kinds:
+        raise UserError(f"preset {preset!r}: expected one of {sorted(kinds)}.")
+    config = kinds[preset]() if config is None else config
+    if isinstance(config, PaperConfig) and preset == "paper":
+        return PaperTask(fitted, held_out, config)
+    if isinstance(config, CalibratedConfig) and preset == "calibrated":
+        return CalibratedTask(fitted, held_out, widths, config)
+    raise UserError(f"config {type(config).__name__}: not the one of preset {preset!r}; give a {kinds[preset].__name__}.")
+
+
+def _describe(source: str, frame: pl.DataFrame, fitted: list[SceneTracks], held_out: list[SceneTracks]) -> dict[str, Any]:
+    return {
+        "file": Path(source).name,
+        "rows": frame.height,
+        "tracks": frame.select(pl.struct("scene", "vehicle").n_unique()).item(),
+        "fitted": [scene.name for scene in fitted],
+        "held_out": [scene.name for scene in held_out],
+    }

@@ -1,0 +1,33 @@
+"""Equation 10: when a driver of generated traffic starts a lane change, and how long that takes on average."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+
+def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
+    """Probability ``t / t_m`` per step of starting a change, for ``clock`` steps since the last one ended.
+
+    Read literally (equation 10) it grows until a change is certain at ``t = t_m``.
+    """
+    return (clock / mean_steps).clamp(0.0, 1.0)
+
+
+def literal_mean_wait(mean_steps: float) -> float:
+    """Mean number of steps that :func:`literal_hazard` waits, about ``sqrt(pi t_m / 2)``; not ``t_m``."""
+    return math.sqrt(math.pi * mean_steps / 2.0)
+
+
+def distance_hazard(speed: Tensor, changes_per_km: float, dt: float) -> Tensor:
+    """Probability per step of ``dt`` s of starting a change, at a constant rate per kilometre driven."""
+    return 1.0 - torch.exp(-speed * (dt * changes_per_km / 1000.0))
+
+
+def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
+    """A random side with a lane on it: -1 right, +1 left, 0 on a road of one lane; ``u`` uniform, ``lane`` int64."""
+    left, right = lane < lanes - 1, lane > 0
+    both = torch.where(u < 0.5, 1, -1)
+    return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))

@@ -1,0 +1,100 @@
+"""The guard: what keeps a generated vehicle on the road, in its lane and off its leader's bumper.
+
+A network that saw relative positions alone drifts: off the road within a minute, and to any speed. The guard
+stands behind it and corrects what it moved. How much of the driving is the guard's is counted and reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ganlane.sim.following import following_acceleration
+from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.neighbours import perceive
+from ganlane.sim.random import Stream
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic.sequential import Overlay
+
+
+@dataclass(frozen=True)
+class GuardParameters:
+    """Limits of the guard.
+
+    Attributes:
+        headway_s: the upper bound on acceleration is IDM's with this (short) time headway.
+        slack: the lower bound is IDM's acceleration less this, m/s2, times speed over desired speed, so that a
+            network that always slows settles at a crawl instead of standing still on a free road.
+        hardest_braking: no acceleration below this, m/s2.
+        centring_per_s: rate at which the offset from the target lane's centre is pulled in (the P of the PD).
+        damping: share of the network's lateral motion that is let through (the D).
+        edge_margin_m: the body stays at least so far inside the edge of the road.
+    """
+
+    headway_s: float = 0.8
+    slack: float = 1.5
+    hardest_braking: float = -8.0
+    centring_per_s: float = 0.5
+    damping: float = 0.8
+    edge_margin_m: float = 0.1
+
+
+class Guard(Overlay):
+    """Bound the acceleration, pull towards the target lane, keep the body on the road."""
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        guard: GuardParameters | None = None,
+        idm: IdmParameters = TABLE_V,
+    ) -> None:
+        super().__init__(road, stream)
+        self.guard, self.idm = guard or GuardParameters(), idm
+
+    def bounds(self, vehicles: Vehicles, target_lane: Tensor) -> tuple[Tensor, Tensor]:
+        """Lowest and highest acceleration allowed, m/s2, [N, M]."""
+        g = self.guard
+        scene = perceive(vehicles.with_(target_lane=target_lane), self.road)
+        close = following_acceleration(scene, self.idm, g.headway_s)
+        normal = following_acceleration(scene, self.idm)
+        highest = close.clamp_min(g.hardest_braking)
+        lowest = normal - g.slack * vehicles.speed / vehicles.desired_speed
+        return torch.minimum(lowest.clamp_min(g.hardest_braking), highest), highest
+
+    def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
+        """``moved`` with its acceleration inside the bounds."""
+        lowest, highest = self.bounds(vehicles, moved.target_lane)
+        wanted = (moved.speed - vehicles.speed) / self.dt
+        acceleration = torch.minimum(torch.maximum(wanted, lowest), highest)
+        speed = (vehicles.speed + acceleration * self.dt).clamp_min(0.0)
+        altered = acceleration != wanted
+        x = vehicles.x + 0.5 * (vehicles.speed + speed) * self.dt
+        return moved.with_(
+            speed=torch.where(altered, speed, moved.speed),
+            acceleration=torch.where(altered, (speed - vehicles.speed) / self.dt, moved.acceleration),
+            x=torch.where(altered, x, moved.x),
+        )
+
+    def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
+        """``moved`` pulled towards its lane's centre where it keeps a lane, and inside the edges everywhere."""
+        g = self.guard
+        centre = self.road.centre_of(moved.target_lane, moved.y.dtype)
+        offset = centre - vehicles.y
+        pulled = vehicles.y + g.damping * (moved.y - vehicles.y) + g.centring_per_s * self.dt * offset
+        keeps = offset.abs() < 0.5 * self.road.lane_width_m
+        y = torch.where(keeps, pulled, moved.y)
+        inside = 0.5 * moved.width + g.edge_margin_m
+        y = torch.maximum(y, torch.zeros_like(y) + self.road.right_edge_m() + inside)
+        y = torch.minimum(y, torch.zeros_like(y) + self.road.left_edge_m() - inside)
+        heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
+        return moved.with_(y=y, heading=torch.where(y == moved.y, moved.heading, heading.clamp(-0.2, 0.2)))
+
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+    ) -> tuple[Vehicles, dict[str, Tensor]]:
+        """Along the road, then across it."""
+        return self.across(vehicles, self.along(vehicles, moved)), memory

@@ -1,0 +1,12 @@
+"""TorchRL transforms around the environment: what the agent sees (Table III) and what it is paid (V.C).
+
+Each reads TensorDict keys that :class:`ganlane.env.HighwayEnv` writes and adds its own. A transform of your own
+stands in the same place::
+
+    TransformedEnv(env, Compose(MyObservation(env), RewardTransform()))
+"""
+
+from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, observation_size
+from ganlane.transforms.reward import RewardParameters, RewardTransform
+
+__all__ = ["OBSERVATIONS", "ObservationTransform", "RewardParameters", "RewardTransform", "observation_size"]

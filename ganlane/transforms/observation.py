@@ -1,0 +1,100 @@
+"""The observation as a TorchRL transform: Table III and the forms of it that were found to teach more."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from ganlane import keys
+from ganlane.errors import UserError
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.transforms.lane_view import LANE_VIEW_SIZE, lane_view
+from ganlane.transforms.table3 import (
+    ObservationScale,
+    as_list,
+    distance_to_ego,
+    nearest_first,
+    other_vehicles,
+    own_state,
+)
+
+#: Name to (the list of vehicles, nearest first; the lane view; the ego's own lane change).
+OBSERVATIONS: Final[dict[str, tuple[bool, bool, bool]]] = {
+    "table3": (True, False, False),
+    "table3_progress": (True, False, True),
+    "lane_view": (False, True, True),
+    "table3_lane_view": (True, True, True),
+}
+
+
+def observation_size(name: str, vehicles: int) -> int:
+    """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
+    listed, viewed, progress = OBSERVATIONS[name]
+    return 3 + listed * 3 * (vehicles - 1) + viewed * LANE_VIEW_SIZE + progress * 2
+
+
+class ObservationTransform(Transform):
+    """Write ``observation`` [N, D] from the raw state.
+
+    Args:
+        road: the environment's.
+        vehicles: M, the ego included.
+        form: ``table3`` (the paper's literal 3 + 3 (M - 1) numbers), ``table3_progress`` (and the ego's own
+            lane change: progress 0 to 1, direction -1, 0 or 1), ``lane_view`` (own state, lane view, lane
+            change), ``table3_lane_view`` (all of it).
+        scale: normalisers.
+
+    Raises:
+        UserError: an unknown form.
+    """
+
+    def __init__(
+        self, road: Road, vehicles: int = 9, form: str = "table3_progress", scale: ObservationScale | None = None
+    ) -> None:
+        super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=[keys.OBSERVATION])
+        if form not in OBSERVATIONS:
+            raise UserError(f"observation.form={form!r} is unknown; choose one of {', '.join(OBSERVATIONS)}.")
+        self.road, self.vehicles, self.form = road, vehicles, form
+        self.scale = scale or ObservationScale()
+
+    def observe(self, vehicles: Vehicles, progress: Tensor, direction: Tensor) -> Tensor:
+        """The observation [N, D]; ``progress`` and ``direction`` [N] of the ego's own lane change."""
+        listed, viewed, with_progress = OBSERVATIONS[self.form]
+        others = other_vehicles(vehicles, self.road, self.scale)
+        parts = [own_state(vehicles, self.road)]
+        if listed:
+            parts.append(as_list(nearest_first(others, distance_to_ego(vehicles, self.road))))
+        if viewed:
+            parts.append(lane_view(others, self.road.lanes, self.scale))
+        if with_progress:
+            parts.append(torch.stack((progress, direction.to(progress.dtype)), dim=1))
+        return torch.cat(parts, dim=1)
+
+    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
+        vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict.get(keys.EGO)
+        observation = self.observe(vehicles, ego.get("change_progress"), ego.get("change_direction"))
+        return tensordict.set(keys.OBSERVATION, observation)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._write(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._write(tensordict_reset)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``observation`` into any TensorDict that holds the raw state."""
+        return self._write(tensordict)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add ``observation`` to the spec."""
+        assert isinstance(observation_spec, Composite)
+        shape = (*observation_spec.shape, observation_size(self.form, self.vehicles))
+        dtype = observation_spec[keys.VEHICLES, "x"].dtype
+        observation_spec[keys.OBSERVATION] = Unbounded(shape=shape, dtype=dtype, device=observation_spec.device)
+        return observation_spec

@@ -1,0 +1,100 @@
+"""The reward of section V.C as a TorchRL transform, every term also on its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from ganlane import keys
+from ganlane.keys import EGO_INDEX
+
+
+@dataclass(frozen=True)
+class RewardParameters:
+    """Section V.C. Speeds in m/s, deceleration in m/s2; the other numbers are rewards.
+
+    ``literal_low_acceleration``: where the ego brakes hard, the paper's text negates the speed reward, which
+    below 15 m/s pays for crawling. By default its absolute value is negated.
+    """
+
+    base_speed_mps: float = 15.0
+    low_acceleration: float = -2.0
+    literal_low_acceleration: bool = False
+    lane_change: float = -1.0
+    out_of_road: float = -100.0
+    hard_crash: float = -100.0
+    soft_crash: float = -10.0
+    goal: float = 100.0
+
+
+SECTION_V_C = RewardParameters()
+
+
+def speed_reward(
+    speed: Tensor, desired_speed: Tensor, mean_acceleration: Tensor, parameters: RewardParameters = SECTION_V_C
+) -> Tensor:
+    """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard on average over the decision."""
+    reward = (speed - parameters.base_speed_mps) / (desired_speed - parameters.base_speed_mps)
+    punished = -reward if parameters.literal_low_acceleration else -reward.abs()
+    return torch.where(mean_acceleration < parameters.low_acceleration, punished, reward)
+
+
+class RewardTransform(Transform):
+    """Write ``reward`` [N, 1] and ``reward_terms.*`` [N, 1] once per decision, on the speed at its end.
+
+    Args:
+        decision_period_s: terms that accrue with time are multiplied by it over 1 s.
+        parameters: the numbers of section V.C.
+    """
+
+    def __init__(self, decision_period_s: float = 1.0, parameters: RewardParameters | None = None) -> None:
+        super().__init__(in_keys=[keys.VEHICLES, keys.EGO, keys.EVENTS], out_keys=[keys.REWARD, keys.REWARD_TERMS])
+        self.period = decision_period_s
+        self.parameters = parameters or RewardParameters()
+
+    def terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Name to reward term [N, 1] of the decision that led to the state in ``tensordict``."""
+        p, vehicles = self.parameters, tensordict.get(keys.VEHICLES)
+        ego, events = tensordict.get(keys.EGO), tensordict.get(keys.EVENTS)
+        speed, desired = (vehicles.get(name)[:, EGO_INDEX, None] for name in ("speed", "desired_speed"))
+        dtype = speed.dtype
+        return {
+            "speed": self.period * speed_reward(speed, desired, ego.get("mean_acceleration")[:, None], p),
+            "lane_change": p.lane_change * ego.get("started_change")[:, None].to(dtype),
+            "out_of_road": p.out_of_road * events.get("out_of_road").to(dtype),
+            "hard_crash": p.hard_crash * events.get("hard_crash").to(dtype),
+            "soft_crash": p.soft_crash * events.get(keys.SOFT_CRASH).to(dtype),
+            "goal": p.goal * events.get("goal").to(dtype),
+        }
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        terms = self.terms(next_tensordict)
+        first, *rest = terms.values()
+        total = first
+        for term in rest:
+            total = total + term
+        batch = next_tensordict.batch_size
+        next_tensordict.set(keys.REWARD_TERMS, TensorDict._new_unsafe(terms, batch_size=batch))
+        return next_tensordict.set(keys.REWARD, total)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
+        terms = {name: zero for name in keys.REWARD_TERM_NAMES}
+        batch = tensordict_reset.batch_size
+        return tensordict_reset.set(keys.REWARD_TERMS, TensorDict._new_unsafe(terms, batch_size=batch))
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the terms to the observation spec; they are zero after a reset."""
+        assert isinstance(observation_spec, Composite)
+        dtype, device = observation_spec[keys.VEHICLES, "x"].dtype, observation_spec.device
+        shape = observation_spec.shape
+        term = Unbounded(shape=(*shape, 1), dtype=dtype, device=device)
+        observation_spec[keys.REWARD_TERMS] = Composite(
+            {name: term.clone() for name in keys.REWARD_TERM_NAMES}, shape=shape
+        ).to(device)
+        return observation_spec

@@ -1,0 +1,110 @@
+"""Films as mp4 or GIF, and film strips as PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from ganlane.errors import UserError
+from ganlane.files import atomic_path
+from ganlane.view.gif import scaled, write_gif
+
+Picture = npt.NDArray[np.uint8]
+Format = Literal["mp4", "gif", "png"]
+#: Frames of a film strip, as in the paper's Figure 3.
+STRIP_FRAMES = 4
+_STRIP_GAP = 4
+
+
+def film_format(path: str | Path, wanted: str | None = None) -> Format:
+    """The format that is ``wanted``, or else the one of the file's ending.
+
+    Raises:
+        UserError: it is none of mp4, gif and png.
+    """
+    name = (wanted or Path(path).suffix.removeprefix(".")).lower()
+    for known in get_args(Format):
+        if name == known:
+            return known
+    raise UserError(f"format={name or 'none'}: expected mp4, gif or png; choose one of them.")
+
+
+def write_film(
+    frames: Sequence[Picture],
+    path: str | Path,
+    fps: float = 20.0,
+    format: Format | None = None,
+    max_bytes: int | None = None,
+    scale: float = 1.0,
+) -> Path:
+    """Write a film, whole or not at all, and return its path.
+
+    Args:
+        frames: pictures [height, width, 3] uint8, all of one size; may be drawn on demand
+            (:class:`ganlane.view.Film`), since no more than a few are held at once.
+        path: where to write.
+        fps: frames per second; a GIF counts in hundredths of a second, so 10, 20, 25 and 50 are exact.
+        format: ``mp4`` (needs the extra ``video``), ``gif`` or ``png`` (a strip of four frames, stacked);
+            by default the file's ending.
+        max_bytes: for a GIF: size and frame rate are lowered until it fits.
+        scale: size of the film's picture, as a share of the frames'.
+
+    Raises:
+        UserError: unknown format, no frames, the extra ``video`` is missing, or no GIF is small enough.
+    """
+    kind = film_format(path, format)
+    if len(frames) == 0:
+        raise UserError(f"{path}: a film of no frames was asked for; record at least one decision.")
+    if kind == "gif":
+        write_gif(frames, path, fps, max_bytes, scale)
+    elif kind == "mp4":
+        _write_mp4(frames, path, fps, scale)
+    else:
+        _write_png(film_strip(frames), path, scale)
+    return Path(path)
+
+
+def film_strip(frames: Sequence[Picture], count: int = STRIP_FRAMES) -> Picture:
+    """``count`` frames, spread evenly from the first to the last, one below the other."""
+    chosen = [frames[int(index)] for index in np.linspace(0, len(frames) - 1, min(count, len(frames))).round()]
+    gap = np.full((_STRIP_GAP, chosen[0].shape[1], 3), 255, np.uint8)
+    rows = [row for picture in chosen for row in (picture, gap)]
+    return np.concatenate(rows[:-1])
+
+
+def _write_png(picture: Picture, path: str | Path, scale: float) -> None:
+    with atomic_path(path) as part:
+        scaled(picture, scale).save(part, format="PNG", optimize=True)
+
+
+def _write_mp4(frames: Sequence[Picture], path: str | Path, fps: float, scale: float) -> None:
+    """H.264 through the ffmpeg that imageio-ffmpeg brings along."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise UserError(
+            f"{path}: mp4 needs the extra 'video'; run `pip install \"ganlane[video]\"` or choose format=gif."
+        ) from error
+    # H.264 wants even sides.
+    size = scaled(frames[0], scale, multiple=2).size
+    with atomic_path(path) as part:
+        writer = imageio_ffmpeg.write_frames(
+            str(part),
+            size,
+            fps=fps,
+            codec="libx264",
+            quality=None,
+            macro_block_size=2,
+            output_params=["-crf", "20", "-preset", "medium", "-movflags", "+faststart", "-f", "mp4"],
+            ffmpeg_log_level="error",
+        )
+        writer.send(None)
+        try:
+            for picture in frames:
+                writer.send(np.ascontiguousarray(scaled(picture, scale, multiple=2)))
+        finally:
+            writer.close()

@@ -1,0 +1,126 @@
+"""A recorded episode: what every vehicle did, frame by frame, as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import torch
+
+from ganlane import keys
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE
+from ganlane.errors import UserError
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.vehicles import Vehicles
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+ACTION_NAMES = ("keep", "left", "right")
+#: A vehicle that moves further than this between two frames was put elsewhere (recycled), m.
+JUMP_M = 30.0
+
+
+@dataclass(frozen=True)
+class EpisodeLabel:
+    """What an episode is: who drives where, and its numbers."""
+
+    agent: str = "ego"
+    traffic: str = "traffic"
+    seed: int = 0
+    episode: int = 0
+    #: Number of lanes; lane 0 is the rightmost.
+    lanes: int = 3
+    lane_width_m: float = 4.0
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """T frames of M vehicles; the ego has index 0.
+
+    Frame 0 is the state after the reset. SI units: positions of the bodies' centres in m, ``x`` along the
+    road, ``y`` to the left; ``heading`` in rad, anticlockwise.
+    """
+
+    label: EpisodeLabel
+    #: Time since the reset, s, [T].
+    time_s: FloatArray
+    #: Fields of ``vehicles`` (:mod:`ganlane.keys`), each [T, M].
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
+    length: FloatArray
+    width: FloatArray
+    target_lane: IntArray
+    valid: BoolArray
+    #: Action of the decision that a frame belongs to, [T]; -1 before the first decision.
+    action: IntArray
+    #: Return up to the decision before, [T]; the last frame has the whole return.
+    returns: FloatArray
+    #: How it ended: one of :data:`ganlane.keys.END_EVENTS`, or empty where it was cut off.
+    outcome: str = ""
+    #: Values of the actions where the policy tells them, [T, A]; empty otherwise.
+    action_values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.time_s)
+
+    @property
+    def vehicles(self) -> int:
+        """Number of vehicles M, the ego included."""
+        return self.x.shape[1]
+
+    @property
+    def frame_s(self) -> float:
+        """Time between two frames, s."""
+        return float(np.median(np.diff(self.time_s))) if len(self) > 1 else keys.PHYSICS_STEP_S
+
+    def lane(self) -> IntArray:
+        """Lane whose centre is nearest, [T, M]."""
+        nearest = np.rint(self.y / self.label.lane_width_m).astype(np.int64)
+        return nearest.clip(0, self.label.lanes - 1)
+
+    def jumped(self) -> BoolArray:
+        """Whether a vehicle was put elsewhere since the frame before, [T, M]."""
+        moved = np.abs(np.diff(self.x, axis=0, prepend=self.x[:1]))
+        return moved > JUMP_M * max(1.0, self.frame_s)
+
+    def overlapping(self) -> BoolArray:
+        """Whether a vehicle's box overlaps another's, [T, M]."""
+        fields = {name: torch.as_tensor(getattr(self, name)) for name in ("x", "y", "heading", "length", "width")}
+        unused = torch.zeros_like(fields["x"])
+        others = {name: unused for name in keys.VEHICLE_FIELDS if name not in fields}
+        everybody = Vehicles(**{**others, **fields, "valid": torch.as_tensor(self.valid)})
+        return pair_overlaps(everybody).any(-1).numpy()
+
+
+def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
+    """The trajectory in the form of recorded traffic (:mod:`ganlane.data.schema`), so that it reads back as such.
+
+    A vehicle that was put elsewhere (recycled) begins a new track.
+
+    Raises:
+        UserError: the frames are not 0.1 s apart.
+    """
+    if len(trajectory) > 1 and abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
+        raise UserError(
+            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need {keys.PHYSICS_STEP_S} s; "
+            "record it at every physics step."
+        )
+    frames, vehicles = trajectory.x.shape
+    track = np.arange(vehicles) + TRACK_STRIDE * np.cumsum(trajectory.jumped(), axis=0)
+    columns = {
+        "vehicle": track,
+        "frame": np.broadcast_to(np.arange(frames)[:, None], (frames, vehicles)),
+        **{name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")},
+        "lane": trajectory.lane(),
+    }
+    shown = trajectory.valid
+    table = pl.DataFrame({"scene": [scene] * int(shown.sum()), **{k: v[shown] for k, v in columns.items()}})
+    return table.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items()).sort("scene", "vehicle", "frame")

@@ -1,0 +1,72 @@
+"""Trained agents as files."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ganlane.agents import Rainbow, RainbowConfig, agent_file, checkpoint, load_agent, save_agent, transfer
+from ganlane.errors import UserError
+
+SMALL = {"hidden": (8, 8), "batch_size": 8, "warmup": 8, "capacity": 100}
+
+
+def agent(size=5, seed=0, **options):
+    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "agent.safetensors"
+    save_agent(path, agent(), {"observation": "table3", "training": {"decisions": 7}})
+    return path
+
+
+def test_a_loaded_agent_drives_like_the_saved_one(saved):
+    policy, metadata = load_agent(saved, observation_size=5)
+    data = TensorDict({"observation": torch.randn(100, 5)}, [100])
+    assert torch.equal(policy(data.clone())["action"], agent().greedy(data.clone())["action"])
+    assert metadata["observation"] == "table3"
+    assert metadata["training"] == {"decisions": 7}
+    assert metadata["network"]["v_max"] == 120.0
+    assert metadata["network"]["observation_size"] == 5
+
+
+def test_another_observation_size_is_refused_naming_both(saved):
+    with pytest.raises(UserError, match=r"\[5\].*\[9\]"):
+        load_agent(saved, observation_size=9)
+    with pytest.raises(UserError, match=r"\[5\].*\[9\]"):
+        transfer(agent(size=9), saved)
+
+
+def test_another_support_is_refused_on_transfer(saved):
+    with pytest.raises(UserError, match=r"agent.v_min=-120.0"):
+        transfer(agent(v_min=-10.0), saved)
+
+
+def test_a_transfer_starts_from_the_saved_weights(saved):
+    fresh = agent(seed=3)
+    assert transfer(fresh, saved)["training"] == {"decisions": 7}
+    assert all(torch.equal(a, b) for a, b in zip(fresh.weights().values(), agent().weights().values()))
+
+
+def test_a_truncated_or_foreign_file_is_refused(saved, tmp_path):
+    whole = saved.read_bytes()
+    saved.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match="agent checkpoint"):
+        load_agent(saved)
+    other = tmp_path / "notes.txt"
+    other.write_text("hello")
+    with pytest.raises(UserError, match="agent checkpoint"):
+        load_agent(other)
+
+
+def test_an_unknown_agent_is_refused_with_the_names_there_are():
+    with pytest.raises(UserError, match="agent_idm, agent_gan"):
+        load_agent("agent_xyz")
+
+
+def test_shipped_agents_are_found_by_name(saved, monkeypatch):
+    monkeypatch.setattr(checkpoint, "FOLDER", saved.parent)
+    saved.rename(saved.with_name("agent_idm.safetensors"))
+    assert agent_file("agent_idm") == agent_file("agent_idm@0")
+    assert load_agent("agent_idm")[1]["observation"] == "table3"

@@ -1,0 +1,104 @@
+"""The n-step window against a brute-force loop over episodes."""
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from ganlane.agents.n_step import NStepWindow
+
+
+def recorded(steps, environments, seed):
+    """Steps with random ends; the observation is a serial number, and the one after a reset is another."""
+    generator = torch.Generator().manual_seed(seed)
+    serial, current, result = 0.0, torch.zeros(environments, 1), []
+    for _ in range(steps):
+        terminated = torch.rand(environments, 1, generator=generator) < 0.2
+        truncated = torch.rand(environments, 1, generator=generator) < 0.2
+        done = terminated | truncated
+        serial += 1.0
+        following = current * 0 + serial + torch.arange(environments)[:, None] / 100
+        after = {
+            "observation": following,
+            "reward": torch.randn(environments, 1, generator=generator),
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": done,
+        }
+        action = torch.randint(0, 3, (environments,), generator=generator)
+        step = TensorDict({"observation": current, "action": action, "next": after}, [environments])
+        result.append(step)
+        current = torch.where(done, following + 0.5, following)
+    return result
+
+
+def brute_force(steps, start, row, n, gamma):
+    reward, length = 0.0, 0
+    for step in steps[start : start + n]:
+        after = step["next"]
+        reward += gamma**length * float(after["reward"][row])
+        length += 1
+        if after["done"][row]:
+            break
+    return reward, length, after["observation"][row], after["terminated"][row]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 10_000))
+def test_each_transition_equals_the_loop_over_its_own_steps(n, environments, seed):
+    gamma, steps = 0.9, recorded(20, environments, seed)
+    window = NStepWindow(n, gamma)
+    transitions = [window.push(step) for step in steps]
+    assert all(t is None for t in transitions[: n - 1])
+    for start, transition in enumerate(transitions[n - 1 :]):
+        assert transition["steps_to_next_obs"].shape == (environments, 1)
+        for row in range(environments):
+            reward, length, following, terminated = brute_force(steps, start, row, n, gamma)
+            assert torch.equal(transition["observation"][row], steps[start]["observation"][row])
+            assert transition["action"][row] == steps[start]["action"][row]
+            torch.testing.assert_close(float(transition["next", "reward"][row]), reward, atol=1e-5, rtol=1e-5)
+            assert transition["steps_to_next_obs"][row] == length
+            assert torch.equal(transition["next", "observation"][row], following)
+            assert transition["next", "terminated"][row] == terminated
+
+
+def test_a_crash_after_the_first_step_is_seen_by_the_transitions_before_it():
+    """The error of TorchRL's own transform: ``terminated`` of the first step would be False here."""
+    steps = recorded(3, 1, 0)
+    for i, step in enumerate(steps):
+        step["next", "done"][:] = step["next", "terminated"][:] = i == 1
+    window = NStepWindow(3, 1.0)
+    transition = [window.push(step) for step in steps][-1]
+    assert transition["next", "terminated"].item()
+    assert transition["steps_to_next_obs"].item() == 2
+
+
+def test_a_truncation_bootstraps_from_the_last_observation_of_its_episode():
+    steps = recorded(3, 1, 0)
+    for i, step in enumerate(steps):
+        step["next", "done"][:] = i == 0
+        step["next", "terminated"][:] = False
+    window = NStepWindow(3, 1.0)
+    transition = [window.push(step) for step in steps][-1]
+    assert not transition["next", "terminated"].item()
+    assert torch.equal(transition["next", "observation"], steps[0]["next", "observation"])
+
+
+def test_a_saved_window_goes_on_as_if_nothing_had_happened():
+    steps = recorded(8, 3, 1)
+    whole, first, second = NStepWindow(3, 0.9), NStepWindow(3, 0.9), NStepWindow(3, 0.9)
+    expected = [whole.push(step) for step in steps][-1]
+    for step in steps[:4]:
+        first.push(step)
+    second.load_state_dict(first.state_dict())
+    actual = [second.push(step) for step in steps[4:]][-1]
+    assert (actual == expected).all()
+
+
+def test_the_window_keeps_its_own_copy():
+    steps = recorded(2, 2, 2)
+    window = NStepWindow(2, 0.9)
+    window.push(steps[0])
+    original = steps[0]["observation"].clone()
+    steps[0]["observation"].fill_(99.0)
+    assert torch.equal(window.push(steps[1])["observation"], original)

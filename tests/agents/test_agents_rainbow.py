@@ -1,0 +1,292 @@
+"""The assembled agent: exploration, updates, switches, saving, and no touch of the global random state."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ganlane.agents import NStepWindow, Rainbow, RainbowConfig
+from ganlane.agents.network import NetworkConfig, QNetwork, duel
+from ganlane.errors import UserError
+
+SIZE = 4
+SMALL = {"hidden": (16, 16), "batch_size": 32, "warmup": 32, "capacity": 500, "v_min": -5.0, "v_max": 5.0}
+
+
+def agent(seed=0, **options):
+    return Rainbow(RainbowConfig(**{**SMALL, **options}), SIZE, seed=seed)
+
+
+def transitions(rows=64, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    after = {
+        "observation": torch.randn(rows, SIZE, generator=generator),
+        "reward": torch.randn(rows, 1, generator=generator),
+        "terminated": torch.rand(rows, 1, generator=generator) < 0.2,
+    }
+    content = {
+        "observation": torch.randn(rows, SIZE, generator=generator),
+        "action": torch.randint(0, 3, (rows,), generator=generator),
+        "steps_to_next_obs": torch.ones(rows, 1),
+        "next": after,
+    }
+    return TensorDict(content, [rows])
+
+
+def trained(updates=5, **options):
+    result = agent(**options)
+    result.store(transitions())
+    for _ in range(updates):
+        result.update()
+    return result
+
+
+def weights_equal(first, second):
+    pairs = zip(first.weights().values(), second.weights().values())
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def observations(rows=2000):
+    return TensorDict({"observation": torch.randn(rows, SIZE, generator=torch.Generator().manual_seed(9))}, [rows])
+
+
+# --- the network
+
+
+def test_dueling_takes_the_mean_advantage_off():
+    rows = torch.tensor([[10.0], [1.0], [2.0], [6.0]])
+    assert duel(rows).flatten().tolist() == [8.0, 9.0, 13.0]
+
+
+@pytest.mark.parametrize("dueling", [True, False])
+@pytest.mark.parametrize("distributional", [True, False])
+def test_the_network_gives_what_torchrl_expects(dueling, distributional):
+    config = NetworkConfig(SIZE, 3, hidden=(8,), atoms=7, dueling=dueling, distributional=distributional)
+    output = QNetwork(config)(torch.randn(2, 5, SIZE))
+    assert output.shape == ((2, 5, 7, 3) if distributional else (2, 5, 3))
+    if distributional:
+        torch.testing.assert_close(output.exp().sum(-2), torch.ones(2, 5, 3))
+
+
+def test_the_value_is_the_mean_of_the_distribution():
+    network = QNetwork(NetworkConfig(SIZE, 3, hidden=(8,), atoms=7))
+    observation = torch.randn(5, SIZE)
+    expected = (network(observation).exp() * network.support[:, None]).sum(-2)
+    torch.testing.assert_close(network.values(observation), expected)
+
+
+# --- exploration
+
+
+def test_the_noise_is_drawn_anew_at_every_step():
+    explorer = agent(noisy_sigma=3.0)
+    data = observations()
+    first, second = (explorer.policy(data.clone())["action"] for _ in range(2))
+    assert not torch.equal(first, second)
+
+
+@pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN])
+def test_under_deterministic_exploration_the_policy_is_greedy(kind):
+    explorer = agent(noisy_sigma=3.0)
+    data = observations()
+    with set_exploration_type(kind):
+        actions = [explorer.policy(data.clone())["action"] for _ in range(2)]
+    greedy = explorer.greedy(data.clone())["action"]
+    assert all(torch.equal(action, greedy) for action in actions)
+
+
+def test_the_greedy_policy_has_no_noise_whatever_the_context():
+    explorer = agent(noisy_sigma=3.0)
+    data = observations()
+    expected = explorer.greedy(data.clone())["action"]
+    explorer.policy(data.clone())
+    with set_exploration_type(ExplorationType.RANDOM):
+        assert torch.equal(explorer.greedy(data.clone())["action"], expected)
+
+
+def test_the_policy_writes_the_action_alone():
+    data = agent().policy(observations(3))
+    assert set(data.keys()) == {"observation", "action"}
+    assert data["action"].dtype == torch.int64
+
+
+def test_without_noise_a_share_epsilon_of_the_actions_is_random_and_legal():
+    def legal(tensordict):
+        mask = torch.ones(*tensordict.shape, 3, dtype=torch.bool)
+        mask[:, 1] = False
+        return mask
+
+    explorer = Rainbow(RainbowConfig(**SMALL, noisy=False, epsilon_start=0.5), SIZE, legal=legal)
+    explorer.network.head.bias.data[:] = 0.0
+    data = observations()
+    differing = explorer.policy(data.clone())["action"] != explorer.greedy(data.clone())["action"]
+    greedy = explorer.greedy(data.clone())["action"]
+    drawn = explorer.policy(data.clone())["action"]
+    assert not (drawn[drawn != greedy] == 1).any()
+    assert 0.15 < differing.float().mean() < 0.5
+    explorer.anneal(10**9)
+    assert explorer.policy.epsilon == RainbowConfig().epsilon
+
+
+def test_noisy_agents_draw_no_random_actions():
+    assert agent().policy.epsilon == 0.0
+
+
+# --- updates
+
+
+def test_the_target_is_copied_exactly_every_period():
+    learner = agent(target_period=3)
+    learner.store(transitions())
+    copied = []
+    for _ in range(9):
+        learner.update()
+        pairs = zip(learner.network.parameters(), learner.loss.target_network.parameters())
+        copied.append(all(torch.equal(a, b) for a, b in pairs))
+    assert copied == [False, False, True] * 3
+
+
+def test_every_update_draws_the_noise_of_both_networks_anew():
+    learner = agent()
+    learner.store(transitions())
+    modules = (learner.network, learner.loss.target_network)
+    before = [module.head.weight_epsilon.clone() for module in modules]
+    learner.update()
+    after = [module.head.weight_epsilon for module in modules]
+    assert not any(torch.equal(a, b) for a, b in zip(before, after))
+    assert not torch.equal(*after)
+
+
+def test_updates_change_every_parameter_sigmas_included():
+    before, after = agent().weights(), trained().weights()
+    assert {name for name in before if torch.equal(before[name], after[name])} == set()
+
+
+def test_the_objective_is_the_mean_of_weight_times_loss():
+    learner = agent(beta_start=1.0)
+    learner.store(transitions())
+    learner.replay.update_priority(torch.arange(64), torch.linspace(0.1, 5.0, 64))
+    learner.replay.sample()
+    seen = {}
+    forward = learner.loss.forward
+
+    def spy(batch):
+        seen["terms"], seen["weight"] = forward(batch), batch["priority_weight"]
+        return seen["terms"]
+
+    learner.loss.forward = spy
+    objective = learner.update()["loss"]
+    torch.testing.assert_close(objective, (seen["weight"] * seen["terms"]["loss"]).mean().detach())
+
+
+def test_an_update_gives_the_drawn_items_their_new_priority():
+    learner = agent()
+    learner.store(transitions())
+    before = learner.replay.sampler.priorities.clone()
+    learner.update()
+    assert not torch.equal(before, learner.replay.sampler.priorities)
+
+
+SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
+
+
+@pytest.mark.parametrize("off", [[name] for name in SWITCHES] + [SWITCHES])
+def test_each_component_can_be_switched_off_and_the_rest_learns(off):
+    learner = agent(**{name: False for name in off}, learning_rate=3e-3, target_period=1000)
+    learner.store(transitions())
+    losses = torch.stack([learner.update()["loss"] for _ in range(80)])
+    assert losses[-10:].mean() < 0.9 * losses[:10].mean()
+
+
+def test_metrics_are_tensors_without_dimensions():
+    learner = agent()
+    learner.store(transitions())
+    metrics = learner.update()
+    assert {"loss", "mean_q", "clamped_fraction", "priority", "gradient_norm"} == set(metrics)
+    assert all(value.shape == () and not value.requires_grad for value in metrics.values())
+
+
+def test_the_agent_learns_the_values_of_a_known_chain():
+    """Two states, the reward of the second is its action; worth gamma^0 * 2 at best, and the first gamma * 2."""
+    learner = agent(learning_rate=3e-3, target_period=20, gamma=0.5, n_step=1, noisy=False)
+    rows = 300
+    state = torch.arange(rows) % 2
+    action = torch.randint(0, 3, (rows,), generator=torch.Generator().manual_seed(0))
+    after = {
+        "observation": torch.nn.functional.one_hot(1 + 0 * state, SIZE).float(),
+        "reward": (state * action).float()[:, None],
+        "terminated": (state == 1)[:, None],
+    }
+    content = {"observation": torch.nn.functional.one_hot(state, SIZE).float(), "action": action, "next": after}
+    learner.store(TensorDict({**content, "steps_to_next_obs": torch.ones(rows, 1)}, [rows]))
+    for _ in range(300):
+        learner.update()
+    values = learner.network.values(torch.eye(SIZE)[:2])
+    torch.testing.assert_close(values, torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 2.0]]), atol=0.15, rtol=0.0)
+
+
+# --- randomness and saving
+
+
+def test_the_global_random_state_is_left_alone():
+    before = torch.get_rng_state()
+    learner = trained()
+    learner.policy(observations(5))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_seed_decides_everything_and_the_global_one_nothing():
+    torch.manual_seed(1)
+    first = trained()
+    torch.manual_seed(2)
+    assert weights_equal(first, trained())
+    assert not weights_equal(first, trained(seed=1))
+
+
+@pytest.mark.parametrize("options", [{}, {name: False for name in SWITCHES}])
+def test_a_restored_agent_goes_on_to_the_same_weights(options, tmp_path):
+    whole, half = trained(6, **options), trained(3, **options)
+    torch.save(half.state_dict(), tmp_path / "agent.pt")
+    restored = agent(seed=77, **options)
+    restored.load_state_dict(torch.load(tmp_path / "agent.pt", weights_only=True))
+    for _ in range(3):
+        restored.update()
+    assert weights_equal(restored, whole)
+    data = observations()
+    assert torch.equal(restored.policy(data.clone())["action"], whole.policy(data.clone())["action"])
+
+
+def test_a_light_state_empties_the_buffer():
+    restored = trained()
+    restored.load_state_dict(trained().state_dict(with_replay=False))
+    assert len(restored.replay) == 0
+    assert not restored.ready
+
+
+def test_the_target_follows_transferred_weights():
+    taught, fresh = trained(), agent(seed=5)
+    fresh.load_weights(taught.weights())
+    data = torch.randn(7, SIZE)
+    assert torch.equal(fresh.network.values(data), taught.network.values(data))
+    assert torch.equal(fresh.loss.target_network.values(data), taught.network.values(data))
+
+
+def test_weights_of_another_shape_are_refused():
+    other = Rainbow(RainbowConfig(**SMALL), SIZE + 1)
+    with pytest.raises(UserError, match=r"\(16, 5\) in the checkpoint and \(16, 4\) in the network"):
+        agent().load_weights(other.weights())
+
+
+def test_the_window_takes_n_and_gamma_from_the_agent():
+    window = agent(n_step=2, gamma=0.9).window()
+    assert isinstance(window, NStepWindow)
+    assert (window.n, window.gamma) == (2, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [({"n_step": 0}, "n_step"), ({"gamma": 1.5}, "gamma"), ({"v_min": 9.0}, "v_min"), ({"warmup": 1}, "warmup")],
+)
+def test_impossible_hyperparameters_are_refused(options, name):
+    with pytest.raises(UserError, match=f"agent.{name}"):
+        RainbowConfig(**{**SMALL, **options})

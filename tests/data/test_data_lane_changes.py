@@ -1,0 +1,128 @@
+"""The lane-change detector and equation 11 on tracks made by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ganlane.data import (
+    lane_changes_of_arrays,
+    lane_changes_of_frame,
+    synthetic_scenes,
+)
+
+WIDTH = 3.6
+TIME = np.arange(80) * 0.1
+#: Keeps lane 0, moves left at 1 m/s from 2.05 s to 5.65 s, keeps lane 1.
+RAMP = np.clip(TIME - 2.05, 0.0, WIDTH)
+
+
+def found(y, **more):
+    changes, _ = lane_changes_of_arrays(np.asarray(y)[:, None], WIDTH, **more)
+    return changes
+
+
+def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
+    # The boundary, 1.8 m, is crossed at 3.85 s. Going back, 2.3 s is the first sample within 0.3 m of the old
+    # centre (0.25 m); going on, 5.4 s is the first within 0.3 m of the new one (3.35 m).
+    change = found(RAMP)
+    assert len(change) == 1
+    assert (change.old_lane[0], change.new_lane[0]) == (0, 1)
+    assert change.sample[0] == 38
+    assert change.tau_s[0] == pytest.approx(1.55)
+    assert change.tau_e[0] == pytest.approx(1.55)
+    assert change.duration_s[0] == pytest.approx(3.1)
+    assert change.lateral_speed[0] == pytest.approx(1.0)
+    assert change.complete[0]
+
+
+def test_a_driver_who_stops_beside_the_centre_has_ended_the_change():
+    # Stops at 2.68 m. Over 1 s about 5.1 s it moves 0.13 m, about 5.2 s 0.03 m: the change ends at 5.2 s.
+    change = found(np.minimum(RAMP, 2.68))
+    assert change.tau_e[0] == pytest.approx(5.2 - 3.85)
+    assert change.lateral_speed[0] == pytest.approx((2.68 - 0.25) / (5.2 - 2.3))
+
+
+def test_a_track_that_ends_in_the_middle_of_the_change_is_censored():
+    change = found(RAMP[:45])
+    assert change.end_censored[0]
+    assert not change.start_censored[0]
+    assert change.tau_e[0] == pytest.approx(4.4 - 3.85)
+    late = found(RAMP[33:])
+    assert late.start_censored[0]
+    assert not late.end_censored[0]
+    assert late.tau_s[0] == pytest.approx(3.85 - 3.3)
+    assert not late.complete[0]
+
+
+@pytest.mark.parametrize(("samples", "changes"), [(4, 0), (5, 2)])
+def test_a_flicker_shorter_than_half_a_second_is_no_change(samples, changes):
+    y = np.full(40, 1.7)
+    y[20 : 20 + samples] = 1.9
+    assert len(found(y)) == changes
+
+
+@pytest.mark.parametrize(("after", "changes"), [(4, 0), (5, 1)])
+def test_the_new_lane_must_be_seen_for_half_a_second(after, changes):
+    assert len(found(np.r_[np.full(20, 1.7), np.full(after, 1.9)])) == changes
+    assert len(found(np.r_[np.full(after, 1.7), np.full(20, 1.9)])) == changes
+
+
+def test_two_lanes_in_one_go_are_two_changes():
+    y = np.clip(1.5 * (TIME - 1.0), 0.0, 2 * WIDTH)
+    changes = found(y)
+    assert changes.old_lane.tolist() == [0, 1]
+    assert changes.new_lane.tolist() == [1, 2]
+
+
+def test_a_gap_in_a_track_and_a_change_of_vehicle_are_no_lane_changes():
+    y = np.r_[np.zeros(20), np.full(20, WIDTH)]
+    valid = np.ones((40, 1), bool)
+    begins = np.zeros((40, 1), bool)
+    assert len(found(y)) == 1
+    begins[20] = True
+    assert len(found(y, begins=begins)) == 0
+    valid[20] = False
+    assert len(found(y, valid=valid)) == 0
+
+
+def test_each_change_is_told_by_its_time_and_column():
+    y = np.stack((np.zeros(80), RAMP, WIDTH - RAMP), axis=1)
+    changes, where = lane_changes_of_arrays(y, WIDTH)
+    assert where.tolist() == [[38, 1], [38, 2]]
+    assert changes.new_lane.tolist() == [1, 0]
+    assert changes.tau_s == pytest.approx([1.55, 1.55])
+
+
+def test_no_vehicles_no_changes():
+    assert len(lane_changes_of_arrays(np.zeros((10, 2)), WIDTH, np.zeros((10, 2), bool))[0]) == 0
+
+
+def test_a_coarser_step_finds_the_same_change():
+    coarse = found(RAMP[::2], step_s=0.2)
+    assert coarse.duration_s[0] == pytest.approx(3.1, abs=0.4)
+
+
+@given(seed=st.integers(0, 500))
+def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(seed):
+    frame = synthetic_scenes(seed=seed)
+    widths = {"synthetic-0": 3.5, "synthetic-1": 3.5}
+    of_frame = lane_changes_of_frame(frame, widths)
+    y = frame["y"].to_numpy().reshape(24, 100).T
+    of_arrays, _ = lane_changes_of_arrays(y, 3.5)
+    mirrored, _ = lane_changes_of_arrays(7.0 - y, 3.5)
+    np.testing.assert_array_equal(of_frame.sample, of_arrays.sample)
+    np.testing.assert_array_equal(of_frame.duration_s, of_arrays.duration_s)
+    np.testing.assert_array_equal(of_frame.new_lane, 2 - mirrored.new_lane)
+    np.testing.assert_allclose(of_frame.lateral_speed, mirrored.lateral_speed, atol=1e-9)
+
+
+@given(lateral_mps=st.floats(0.4, 2.0), begin_s=st.floats(1.5, 3.0))
+def test_the_time_of_a_steady_move_is_its_distance_over_its_speed(lateral_mps, begin_s):
+    time = np.arange(200) * 0.1
+    change = found(np.clip(lateral_mps * (time - begin_s), 0.0, WIDTH))
+    assert change.complete[0]
+    # Between 0.3 m off either centre, and up to one sample more at either end.
+    least = (WIDTH - 0.6) / lateral_mps
+    assert least - 1e-9 <= change.duration_s[0] <= least + 0.2 + 1e-9
+    assert change.lateral_speed[0] == pytest.approx(lateral_mps, rel=0.15)

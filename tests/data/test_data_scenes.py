@@ -1,0 +1,177 @@
+"""Scene CSV and the schema: what is read, and how each kind of damage is told."""
+
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from ganlane.data import (
+    SCHEMA,
+    SyntheticTraffic,
+    data_folder,
+    default_scenes,
+    read_scenes,
+    scene_lane_counts,
+    synthetic_scenes,
+    validate,
+    write_scene_csv,
+)
+from ganlane.errors import UserError
+
+HEADER = "scene,vehicle,frame,x,y,heading,v,lane,length,width"
+#: Two cars, one in the left lane (1) and one in the right (2), 3.5 m apart, at 10 m/s.
+ROWS = [
+    f"s,{vehicle},{frame},{frame * 1.0 + 20 * vehicle},{-3.5 * (vehicle - 1)},0,10,{vehicle},4.5,2.0"
+    for vehicle in (1, 2)
+    for frame in range(6)
+]
+
+
+def written(folder: Path, lines: list[str]) -> Path:
+    path = folder / "scenes.csv"
+    path.write_text("\n".join([HEADER, *lines]) + "\n")
+    return path
+
+
+def test_lanes_are_counted_from_the_right_and_y_from_the_right_lanes_centre(tmp_path):
+    frame = read_scenes(written(tmp_path, ROWS))
+    assert frame.schema == SCHEMA
+    left = frame.filter(pl.col("vehicle") == 1)
+    right = frame.filter(pl.col("vehicle") == 2)
+    assert left["lane"].to_list() == [1] * 6
+    assert right["lane"].to_list() == [0] * 6
+    assert left["y"].to_list() == pytest.approx([3.5] * 6)
+    assert right["y"].to_list() == pytest.approx([0.0] * 6)
+    assert scene_lane_counts(frame) == {"s": 2}
+
+
+def test_rows_come_out_sorted_whatever_their_order_across_tracks(tmp_path):
+    by_frame = sorted(ROWS, key=lambda row: int(row.split(",")[2]))
+    assert read_scenes(written(tmp_path, by_frame)).equals(read_scenes(written(tmp_path, ROWS)))
+
+
+def test_a_synthetic_recording_survives_the_file(tmp_path):
+    made = synthetic_scenes(seed=3)
+    path = tmp_path / "made.csv"
+    write_scene_csv(made, path)
+    read = read_scenes(path)
+    exact = ["scene", "vehicle", "frame", "lane"]
+    assert read.select(exact).equals(made.select(exact))
+    for name, tolerance in {"x": 1e-4, "speed": 1e-4, "length": 1e-9, "width": 1e-9}.items():
+        assert (read[name] - made[name]).abs().max() <= tolerance
+    # The lane width is estimated anew, to 4 cm; two lanes to the left that makes 8 cm.
+    assert (read["y"] - made["y"]).abs().max() < 0.08
+
+
+def field(row: int, column: str, value: str) -> list[str]:
+    lines = [line.split(",") for line in ROWS]
+    lines[row][HEADER.split(",").index(column)] = value
+    return [",".join(line) for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        (field(3, "x", "abc"), r"line 5, column x: 'abc' is not a number"),
+        (field(0, "y", "NaN"), r"line 2, column y: 'NaN' is not a finite number"),
+        (field(2, "v", "inf"), r"line 4, column v: 'inf' is not a finite number"),
+        (field(4, "frame", "4.5"), r"line 6, column frame: '4.5' is not a whole number"),
+        (field(5, "lane", ""), r"line 7, column lane: the field is empty"),
+        (field(7, "lane", "0"), r"line 9, column lane: 0 is below 1"),
+        (field(8, "frame", "1"), r"line 10, column frame: 1 comes twice"),
+        (field(9, "frame", "0"), r"line 11, column frame: 0 is before"),
+        (field(10, "length", "0"), r"line 12, column length: 0.0 is not above 0"),
+        ([*ROWS[:-1], "s,2,5,45.0"], r"line 13, column y: the field is empty; the row is incomplete"),
+    ],
+)
+def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, lines, told):
+    path = written(tmp_path, lines)
+    with pytest.raises(UserError, match=told) as caught:
+        read_scenes(path)
+    assert str(path) in str(caught.value)
+
+
+def scaled(column: str, factor: float) -> list[str]:
+    at = HEADER.split(",").index(column)
+    lines = [line.split(",") for line in ROWS]
+    return [",".join([*line[:at], str(float(line[at]) * factor), *line[at + 1 :]]) for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "told"),
+    [
+        ("v", 10.0, "column speed: the median is 100.0"),
+        ("v", 3.6, "x moves by 10.0 m per second where speed says 36.0"),
+        ("x", 3.28, "x moves by 32.8 m per second where speed says 10.0"),
+        ("x", -1.0, "x moves by -10.0 m per second"),
+        ("length", 3.28, "column length: the median is 14.8"),
+        ("y", 3.28, "lanes are 11.48 m apart"),
+        ("y", -1.0, "lanes are -3.50 m apart"),
+    ],
+)
+def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, told):
+    with pytest.raises(UserError, match=told):
+        read_scenes(written(tmp_path, scaled(column, factor)))
+
+
+def test_a_missing_column_names_what_was_found_and_expected(tmp_path):
+    path = tmp_path / "scenes.csv"
+    path.write_text("scene,vehicle,frame,x,y,speed,lane,length,width\n" + "s,1,0,0,0,10,1,4,2\n")
+    with pytest.raises(UserError, match=r"line 1: no column v; found scene.*speed.*expected"):
+        read_scenes(path)
+
+
+def test_files_that_hold_nothing_or_no_table_are_refused(tmp_path):
+    path = tmp_path / "scenes.csv"
+    with pytest.raises(UserError, match="no such file"):
+        read_scenes(path)
+    path.write_text("")
+    with pytest.raises(UserError, match="the file is empty"):
+        read_scenes(path)
+    path.write_text(HEADER + "\n")
+    with pytest.raises(UserError, match="a header but no rows"):
+        read_scenes(path)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50)
+    with pytest.raises(UserError, match=r"not a readable CSV|no column"):
+        read_scenes(path)
+    with pytest.raises(UserError, match="no such file"):
+        read_scenes(tmp_path)
+
+
+def test_the_validator_checks_frames_that_come_from_nowhere():
+    made = synthetic_scenes(SyntheticTraffic(scenes=1))
+    assert validate(made, "made").equals(made)
+    with pytest.raises(UserError, match="made: no column speed"):
+        validate(made.drop("speed"), "made")
+    with pytest.raises(UserError, match="made: no rows"):
+        validate(made.clear(), "made")
+    with pytest.raises(UserError, match="made, column x: String found, Float64 expected"):
+        validate(made.with_columns(x=pl.lit("here")), "made")
+    holed = made.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
+    with pytest.raises(UserError, match="made, line 9, column x: None is not a finite number"):
+        validate(holed, "made")
+
+
+def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
+    monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
+    assert data_folder() == tmp_path
+    with pytest.raises(UserError, match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"):
+        default_scenes()
+    (tmp_path / "ngsim").mkdir()
+    deep = tmp_path / "ngsim" / "us101_scenes.csv"
+    deep.write_text(HEADER)
+    assert default_scenes() == deep
+    monkeypatch.setenv("GANLANE_DATA", str(tmp_path / "nowhere"))
+    with pytest.raises(UserError, match="no such folder"):
+        data_folder()
+
+
+def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.delenv("GANLANE_DATA", raising=False)
+    monkeypatch.setattr("ganlane.data.find.__file__", str(tmp_path / "site" / "ganlane" / "data" / "find.py"))
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    assert data_folder() is None
+    (tmp_path / "shared" / "data").mkdir(parents=True)
+    assert data_folder() == tmp_path / "shared" / "data"

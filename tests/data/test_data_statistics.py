@@ -1,0 +1,181 @@
+"""Equations 9 and 10, intervals, durations, and whole statistics against values worked by hand."""
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+
+from ganlane.data import (
+    SCHEMA,
+    DrivingStatistics,
+    SyntheticTraffic,
+    describe,
+    describe_durations,
+    driving_statistics,
+    follower_headways,
+    poisson_interval,
+    raw_accelerations,
+    smoothed_accelerations,
+    srlc,
+    steps_between_changes,
+    synthetic_scenes,
+)
+from ganlane.errors import UserError
+
+
+def track(vehicle, x, lane=0, scene="s", y=None, length=4.0):
+    """One vehicle at positions ``x``, a sample every 0.1 s; its speed is the forward difference."""
+    x = np.asarray(x, float)
+    n = len(x)
+    speed = np.gradient(x, 0.1)
+    y = np.full(n, 3.5 * lane) if y is None else y
+    columns = [[scene] * n, [vehicle] * n, range(n), x, y, speed, np.rint(y / 3.5), [length] * n, [2.0] * n]
+    return pl.DataFrame(dict(zip(SCHEMA, columns)), schema=SCHEMA, strict=False)
+
+
+def test_equation_9_counts_changes_per_vehicle_and_kilometre_of_road():
+    # 6 changes among 100 vehicles on 500 m: 0.06 each, on half a kilometre.
+    assert srlc(6, 100, 500.0) == pytest.approx(0.12)
+
+
+def test_equation_10s_mean_time_between_changes():
+    # Half a change per km at 20 m/s: a change every 2 km, that is every 100 s, that is every 1000 steps.
+    assert steps_between_changes(0.5, 20.0) == pytest.approx(1000.0)
+    assert steps_between_changes(0.5, 20.0, step_s=1.0) == pytest.approx(100.0)
+
+
+@pytest.mark.parametrize(
+    ("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39), (57, 43.17, 73.85)]
+)
+def test_the_exact_interval_of_a_count_is_the_tabled_one(count, low, high):
+    # Garwood's limits as tabled in textbooks of epidemiology.
+    assert poisson_interval(count) == pytest.approx((low, high), rel=2e-3)
+
+
+def test_durations_cut_off_push_the_mean_up():
+    # Kaplan and Meier by hand: ends at 1 and 3, cut off at 2. S = 1 until 1, 2/3 until 3, then 0.
+    durations = describe_durations([1.0, 2.0, 3.0], [True, False, True])
+    assert durations.survival_mean_s == pytest.approx(1.0 + 2.0 * 2.0 / 3.0)
+    assert durations.survival_median_s == 3.0
+    assert durations.complete.mean == pytest.approx(2.0)
+    assert durations.complete.sd == pytest.approx(np.sqrt(2.0))
+    assert (durations.complete.count, durations.censored) == (2, 1)
+
+
+def test_durations_none_of_which_was_seen_whole_have_no_mean():
+    durations = describe_durations([1.0, 2.0], [False, False])
+    assert durations.censored == 2
+    assert durations.survival_mean_s is None
+    assert durations.complete.mean is None
+    # One seen and a longer one cut off: the curve stays at one half or above after the last end.
+    open_ended = describe_durations([1.0, 2.0, 2.5], [True, False, False])
+    assert open_ended.survival_median_s is None
+    assert open_ended.survival_mean_s == pytest.approx(1.0 + 1.5 * 2.0 / 3.0)
+
+
+def test_a_sample_is_summed_up():
+    summary = describe(np.arange(101.0))
+    assert (summary.count, summary.mean) == (101, 50.0)
+    assert summary.quantile(0.05) == pytest.approx(5.0)
+    assert summary.quantile(0.5) == pytest.approx(50.0)
+    assert describe([]).quantiles == ()
+    assert describe([2.0]).sd is None
+
+
+def test_a_steady_acceleration_is_found_by_either_measure_and_a_lost_frame_splits_a_track():
+    time = np.arange(50) * 0.1
+    frame = track(1, 10.0 * time + 0.75 * time**2)
+    assert smoothed_accelerations(frame).to_list() == pytest.approx([1.5] * 30)
+    # numpy's gradient is one-sided at both ends.
+    assert raw_accelerations(frame)[1:-1].to_list() == pytest.approx([1.5] * 47)
+    holed = frame.filter(pl.col("frame") != 25)
+    # Frames 20 to 24 and 46 to 49 have two seconds without a gap behind them.
+    assert smoothed_accelerations(holed).to_list() == pytest.approx([1.5] * 9)
+    assert len(raw_accelerations(holed)) == 49 - 2
+
+
+def test_noise_from_frame_to_frame_is_smoothed_away():
+    time = np.arange(100) * 0.1
+    noisy = track(1, 10.0 * time + 0.05 * (-1.0) ** np.arange(100))
+    assert smoothed_accelerations(noisy).abs().max() == pytest.approx(0.0, abs=1e-9)
+    shaken = noisy.with_columns(speed=10.0 + pl.col("frame") % 2)
+    assert raw_accelerations(shaken).abs().min() == pytest.approx(10.0)
+
+
+def test_the_headway_is_the_followers_own():
+    time = np.arange(20) * 0.1
+    leader = track(1, 26.0 + 10.0 * time)
+    follower = track(2, 10.0 * time)  # gap 22 m at 10 m/s: (22 - 2) / 10 = 2 s
+    beside = track(3, 13.0 + 10.0 * time, lane=1)
+    assert follower_headways(pl.concat((leader, follower, beside))).to_list() == pytest.approx([2.0])
+    far = track(1, 100.0 + 10.0 * time)
+    assert len(follower_headways(pl.concat((far, follower)))) == 0
+    short = pl.concat((leader, follower)).filter(pl.col("frame") < 9)
+    assert len(follower_headways(short)) == 0
+
+
+def recording():
+    """Three cars of 20 m/s on 500 m; one changes lanes; one comes in two tracks of 100 m."""
+    time = np.arange(251) * 0.1
+    moves = np.clip(time - 10.05, 0.0, 3.5)
+    one = track(1, 20.0 * time, y=moves)
+    other = track(2, 20.0 * time, lane=1)
+    early, late = (track(v, 20.0 * time[:51] + off, lane=2) for v, off in ((3, 0.0), (10_003, 400.0)))
+    return pl.concat((one, other, early, late.with_columns(pl.col("frame") + 200)))
+
+
+def test_a_recording_is_measured_as_by_hand():
+    measured = driving_statistics(recording(), {"s": 3.5})
+    exposure, changes = measured.exposure, measured.lane_changes
+    assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (1, 4, 3, 604)
+    assert exposure.road_m == pytest.approx(500.0)
+    # Straight: 500 + 500 + 100 + 100 m; the change adds 3.5 s of sqrt(20^2 + 1) less 20 m/s, 0.09 m.
+    assert exposure.vehicle_km == pytest.approx(1.2001, abs=1e-4)
+    assert changes.count == 1
+    assert changes.srlc == pytest.approx(1 / 3 * 1000 / 500)
+    assert changes.per_vehicle_km == pytest.approx(1 / 1.2, rel=1e-3)
+    assert changes.per_vehicle_km_low == pytest.approx(0.0253 / 1.2, rel=1e-2)
+    assert changes.per_vehicle_km_high == pytest.approx(5.572 / 1.2, rel=1e-2)
+    assert changes.t_m_srlc_steps == pytest.approx(750.0)
+    assert changes.t_m_vehicle_km_steps == pytest.approx(600.0, rel=1e-3)
+    assert changes.duration.complete.count == 1
+    assert changes.lateral_speed.mean == pytest.approx(1.0)
+    assert measured.speed.mean == pytest.approx(20.0)
+    assert measured.speed_sd_in_frame == pytest.approx(0.0, abs=1e-9)
+
+
+def test_speeds_differ_within_a_frame_but_not_within_a_lane():
+    time = np.arange(30) * 0.1
+    slow = pl.concat([track(v, 10.0 * time + 30.0 * v) for v in (1, 2)])
+    fast = pl.concat([track(v, 14.0 * time + 30.0 * v, lane=1) for v in (3, 4)])
+    measured = driving_statistics(pl.concat((slow, fast)))
+    # 10, 10, 14, 14 about 12: the sum of squares is 16, over 3.
+    assert measured.speed_sd_in_frame == pytest.approx(np.sqrt(16 / 3))
+    assert measured.speed_sd_in_lane == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("frame", [recording(), synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1))])
+def test_statistics_survive_json(frame):
+    measured = driving_statistics(frame)
+    stored = json.dumps(measured.to_dict(), allow_nan=False)
+    assert DrivingStatistics.from_dict(json.loads(stored)) == measured
+
+
+def test_foreign_statistics_are_refused():
+    numbers = driving_statistics(recording()).to_dict()
+    del numbers["lane_changes"]["srlc"]
+    with pytest.raises(UserError, match="srlc"):
+        DrivingStatistics.from_dict(numbers)
+    with pytest.raises(UserError, match="measure them again"):
+        DrivingStatistics.from_dict({"speed": 3})
+
+
+def test_a_lone_lane_keeper_leaves_the_rest_open():
+    measured = driving_statistics(synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0)))
+    assert measured.lane_changes.count == 0
+    assert measured.lane_changes.t_m_srlc_steps is None
+    assert measured.lane_changes.per_vehicle_km_low == 0.0
+    assert measured.lane_changes.per_vehicle_km_high > 0.0
+    assert measured.headway.count == 0
+    assert measured.speed_sd_in_frame is None

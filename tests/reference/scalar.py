@@ -1,0 +1,354 @@
+"""The simulator once more, one car at a time in plain Python floats: what the tensor code is tested against.
+
+Written from the equations (section IV.C of the paper, Tables IV and V, Treiber et al. 2000, Kesting et al. 2007,
+Salvucci and Gray 2004), not from the tensor code, and for reading, not for speed. SI units.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+DT = 0.1
+WHEELBASE = 2.7
+NOBODY = 10_000.0  # Table V: the gap of an empty lane
+CENTRE, BODY, SIGNALLED = 0, 1, 2
+KEEP, LEFT, RIGHT = 0, 1, 2
+
+
+@dataclass
+class Car:
+    x: float
+    y: float
+    heading: float
+    speed: float
+    acceleration: float
+    length: float
+    width: float
+    desired_speed: float
+    target_lane: int
+    visibility: int
+    valid: bool
+    steering: float = 0.0
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What of a run can be chosen."""
+
+    lanes: int
+    lane_width: float = 4.0
+    mobil: bool = True
+    abort: bool = False
+    substeps: int = 10
+    goal: float = 5000.0
+    timeout_steps: int = 10_000
+    ring: float | None = None
+
+
+@dataclass
+class State:
+    """Cars (the ego first) and what is remembered between two decisions."""
+
+    cars: list[Car]
+    step: int = 0
+    direction: int = 0
+    close_ahead: bool = False
+    close_behind: bool = False
+    lane_changes: int = 0
+
+
+@dataclass
+class Outcome:
+    """Of one decision."""
+
+    reasons: list[str] = field(default_factory=list)
+    soft_crash: int = 0
+    soft_crash_behind: int = 0
+    started_change: bool = False
+    mean_acceleration: float = 0.0
+    progress: float = 0.0
+
+
+# Along the road: IDM, Table V
+
+
+def idm(speed: float, desired_speed: float, gap: float, leader_speed: float) -> float:
+    """a (1 - (v/v0)^4 - (s*/s)^2), s* = d0 + max(0, v T + v dv / (2 sqrt(a b))); between -20 and 0.7 m/s2."""
+    a, b, headway, d0 = 0.7, 1.7, 1.6, 2.0
+    wanted = d0 + max(0.0, speed * headway + speed * (speed - leader_speed) / (2.0 * math.sqrt(a * b)))
+    acceleration = a * (1.0 - (speed / desired_speed) ** 4 - (wanted / max(gap, 0.1)) ** 2)
+    return min(0.7, max(-20.0, acceleration))
+
+
+# Who is where
+
+
+def lanes_entered(car: Car, rules: Rules) -> set[int]:
+    """Lanes whose strip the body enters by more than 0.1 m."""
+    half = 0.5 * (car.width * math.cos(car.heading) + car.length * abs(math.sin(car.heading)))
+    right, left = car.y - half + 0.1, car.y + half - 0.1
+    w = rules.lane_width
+    return {k for k in range(rules.lanes) if right < (k + 0.5) * w and left > (k - 0.5) * w}
+
+
+def lanes_seen_in(car: Car, rules: Rules) -> set[int]:
+    """Lanes in which the others see it."""
+    if not car.valid:
+        return set()
+    if car.visibility == CENTRE:
+        return {min(rules.lanes - 1, max(0, round(car.y / rules.lane_width)))}
+    entered = lanes_entered(car, rules)
+    return entered | {car.target_lane} if car.visibility == SIGNALLED else entered
+
+
+class View:
+    """The cars at one instant, and who stands in which lane."""
+
+    def __init__(self, cars: list[Car], rules: Rules) -> None:
+        self.cars, self.rules = cars, rules
+        self.in_lane: dict[int, list[int]] = {k: [] for k in range(rules.lanes)}
+        for index, car in enumerate(cars):
+            for lane in lanes_seen_in(car, rules):
+                self.in_lane[lane].append(index)
+
+    def distance(self, i: int, j: int) -> float:
+        """From the centre of i forward to the centre of j (on a ring the nearer way round)."""
+        distance = self.cars[j].x - self.cars[i].x
+        ring = self.rules.ring
+        return distance if ring is None else (distance + ring / 2) % ring - ring / 2
+
+    def gap(self, behind: int, ahead: int) -> float:
+        """Bumper to bumper."""
+        return self.distance(behind, ahead) - 0.5 * (self.cars[behind].length + self.cars[ahead].length)
+
+    def is_ahead(self, i: int, j: int) -> bool:
+        """Whether j is ahead of i; at the same x the lower index is."""
+        distance = self.distance(i, j)
+        return distance > 0 or (distance == 0 and j < i)
+
+    def leader(self, i: int, lane: int) -> int | None:
+        """Nearest car ahead of i in ``lane``; of two as near the slower."""
+        ahead = [j for j in self.in_lane.get(lane, []) if j != i and self.is_ahead(i, j)]
+        return min(ahead, key=lambda j: (self.gap(i, j), self.cars[j].speed), default=None)
+
+    def follower(self, i: int, lane: int) -> int | None:
+        """Nearest car behind i in ``lane``."""
+        behind = [j for j in self.in_lane.get(lane, []) if j != i and not self.is_ahead(i, j)]
+        return min(behind, key=lambda j: self.gap(j, i), default=None)
+
+    def acceleration(self, i: int, ahead: int | None) -> float:
+        """IDM of car i behind car ``ahead``, or behind nobody."""
+        car = self.cars[i]
+        if ahead is None:
+            return idm(car.speed, car.desired_speed, NOBODY, car.speed)
+        return idm(car.speed, car.desired_speed, self.gap(i, ahead), self.cars[ahead].speed)
+
+    def demanded(self, i: int) -> float:
+        """What the lanes that the driver attends to (body and target) allow."""
+        attended = lanes_entered(self.cars[i], self.rules) | {self.cars[i].target_lane}
+        return min(self.acceleration(i, self.leader(i, lane)) for lane in attended)
+
+
+# Across the road: MOBIL, Table IV
+
+
+def settled(car: Car, rules: Rules) -> bool:
+    return abs(car.y - car.target_lane * rules.lane_width) < 0.3
+
+
+def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
+    """``a~_c - a_c + p (a~_n - a_n) + q (a~_o - a_o)`` and whether nobody has to brake harder than 4 m/s2."""
+    own = view.cars[i].target_lane
+    gain = view.acceleration(i, view.leader(i, lane)) - view.acceleration(i, view.leader(i, own))
+    safe = view.acceleration(i, view.leader(i, lane)) >= -4.0
+    new = view.follower(i, lane)
+    if new is not None:
+        after, before = view.acceleration(new, i), view.acceleration(new, view.leader(i, lane))
+        gain += 1.0 * (after - before)
+        safe = safe and after >= -4.0
+    old = view.follower(i, own)
+    if old is not None:
+        gain += 0.5 * (view.acceleration(old, view.leader(i, own)) - view.acceleration(old, i))
+    return gain, safe
+
+
+def mobil_wish(view: View, i: int) -> int:
+    """-1, 0 or +1 lanes; the better side, left at a tie; nothing in the middle of a change."""
+    car, rules = view.cars[i], view.rules
+    if not car.valid or not settled(car, rules):
+        return 0
+    best, wish = -math.inf, 0
+    for side in (1, -1):
+        if 0 <= car.target_lane + side < rules.lanes:
+            gain, safe = incentive(view, i, car.target_lane + side)
+            if safe and gain > 0.1 and gain > best:
+                best, wish = gain, side
+    return wish
+
+
+def mobil_changes(view: View) -> dict[int, int]:
+    """Car to change, of all but the ego; of several that want into one lane within 60 m the foremost goes."""
+    wishes = {i: mobil_wish(view, i) for i in range(1, len(view.cars))}
+    wanted = {i: view.cars[i].target_lane + wish for i, wish in wishes.items() if wish}
+
+    def yields(i: int) -> bool:
+        return any(
+            wanted[j] == wanted[i] and view.is_ahead(i, j) and view.distance(i, j) < 60.0 for j in wanted if j != i
+        )
+
+    return {i: wishes[i] for i in wanted if not yields(i)}
+
+
+# Motion
+
+
+def steered(car: Car, centre: float) -> float:
+    """Two points on the lane centre, 1 s and 4 s ahead; gains 1.5, 3 and 3.375 times L/v'."""
+    pace = max(car.speed, 3.0)
+    beta = math.atan(math.tan(car.steering) / 2)
+    sideways = car.speed * math.sin(car.heading + beta)
+    yaw_rate = car.speed * math.sin(beta) / (WHEELBASE / 2)
+    offset = centre - car.y
+
+    def angle_rate(distance: float) -> float:
+        # d/dt atan(offset / distance), the point moving along with the car
+        return -sideways * distance / (distance**2 + offset**2) - yaw_rate
+
+    near, far = 1.0 * pace, 4.0 * pace
+    near_angle = math.atan2(offset, near) - car.heading
+    # Below 3 m/s the integral term is per distance: it fades with the speed.
+    rate = 1.5 * angle_rate(far) + 3.0 * angle_rate(near) + 3.375 * near_angle * car.speed / pace
+    return min(0.5, max(-0.5, car.steering + WHEELBASE / pace * rate * DT))
+
+
+def driven(car: Car, acceleration: float, steering: float) -> Car:
+    """Kinematic bicycle with slip angle, over 0.1 s, along the chord of its mean heading."""
+    speed = max(0.0, car.speed + acceleration * DT)
+    distance = (car.speed + speed) / 2 * DT
+    beta = math.atan(math.tan(steering) / 2)
+    turn = distance * math.sin(beta) / (WHEELBASE / 2)
+    course = car.heading + beta + turn / 2
+    return replace(
+        car,
+        x=car.x + distance * math.cos(course),
+        y=car.y + distance * math.sin(course),
+        heading=car.heading + turn,
+        speed=speed,
+        acceleration=(speed - car.speed) / DT,
+        steering=steering,
+    )
+
+
+# Events
+
+
+def corners(car: Car) -> list[tuple[float, float]]:
+    c, s = math.cos(car.heading), math.sin(car.heading)
+    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    half = [(a * car.length / 2, b * car.width / 2) for a, b in signs]
+    return [(car.x + c * a - s * b, car.y + s * a + c * b) for a, b in half]
+
+
+def overlap(one: Car, other: Car) -> bool:
+    """Whether no line parallel to an edge separates the two boxes."""
+    boxes = corners(one), corners(other)
+    for angle in (one.heading, one.heading + math.pi / 2, other.heading, other.heading + math.pi / 2):
+        c, s = math.cos(angle), math.sin(angle)
+        shadows = [[c * x + s * y for x, y in box] for box in boxes]
+        if max(shadows[0]) <= min(shadows[1]) or max(shadows[1]) <= min(shadows[0]):
+            return False
+    return True
+
+
+def close(gap: float, closing: float) -> bool:
+    """Soft crash: gap under 2 m or time to collision under 1.5 s."""
+    return gap < 2.0 or (closing > 0 and gap / closing < 1.5)
+
+
+def ego_close(view: View) -> tuple[bool, bool]:
+    """Whether the ego is dangerously close to somebody ahead, behind, in a lane its body is in."""
+    ego, cars = view.cars[0], view.cars
+    ahead = behind = False
+    for lane in lanes_entered(ego, view.rules):
+        j = view.leader(0, lane)
+        ahead |= j is not None and close(view.gap(0, j), ego.speed - cars[j].speed)
+        j = view.follower(0, lane)
+        behind |= j is not None and close(view.gap(j, 0), cars[j].speed - ego.speed)
+    return ahead, behind
+
+
+# Episodes
+
+
+def physics_step(state: State, rules: Rules) -> None:
+    """Everybody looks, then everybody moves."""
+    view = View(state.cars, rules)
+    accelerations = [view.demanded(i) for i in range(len(state.cars))]
+    if rules.mobil and state.step % 10 == 0:
+        for i, change in mobil_changes(view).items():
+            state.cars[i] = replace(state.cars[i], target_lane=state.cars[i].target_lane + change)
+    state.cars = [
+        driven(car, a, steered(car, car.target_lane * rules.lane_width))
+        for car, a in zip(state.cars, accelerations)
+    ]
+    state.step += 1
+
+
+def obey(state: State, action: int, rules: Rules) -> tuple[bool, bool]:
+    """Whether the command starts a change, and whether it would leave the road."""
+    wish = {KEEP: 0, LEFT: 1, RIGHT: -1}[action]
+    turns_back = rules.abort and state.direction != 0 and wish == -state.direction
+    if wish == 0 or (state.direction != 0 and not turns_back):
+        return False, False
+    target = state.cars[0].target_lane + wish
+    if not 0 <= target < rules.lanes:
+        return False, True
+    state.cars[0] = replace(state.cars[0], target_lane=target)
+    state.direction = wish
+    state.lane_changes += 1
+    return True, False
+
+
+def decide(state: State, action: int, rules: Rules) -> Outcome:
+    """One decision, in place; a state that has ended stays as it was at that instant."""
+    outcome = Outcome()
+    start_speed, start_step = state.cars[0].speed, state.step
+    outcome.started_change, off_road = obey(state, action, rules)
+    if off_road:
+        outcome.reasons.append("out_of_road")
+    for _ in range(rules.substeps):
+        if outcome.reasons:
+            break
+        physics_step(state, rules)
+        ego = state.cars[0]
+        ahead, behind = ego_close(View(state.cars, rules))
+        outcome.soft_crash += ahead and not state.close_ahead
+        outcome.soft_crash_behind += behind and not state.close_behind
+        state.close_ahead, state.close_behind = ahead, behind
+        if any(overlap(ego, other) for other in state.cars[1:] if other.valid):
+            outcome.reasons.append("hard_crash")
+        elif ego.x >= rules.goal:
+            outcome.reasons.append("goal")
+        elif state.step >= rules.timeout_steps:
+            outcome.reasons.append("timeout")
+    ego = state.cars[0]
+    if settled(ego, rules):
+        state.direction = 0
+    if state.step > start_step:
+        outcome.mean_acceleration = (ego.speed - start_speed) / ((state.step - start_step) * DT)
+    if state.direction:
+        remaining = abs(ego.y - ego.target_lane * rules.lane_width) / rules.lane_width
+        outcome.progress = min(1.0, max(0.0, 1.0 - remaining))
+    return outcome
+
+
+def simulate(state: State, actions: list[int], rules: Rules) -> list[tuple[State, Outcome]]:
+    """State and outcome after each decision, until the episode ends."""
+    record = []
+    for action in actions:
+        outcome = decide(state, action, rules)
+        record.append((replace(state, cars=list(state.cars)), outcome))
+        if outcome.reasons:
+            break
+    return record

@@ -1,0 +1,128 @@
+"""Scenes for tests: vehicles placed by hand, environments in one line, states turned into scalar cars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from reference import scalar
+from tensordict import TensorDictBase
+
+from ganlane import keys
+from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.sim.ego import EgoParameters
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.road import Road
+from ganlane.sim.spawn import SpawnParameters
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
+
+DOUBLE = torch.float64
+DEFAULTS = {
+    "heading": 0.0,
+    "speed": 20.0,
+    "acceleration": 0.0,
+    "length": 4.5,
+    "width": 2.5,
+    "desired_speed": 25.0,
+    "visibility": int(Visibility.SIGNALLED),
+    "valid": True,
+}
+
+
+def vehicles(*cars: dict, lane_width_m: float = 4.0, dtype: torch.dtype = DOUBLE) -> Vehicles:
+    """One row of cars, each a dict of fields; ``lane`` gives y and target lane unless they are named."""
+    columns: dict[str, torch.Tensor] = {}
+    filled = [
+        {**DEFAULTS, "y": car.get("lane", 0) * lane_width_m, "target_lane": car.get("lane", 0), **car} for car in cars
+    ]
+    for name in keys.VEHICLE_FIELDS:
+        kind = dtype if name in keys.VEHICLE_FLOATS else torch.bool if name in keys.VEHICLE_FLAGS else torch.int64
+        columns[name] = torch.tensor([[car[name] for car in filled]], dtype=kind)
+    return Vehicles(**columns)
+
+
+def environment(
+    lanes: int = 3,
+    num_envs: int = 1,
+    vehicles: int = 9,
+    mobil: bool = True,
+    period_s: float = 1.0,
+    goal_m: float = 5000.0,
+    timeout_s: float = 1000.0,
+    abort: bool = False,
+    visibility: Visibility = Visibility.BODY,
+    spawn: SpawnParameters | None = None,
+    traffic: TrafficModule | None = None,
+    **others: object,
+) -> HighwayEnv:
+    """A HighwayEnv in float64 unless told otherwise."""
+    road = Road(lanes=lanes)
+    traffic = traffic or (IdmMobilTraffic(road) if mobil else IdmTraffic(road))
+    return HighwayEnv(
+        traffic,
+        num_envs=num_envs,
+        vehicles=vehicles,
+        spawn_parameters=spawn,
+        ego=EgoParameters(abort_lane_change=abort, visibility=visibility),
+        episode=EpisodeParameters(decision_period_s=period_s, goal_m=goal_m, timeout_s=timeout_s),
+        **{"dtype": DOUBLE, **others},  # type: ignore[arg-type]
+    )
+
+
+def rules_of(env: HighwayEnv) -> scalar.Rules:
+    """The scalar simulator's settings for the same run."""
+    return scalar.Rules(
+        lanes=env.road.lanes,
+        mobil=isinstance(env.traffic, IdmMobilTraffic),
+        abort=env.ego.abort_lane_change,
+        substeps=env.episode.substeps(),
+        goal=env.episode.goal_m,
+        timeout_steps=round(env.episode.timeout_s / 0.1),
+    )
+
+
+def placed(env: HighwayEnv, scene: Vehicles) -> TensorDictBase:
+    """The state after a reset with the vehicles replaced by ``scene``."""
+    td = env.reset()
+    for name, value in scene.as_dict().items():
+        td[keys.VEHICLES, name] = value.clone()
+    return td
+
+
+def step(env: HighwayEnv, td: TensorDictBase, action: int | Sequence[int] | torch.Tensor = 0) -> TensorDictBase:
+    """The state after one decision; ``td`` stays as it is."""
+    td = td.clone()
+    td["action"] = torch.as_tensor(action, dtype=torch.int64).expand(env.batch_size).clone()
+    return env.step(td)["next"]
+
+
+def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
+    """Row ``row`` of an environment's state as scalar cars."""
+    fields = {name: td[keys.VEHICLES, name][row].tolist() for name in keys.VEHICLE_FIELDS}
+    count = len(fields["x"])
+    steering = td[keys.TRAFFIC, "steering"][row].tolist()
+    steering[0] = td[keys.EGO, "steering"][row].item()
+    cars = [
+        scalar.Car(**{name: value[i] for name, value in fields.items()}, steering=steering[i]) for i in range(count)
+    ]
+    return scalar.State(
+        cars,
+        step=td[keys.STEP][row].item(),
+        direction=td[keys.EGO, "change_direction"][row].item(),
+        close_ahead=td[keys.EGO, "soft_crash"][row].item(),
+        close_behind=td[keys.EGO, "soft_crash_behind"][row].item(),
+        lane_changes=td[keys.EGO, "lane_changes"][row].item(),
+    )
+
+
+def leaves(td: TensorDictBase) -> Iterator[tuple[str | tuple[str, ...], torch.Tensor]]:
+    """All tensors of a TensorDict with their keys, in a fixed order."""
+    yield from sorted(td.items(include_nested=True, leaves_only=True), key=lambda item: str(item[0]))
+
+
+def same_bits(one: TensorDictBase, other: TensorDictBase) -> list[str]:
+    """Names of the entries that are missing in one or differ in any bit."""
+    a, b = dict(leaves(one)), dict(leaves(other))
+    return [str(name) for name in {**a, **b} if name not in a or name not in b or not torch.equal(a[name], b[name])]

@@ -1,0 +1,148 @@
+"""The environment against the plain scalar simulator of ``tests/reference/scalar.py``."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import torch
+from reference import scalar
+from reference.worlds import DOUBLE, environment, placed, rules_of, scalar_state, step
+
+from ganlane import keys
+from ganlane.env import HighwayEnv
+from ganlane.sim.spawn import SpawnParameters
+from ganlane.sim.vehicles import Vehicles
+
+MOTION = ("x", "y", "heading", "speed", "acceleration")
+
+
+def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
+    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all decision periods."""
+    lanes = rng.randint(1, 6)
+    vehicles = rng.randint(2, 20)
+    spacing = rng.choice([8.0, 12.0, 25.0])
+    spread = max(60.0, 1.5 * spacing * vehicles / lanes + spacing)
+    return environment(
+        lanes,
+        rows,
+        vehicles,
+        mobil=rng.random() < 0.75,
+        period_s=rng.choice([0.5, 1.0]),
+        abort=rng.random() < 0.3,
+        spawn=SpawnParameters(spread_m=spread, min_spacing_m=spacing),
+        seed=rng.randrange(10**9),
+    )
+
+
+def disturbed(scene: Vehicles, lanes: int, generator: torch.Generator) -> Vehicles:
+    """The scene with everything a little off: in the middle of changes, at odd angles, seen in all three ways."""
+
+    def between(low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(scene.x.shape, generator=generator, dtype=DOUBLE)
+
+    changing = between(0, 1) < 0.3
+    side = (between(0, 2).long() * 2 - 1) * changing
+    return scene.with_(
+        y=scene.y + between(-0.5, 0.5) + 0.5 * side * between(0, 4),
+        heading=between(-0.03, 0.03),
+        speed=between(0, 30) * (between(0, 1) < 0.9),
+        length=between(4, 6),
+        width=between(1.8, 2.6),
+        desired_speed=between(15, 35),
+        target_lane=(scene.target_lane + side).clamp(0, lanes - 1),
+        visibility=between(0, 3).long(),
+    )
+
+
+def compare(env: HighwayEnv, td, duration_s: float, rng: random.Random, tolerance: float = 1e-6) -> None:
+    """Drive both simulators with the same random actions and compare every state, event and memory."""
+    rules = rules_of(env)
+    rows = env.batch_size[0]
+    states = [scalar_state(td, row) for row in range(rows)]
+    running = [True] * rows
+    for _ in range(round(duration_s / env.episode.decision_period_s)):
+        actions = [rng.choice((0, 0, 1, 2)) for _ in range(rows)]
+        td = step(env, td, actions)
+        for row in range(rows):
+            if running[row]:
+                outcome = scalar.decide(states[row], actions[row], rules)
+                assert_same(td, row, states[row], outcome, tolerance)
+                running[row] = not outcome.reasons
+        if not any(running):
+            break
+
+
+def assert_same(td, row: int, state: scalar.State, outcome: scalar.Outcome, tolerance: float) -> None:
+    for name in MOTION:
+        expected = torch.tensor([getattr(car, name) for car in state.cars], dtype=DOUBLE)
+        error = (td[keys.VEHICLES, name][row] - expected).abs().max().item()
+        assert error < tolerance, (name, row, state.step, error)
+    assert td[keys.VEHICLES, "target_lane"][row].tolist() == [car.target_lane for car in state.cars]
+    assert td[keys.STEP][row] == state.step
+    assert [name for name in keys.END_EVENTS if td[keys.EVENTS, name][row]] == outcome.reasons
+    assert td[keys.EVENTS, keys.SOFT_CRASH][row] == outcome.soft_crash
+    assert td[keys.EVENTS, keys.SOFT_CRASH_BEHIND][row] == outcome.soft_crash_behind
+    ego = {name: td[keys.EGO, name][row].item() for name in td[keys.EGO].keys()}
+    assert ego["started_change"] == outcome.started_change
+    assert ego["change_direction"] == state.direction
+    assert ego["lane_changes"] == state.lane_changes
+    assert ego["steering"] == pytest.approx(state.cars[0].steering, abs=tolerance)
+    assert ego["distance"] == pytest.approx(state.cars[0].x, abs=tolerance)
+    assert ego["mean_acceleration"] == pytest.approx(outcome.mean_acceleration, abs=tolerance)
+    assert ego["change_progress"] == pytest.approx(outcome.progress, abs=tolerance)
+
+
+def compare_random_scenes(scenes: int, rows: int, duration_s: float, seed: int) -> None:
+    rng = random.Random(seed)
+    generator = torch.Generator().manual_seed(seed)
+    for block in range(scenes // rows):
+        env = random_environment(rng, rows)
+        td = env.reset()
+        if block % 2:
+            td = placed(env, disturbed(Vehicles.of(td[keys.VEHICLES]), env.road.lanes, generator))
+            td[keys.TRAFFIC, "steering"] = 0.02 * torch.randn(td[keys.TRAFFIC, "steering"].shape, dtype=DOUBLE)
+        compare(env, td, duration_s, rng)
+
+
+def test_the_tensor_code_agrees_with_the_scalar_one_on_100_random_scenes():
+    compare_random_scenes(scenes=100, rows=4, duration_s=5.0, seed=0)
+
+
+@pytest.mark.slow
+def test_the_tensor_code_agrees_with_the_scalar_one_on_2000_random_scenes():
+    compare_random_scenes(scenes=2000, rows=5, duration_s=10.0, seed=1)
+
+
+def compare_whole_episodes(episodes: int, goal_m: float) -> None:
+    for block, mobil in enumerate((True, False)):
+        env = environment(num_envs=episodes // 2, mobil=mobil, goal_m=goal_m, first_episode=1000 * block)
+        compare(env, env.reset(), duration_s=1000.0, rng=random.Random(block))
+
+
+def test_a_few_short_episodes_agree_to_their_end():
+    compare_whole_episodes(episodes=4, goal_m=300.0)
+
+
+@pytest.mark.slow
+def test_30_whole_episodes_agree_to_their_end():
+    """Keeping the road, so that they last to the goal."""
+    for block, mobil in enumerate((True, False)):
+        env = environment(num_envs=15, mobil=mobil, first_episode=1000 * block)
+        rng, rules = random.Random(block), rules_of(env)
+        td = env.reset()
+        states = [scalar_state(td, row) for row in range(15)]
+        running = [True] * 15
+        while any(running):
+            actions = [legal(rng, state, rules.lanes) for state in states]
+            td = step(env, td, actions)
+            for row in range(15):
+                if running[row]:
+                    outcome = scalar.decide(states[row], actions[row], rules)
+                    assert_same(td, row, states[row], outcome, 1e-6)
+                    running[row] = not outcome.reasons
+
+
+def legal(rng: random.Random, state: scalar.State, lanes: int) -> int:
+    lane = state.cars[0].target_lane
+    return rng.choice([0] * 8 + [1] * (lane < lanes - 1) + [2] * (lane > 0))

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import NoisyLinear
 
+from ganlane.agents.linear import linear
 from ganlane.errors import UserError
 
 
@@ -71,8 +72,8 @@ class QNetwork(nn.Module):
         """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations [*, D]."""
         hidden = observation.to(self.support.dtype)
         for layer in self.trunk:
-            hidden = torch.relu(layer(hidden))
-        rows = self.head(hidden).unflatten(-1, (-1, self.config.outputs))
+            hidden = torch.relu(linear(hidden, layer.weight, layer.bias))
+        rows = linear(hidden, self.head.weight, self.head.bias).unflatten(-1, (-1, self.config.outputs))
         return duel(rows) if self.config.dueling else rows
 
     def forward(self, observation: Tensor) -> Tensor:

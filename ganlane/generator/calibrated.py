@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ganlane.generator.anchored import EXTRA_INPUTS
 from ganlane.generator.loop import LoopConfig, descend
@@ -13,7 +13,8 @@ from ganlane.generator.losses import distance, energy_score, masked_mean
 from ganlane.generator.metrics import Metrics
 from ganlane.generator.networks import Generator, GeneratorSizes
 from ganlane.generator.rollout_metrics import closed_form_errors, rollout_metrics
-from ganlane.generator.rollouts import RolloutScenes, SceneSource, cut_stretches, rollout
+from ganlane.generator.rollouts import rollout
+from ganlane.generator.stretches import RolloutScenes, SceneSource, cut_stretches
 from ganlane.generator.tracks import SceneTracks
 from ganlane.generator.traits import fitting_traits
 
@@ -64,8 +65,10 @@ class CalibratedTask:
         torch.manual_seed(config.seed)
         self.config = config
         self.generator = Generator(config.sizes)
-        self.modules = {"generator": self.generator}
-        self.optimisers = {"generator": torch.optim.Adam(self.generator.parameters())}
+        self.modules: dict[str, nn.Module] = {"generator": self.generator}
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            "generator": torch.optim.Adam(self.generator.parameters())
+        }
         self.random = torch.Generator().manual_seed(config.seed)
         self.sources = [SceneSource.of(scene, lane_widths[scene.name]) for scene in fitted]
         self.held_out = [SceneSource.of(scene, lane_widths[scene.name]) for scene in held_out]

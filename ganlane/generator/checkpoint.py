@@ -19,7 +19,7 @@ from ganlane.generator.networks import Generator, GeneratorSizes
 KIND = "generator"
 Preset = Literal["paper", "calibrated"]
 #: Numbers beside the motion that each preset sees.
-PRESET_INPUTS: dict[str, int] = {"paper": 0, "calibrated": EXTRA_INPUTS}
+PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
 SHIPPED = Path(ganlane.__file__).parent / "checkpoints"
 
 
@@ -72,9 +72,11 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         UserError: absent, foreign, of another preset, or its weights do not fit its own sizes.
     """
     tensors, metadata = load_weights(path, KIND)
-    found = metadata.get("preset")
+    found = str(metadata.get("preset"))
     if found not in get_args(Preset) or (preset is not None and found != preset):
-        raise UserError(f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one.")
+        raise UserError(
+            f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one."
+        )
     generator = _build(path, metadata, tensors)
     if generator.sizes.extra_inputs != PRESET_INPUTS[found]:
         raise UserError(
@@ -95,7 +97,9 @@ def _build(path: str | Path, metadata: Mapping[str, Any], tensors: Mapping[str, 
             generator = Generator(GeneratorSizes(**sizes))
         generator.load_state_dict(dict(tensors))
     except RuntimeError as error:
-        raise UserError(f"{path}: its weights do not have the shapes that its sizes {sizes} ask for; fit it again.") from error
+        raise UserError(
+            f"{path}: its weights do not have the shapes that its sizes {sizes} ask for; fit it again."
+        ) from error
     return generator
 
 

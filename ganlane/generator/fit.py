@@ -118,7 +118,10 @@ def _task(
     widths: dict[str, float],
     config: PaperConfig | CalibratedConfig | None,
 ) -> PaperTask | CalibratedTask:
-    kinds: dict[str, Callable[[], PaperConfig | CalibratedConfig]] = {"paper": PaperConfig, "calibrated": CalibratedConfig}
+    kinds: dict[str, Callable[[], PaperConfig | CalibratedConfig]] = {
+        "paper": PaperConfig,
+        "calibrated": CalibratedConfig,
+    }
     if preset not in kinds:
         raise UserError(f"preset {preset!r}: expected one of {sorted(kinds)}.")
     config = kinds[preset]() if config is None else config
@@ -126,10 +129,14 @@ def _task(
         return PaperTask(fitted, held_out, config)
     if isinstance(config, CalibratedConfig) and preset == "calibrated":
         return CalibratedTask(fitted, held_out, widths, config)
-    raise UserError(f"config {type(config).__name__}: not the one of preset {preset!r}; give a {kinds[preset].__name__}.")
+    raise UserError(
+        f"config {type(config).__name__}: not the one of preset {preset!r}; give a {kinds[preset].__name__}."
+    )
 
 
-def _describe(source: str, frame: pl.DataFrame, fitted: list[SceneTracks], held_out: list[SceneTracks]) -> dict[str, Any]:
+def _describe(
+    source: str, frame: pl.DataFrame, fitted: list[SceneTracks], held_out: list[SceneTracks]
+) -> dict[str, Any]:
     return {
         "file": Path(source).name,
         "rows": frame.height,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ganlane.generator.groups import Groups, group_windows
 from ganlane.generator.loop import LoopConfig, descend
@@ -43,7 +43,7 @@ class PaperConfig:
 
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
     weights: LossWeights = field(default_factory=LossWeights)
-    loop: LoopConfig = field(default_factory=LoopConfig)
+    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=2200, learning_rate=4e-3))
     group_size: int = 9
     stride: int = 1
     held_out_stride: int = 3
@@ -61,8 +61,10 @@ class PaperTask:
         self.config = config
         self.generator = Generator(config.sizes)
         self.discriminator = Discriminator(config.sizes.embedding, config.sizes.hidden)
-        self.modules = {"generator": self.generator, "discriminator": self.discriminator}
-        self.optimisers = {name: torch.optim.Adam(module.parameters()) for name, module in self.modules.items()}
+        self.modules: dict[str, nn.Module] = {"generator": self.generator, "discriminator": self.discriminator}
+        self.optimisers: dict[str, torch.optim.Optimizer] = {
+            name: torch.optim.Adam(module.parameters()) for name, module in self.modules.items()
+        }
         self.random = torch.Generator().manual_seed(config.seed)
         self.groups = group_windows(cut_windows(fitted, config.stride), config.group_size, config.seed)
         self.held_out = group_windows(cut_windows(held_out, config.held_out_stride), config.group_size, config.seed)

@@ -41,7 +41,7 @@ def start(generator: Generator, displacement: Tensor) -> History:
 
 
 def recorded(generator: Generator, displacements: Tensor) -> History:
-    """The past after the recorded ``displacements`` [N, M, observed - 1, 2]; the oldest motion is held back in time."""
+    """The past after the recorded ``displacements`` [N, M, observed - 1, 2]; its oldest motion stands twice."""
     motions = generator.project(displacements)
     return History(torch.cat([motions[..., :1, :], motions], dim=-2), displacements[..., -1, :])
 

@@ -159,7 +159,7 @@ class FitLoop:
                 optimiser.load_state_dict(state["optimisers"][name])
         except (KeyError, RuntimeError, ValueError) as error:
             raise UserError(
-                f"{self.path}: holds another fit than the one asked for; give the same preset and sizes, or remove it."
+                f"{self.path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
             ) from error
         self.done, self.waited, self.best_update = state["counters"]
         self.best, self.best_weights = state["best"], state["best_weights"]

@@ -23,10 +23,10 @@ class LossWeights:
         adversarial: cross-entropy of the discriminator's logits.
     """
 
-    variety: float = 1.0
+    variety: float = 1.6
     single: float = 1.0
     mean: float = 1.0
-    adversarial: float = 0.01
+    adversarial: float = 0.02
 
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:

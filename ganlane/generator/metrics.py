@@ -18,14 +18,14 @@ Metrics = dict[str, dict[str, float]]
 
 
 def constant_velocity(displacements: Tensor, observed: int) -> Tensor:
-    """Errors [B, G, T] in m of repeating the last observed displacement; ``displacements`` is [B, G, observed + T, 2]."""
+    """Errors [B, G, T] in m of repeating the last observed of the ``displacements`` [B, G, observed + T, 2]."""
     future = displacements[..., observed:, :]
     return distances(displacements[..., observed - 1 : observed, :].expand_as(future), future)
 
 
 @torch.no_grad()
 def group_errors(generator: Generator, groups: Groups, random: torch.Generator) -> dict[str, Tensor]:
-    """Errors [B, G, T] in m per kind: ``mean`` (z = 0), ``single``, ``best_of_20`` (by ADE), ``constant_velocity``."""
+    """Errors [B, G, T] in m: ``mean`` (z = 0), ``single``, ``best_of_20`` (by ADE), ``constant_velocity``."""
     observed, latent = generator.sizes.observed, generator.sizes.noise
     past, future = groups.displacements[..., :observed, :], groups.displacements[..., observed:, :]
     seen = generator.observe(past, groups.position, groups.mask)

@@ -14,7 +14,7 @@ from ganlane.sim.vehicles import Vehicles
 
 
 class Plan(NamedTuple):
-    """Displacements still to be driven: ``ahead`` [N, M, execute_k, 2] in m, the next one first, and how many, ``left``."""
+    """Displacements still to be driven: ``ahead`` [N, M, execute_k, 2] in m, the next one first; ``left`` of them."""
 
     ahead: Tensor
     left: Tensor

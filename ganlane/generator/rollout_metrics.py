@@ -8,7 +8,8 @@ from torch import Tensor
 from ganlane.generator.losses import distance, energy_score
 from ganlane.generator.metrics import Metrics
 from ganlane.generator.networks import Generator
-from ganlane.generator.rollouts import PRESENT, RolloutScenes, SceneSource, cut_stretches, rollout
+from ganlane.generator.rollouts import rollout
+from ganlane.generator.stretches import PRESENT, RolloutScenes, SceneSource, cut_stretches
 from ganlane.generator.traits import typical_traits
 from ganlane.generator.windows import PREDICTED_STEPS
 
@@ -74,9 +75,10 @@ def rollout_metrics(
 
 def _summary(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dict[str, float]:
     """Means over vehicles whose recording lasts until the step in question."""
-    count = sum(scored.sum((0, 2)) for _, scored in parts).clamp_min(1)
+    count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
     by_step = {
-        kind: sum((errors[kind] * scored).sum((0, 2)) for errors, scored in parts) / count for kind in parts[0][0]
+        kind: torch.stack([(errors[kind] * scored).sum((0, 2)) for errors, scored in parts]).sum(0) / count
+        for kind in parts[0][0]
     }
     short = min(PREDICTED_STEPS, horizon)
     summary = {}

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from ganlane.generator.rollouts import PRESENT, RolloutScenes, recorded_vehicles
+from ganlane.data import DrivingStatistics
+from ganlane.generator.rollouts import recorded_vehicles
+from ganlane.generator.stretches import PRESENT, RolloutScenes
 from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
 
 #: Levels of the headway quantiles.
@@ -18,6 +23,12 @@ _MIN_GAP_M = 2.0
 DESIRED_EXCESS_MPS = (1.0, 11.0)
 #: In fitting the headways are scattered by this factor's logarithm, so that the network sees drivers off balance.
 _SCATTER = 0.25
+
+
+def headway_quantiles(statistics: Mapping[str, Any]) -> tuple[float, ...]:
+    """The 5, 25, 50, 75 and 95 % headways in s from a checkpoint's ``driving_statistics``."""
+    headway = DrivingStatistics.from_dict(statistics).headway
+    return tuple(headway.quantile(level) for level in QUANTILE_LEVELS)
 
 
 def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S) -> Tensor:

@@ -92,7 +92,10 @@ def uniform(
 def normal(
     key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int], dtype: torch.dtype = torch.float32
 ) -> Tensor:
-    """Standard normal numbers, [N, vehicles, len(purposes)], by Box and Muller's transform."""
+    """Standard normal numbers, [N, vehicles, len(purposes)], by Box and Muller's transform.
+
+    Independent of :func:`uniform` at the same place.
+    """
     keys = draw_keys(key, step, vehicles, purposes)
-    radius = torch.sqrt(-2.0 * torch.log(1.0 - to_uniform(keys, dtype)))
-    return radius * torch.cos(2.0 * math.pi * to_uniform(absorb(keys, 1), dtype))
+    radius = torch.sqrt(-2.0 * torch.log(1.0 - to_uniform(absorb(keys, 1), dtype)))
+    return radius * torch.cos(2.0 * math.pi * to_uniform(absorb(keys, 2), dtype))

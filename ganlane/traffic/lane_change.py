@@ -54,7 +54,9 @@ class LiteralLaneChange(Overlay):
         """The clock starts at 0, as the paper's does after each change."""
         return {"clock": torch.zeros_like(vehicles.target_lane), "lateral_speed": torch.zeros_like(vehicles.x)}
 
-    def _start(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+    def _start(
+        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Side of the changes that start now (0: none) and lateral speed drawn for them (m/s, at least slowest)."""
         c, m = self.changes, vehicles.x.shape[1]
         dtype = vehicles.x.dtype

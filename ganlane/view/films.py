@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, get_args, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
+from ganlane.view.frames import FramePainter
 from ganlane.view.gif import scaled, write_gif
 
 Picture = npt.NDArray[np.uint8]
@@ -18,6 +19,62 @@ Format = Literal["mp4", "gif", "png"]
 #: Frames of a film strip, as in the paper's Figure 3.
 STRIP_FRAMES = 4
 _STRIP_GAP = 4
+
+
+class Film(Sequence[Picture]):
+    """The frames of a film, each drawn when it is asked for, so that long films need no memory.
+
+    Args:
+        painter: draws the frames.
+        fps: frames per second of the film.
+        speedup: simulated seconds per second of film.
+        start_s, end_s: part of the episode, s; None for its end.
+        hold_s: how long the last frame stays, s of film.
+
+    Raises:
+        UserError: the part of the episode is empty, or ``fps`` or ``speedup`` is not above 0.
+    """
+
+    def __init__(
+        self,
+        painter: FramePainter,
+        fps: float = 20.0,
+        speedup: float = 1.0,
+        start_s: float = 0.0,
+        end_s: float | None = None,
+        hold_s: float = 1.5,
+    ):
+        if not (fps > 0 and speedup > 0):
+            raise UserError(f"film with fps={fps:g}, speedup={speedup:g}: both must be above 0.")
+        time = painter.trajectory.time_s
+        end = float(time[-1]) if end_s is None else min(end_s, float(time[-1]))
+        if not 0 <= start_s <= end:
+            raise UserError(
+                f"film from {start_s:g} to {end:g} s: the episode lasts {time[-1]:g} s; choose a part of it."
+            )
+        self.painter, self.fps = painter, fps
+        last = int(np.searchsorted(time, end + 1e-9, side="right") - 1)
+        wanted = np.arange(start_s, end + 1e-9, speedup / fps)
+        shown = np.searchsorted(time, wanted + 1e-9, side="right") - 1
+        self._frames: list[int] = [*shown.clip(0, last).tolist(), *[last] * max(1, round(hold_s * fps))]
+
+    def __len__(self) -> int:
+        """Number of frames of the film."""
+        return len(self._frames)
+
+    @overload
+    def __getitem__(self, index: int) -> Picture: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Picture]: ...
+    def __getitem__(self, index: int | slice) -> Picture | list[Picture]:
+        """Draw one frame, or a list of them."""
+        if isinstance(index, slice):
+            return [self.painter.draw(frame) for frame in self._frames[index]]
+        return self.painter.draw(self._frames[index])
+
+    def __iter__(self) -> Iterator[Picture]:
+        """Draw all frames, one after the other."""
+        return (self.painter.draw(frame) for frame in self._frames)
 
 
 def film_format(path: str | Path, wanted: str | None = None) -> Format:

@@ -7,21 +7,20 @@ across the road is larger than along it (:class:`~ganlane.view.window.WindowPara
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, ImageDraw
+from PIL import Image
 
 from ganlane.view import style
+from ganlane.view.annotations import draw_counts, draw_crash, draw_leader_line
 from ganlane.view.backdrop import Backdrop
 from ganlane.view.bodies import Body, draw_body
 from ganlane.view.header import Header
 from ganlane.view.trails import draw_trails
 from ganlane.view.trajectory import Trajectory
-from ganlane.view.window import HEADER_HEIGHT, Window, WindowParameters
+from ganlane.view.window import Window, WindowParameters
 
 Picture = npt.NDArray[np.uint8]
 #: Braking harder than this lights the brake lights, m/s2.
@@ -73,10 +72,11 @@ class FramePainter:
         self._draw_trails(picture, frame, ego_x)
         shown = self._shown(frame, ego_x)
         if self.drawing.leader_line:
-            self._draw_leader_line(picture, frame, ego_x)
+            draw_leader_line(picture, self.window, self.trajectory, frame)
         for vehicle in shown[::-1]:  # the ego comes last, on top of the others
             draw_body(picture, self._body(frame, vehicle, ego_x), self.window, self.drawing.speeds)
-        self._draw_counts(picture, frame, ego_x)
+        draw_crash(picture, self.window, self.trajectory, frame)
+        draw_counts(picture, self.window, self.trajectory, frame)
         self._header.draw(picture, frame)
         return np.asarray(picture)
 
@@ -124,75 +124,3 @@ class FramePainter:
         )
         columns, rows = self.window.column(t.x[past], ego_x), self.window.row(t.y[past])
         draw_trails(picture, columns, rows, known & same_place, self.window.edges)
-
-    def _draw_leader_line(self, picture: Image.Image, frame: int, ego_x: float) -> None:
-        """A line from the ego's front to the rear of the nearest vehicle ahead in its lane, with the gap."""
-        t, lane = self.trajectory, self.trajectory.lane()[frame]
-        ahead = t.valid[frame] & (lane == lane[0]) & (t.x[frame] > t.x[frame, 0])
-        if not ahead.any():
-            return
-        leader = int(np.where(ahead, t.x[frame], np.inf).argmin())
-        front = t.x[frame, 0] + t.length[frame, 0] / 2
-        rear = t.x[frame, leader] - t.length[frame, leader] / 2
-        start, end = self.window.column([front, rear], ego_x)
-        row = float(self.window.row(t.y[frame, 0]))
-        ImageDraw.Draw(picture).line((start, row, end, row), fill=style.LEADER, width=1)
-        text_at = ((start + min(end, self.window.parameters.width)) / 2, row - 17)
-        style.put_text(picture, text_at, f"{rear - front:.0f} m", 12, style.LEADER, 0.5)
-
-    def _draw_counts(self, picture: Image.Image, frame: int, ego_x: float) -> None:
-        """How many vehicles are behind and ahead of the picture."""
-        columns, size = self.window.column(self.trajectory.x[frame], ego_x), self.window.parameters
-        valid = self.trajectory.valid[frame]
-        behind, ahead = int((valid & (columns < 0)).sum()), int((valid & (columns > size.width)).sum())
-        top = HEADER_HEIGHT + 6
-        style.put_text(picture, (12, top), f"{behind} behind" if behind else "", 12, style.FAINT)
-        style.put_text(picture, (size.width - 12, top), f"{ahead} ahead" if ahead else "", 12, style.FAINT, 1.0)
-
-
-class Film(Sequence[Picture]):
-    """The frames of a film, each drawn when it is asked for, so that long films need no memory.
-
-    Args:
-        painter: draws the frames.
-        fps: frames per second of the film.
-        speedup: simulated seconds per second of film.
-        start_s, end_s: part of the episode, s; None for its end.
-        hold_s: how long the last frame stays, s of film.
-    """
-
-    def __init__(
-        self,
-        painter: FramePainter,
-        fps: float = 20.0,
-        speedup: float = 1.0,
-        start_s: float = 0.0,
-        end_s: float | None = None,
-        hold_s: float = 1.5,
-    ):
-        self.painter, self.fps = painter, fps
-        time = painter.trajectory.time_s
-        end = float(time[-1]) if end_s is None else min(end_s, float(time[-1]))
-        wanted = np.arange(start_s, end + 1e-9, speedup / fps)
-        # The nearest frame of the trajectory; the last one always belongs to the film.
-        nearest = np.searchsorted(time, wanted + painter.trajectory.frame_s / 2, side="right") - 1
-        last = int(np.searchsorted(time, end + 1e-9, side="right") - 1)
-        self._frames: list[int] = [*nearest.clip(0, last).tolist(), *[last] * max(1, round(hold_s * fps))]
-
-    def __len__(self) -> int:
-        """Number of frames of the film."""
-        return len(self._frames)
-
-    @overload
-    def __getitem__(self, index: int) -> Picture: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Picture]: ...
-    def __getitem__(self, index: int | slice) -> Picture | list[Picture]:
-        """Draw one frame, or a list of them."""
-        if isinstance(index, slice):
-            return [self.painter.draw(frame) for frame in self._frames[index]]
-        return self.painter.draw(self._frames[index])
-
-    def __iter__(self) -> Iterator[Picture]:
-        """Draw all frames, one after the other."""
-        return (self.painter.draw(frame) for frame in self._frames)

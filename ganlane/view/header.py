@@ -13,6 +13,8 @@ from ganlane.view.window import HEADER_HEIGHT
 
 #: Titles and widths in pixels of the values, for a picture 1280 pixels wide.
 _VALUES = (("time", 90), ("speed", 100), ("return", 90), ("action", 80))
+#: In a narrower picture the scale of the tints is left out.
+_WIDTH_FOR_TINTS = 1000
 _OUTCOMES = {
     "goal": ("GOAL", style.GOOD),
     "hard_crash": ("HARD CRASH", style.CRASH),
@@ -30,7 +32,9 @@ class Header:
     width: int
 
     def __post_init__(self) -> None:
-        self._columns = self.width - 340 - sum(width for _, width in _VALUES)
+        self._has_tints = self.width >= _WIDTH_FOR_TINTS
+        values = sum(width for _, width in _VALUES)
+        self._columns = self.width - values - (340 if self._has_tints else 10)
         self._still = self._draw_still()
 
     def _draw_still(self) -> Image.Image:
@@ -44,7 +48,8 @@ class Header:
         for title, width in _VALUES:
             style.put_text(still, (column, 9), title, 12, style.FAINT)
             column += width
-        self._draw_tints(still)
+        if self._has_tints:
+            self._draw_tints(still)
         return still
 
     def _draw_tints(self, still: Image.Image) -> None:

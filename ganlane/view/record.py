@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
+from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
 from ganlane.sim.vehicles import Vehicles
 from ganlane.view.trajectory import EpisodeLabel, Trajectory
@@ -87,25 +88,23 @@ def innermost(env: Any) -> Any:
 
 
 @contextmanager
-def _hooked(env: EnvBase, recorder: Recorder) -> Iterator[bool]:
-    """Hang the recorder into the environment for a while; whether it offers the hook."""
+def _listening(env: EnvBase, recorder: Recorder) -> Iterator[None]:
+    """Hang the recorder into the environment for a while."""
     base = innermost(env)
-    offered = hasattr(base, "recorder")
-    if offered:
-        before, base.recorder = base.recorder, recorder
+    if not hasattr(base, "recorder"):
+        raise UserError(f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this process.")
+    before, base.recorder = base.recorder, recorder
     try:
-        yield offered
+        yield
     finally:
-        if offered:
-            base.recorder = before
+        base.recorder = before
 
 
 def _label(env: EnvBase, agent: str, traffic: str, seed: int, episode: int) -> EpisodeLabel:
-    """The label of row 0, with the road as the environment has it (three lanes of 4 m where it tells none)."""
-    road = getattr(innermost(env), "road", None)
-    lanes, width = getattr(road, "lanes", 3), getattr(road, "lane_width_m", 4.0)
-    first = [value.flatten()[0].item() if isinstance(value, Tensor) else value for value in (lanes, width)]
-    return EpisodeLabel(agent, traffic, seed, episode, int(first[0]), float(first[1]))
+    """The label of row 0, with the road as the environment has it."""
+    road = innermost(env).road
+    lanes, width = (torch.as_tensor(value).flatten()[0].item() for value in (road.lanes, road.lane_width_m))
+    return EpisodeLabel(agent, traffic, seed, episode, int(lanes), float(width))
 
 
 def record_episode(
@@ -117,7 +116,7 @@ def record_episode(
     traffic: str = "traffic",
     max_time_s: float = float("inf"),
 ) -> Trajectory:
-    """Drive one episode to its end and record it, at every physics step (or decision, without a hook for steps).
+    """Drive one episode to its end and record it at every physics step.
 
     Args:
         env: batched environment; all rows run the episode, row 0 is recorded. One row is enough.
@@ -125,34 +124,31 @@ def record_episode(
         seed, episode: the episode's numbers.
         agent, traffic: names for the label.
         max_time_s: stop after this much simulated time; the outcome is then empty.
+
+    Raises:
+        UserError: the environment, below its transforms, is no ``HighwayEnv``.
     """
     recorder = Recorder()
-    label = _label(env, agent, traffic, seed, episode)
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _hooked(env, recorder) as hooked:
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _listening(env, recorder):
         state = env.reset(start_of(env, [episode], seed))
         recorder.add(state[keys.VEHICLES], 0.0)
         outcome, done = "", False
-        while not done and recorder.time_s[-1] < max_time_s:
-            after = _decide(env, policy(state), recorder, hooked)
-            done = bool(after["done"][0])
-            outcome = _outcome(after) if done else ""
-            state = after
-    return recorder.trajectory(label, outcome)
+        while not done and recorder.time_s[-1] < max_time_s - 1e-6:
+            state = _decide(env, policy(state), recorder)
+            done = bool(state["done"][0])
+            outcome = _outcome(state) if done else ""
+    return recorder.trajectory(_label(env, agent, traffic, seed, episode), outcome)
 
 
-def _decide(env: EnvBase, state: TensorDictBase, recorder: Recorder, hooked: bool) -> TensorDictBase:
+def _decide(env: EnvBase, state: TensorDictBase, recorder: Recorder) -> TensorDictBase:
     """One decision; the state after it."""
     recorder.current_action = int(state[keys.ACTION][0])
     values = state.get("action_value", None)
     if values is not None and values.ndim == 2:
         recorder.current_values = values[0].double().cpu().numpy()
-    begun = int(state[keys.STEP][0])
     stepped = env.step(state)
-    after = env.step_mdp(stepped) if hasattr(env, "step_mdp") else stepped["next"]
-    if not hooked:
-        recorder.add(after[keys.VEHICLES], (int(after[keys.STEP][0]) - begun) * keys.PHYSICS_STEP_S)
     recorder.current_return += float(stepped["next", keys.REWARD][0])
-    return after
+    return env.step_mdp(stepped)
 
 
 def _outcome(after: TensorDictBase) -> str:

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ganlane.errors import UserError
+
 HEADER_HEIGHT = 56
 FOOTER_HEIGHT = 24
+#: Below these the header and the road have no room, pixels.
+MIN_WIDTH, MIN_HEIGHT = 600, 160
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,19 @@ class WindowParameters:
     #: Share of it that lies behind the ego.
     behind: float = 0.38
     lateral_exaggeration: float = 1.5
+
+    def __post_init__(self) -> None:
+        """Check the sizes."""
+        if self.width < MIN_WIDTH or self.height < MIN_HEIGHT:
+            raise UserError(
+                f"picture of {self.width} x {self.height} pixels: at least {MIN_WIDTH} x {MIN_HEIGHT} are needed; "
+                "draw it larger and scale the film down."
+            )
+        if not (self.length_m > 0 and 0 <= self.behind <= 1 and self.lateral_exaggeration > 0):
+            raise UserError(
+                f"picture of {self.length_m:g} m of road, {self.behind:g} behind, {self.lateral_exaggeration:g} "
+                "times wider across: expected a length and a factor above 0 and a share from 0 to 1."
+            )
 
 
 @dataclass(frozen=True)

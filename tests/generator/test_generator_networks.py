@@ -10,7 +10,7 @@ from ganlane.generator.pooling import RANGE_M, PairPooling, gather_vehicles, nea
 SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14, noise=4)
 
 
-@pytest.fixture()
+@pytest.fixture
 def scene():
     """Displacements [3, 13, 8, 2], positions and mask of a few padded groups."""
     torch.manual_seed(0)
@@ -20,7 +20,7 @@ def scene():
     return displacements, position, mask
 
 
-@pytest.fixture()
+@pytest.fixture
 def generator():
     torch.manual_seed(1)
     return Generator(SIZES)
@@ -57,7 +57,9 @@ def test_pooling_ignores_padding(scene, count):
     pooled = pooling(hidden, position, motion, mask)
     noisy = torch.where(mask[..., None], hidden, 99.0), torch.where(mask[..., None], position, -3.0)
     torch.testing.assert_close(pooling(noisy[0], noisy[1], motion, mask)[mask], pooled[mask])
-    torch.testing.assert_close(pooling(hidden[1:2, :7], position[1:2, :7], motion[1:2, :7], mask[1:2, :7]), pooled[1:2, :7])
+    torch.testing.assert_close(
+        pooling(hidden[1:2, :7], position[1:2, :7], motion[1:2, :7], mask[1:2, :7]), pooled[1:2, :7]
+    )
 
 
 def test_a_vehicle_alone_pools_zeros(scene):

@@ -57,7 +57,10 @@ def test_a_window_carries_the_lane_and_length_of_its_vehicle():
     windows = cut_windows(scenes)
     row = len(windows.scene) // 2
     scene = scenes[windows.scene[row]]
-    number, now = scene.vehicles[windows.vehicle[row]], scene.first_frame + windows.start[row] + OBSERVED_POSITIONS - 1
+    number, now = (
+        scene.vehicles[windows.vehicle[row]],
+        scene.first_frame + windows.start[row] + OBSERVED_POSITIONS - 1,
+    )
     same = (pl.col("scene") == scene.name) & (pl.col("vehicle") == number) & (pl.col("frame") == now)
     record = frame.filter(same).row(0, named=True)
     assert (windows.lane[row], windows.length[row]) == (record["lane"], record["length"])

@@ -1,0 +1,171 @@
+"""From plain config dataclasses to environments, traffic and drivers; no Hydra in here.
+
+::
+
+    road = make_env(make_traffic(GanTrafficConfig(), EnvConfig()), EnvConfig(), num_envs=256)
+    driver = make_driver("mobil", EnvConfig())
+"""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, TransformedEnv
+
+from ganlane import keys
+from ganlane.agents import load_agent
+from ganlane.agents.checkpoint import SHIPPED
+from ganlane.agents.drivers import DRIVERS
+from ganlane.config.env import EnvConfig
+from ganlane.config.observation import ObservationConfig
+from ganlane.config.reward import RewardConfig
+from ganlane.config.targets import call_with, import_target
+from ganlane.config.traffic import TrafficConfig
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.sim.random import Stream
+from ganlane.sim.road import Road
+from ganlane.sim.steering import STEERING
+from ganlane.traffic import TrafficModule
+from ganlane.transforms import ObservationTransform, RewardTransform, observation_size
+
+
+def set_threads(threads: int) -> None:
+    """Let torch use so many threads; 0 takes one, which is fastest for batches of the sizes used here."""
+    torch.set_num_threads(threads or 1)
+
+
+def make_road(env: EnvConfig) -> Road:
+    """The road of an environment."""
+    return Road(env.lanes, env.lane_width_m)
+
+
+def _offered(env: EnvConfig, stream: int) -> dict[str, Any]:
+    """What a traffic model or a driver may ask for by name."""
+    return {
+        "road": make_road(env),
+        "stream": stream,
+        "idm": env.idm.parameters(),
+        "mobil": env.mobil.parameters(),
+        "steering": STEERING,
+    }
+
+
+def make_traffic(traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TRAIN) -> TrafficModule:
+    """The traffic model that ``traffic`` names, on the road of ``env``.
+
+    Raises:
+        UserError: the target cannot be imported or called, or gives no :class:`ganlane.traffic.TrafficModule`.
+    """
+    key = "traffic._target_"
+    target = import_target(traffic._target_, key)
+    expected = UserError(
+        f"{key}={traffic._target_}: expected a subclass of ganlane.traffic.TrafficModule or a function that returns "
+        "one; derive your model from it."
+    )
+    if not callable(target) or (inspect.isclass(target) and not issubclass(target, TrafficModule)):
+        raise expected
+    made = call_with(target, _offered(env, stream), traffic.arguments(), key)
+    if not isinstance(made, TrafficModule):
+        raise expected
+    return made
+
+
+def make_env(
+    traffic: TrafficModule,
+    env: EnvConfig,
+    observation: ObservationConfig | None = None,
+    reward: RewardConfig | None = None,
+    num_envs: int = 1,
+    seed: int = 0,
+    device: str = "cpu",
+) -> TransformedEnv:
+    """A batched environment with observation and reward; its stream is the traffic's.
+
+    Raises:
+        UserError: see :class:`ganlane.env.HighwayEnv`.
+    """
+    observation, reward = observation or ObservationConfig(), reward or RewardConfig()
+    base = HighwayEnv(
+        traffic,
+        num_envs,
+        env.vehicles,
+        env.spawn_parameters(),
+        env.ego.parameters(),
+        env.episode_parameters(),
+        env.idm.parameters(),
+        stream=traffic.stream,
+        seed=seed,
+        device=device,
+    )
+    seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
+    return TransformedEnv(base, Compose(seen, RewardTransform(env.decision_period_s, reward.parameters())))
+
+
+@dataclass(frozen=True)
+class Driver:
+    """Somebody who can drive the ego: a policy, and the observation that it reads (None: any)."""
+
+    name: str
+    policy: TensorDictModuleBase
+    observation: ObservationConfig | None = None
+
+
+def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: str = "cpu") -> Driver:
+    """A driver by its name.
+
+    Args:
+        name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent, the path of an agent's file,
+            or the import path of a policy of your own (a class or function; it may ask for ``road``, ``stream``,
+            ``idm`` and ``mobil``).
+        env: where it is to drive.
+        stream: of its random numbers, if it draws any.
+        device: of its network.
+
+    Raises:
+        UserError: no such driver, or a network of another shape than the environment's observation.
+    """
+    if name in DRIVERS:
+        policy = call_with(DRIVERS[name], _offered(env, stream), {}, "agents")
+        return Driver(name, policy.to(device))
+    if name.removesuffix("@0") in SHIPPED or Path(name).is_file() or name.endswith(".safetensors"):
+        return _trained(name, env, device)
+    if "." in name and all(part.isidentifier() for part in name.split(".")):
+        return _imported(name, env, stream, device)
+    known = ", ".join((*DRIVERS, *SHIPPED))
+    raise UserError(
+        f"agent {name}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the import path "
+        "of a policy."
+    )
+
+
+def _trained(name: str, env: EnvConfig, device: str) -> Driver:
+    """A trained agent with the observation that it was trained on."""
+    policy, metadata = load_agent(name, device=device)
+    observation = observation_of(metadata)
+    load_agent(name, observation_size(observation.form, env.vehicles), device)
+    return Driver(name, policy, observation)
+
+
+def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
+    """The observation that an agent's metadata name."""
+    return ObservationConfig(
+        metadata.get("observation", ObservationConfig().form), **metadata.get("observation_scale", {})
+    )
+
+
+def _imported(name: str, env: EnvConfig, stream: int, device: str) -> Driver:
+    """A user's own policy; it reads the raw state or the observation of the command."""
+    target = import_target(name, "agents")
+    policy = call_with(target, _offered(env, stream), {}, "agents") if callable(target) else target
+    if not isinstance(policy, torch.nn.Module) or keys.ACTION not in getattr(policy, "out_keys", []):
+        raise UserError(
+            f"agents={name}: expected a TensorDictModule that writes 'action' (its out_keys name it), or a class or "
+            "function that makes one; derive your policy from tensordict.nn.TensorDictModuleBase."
+        )
+    return Driver(name, policy.to(device))

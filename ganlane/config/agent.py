@@ -1,0 +1,84 @@
+"""``agent=...``: Rainbow, and what can be switched off in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from ganlane.config.checks import above, at_least, between, check, every, number, optional
+from ganlane.config.plain import plain_copy
+
+if TYPE_CHECKING:
+    from ganlane.agents import RainbowConfig
+
+
+@dataclass
+class AgentConfig:
+    """``agent=rainbow``: all of :class:`ganlane.agents.RainbowConfig`."""
+
+    hidden: list[int] = field(default_factory=lambda: [256, 256])
+    noisy: bool = True
+    dueling: bool = True
+    distributional: bool = True
+    double: bool = True
+    prioritised: bool = True
+    n_step: int = 3
+    gamma: float = 0.99
+    atoms: int = 51
+    v_min: float = -120.0
+    v_max: float = 120.0
+    noisy_sigma: float = 0.5
+    batch_size: int = 256
+    capacity: int = 1_000_000
+    warmup: int = 20_000
+    decisions_per_update: int = 64
+    target_period: int = 500
+    learning_rate: float = 2.5e-4
+    adam_eps: float | None = None
+    gradient_clip: float = 10.0
+    alpha: float = 0.5
+    beta_start: float = 0.4
+    beta_updates: int = 100_000
+    kl_priority: bool = True
+    epsilon_start: float = 1.0
+    epsilon: float = 0.02
+    epsilon_decisions: int = 100_000
+
+    def __post_init__(self) -> None:
+        counts = ("n_step", "batch_size", "capacity", "warmup", "decisions_per_update", "target_period", "atoms")
+        shares = ("alpha", "beta_start", "epsilon_start", "epsilon")
+        check(
+            self,
+            "agent",
+            hidden=every(at_least(1)),
+            gamma=between(0, 1),
+            v_min=number(),
+            v_max=number(),
+            noisy_sigma=at_least(0),
+            learning_rate=above(0),
+            adam_eps=optional(above(0)),
+            gradient_clip=above(0),
+            beta_updates=at_least(0),
+            epsilon_decisions=at_least(0),
+            **dict.fromkeys(counts, at_least(1)),
+            **dict.fromkeys(shares, between(0, 1)),
+        )
+        self.rainbow()
+
+    def rainbow(self) -> RainbowConfig:
+        """As the agent takes it; checks what concerns several keys at once."""
+        from ganlane.agents import RainbowConfig
+
+        return plain_copy(self, RainbowConfig)
+
+
+@dataclass
+class DqnConfig(AgentConfig):
+    """``agent=dqn``: plain DQN (Mnih et al. 2015), every component of Rainbow switched off."""
+
+    noisy: bool = False
+    dueling: bool = False
+    distributional: bool = False
+    double: bool = False
+    prioritised: bool = False
+    n_step: int = 1

@@ -1,0 +1,2 @@
+def print_help(command):
+    print("help")

@@ -1,0 +1,66 @@
+"""What stands on the command line: flags, overrides, and the single runs that a sweep means."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Sequence
+from typing import NoReturn
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+
+from ganlane.errors import UserError
+
+
+def parse_arguments(arguments: Sequence[str]) -> Namespace:
+    """Hydra's flags and the overrides.
+
+    Raises:
+        UserError: an unknown flag.
+    """
+    parser = get_args_parser()
+
+    def refuse(message: str) -> NoReturn:
+        raise UserError(f"{message}; run the command with --help or --hydra-help to see the flags.")
+
+    parser.error = refuse  # type: ignore[method-assign]
+    return parser.parse_args(list(arguments))
+
+
+def parse(overrides: Sequence[str]) -> list[Override]:
+    """The overrides as Hydra understands them, with those refused that would add or delete keys."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    for override in parsed:
+        _refuse_new_keys(override)
+    return parsed
+
+
+def _refuse_new_keys(override: Override) -> None:
+    """``+key``, ``++key`` and ``~key`` would slip past the schema; only a target's free parameters are open."""
+    key = override.key_or_group
+    if key.startswith(("hydra.", "hydra/")) or override.type == OverrideType.CHANGE:
+        return
+    if override.is_delete():
+        raise UserError(f"{override.input_line}: keys cannot be deleted; give {key}=null or leave it as it is.")
+    if ".parameters." not in key:
+        raise UserError(
+            f"{override.input_line}: keys cannot be added; write {key}=... without + if it exists "
+            "(+ is for traffic.parameters.NAME alone)."
+        )
+
+
+def without_repetitions(overrides: Sequence[str]) -> list[str]:
+    """The overrides with the last one of each key: Hydra itself refuses to choose an option twice."""
+    last = {override.get_key_element().lstrip("+"): str(override.input_line) for override in parse(overrides)}
+    return list(last.values())
+
+
+def single_runs(overrides: Sequence[str], multirun: bool) -> list[list[str]]:
+    """The overrides of every run: one, or all combinations of a sweep."""
+    if not multirun:
+        return [list(overrides)]
+    parsed = [override for override in parse(overrides) if not override.key_or_group.startswith("hydra")]
+    batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    return [list(run) for batch in batches for run in batch]

@@ -1,0 +1,69 @@
+"""``resume=...`` takes over the run folder and the command line of the run that is resumed."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from ganlane.config.overrides import parse, without_repetitions
+from ganlane.errors import UserError
+
+#: The command line of a run, in its folder.
+OVERRIDES = "overrides.yaml"
+_RUNS = Path("outputs")
+
+
+def with_resumed(command: str, flags: Namespace) -> list[str]:
+    """The overrides with those of the resumed run before them, and its folder as run folder.
+
+    Args:
+        command: ``train``; other commands have nothing to resume.
+        flags: the command line.
+
+    Raises:
+        UserError: the run is not there, or a sweep was to be resumed.
+    """
+    overrides = list(flags.overrides)
+    asked = _asked(overrides)
+    if command != "train" or asked in (None, "null", "None", ""):
+        return overrides
+    if flags.multirun:
+        raise UserError(f"resume={asked}: one run is resumed at a time; start without -m.")
+    run = newest_unfinished(_RUNS / command) if asked == "auto" else run_folder(Path(str(asked)))
+    if run is None:
+        return without_repetitions([*overrides, "resume=null"])
+    stored = [str(override) for override in OmegaConf.load(run / OVERRIDES)]
+    return without_repetitions([*stored, *overrides, f"resume='{run}'", f"hydra.run.dir='{run}'"])
+
+
+def _asked(overrides: list[str]) -> str | None:
+    values = [override.value() for override in parse(overrides) if override.key_or_group == "resume"]
+    return str(values[-1]) if values and values[-1] is not None else None
+
+
+def run_folder(path: Path) -> Path:
+    """The run that a path means: its folder, a phase's folder, or a checkpoint in it.
+
+    Raises:
+        UserError: there is no run.
+    """
+    from ganlane.training import find_checkpoint
+
+    candidates = [path, *path.parents[:3]] if path.exists() else []
+    for folder in candidates:
+        if (folder / OVERRIDES).is_file() and any(folder.rglob("last.pt")):
+            return folder
+    find_checkpoint(path, _RUNS)
+    raise UserError(f"resume={path}: {OVERRIDES} is missing there; give the folder that the run was written to.")
+
+
+def newest_unfinished(runs: Path) -> Path | None:
+    """The run with the newest checkpoint among those without results; None if there is none."""
+    checkpoints = sorted(runs.rglob("last.pt"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for checkpoint in checkpoints:
+        folder = next((parent for parent in checkpoint.parents if (parent / OVERRIDES).is_file()), None)
+        if folder is not None and not (folder / "results.json").is_file():
+            return folder
+    return None

@@ -1,0 +1,53 @@
+"""Every option's schema in Hydra's ConfigStore, as ``GROUP/NAME_schema``; the YAML in conf/ holds the values."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from ganlane.config.agent import AgentConfig, DqnConfig
+from ganlane.config.collector import CollectorConfig
+from ganlane.config.env import DenseEnvConfig, EnvConfig
+from ganlane.config.evaluate import EvaluateConfig
+from ganlane.config.init import InitConfig, NoInitConfig
+from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig
+from ganlane.config.observation import ObservationConfig
+from ganlane.config.reward import RewardConfig
+from ganlane.config.traffic import (
+    GanCalibratedTrafficConfig,
+    GanTrafficConfig,
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+)
+from ganlane.config.train import TrainConfig
+
+#: Group (empty at the root) to schema name to dataclass.
+SCHEMAS: dict[str, dict[str, Any]] = {
+    "": {"train": TrainConfig, "evaluate": EvaluateConfig},
+    "env": {"highway": EnvConfig, "dense": DenseEnvConfig},
+    "traffic": {
+        "idm": IdmTrafficConfig,
+        "idm_mobil": IdmMobilTrafficConfig,
+        "gan": GanTrafficConfig,
+        "gan_calibrated": GanCalibratedTrafficConfig,
+    },
+    "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
+    "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
+    "observation": {"observation": ObservationConfig},
+    "reward": {"paper": RewardConfig},
+    "collector": {"single": CollectorConfig},
+    "logger": {"csv": LoggerConfig, "tensorboard": TensorBoardLoggerConfig},
+}
+SUFFIX = "_schema"
+
+
+def register() -> None:
+    """Fill the ConfigStore; again does no harm."""
+    store = ConfigStore.instance()
+    for group, options in SCHEMAS.items():
+        for name, schema in options.items():
+            store.store(group=group or None, name=name + SUFFIX, node=schema, provider="ganlane")
+    OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)

@@ -1,0 +1,88 @@
+"""Root of ``ganlane train``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ganlane.config.agent import AgentConfig
+from ganlane.config.checks import at_least, between, check
+from ganlane.config.collector import CollectorConfig
+from ganlane.config.env import EnvConfig
+from ganlane.config.evaluate import NAMES
+from ganlane.config.init import InitConfig
+from ganlane.config.logger import LoggerConfig
+from ganlane.config.observation import ObservationConfig
+from ganlane.config.reward import RewardConfig
+from ganlane.config.run import GeneratorFile, RunConfig
+from ganlane.config.traffic import TrafficConfig
+from ganlane.errors import UserError
+
+
+@dataclass
+class PretrainConfig:
+    """``pretrain``: a first phase on other traffic, whose agent the main phase starts from."""
+
+    total_decisions: int = 0
+    traffic: TrafficConfig | None = None
+
+    def __post_init__(self) -> None:
+        check(self, "pretrain", total_decisions=at_least(0))
+        if self.total_decisions > 0 and self.traffic is None:
+            raise UserError(
+                f"pretrain.total_decisions={self.total_decisions}: on which traffic? give for instance "
+                "traffic@pretrain.traffic=idm_mobil."
+            )
+
+
+@dataclass
+class FinalEvaluationConfig:
+    """``evaluation``: the trained agent beside others, on the same episodes, when training is over."""
+
+    agents: list[str] = field(default_factory=lambda: ["mobil", "agent_idm", "keep_lane", "random_legal"])
+    traffic: TrafficConfig | None = None
+    episodes: int = 100
+    num_envs: int = 128
+
+    def __post_init__(self) -> None:
+        check(self, "evaluation", agents=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+
+
+@dataclass
+class TrainConfig(RunConfig):
+    """Everything that ``ganlane train`` can be told."""
+
+    total_decisions: int = 100_000
+    log_every: int = 10_000
+    evaluate_every: int = 0
+    selection_episodes: int = 64
+    checkpoint_every_s: float = 120.0
+    checkpoint_replay: bool = True
+    resume: str | None = None
+    env: EnvConfig = field(default_factory=EnvConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    init: InitConfig = field(default_factory=InitConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    collector: CollectorConfig = field(default_factory=CollectorConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+    generator: GeneratorFile = field(default_factory=GeneratorFile)
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    evaluation: FinalEvaluationConfig = field(default_factory=FinalEvaluationConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(
+            self,
+            "",
+            total_decisions=at_least(1),
+            log_every=at_least(1),
+            evaluate_every=at_least(0),
+            selection_episodes=at_least(1),
+            checkpoint_every_s=at_least(0),
+        )
+
+    def evaluation_traffic(self) -> dict[str, TrafficConfig]:
+        """The traffic of the final evaluation by its name: training's, unless another one was chosen."""
+        chosen = self.evaluation.traffic or self.traffic
+        return {chosen.label(): chosen}

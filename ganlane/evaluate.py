@@ -1,0 +1,54 @@
+"""``ganlane evaluate``: agents x traffics on the same episodes, as one table.
+
+    ganlane evaluate agents=[mobil,random_legal,agent_idm] traffics=[idm_mobil,gan] episodes=1000
+    ganlane evaluate agents=[mobil,random_legal,outputs/train/RUN/agent.safetensors] seed=1
+    ganlane evaluate agents=[mobil,random_legal,my.module.MyPolicy] traffics=[my.module.MyTraffic]
+
+Writes results.json and episodes.parquet (one row per episode) into its run folder.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from ganlane.config.app import run_command
+from ganlane.config.evaluate import EvaluateConfig
+
+
+def evaluate(config: EvaluateConfig, folder: Path) -> str:
+    """Run, print and keep the table."""
+    from ganlane.build import make_driver, set_threads
+    from ganlane.compare import compare
+    from ganlane.evaluation import evaluation_rows, text_table, write_episodes, write_results
+
+    set_threads(config.threads)
+    drivers = [make_driver(name, config.env, device=config.device) for name in config.agents]
+    table = compare(
+        drivers,
+        config.chosen_traffics(),
+        config.env,
+        config.reward,
+        config.observation,
+        config.episodes,
+        config.seed,
+        config.num_envs,
+        config.device,
+    )
+    rows = evaluation_rows(table)
+    print(text_table(rows))
+    write_episodes(folder, table)
+    seeds = {"stream": "report", "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    path = write_results(folder, {"rows": rows}, asdict(config), seeds)
+    return f"results: {path}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; the exit status."""
+    return run_command("evaluate", evaluate, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,174 @@
+"""Training runs from plain configs: one phase or two, each resumable, the second starting from the first one's agent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ganlane import keys
+from ganlane.agents import GreedyPolicy, Rainbow, read_agent, save_agent, transfer
+from ganlane.agents.network import load_parameters
+from ganlane.build import make_env, make_traffic, observation_of
+from ganlane.config.train import TrainConfig
+from ganlane.config.traffic import TrafficConfig
+from ganlane.errors import UserError
+from ganlane.evaluation import run_episodes
+from ganlane.keys import EGO_INDEX
+from ganlane.sim.random import Stream
+from ganlane.sim.road import Road
+from ganlane.training import TensorBoardLog, TrainingConfig, TrainingResult, find_checkpoint, train
+from ganlane.transforms import observation_size
+
+#: The trained agent, in the folder of its phase; its presence says that the phase is over.
+AGENT_FILE = "agent.safetensors"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of training on one traffic: where its files go, what it starts from (None: random weights)."""
+
+    name: str
+    folder: Path
+    traffic: TrafficConfig
+    total_decisions: int
+    init: str | None
+
+
+def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
+    """The phases that ``config`` asks for, in order."""
+    main = Phase("train", folder, config.traffic, config.total_decisions, config.init.path)
+    before = config.pretrain
+    if before.total_decisions == 0 or before.traffic is None:
+        return [main]
+    first = Phase("pretrain", folder / "pretrain", before.traffic, before.total_decisions, config.init.path)
+    return [first, Phase("train", folder, config.traffic, config.total_decisions, str(first.folder / AGENT_FILE))]
+
+
+def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = None) -> TrainingResult:
+    """Train the agent of one phase and write its :data:`AGENT_FILE`, unless a signal stopped it early.
+
+    Args:
+        config: of the whole run.
+        phase: which part of it.
+        resume: checkpoint to go on from.
+
+    Raises:
+        UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
+    """
+    agent = make_agent(config)
+    if phase.init is not None and resume is None:
+        check_observation(phase.init, config)
+        transfer(agent, phase.init)
+    traffic = make_traffic(phase.traffic, config.env, Stream.TRAIN)
+    sizes = {"num_envs": config.collector.num_envs, "seed": config.seed, "device": config.device}
+    env = make_env(traffic, config.env, config.observation, config.reward, **sizes)
+    result = train(
+        env,
+        agent,
+        _rhythm(config, phase),
+        phase.folder,
+        evaluate=_selection(config, phase) if config.evaluate_every else None,
+        logs=[TensorBoardLog(phase.folder / "tensorboard")] if config.logger.kind == "tensorboard" else [],
+        metadata=describe(config, phase),
+        resume=resume,
+    )
+    if result.stopped_by is None:
+        _keep(agent, config, phase, result)
+    return result
+
+
+def make_agent(config: TrainConfig) -> Rainbow:
+    """A fresh agent for the observation of ``config``."""
+    size = observation_size(config.observation.form, config.env.vehicles)
+    legal = LegalActions(Road(config.env.lanes, config.env.lane_width_m))
+    return Rainbow(config.agent.rainbow(), size, seed=config.seed, device=config.device, legal=legal)
+
+
+class LegalActions:
+    """Which actions stay on the road, [N, 3] bool."""
+
+    def __init__(self, road: Road) -> None:
+        self.road = road
+
+    def __call__(self, tensordict: TensorDictBase) -> Tensor:
+        """From the ego's target lane."""
+        lane = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
+        return torch.stack((lane >= 0, lane < self.road.lanes - 1, lane > 0), dim=1)
+
+
+def check_observation(name: str, config: TrainConfig) -> None:
+    """Refuse to start from an agent that was trained on another observation."""
+    theirs, ours = observation_of(read_agent(name)[2]), config.observation
+    for key, value in asdict(theirs).items():
+        if value != getattr(ours, key):
+            option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
+            raise UserError(
+                f"init.path={name}: this agent was trained with {option}, the run has {getattr(ours, key)}; "
+                f"give {option} or start with init=none."
+            )
+
+
+def _rhythm(config: TrainConfig, phase: Phase) -> TrainingConfig:
+    return TrainingConfig(
+        total_decisions=phase.total_decisions,
+        log_every=config.log_every,
+        evaluate_every=config.evaluate_every,
+        checkpoint_every_s=config.checkpoint_every_s,
+        checkpoint_replay=config.checkpoint_replay,
+        progress=config.logger.progress,
+    )
+
+
+def _selection(config: TrainConfig, phase: Phase) -> Callable[[GreedyPolicy], Mapping[str, float]]:
+    """Drives the greedy policy through episodes of the stream that is kept for choosing among checkpoints."""
+    traffic = make_traffic(phase.traffic, config.env, Stream.SELECT)
+    rows = min(config.selection_episodes, config.evaluation.num_envs)
+    env = make_env(traffic, config.env, config.observation, config.reward, rows, config.seed, config.device)
+
+    def evaluate(policy: GreedyPolicy) -> dict[str, float]:
+        table = run_episodes(env, policy, range(config.selection_episodes), config.seed)
+        crashes = (table["reason"] == "hard_crash").sum()
+        return {
+            "mean_reward": float(table["reward"].sum()) / table.height,
+            "crash_rate": crashes / table.height,
+            "lane_changes_per_km": 1000.0 * table["lane_changes"].sum() / max(table["distance_m"].sum(), 1.0),
+        }
+
+    return evaluate
+
+
+def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
+    """Metadata of the agent's files."""
+    scale = {"range_m": config.observation.range_m, "speed_mps": config.observation.speed_mps}
+    training = {"phase": phase.name, "init": phase.init, "seed": config.seed, "traffic": asdict(phase.traffic)}
+    environment = {"vehicles": config.env.vehicles, "lanes": config.env.lanes}
+    return {
+        "observation": config.observation.form,
+        "observation_scale": scale,
+        "environment": environment,
+        "training": training,
+    }
+
+
+def _keep(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
+    """Write the agent of the phase: the best one where the run chose among several, else the last."""
+    best = phase.folder / "checkpoints" / "best.safetensors"
+    if result.best is not None and best.is_file():
+        load_parameters(agent.network, read_agent(best)[0])
+    metadata = describe(config, phase)
+    metadata["training"] |= {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
+    save_agent(phase.folder / AGENT_FILE, agent, metadata)
+
+
+def checkpoint_of(phase: Phase, resume: str | None) -> Path | None:
+    """Where ``phase`` goes on in a resumed run: its own checkpoint, if it had got so far as to write one."""
+    if resume is None:
+        return None
+    own = phase.folder / "checkpoints" / "last.pt"
+    return find_checkpoint(own, phase.folder) if own.is_file() else None

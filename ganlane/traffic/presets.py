@@ -1,0 +1,117 @@
+"""The two generated traffics that ship: the paper's, and the calibrated one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ganlane.data import DrivingStatistics
+from ganlane.errors import UserError
+from ganlane.generator import load_generator, shipped_generator
+from ganlane.sim.random import Stream
+from ganlane.sim.road import Road
+from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
+from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.guard import Guard, GuardParameters
+from ganlane.traffic.lane_change import (
+    CalibratedChanges,
+    CalibratedLaneChange,
+    LiteralChanges,
+    LiteralLaneChange,
+)
+from ganlane.traffic.sequential import TrafficSequential
+from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
+
+
+def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
+    """Equations 9 to 11 with the numbers of the recordings that the generator was fitted to."""
+    changes = statistics.lane_changes
+    numbers = (changes.t_m_srlc_steps, changes.lateral_speed.mean, changes.lateral_speed.sd)
+    if None in numbers:
+        raise UserError(
+            f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no numbers; "
+            "fit the generator to recordings with lane changes."
+        )
+    mean_steps, speed, sd = (float(number) for number in numbers if number is not None)
+    return LiteralChanges(mean_steps, speed, sd)
+
+
+def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
+    """Gaussian of the recorded accelerations over one second."""
+    recorded = statistics.acceleration_smoothed
+    default = SuddenAccelerations()
+    return SuddenAccelerations(mean=recorded.mean or default.mean, sd=recorded.sd or default.sd)
+
+
+def gan_traffic(
+    road: Road | None = None,
+    stream: int = Stream.TRAIN,
+    path: str | Path | None = None,
+    guard: bool = True,
+    noise_scale: float = 1.0,
+    execute_k: int = 1,
+) -> TrafficSequential:
+    """``traffic=gan``, the paper's: positions only, literal lane changes that are blind, sudden accelerations.
+
+    Args:
+        road, stream: as for every traffic module.
+        path: weights of the paper's preset; by default those that ship.
+        guard: the guard behind it; without, the closed loop drifts off.
+        noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
+        execute_k: predicted steps that are driven before predicting again (the paper: 1).
+
+    Raises:
+        UserError: the weights are absent, foreign or of the other preset.
+    """
+    source = path or shipped_generator("paper")
+    generator, metadata = load_generator(source, "paper")
+    statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
+    parts: dict[str, TrafficModule] = {
+        "generator": SocialGanTraffic(generator, road, stream, noise_scale=noise_scale, execute_k=execute_k),
+        "acceleration": AccelerationOverlay(road, stream, sudden_accelerations(statistics)),
+        "lane_change": LiteralLaneChange(road, stream, literal_changes(statistics, source)),
+    }
+    if guard:
+        parts["guard"] = Guard(road, stream, GuardParameters())
+    return TrafficSequential(parts)
+
+
+def gan_calibrated_traffic(
+    road: Road | None = None,
+    stream: int = Stream.TRAIN,
+    path: str | Path | None = None,
+    noise_scale: float = 1.0,
+    changes_per_km: float | None = None,
+) -> TrafficSequential:
+    """``traffic=gan_calibrated``: anchored residual, traits, lane changes behind a gap check at the recorded rate.
+
+    Args:
+        road, stream: as for every traffic module.
+        path: weights of the calibrated preset; by default those that ship.
+        noise_scale: 1 samples as fitted, 0 drives everybody by the mean prediction.
+        changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the rate of the
+            recordings, which gives that rate in the simulation.
+
+    Raises:
+        UserError: the weights are absent, foreign or of the other preset.
+    """
+    source = path or shipped_generator("calibrated")
+    generator, metadata = load_generator(source, "calibrated")
+    statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
+    recorded = statistics.lane_changes.per_vehicle_km or 0.0
+    wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
+    options: dict[str, Any] = {"headway_quantiles_s": headway_quantiles(statistics)}
+    parts: dict[str, TrafficModule] = {
+        "generator": AnchoredGanTraffic(generator, road, stream, noise_scale=noise_scale, **options),
+        "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes)),
+    }
+    return TrafficSequential(parts)
+
+
+#: Wishes per change that is carried out, measured in the simulation: waiting for a gap costs distance.
+WISH_PER_CHANGE = 1.3
+
+
+def headway_quantiles(statistics: DrivingStatistics) -> tuple[float, ...]:
+    """5, 25, 50, 75 and 95 % quantiles of the recorded followers' headways, s."""
+    return tuple(statistics.headway.quantile(level) for level in (0.05, 0.25, 0.5, 0.75, 0.95))

@@ -1,0 +1,119 @@
+"""What happens while training, summed up on tensors and read out only when it is logged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ganlane import keys
+
+#: Ends that are counted per finished episode, and the column that reports their share.
+RATES = {
+    "goal": "goal_rate",
+    "hard_crash": "crash_rate",
+    "out_of_road": "out_of_road_rate",
+    "timeout": "timeout_rate",
+}
+
+
+class Meter:
+    """Episode and update statistics since the last :meth:`read`.
+
+    Keys that an environment does not write (``events``, ``ego``) are left out, so the meter serves any environment.
+
+    Args:
+        environments: N.
+        actions: A, for the shares of the actions.
+        gamma: discount per decision; the discounted return is what the Q-values should agree with.
+        device: of the sums.
+    """
+
+    def __init__(self, environments: int, actions: int, gamma: float, device: torch.device | str = "cpu") -> None:
+        self.gamma = gamma
+        self.returns, self.discounted = (torch.zeros(environments, device=device) for _ in range(2))
+        self.discount = torch.ones(environments, device=device)
+        self.actions = torch.arange(actions, device=device)
+        self.sums: dict[str, Tensor] = {}
+        self.updates: dict[str, Tensor] = {}
+        self.update_count = 0
+
+    @torch.no_grad()
+    def step(self, step: TensorDictBase) -> None:
+        """Add one step of the environments, batch [N]."""
+        after = step.get("next")
+        reward, done = after.get("reward").squeeze(-1), after.get("done").squeeze(-1)
+        self.returns += reward
+        self.discounted += self.discount * reward
+        self.discount *= self.gamma
+        self._finish(after, done)
+        self._add("actions", (step.get(keys.ACTION)[:, None] == self.actions).sum(0))
+
+    def _finish(self, after: TensorDictBase, done: Tensor) -> None:
+        """Count the episodes that ended and start their sums afresh."""
+        self._add("episodes", done.sum())
+        self._add("return", (self.returns * done).sum())
+        self._add("discounted", (self.discounted * done).sum())
+        events = after.get(keys.EVENTS, None)
+        if events is not None:
+            for name in RATES.keys() & events.keys():
+                self._add(name, (events.get(name).squeeze(-1) & done).sum())
+        ego = after.get(keys.EGO, None)
+        if ego is not None:
+            for name in ("distance", "lane_changes"):
+                self._add(name, (ego.get(name) * done).sum())
+        going = ~done
+        self.returns *= going
+        self.discounted *= going
+        self.discount = torch.where(done, 1.0, self.discount)
+
+    def update(self, metrics: Mapping[str, Tensor]) -> None:
+        """Add the 0-dim ``metrics`` of one update."""
+        self.update_count += 1
+        for name, value in metrics.items():
+            self.updates[name] = self.updates[name] + value if name in self.updates else value
+
+    def _add(self, name: str, value: Tensor) -> None:
+        value = value.double()
+        self.sums[name] = self.sums[name] + value if name in self.sums else value
+
+    def read(self) -> dict[str, float]:
+        """Means since the last call; the sums start afresh. Means over no episode or no update are absent."""
+        sums: dict[str, Any] = {name: value.tolist() for name, value in self.sums.items()}
+        row = {name: float(value) / self.update_count for name, value in self.updates.items()}
+        shares = sums.pop("actions", [])
+        row |= {f"action_{i}_share": share / max(sum(shares), 1) for i, share in enumerate(shares)}
+        self.sums, self.updates, self.update_count = {}, {}, 0
+        return row | _per_episode(sums)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Sums of the running episodes and of the present interval."""
+        names = ("returns", "discounted", "discount", "sums", "updates", "update_count")
+        return {name: _copy(getattr(self, name)) for name in names}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        for name, value in state.items():
+            setattr(self, name, _copy(value))
+
+
+def _per_episode(sums: dict[str, float]) -> dict[str, float]:
+    """Means and rates over the finished episodes."""
+    episodes = sums.get("episodes", 0.0)
+    row = {"episodes": episodes}
+    if episodes == 0.0:
+        return row
+    row |= {"mean_return": sums["return"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
+    row |= {column: sums[name] / episodes for name, column in RATES.items() if name in sums}
+    if sums.get("distance", 0.0) > 0.0:
+        row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]
+    return row
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.clone()
+    return {name: tensor.clone() for name, tensor in value.items()} if isinstance(value, dict) else value

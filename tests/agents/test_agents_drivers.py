@@ -1,0 +1,75 @@
+"""Rule-based drivers of the ego."""
+
+import torch
+
+from ganlane.agents.drivers import DRIVERS, EGOISTIC, KeepLaneDriver, MobilDriver, RandomDriver, RandomLegalDriver
+from ganlane.env import HighwayEnv
+from ganlane.keys import KEEP, LEFT, RIGHT
+from ganlane.sim import Road
+from ganlane.traffic import IdmTraffic
+
+
+def states(n=256, lanes=3, m=9):
+    return HighwayEnv(IdmTraffic(Road(lanes)), num_envs=n, vehicles=m).reset()
+
+
+def test_every_driver_writes_one_of_three_actions_per_row():
+    for make in DRIVERS.values():
+        action = make(Road(), 0)(states(64))["action"]
+        assert action.shape == (64,)
+        assert action.dtype == torch.int64
+        assert set(action.tolist()) <= {KEEP, LEFT, RIGHT}
+
+
+def test_keeping_the_lane_is_always_action_0():
+    assert (KeepLaneDriver(Road())(states())["action"] == KEEP).all()
+
+
+def test_random_drivers_use_all_actions_equally():
+    action = RandomDriver(Road())(states(9000))["action"]
+    shares = torch.bincount(action, minlength=3) / 9000
+    assert (shares - 1 / 3).abs().max() < 0.02  # four standard deviations of a share of a third
+
+
+def test_the_legal_random_driver_never_asks_for_a_lane_that_is_not_there():
+    state = states(6000)
+    lane, action = state["vehicles", "target_lane"][:, 0], RandomLegalDriver(Road())(state)["action"]
+    assert not ((lane == 2) & (action == LEFT)).any()
+    assert not ((lane == 0) & (action == RIGHT)).any()
+    for own, legal in ((0, (KEEP, LEFT)), (1, (KEEP, LEFT, RIGHT)), (2, (KEEP, RIGHT))):
+        shares = torch.bincount(action[lane == own], minlength=3) / (lane == own).sum()
+        assert all(abs(shares[a] - 1 / len(legal)) < 0.06 for a in legal)
+
+
+def test_on_one_lane_the_legal_random_driver_keeps_it():
+    assert (RandomLegalDriver(Road(1))(states(32, lanes=1, m=5))["action"] == KEEP).all()
+
+
+def test_random_actions_depend_on_the_episode_and_not_on_the_batch():
+    few, many = states(4), states(64)
+    driver = RandomDriver(Road())
+    assert torch.equal(driver(few)["action"], driver(many)["action"][:4])
+
+
+def test_mobil_overtakes_a_slow_leader_where_the_left_lane_is_free():
+    state = states(1, m=2)
+    vehicles = state["vehicles"]
+    vehicles["x"][:] = torch.tensor([[0.0, 30.0]])
+    vehicles["y"][:] = 0.0
+    vehicles["target_lane"][:] = 0
+    vehicles["speed"][:] = torch.tensor([[20.0, 12.0]])
+    assert MobilDriver(Road())(state)["action"].item() == LEFT
+    vehicles["x"][:] = torch.tensor([[0.0, 900.0]])
+    assert MobilDriver(Road())(state)["action"].item() == KEEP
+
+
+def test_a_polite_mobil_yields_where_an_egoistic_one_cuts_in():
+    state = states(1, m=3)
+    vehicles = state["vehicles"]
+    vehicles["x"][:] = torch.tensor([[0.0, 60.0, -25.0]])
+    vehicles["target_lane"][:] = torch.tensor([[0, 0, 1]])
+    vehicles["y"][:] = vehicles["target_lane"] * 4.0
+    vehicles["speed"][:] = torch.tensor([[20.0, 17.0, 21.0]])
+    vehicles["desired_speed"][:] = torch.tensor([[25.0, 20.0, 26.0]])
+    assert MobilDriver(Road(), mobil=EGOISTIC)(state)["action"].item() == LEFT
+    assert MobilDriver(Road())(state)["action"].item() == KEEP

@@ -1,0 +1,172 @@
+import math
+
+import pytest
+import torch
+
+from ganlane.generator.anchored import ANCHOR, EXTRA_INPUTS, DriverMemory, anchored_step, bounded, washout
+from ganlane.generator.history import STEEPEST, displacement_of, moved_by, start
+from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.noise import wander
+from ganlane.generator.paper import Plan, paper_step
+from ganlane.generator.traits import HEADWAY_QUANTILES_S, headway_from_uniform
+from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+
+SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
+ROAD = Road(3, 4.0)
+
+
+def vehicles(x, y=None, speed=20.0, desired=25.0, target=None):
+    x = torch.as_tensor(x, dtype=torch.float64)[None]
+    y = torch.zeros_like(x) if y is None else torch.as_tensor(y, dtype=torch.float64)[None]
+    lane = (y / 4.0).round().long() if target is None else torch.as_tensor(target)[None]
+    same = torch.ones_like(x)
+    return Vehicles(
+        x=x, y=y, heading=0 * same, speed=speed * same, acceleration=0 * same, length=4.5 * same, width=2.0 * same,
+        desired_speed=desired * same, target_lane=lane, visibility=torch.full_like(lane, Visibility.BODY),
+        valid=torch.ones_like(lane, dtype=torch.bool),
+    )  # fmt: skip
+
+
+def silent_generator() -> Generator:
+    """A network whose residual is 0."""
+    generator = Generator(GeneratorSizes(**SMALL, extra_inputs=EXTRA_INPUTS)).double()
+    torch.nn.init.zeros_(generator.head.weight)
+    torch.nn.init.zeros_(generator.head.bias)
+    return generator.requires_grad_(False)
+
+
+def drive(generator, state, seconds, headway=1.27, noise=0.0):
+    history = start(generator, displacement_of(state))
+    zero = torch.zeros_like(history.displacement)
+    memory = DriverMemory(history, zero, torch.full_like(state.x, headway))
+    z = noise * torch.randn(*state.x.shape, generator.sizes.noise, dtype=state.x.dtype)
+    for _ in range(round(seconds / 0.1)):
+        state, memory = anchored_step(generator, state, ROAD, memory, z)
+    return state, memory
+
+
+def test_without_a_residual_a_lone_driver_reaches_its_desired_speed():
+    state, _ = drive(silent_generator(), vehicles([0.0], speed=15.0, desired=22.0), 120)
+    assert state.speed.item() == pytest.approx(22.0, abs=0.1)
+
+
+def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
+    state, _ = drive(silent_generator(), vehicles([0.0, 60.0], speed=18.0, desired=18.0), 1)
+    state = state.with_(desired_speed=torch.tensor([[25.0, 18.0]]).double())
+    state, _ = drive(silent_generator(), state, 300)
+    gap = state.x[0, 1] - state.x[0, 0] - 4.5
+    own = IdmParameters(headway_s=1.27)
+    assert gap.item() == pytest.approx(equilibrium_gap(state.speed[0, 0], 25.0, own).item(), rel=0.01)
+
+
+def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
+    state = vehicles([0.0], y=[0.0], target=[1])
+    highest = 0.0
+    generator = silent_generator()
+    for _ in range(20):
+        state, _ = drive(generator, state, 0.5)
+        highest = max(highest, state.y.item())
+    assert state.y.item() == pytest.approx(4.0, abs=0.3)
+    assert highest < 4.05
+
+
+def test_the_first_step_is_idm_and_the_lateral_law():
+    state = vehicles([0.0, 30.0], y=[0.5, 0.0])
+    after, _ = drive(silent_generator(), state, 0.1)
+    gap = torch.tensor(30.0 - 4.5, dtype=torch.float64)
+    own = torch.tensor(20.0, dtype=torch.float64)
+    expected = idm_acceleration(own, 25.0, gap, own, ANCHOR.idm, 1.27)
+    assert after.x[0, 0].item() == pytest.approx(2.0 + 0.01 * expected.item(), abs=1e-9)
+    assert after.y[0, 0].item() == pytest.approx(0.5 + 0.01 * 0.3 * -0.5, abs=1e-9)
+
+
+def test_the_washout_removes_a_constant():
+    mean = torch.zeros(1, 2)
+    constant = torch.tensor([[2.0, -1.0]])
+    first, mean = washout(constant, mean, 3.0)
+    for _ in range(300):
+        left, mean = washout(constant, mean, 3.0)
+    torch.testing.assert_close(first, constant * (1 - 0.1 / 3.0))
+    assert left.abs().max() < 1e-3
+
+
+def test_a_network_that_always_pushes_changes_the_speed_for_a_while_only():
+    generator = silent_generator()
+    generator.head.bias.copy_(torch.tensor([3.0, 0.0]))
+    state, memory = drive(generator, vehicles([0.0], speed=20.0, desired=20.0), 100)
+    assert state.speed.item() == pytest.approx(20.0, abs=0.1)
+    assert memory.mean[0, 0, 0].item() == pytest.approx(4 * math.tanh(0.75), abs=1e-6)
+
+
+def test_the_residual_is_bounded():
+    limited = bounded(torch.tensor([1e6, -1e6]), ANCHOR.residual)
+    torch.testing.assert_close(limited, torch.tensor([4.0, -2.0]))
+    torch.testing.assert_close(bounded(torch.tensor([0.01, 0.01]), ANCHOR.residual), torch.tensor([0.01, 0.01]))
+
+
+def test_nobody_rolls_back_or_slides_sideways():
+    state = vehicles([0.0, 0.0], speed=0.0)
+    after = moved_by(state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double())
+    assert after.x[0, 0].item() == 0.0
+    assert after.y[0, 0].item() == 0.0
+    assert after.y[0, 1].item() == pytest.approx(STEEPEST * 1.0)
+    assert after.heading[0, 1].item() == pytest.approx(math.atan(STEEPEST))
+
+
+def test_speed_and_heading_carry_the_whole_displacement():
+    state = vehicles([100.0, 200.0])
+    after = moved_by(state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double())
+    step = torch.stack([after.x - state.x, after.y - state.y], dim=-1)
+    torch.testing.assert_close(displacement_of(after), step, atol=1e-8, rtol=1e-8)
+
+
+def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
+    torch.manual_seed(0)
+    begin = z = torch.randn(20000)
+    for _ in range(50):
+        z = wander(z, torch.randn(20000), period_s=5.0)
+    assert z.std().item() == pytest.approx(1.0, abs=0.02)
+    assert (z * begin).mean().item() == pytest.approx(math.exp(-1), abs=0.02)
+    fresh = torch.randn(5)
+    torch.testing.assert_close(wander(z[:5], fresh, 0.0), fresh)
+
+
+def test_headways_have_the_quantiles_asked_for():
+    u = (torch.arange(100000) + 0.5) / 100000
+    levels = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
+    torch.testing.assert_close(
+        headway_from_uniform(u).quantile(levels), torch.tensor(HEADWAY_QUANTILES_S), atol=1e-3, rtol=0
+    )
+
+
+def paper_generator() -> Generator:
+    torch.manual_seed(0)
+    return Generator(GeneratorSizes(**SMALL)).double().requires_grad_(False)
+
+
+def test_the_paper_drives_the_first_predicted_displacement():
+    generator, state = paper_generator(), vehicles([0.0, 25.0], y=[0.0, 4.0])
+    history = start(generator, displacement_of(state))
+    noise = torch.randn(1, 2, 4).double()
+    after, _, _ = paper_step(generator, state, history, noise)
+    past = displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
+    seen = generator.observe(past, torch.stack([state.x, state.y], -1), state.valid)
+    expected = generator(seen, noise)[..., 0, :]
+    torch.testing.assert_close(torch.stack([after.x - state.x, after.y - state.y], -1), expected)
+
+
+def test_with_execute_k_the_first_k_predictions_are_driven_before_planning_anew():
+    generator, state = paper_generator(), vehicles([0.0, 25.0], y=[0.0, 4.0])
+    history, noise = start(generator, displacement_of(state)), torch.randn(1, 2, 4).double()
+    past = displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
+    predicted = generator(generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise)
+    plan = Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long))
+    for step in range(3):
+        before = state
+        state, history, plan = paper_step(generator, state, history, noise, plan)
+        moved = torch.stack([state.x - before.x, state.y - before.y], -1)
+        torch.testing.assert_close(moved, predicted[..., step, :])
+    assert (plan.left == 0).all()

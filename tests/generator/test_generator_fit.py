@@ -1,0 +1,165 @@
+import json
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.errors import UserError
+from ganlane.files import save_weights
+from ganlane.generator.calibrated import CalibratedConfig
+from ganlane.generator.checkpoint import load_generator, shipped_generator
+from ganlane.generator.fit import fit_generator
+from ganlane.generator.fitting import PaperConfig
+from ganlane.generator.loop import LoopConfig, learning_rate
+from ganlane.generator.losses import LossWeights
+from ganlane.generator.networks import Generator, GeneratorSizes
+
+SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
+HELD_OUT = ("synthetic-1",)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=8, seconds=7.0))
+
+
+def paper_config(updates: int) -> PaperConfig:
+    loop = LoopConfig(updates=updates, evaluate_every=10, learning_rate=5e-3, warmup=1)
+    return PaperConfig(SIZES, LossWeights(), loop, stride=4, held_out_stride=8, samples=3, batch=8)
+
+
+def calibrated_config(updates: int) -> CalibratedConfig:
+    loop = LoopConfig(updates=updates, evaluate_every=3, learning_rate=5e-3, warmup=1)
+    sizes = replace(SIZES, extra_inputs=4)
+    return CalibratedConfig(sizes, loop, horizons=(4, 6), held_out_horizon=6, batch=3, held_out_stride=20)
+
+
+def test_fitting_the_paper_preset_lowers_its_error(frame):
+    seen = []
+    fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(60), on_progress=seen.append)
+    first = sum(progress.losses["mean"] for progress in seen[:5])
+    last = sum(progress.losses["mean"] for progress in seen[-5:])
+    assert last < 0.8 * first
+    assert {"variety", "single", "mean", "adversarial", "discriminator"} == set(seen[-1].losses)
+
+
+def test_fitting_the_calibrated_preset_runs_and_reports(frame):
+    result = fit_generator(
+        "calibrated", frame, held_out=HELD_OUT, config=calibrated_config(6), source="x/made_up.csv"
+    )
+    assert set(result.metrics) == {"all", "synthetic-1"}
+    assert result.data["file"] == "made_up.csv"
+    assert result.data["fitted"] == ["synthetic-0"]
+    assert 0 < result.updates <= 6
+
+
+def test_the_calibrated_loss_falls(frame):
+    from ganlane.data import scene_lane_widths
+    from ganlane.generator.calibrated import CalibratedTask
+    from ganlane.generator.tracks import scene_tracks
+
+    fitted, held_out = scene_tracks(frame)
+    task = CalibratedTask([fitted], [held_out], scene_lane_widths(frame), calibrated_config(40))
+    for optimiser in task.optimisers.values():
+        optimiser.param_groups[0]["lr"] = 5e-3
+    losses = [task.update(0)["relative_error"] for _ in range(40)]
+    assert sum(losses[-5:]) < sum(losses[:5])
+
+
+def test_save_and_load_give_the_same_network_and_its_description(frame, tmp_path):
+    result = fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(2))
+    path = tmp_path / "generator.safetensors"
+    result.save(path)
+    generator, metadata = load_generator(path, "paper")
+    for name, tensor in result.module.state_dict().items():
+        assert (generator.state_dict()[name] == tensor).all(), name
+    assert metadata["config"] == json.loads(json.dumps(asdict(paper_config(2))))
+    assert metadata["metrics"]["all"]["ade_m/mean"] == result.metrics["all"]["ade_m/mean"]
+    assert {"headway", "lane_changes"} <= set(metadata["driving_statistics"])
+    assert not any(parameter.requires_grad for parameter in generator.parameters())
+
+
+def test_an_interrupted_fit_goes_on_to_the_same_weights(frame, tmp_path):
+    whole = fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(20))
+    path = tmp_path / "fit.pt"
+
+    def stop(progress):
+        if progress.update == 13:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(20), resume_path=path, on_progress=stop)
+    resumed = fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(20), resume_path=path)
+    for name, tensor in whole.module.state_dict().items():
+        torch.testing.assert_close(resumed.module.state_dict()[name], tensor, msg=name)
+
+
+def test_foreign_states_are_refused(frame, tmp_path):
+    path = tmp_path / "fit.pt"
+    path.write_bytes(b"not a state")
+    with pytest.raises(UserError, match="not the state of a fit"):
+        fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(2), resume_path=path)
+    path.unlink()
+    fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(2), resume_path=path)
+    other = replace(paper_config(4), sizes=replace(SIZES, hidden=20))
+    with pytest.raises(UserError, match="another fit"):
+        fit_generator("paper", frame, held_out=HELD_OUT, config=other, resume_path=path)
+
+
+def generator_file(path, sizes=None, preset="paper", tensors=None, kind="generator"):
+    generator = Generator(SIZES)
+    metadata = {"preset": preset, "sizes": asdict(SIZES) if sizes is None else sizes}
+    save_weights(path, kind, generator.state_dict() if tensors is None else tensors, metadata)
+    return path
+
+
+def test_wrong_checkpoints_are_refused_in_one_sentence(tmp_path):
+    path = tmp_path / "generator.safetensors"
+    with pytest.raises(UserError, match="no such file"):
+        load_generator(path)
+    path.write_bytes(b"\x10\x00\x00")
+    with pytest.raises(UserError, match="not a readable safetensors"):
+        load_generator(path)
+    with pytest.raises(UserError, match="expected a ganlane generator"):
+        load_generator(generator_file(path, kind="agent"))
+    with pytest.raises(UserError, match="expected 'calibrated'"):
+        load_generator(generator_file(path), "calibrated")
+    with pytest.raises(UserError, match="preset 'own'"):
+        load_generator(generator_file(path, preset="own"))
+    with pytest.raises(UserError, match="not those of a generator"):
+        load_generator(generator_file(path, sizes={"hidden": 3}))
+    with pytest.raises(UserError, match="not those of a generator"):
+        load_generator(generator_file(path, sizes={**asdict(SIZES), "hidden": 10**9}))
+    with pytest.raises(UserError, match="shapes"):
+        load_generator(generator_file(path, sizes={**asdict(SIZES), "hidden": 20}))
+    with pytest.raises(UserError, match="shapes"):
+        load_generator(generator_file(path, tensors={"x": torch.zeros(2)}))
+    with pytest.raises(UserError, match="further inputs"):
+        load_generator(generator_file(path, preset="calibrated"), "calibrated")
+
+
+def test_a_preset_and_its_config_must_agree(frame):
+    with pytest.raises(UserError, match="preset 'sgan'"):
+        fit_generator("sgan", frame, held_out=HELD_OUT)
+    with pytest.raises(UserError, match="PaperConfig"):
+        fit_generator("calibrated", frame, held_out=HELD_OUT, config=paper_config(1))
+
+
+def test_the_learning_rate_rises_and_then_falls_to_nothing():
+    config = LoopConfig(updates=100, warmup=10, learning_rate=1e-2)
+    rates = [learning_rate(config, number) for number in range(100)]
+    assert rates[0] < rates[5] < rates[9]
+    assert rates[10:] == sorted(rates[10:], reverse=True)
+    assert rates[-1] < 1e-5
+
+
+@pytest.mark.parametrize("preset", ["paper", "calibrated"])
+def test_the_shipped_weights_beat_constant_velocity_on_scenes_they_were_not_fitted_to(preset):
+    path = shipped_generator(preset)
+    if not path.exists():
+        pytest.skip(f"{path.name} has not been fitted yet")
+    _, metadata = load_generator(path, preset)
+    held_out = metadata["metrics"]["all"]
+    assert held_out["ade_m/mean"] < 0.97 * held_out["ade_m/constant_velocity"]
+    assert path.stat().st_size < 5_000_000

@@ -1,0 +1,111 @@
+"""Box overlap against a brute-force sampler, and cases by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from reference import scalar
+from reference.worlds import DOUBLE, vehicles
+
+from ganlane.sim.collisions import boxes_overlap, dangerously_close, ego_overlaps, pair_overlaps
+
+GRID_M = 0.08
+
+
+def random_pairs(count: int) -> tuple[torch.Tensor, ...]:
+    """dx, dy, heading, length, width, and the other's heading, length, width."""
+    generator = torch.Generator().manual_seed(11)
+
+    def between(low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(count, generator=generator, dtype=DOUBLE)
+
+    angle, sizes = (-math.pi, math.pi), ((3.0, 6.0), (1.6, 2.6))
+    one = between(*angle), *(between(*size) for size in sizes)
+    other = between(*angle), *(between(*size) for size in sizes)
+    return between(-6, 6), between(-6, 6), *one, *other
+
+
+def a_point_in_both(dx, dy, heading, length, width, other_heading, other_length, other_width) -> bool:
+    """Whether a point of a fine grid on the first box lies in the other one."""
+    along = torch.linspace(-0.5, 0.5, math.ceil(length / GRID_M) + 1, dtype=DOUBLE) * length
+    across = torch.linspace(-0.5, 0.5, math.ceil(width / GRID_M) + 1, dtype=DOUBLE) * width
+    a, b = torch.meshgrid(along, across, indexing="ij")
+    x = a * math.cos(heading) - b * math.sin(heading) - dx
+    y = a * math.sin(heading) + b * math.cos(heading) - dy
+    c, s = math.cos(other_heading), math.sin(other_heading)
+    inside = ((x * c + y * s).abs() < other_length / 2) & ((y * c - x * s).abs() < other_width / 2)
+    return bool(inside.any())
+
+
+def test_boxes_overlap_where_a_sampler_finds_a_common_point():
+    """A sampled point proves an overlap; one that is left after both boxes shrink is deep enough to be sampled."""
+    pairs = random_pairs(600)
+    dx, dy, heading, length, width, other_heading, other_length, other_width = pairs
+    found = [a_point_in_both(*(value.item() for value in pair)) for pair in zip(*pairs)]
+    found = torch.tensor(found)
+    said = boxes_overlap(*pairs)
+    shrunk = boxes_overlap(
+        dx, dy, heading, length - 0.3, width - 0.3, other_heading, other_length - 0.3, other_width - 0.3
+    )
+    assert (found & ~said).sum() == 0
+    assert (shrunk & ~found).sum() == 0
+    assert 100 < found.sum() < 500
+    assert (said != shrunk).sum() < 60  # few are too close to call
+
+
+def test_overlap_is_the_same_from_either_side():
+    dx, dy, *boxes = random_pairs(600)
+    assert torch.equal(boxes_overlap(dx, dy, *boxes), boxes_overlap(-dx, -dy, *boxes[3:], *boxes[:3]))
+
+
+def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
+    pairs = random_pairs(2000)
+    said = boxes_overlap(*pairs)
+    rest = {"speed": 0.0, "acceleration": 0.0, "desired_speed": 25.0, "target_lane": 0, "visibility": 0, "valid": True}
+    for index, (dx, dy, heading, length, width, *other) in enumerate(zip(*(value.tolist() for value in pairs))):
+        one = scalar.Car(x=0.0, y=0.0, heading=heading, length=length, width=width, **rest)
+        two = scalar.Car(x=dx, y=dy, heading=other[0], length=other[1], width=other[2], **rest)
+        assert scalar.overlap(one, two) == said[index]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "heading", "hit"),
+    [
+        (4.5, 0.0, 0.0, False),  # bumper to bumper is no crash
+        (4.49, 0.0, 0.0, True),
+        (0.0, 2.5, 0.0, False),
+        (0.0, 2.49, 0.0, True),
+        (3.5, 0.0, math.pi / 2, False),  # crosswise: (4.5 + 2.5) / 2
+        (3.49, 0.0, math.pi / 2, True),
+        # Turned by 45 degrees its corner reaches (4.5 + 2.5) / 2 / sqrt(2) = 2.4749 m: 4.7249 in all.
+        (4.73, -1.0, math.pi / 4, False),
+        (4.70, 0.7071, math.pi / 4, True),
+    ],
+)
+def test_overlap_by_hand(x, y, heading, hit):
+    scene = vehicles({"x": 0.0, "y": 0.0}, {"x": x, "y": y, "heading": heading})
+    assert ego_overlaps(scene).tolist() == [[hit]]
+    assert pair_overlaps(scene).tolist() == [[[False, hit], [hit, False]]]
+
+
+def test_an_invalid_vehicle_hits_nobody():
+    scene = vehicles({"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 0.0, "valid": False}, {"x": 2.0, "y": 0.0})
+    assert ego_overlaps(scene).tolist() == [[False, True]]
+    assert pair_overlaps(scene)[0].nonzero().tolist() == [[0, 2], [2, 0]]
+
+
+@pytest.mark.parametrize(
+    ("gap", "closing", "close"),
+    [
+        (1.99, -5.0, True),  # under 2 m, whatever the speeds
+        (2.0, 0.0, False),
+        (14.9, 10.0, True),  # 1.49 s
+        (15.0, 10.0, False),
+        (3.0, -10.0, False),
+        (10_000.0, 0.0, False),
+    ],
+)
+def test_a_soft_crash_is_a_gap_under_2_m_or_under_1_5_s(gap, closing, close):
+    assert dangerously_close(torch.tensor(gap), torch.tensor(closing)).item() is close

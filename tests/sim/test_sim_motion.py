@@ -1,0 +1,140 @@
+"""Bicycle model and two-point steering."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from reference.worlds import DOUBLE
+
+from ganlane.sim.bicycle import WHEELBASE_M, advance, slip_angle
+from ganlane.sim.steering import steer
+
+
+def number(value: float) -> torch.Tensor:
+    return torch.tensor([value], dtype=DOUBLE)
+
+
+def drive(speed: float, steering: float, duration_s: float, dt: float):
+    zero = number(0.0)
+    pose = x, y, heading, v, _ = zero, zero, zero, number(speed), zero
+    for _ in range(round(duration_s / dt)):
+        pose = x, y, heading, v, _ = advance(x, y, heading, v, zero, number(steering), dt)
+    return pose
+
+
+def circle(speed: float, steering: float, duration_s: float) -> tuple[float, float, float]:
+    """Closed form: the centre of gravity runs on a circle of radius ``l_r / sin(beta)``."""
+    beta = math.atan(0.5 * math.tan(steering))
+    radius = 0.5 * WHEELBASE_M / math.sin(beta)
+    turned = speed * duration_s / radius
+    return radius * (math.sin(beta + turned) - math.sin(beta)), radius * (math.cos(beta) - math.cos(beta + turned)), turned
+
+
+@pytest.mark.parametrize(("speed", "steering"), [(3.0, 0.5), (3.0, -0.5), (10.0, 0.1), (30.0, 0.01), (30.0, -0.002)])
+def test_a_constant_steering_angle_drives_a_circle(speed, steering):
+    x, y, heading = circle(speed, steering, 10.0)
+    pose = drive(speed, steering, 10.0, dt=0.1)
+    assert pose.heading.item() == pytest.approx(heading, abs=1e-12)
+    assert math.hypot(pose.x.item() - x, pose.y.item() - y) < 2e-3 * speed
+
+
+def test_the_error_against_the_circle_falls_with_the_square_of_the_step():
+    x, y, _ = circle(8.0, 0.3, 7.0)
+    errors = []
+    for dt in (0.1, 0.05):
+        pose = drive(8.0, 0.3, 7.0, dt)
+        errors.append(math.hypot(pose.x.item() - x, pose.y.item() - y))
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
+
+
+def test_the_slip_angle_is_half_the_wheel_s_for_small_angles():
+    # tan(0.4) = 0.4227932; atan(0.2113966) = 0.2083294
+    assert slip_angle(number(0.4)).item() == pytest.approx(0.2083294, abs=1e-7)
+    assert slip_angle(number(1e-4)).item() == pytest.approx(0.5e-4, rel=1e-6)
+
+
+def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
+    x = v = number(0.0)
+    for _ in range(100):
+        x, _, _, v, _ = advance(x, number(0.0), number(0.0), v, number(0.7), number(0.0), 0.1)
+    assert x.item() == pytest.approx(0.5 * 0.7 * 10.0**2)
+    pose = advance(number(0.0), number(0.0), number(0.0), number(1.0), number(-20.0), number(0.0), 0.1)
+    assert pose.speed.item() == 0.0
+    assert pose.x.item() == pytest.approx(0.05)
+    assert pose.acceleration.item() == pytest.approx(-10.0)  # what was realised, not what was asked for
+
+
+@given(
+    speed=st.floats(0.0, 60.0),
+    acceleration=st.floats(-20.0, 0.7),
+    steering=st.floats(-0.5, 0.5),
+    heading=st.floats(-1.5, 1.5),
+)
+def test_nobody_goes_farther_than_its_speed_allows_nor_backwards(speed, acceleration, steering, heading):
+    pose = advance(
+        number(0.0), number(0.0), number(heading), number(speed), number(acceleration), number(steering), 0.1
+    )
+    moved = math.hypot(pose.x.item(), pose.y.item())
+    assert pose.speed.item() >= 0.0
+    assert moved <= max(speed, pose.speed.item()) * 0.1 + 1e-12
+
+
+# Steering
+
+SPEEDS = torch.linspace(3.0, 35.0, 65, dtype=DOUBLE)
+
+
+def lane_change(speed: torch.Tensor, width: float, duration_s: float = 30.0) -> torch.Tensor:
+    """Lateral positions [steps, speeds] after the command to move ``width`` m to the left."""
+    x = y = heading = wheel = torch.zeros_like(speed)
+    track = []
+    for _ in range(round(duration_s / 0.1)):
+        wheel = steer(wheel, y, heading, speed, torch.full_like(speed, width), 0.1)
+        x, y, heading, _, _ = advance(x, y, heading, speed, torch.zeros_like(speed), wheel, 0.1)
+        track.append(y)
+    return torch.stack(track)
+
+
+@pytest.mark.parametrize("width", [4.0, -4.0, 3.5])
+def test_a_lane_change_takes_two_to_five_seconds_at_every_speed_without_overshoot(width):
+    track = lane_change(SPEEDS, width)
+    remaining = (track - width) * (1.0 if width > 0 else -1.0)
+    arrival_s = ((remaining < -0.3).sum(0) + 1) * 0.1
+    assert 2.0 <= arrival_s.min()
+    assert arrival_s.max() <= 5.0
+    assert remaining.max() <= 0.05
+    assert remaining[-1].abs().max() < 1e-3
+
+
+def test_a_standing_car_does_not_turn_its_wheels():
+    zero = number(0.0)
+    assert steer(zero, zero, zero, zero, number(4.0), 0.1).item() == 0.0
+
+
+def test_a_crawling_car_changes_lanes_over_the_distance_of_one_at_3_mps():
+    """Below 3 m/s the path is the same, only slower."""
+    slow, fast = lane_change(number(1.5), 4.0)[1::2], lane_change(number(3.0), 4.0)[:150]
+    assert (slow - fast).abs().max() < 0.1
+
+
+def test_a_car_in_the_middle_of_its_lane_goes_straight_on():
+    zero = number(0.0)
+    assert steer(zero, number(4.0), zero, number(20.0), number(4.0), 0.1).item() == 0.0
+
+
+def test_steering_by_hand():
+    """20 m/s, 1 m right of the centre, straight wheels: near point at 20 m, far point at 80 m.
+
+    Nothing turns yet, so only the integral counts: 2.7 / 20 * 3.375 * atan(1 / 20) * 0.1 = 0.00227623 rad.
+    """
+    zero = number(0.0)
+    assert steer(zero, number(-1.0), zero, number(20.0), zero, 0.1).item() == pytest.approx(0.00227623, abs=1e-8)
+
+
+def test_the_wheels_turn_at_most_half_a_radian():
+    zero = number(0.0)
+    assert steer(number(0.45), number(-50.0), number(-1.0), number(3.0), zero, 0.1).item() == 0.5

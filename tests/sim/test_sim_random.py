@@ -1,0 +1,150 @@
+"""Random numbers as pure functions of (stream, seed, episode, vehicle, step, purpose)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from ganlane.sim.random import (
+    _GOLDEN,
+    Purpose,
+    Stream,
+    _mix,
+    absorb,
+    draw_keys,
+    episode_key,
+    normal,
+    to_uniform,
+    uniform,
+)
+
+PURPOSES = [int(p) for p in Purpose]
+
+
+def keys(episodes: int, stream: int = 0, seed: int = 0) -> torch.Tensor:
+    return episode_key(stream, torch.full((episodes,), seed), torch.arange(episodes))
+
+
+def unsigned(value: torch.Tensor) -> list[int]:
+    return [v % 2**64 for v in value.tolist()]
+
+
+def splitmix64(z: int) -> int:
+    """The finaliser in Python's own integers."""
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
+    return z ^ (z >> 31)
+
+
+def test_the_mixer_is_that_of_splitmix64():
+    """The published test vector: the first three numbers from the state 1234567."""
+    states = 1234567 + torch.tensor([1, 2, 3]) * _GOLDEN
+    assert unsigned(_mix(states)) == [6457827717110365317, 3203168211198807973, 9817491932198370423]
+
+
+def test_fields_are_mixed_in_one_after_the_other():
+    def mixed(*fields: int) -> int:
+        key = fields[0]
+        for value in fields[1:]:
+            key = splitmix64(((key ^ value) + 0x9E3779B97F4A7C15) % 2**64)
+        return key
+
+    made = draw_keys(episode_key(2, torch.tensor([5]), torch.tensor([2**40])), 17, 3, [4, 9])
+    for vehicle, (column, purpose) in itertools.product(range(3), enumerate([4, 9])):
+        assert made[0, vehicle, column].item() % 2**64 == mixed(2, 0, 5, 2**40, 17, vehicle, purpose)
+
+
+def chi_square(u: torch.Tensor, bins: int) -> float:
+    """Of ``bins`` equal bins, as a standard score."""
+    counts = torch.bincount((u.flatten() * bins).long(), minlength=bins).double()
+    expected = u.numel() / bins
+    statistic = ((counts - expected) ** 2 / expected).sum().item()
+    return (statistic - (bins - 1)) / math.sqrt(2 * (bins - 1))
+
+
+def test_numbers_are_uniform_along_every_field():
+    """Each slice of the numbers fills 64 bins evenly (4.5 standard deviations, some 90 slices)."""
+    by_episode = uniform(keys(4000), 3, 4, PURPOSES)
+    by_step = uniform(torch.full((4000,), 42), torch.arange(4000), 4, PURPOSES)
+    by_vehicle = uniform(keys(2), 0, 8000, [Purpose.NOISE])
+    by_seed = uniform(episode_key(1, torch.arange(16000), torch.zeros(16000).long()), 0, 1, [0])
+    slices = [by_episode[..., k] for k in range(len(PURPOSES))] + [by_step[..., k] for k in range(len(PURPOSES))]
+    slices += [by_episode[:, v] for v in range(4)] + [by_vehicle, by_seed]
+    assert max(abs(chi_square(u, 64)) for u in slices) < 4.5
+    assert by_episode.min() >= 0.0
+    assert by_episode.max() < 1.0
+
+
+def test_neighbours_in_any_field_are_independent():
+    """Pairs fill 16 x 16 bins evenly."""
+    u = uniform(keys(20_000), 3, 2, [0, 1], torch.float64)
+    after = uniform(keys(20_000), 4, 1, [0], torch.float64)[:, 0, 0]
+    first = u[:, 0, 0]
+    for other in (u[:, 1, 0], u[:, 0, 1], u[:, 0, 0].roll(1), after):
+        pair = ((first * 16).long() * 16 + (other * 16).long() + 0.5) / 256
+        assert abs(chi_square(pair, 256)) < 4.5
+
+
+def test_no_two_places_share_a_number():
+    """All of a block of (stream, seed, episode, step, vehicle, purpose), the fields' values overlapping."""
+    seen = []
+    for stream, step in itertools.product(Stream, range(6)):
+        seed, episode = torch.meshgrid(torch.arange(6), torch.arange(6), indexing="ij")
+        key = episode_key(stream, seed.flatten(), episode.flatten())
+        seen.append(draw_keys(key, step, 6, list(range(6))).flatten())
+    seen = torch.cat(seen)
+    assert seen.unique().numel() == seen.numel() == 3 * 6**5
+
+
+def test_a_million_episodes_have_a_million_keys():
+    assert keys(1_000_000).unique().numel() == 1_000_000
+
+
+def test_workers_and_seeds_far_apart_do_not_meet():
+    episodes = torch.cat([w * 2**40 + torch.arange(1000) for w in range(50)])
+    both = torch.cat([episode_key(0, torch.full_like(episodes, seed), episodes) for seed in (0, 1, 2**40, 2**62)])
+    assert both.unique().numel() == both.numel()
+
+
+def test_float32_and_float64_numbers_agree_to_24_bits():
+    single = uniform(keys(1000), 5, 3, [1, 2], torch.float32)
+    double = uniform(keys(1000), 5, 3, [1, 2], torch.float64)
+    assert torch.equal((double * 2**24).floor(), single.double() * 2**24)
+
+
+def test_the_extreme_keys_stay_within_the_unit_interval():
+    ends = torch.tensor([0, -1, 2**63 - 1, -(2**63)])
+    for dtype in (torch.float32, torch.float64):
+        u = to_uniform(ends, dtype)
+        assert u[0] == 0.0
+        assert 0.999 < u[1] < 1.0
+        assert u[2] < 0.5 == u[3]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_number_does_not_depend_on_the_batch_the_row_or_what_else_is_drawn(dtype):
+    steps = torch.arange(64) * 7
+    together = uniform(keys(64), steps, 9, PURPOSES, dtype)
+    for row in (0, 13, 63):
+        alone = uniform(keys(64)[row : row + 1], int(steps[row]), 9, PURPOSES, dtype)
+        assert torch.equal(alone[0], together[row])
+    fewer = uniform(keys(64), steps, 4, [Purpose.FAULT], dtype)
+    assert torch.equal(fewer[..., 0], together[:, :4, PURPOSES.index(Purpose.FAULT)])
+
+
+def test_normal_numbers_have_the_moments_of_the_normal_distribution():
+    z = normal(keys(20_000), 0, 2, [int(Purpose.NOISE), int(Purpose.NOISE) + 1], torch.float64).flatten()
+    error = 1.0 / math.sqrt(z.numel())
+    assert abs(z.mean()) < 5 * error
+    assert abs(z.var() - 1.0) < 5 * math.sqrt(2.0) * error
+    assert abs((z**3).mean()) < 5 * math.sqrt(15.0) * error
+    assert abs((z**4).mean() - 3.0) < 5 * math.sqrt(96.0) * error
+    assert torch.isfinite(z).all()
+
+
+def test_absorbing_different_fields_gives_different_keys():
+    key = keys(1)
+    assert absorb(key, 1).item() != absorb(key, 2).item() != key.item()

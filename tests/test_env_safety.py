@@ -1,0 +1,129 @@
+"""Rule-driven traffic has no crashes of its own making, with an ego that keeps its lane or shows its changes."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+import pytest
+import torch
+from reference.worlds import environment
+
+from ganlane import keys
+from ganlane.agents.drivers import KeepLaneDriver, MobilDriver
+from ganlane.env import HighwayEnv
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.spawn import SpawnParameters
+from ganlane.sim.vehicles import Vehicles
+
+ROWS = 16
+
+
+@dataclass
+class Log:
+    """What a recorder saw: vehicle-km, steps with overlaps, vehicles off the road, the fewest and most vehicles."""
+
+    vehicle_km: float = 0.0
+    overlaps: int = 0
+    off_road: int = 0
+    slowest_mps: float = 0.0
+
+    def watch(self, env: HighwayEnv) -> None:
+        edges = env.road.right_edge_m(), env.road.left_edge_m()
+
+        def record(vehicles: Vehicles, running: torch.Tensor) -> None:
+            self.vehicle_km += (vehicles.speed * running[:, None]).sum().item() * keys.PHYSICS_STEP_S / 1000.0
+            self.overlaps += pair_overlaps(vehicles)[running].sum().item() // 2
+            self.off_road += ((vehicles.y < edges[0]) | (vehicles.y > edges[1])).sum().item()
+            self.slowest_mps = min(self.slowest_mps, vehicles.speed.min().item())
+
+        env.recorder = record
+
+
+def sparse(vehicles: int, lanes: int) -> SpawnParameters:
+    """Table II, its spread grown with the number of vehicles."""
+    return SpawnParameters(spread_m=max(200.0, 25.0 * (vehicles / lanes + 2)))
+
+
+def dense(rng: random.Random, vehicles: int, lanes: int) -> SpawnParameters:
+    """Up to a jam: speeds no higher than what the smallest gap allows to brake from."""
+    spacing = rng.choice([6.0, 8.0, 12.0])
+    speeds = (0.0, min(rng.choice([1.0, 3.0, 8.0]), 1.2 * (spacing - 4.5)))
+    return SpawnParameters(
+        spread_m=vehicles / lanes * spacing * rng.uniform(1.1, 3.0) + spacing,
+        min_spacing_m=spacing,
+        front_speed_mps=speeds,
+        rear_speed_mps=speeds,
+        ego_speed_mps=speeds,
+    )
+
+
+def crawling(p: SpawnParameters, rng: random.Random) -> SpawnParameters:
+    """Drivers of very different desired speeds: queues behind the slow ones."""
+    return SpawnParameters(
+        **{**vars(p), "desired_speed_mps": (rng.choice([1.0, 5.0]), rng.choice([8.0, 36.0]))},
+    )
+
+
+def drive(rng: random.Random, log: Log, most_vehicles: int, duration_s: float) -> None:
+    """One random road with random traffic, ``ROWS`` episodes of it."""
+    lanes, vehicles = rng.randint(1, 6), rng.randint(2, most_vehicles)
+    spawn = dense(rng, vehicles, lanes) if rng.random() < 0.5 else sparse(vehicles, lanes)
+    spawn = crawling(spawn, rng) if rng.random() < 0.4 else spawn
+    period_s = rng.choice([0.1, 0.2, 0.5, 1.0, 2.0])
+    env = environment(
+        lanes,
+        ROWS,
+        vehicles,
+        mobil=rng.random() < 0.8,
+        period_s=period_s,
+        timeout_s=duration_s,
+        visibility=Visibility.SIGNALLED,
+        spawn=spawn,
+        seed=rng.randrange(10**9),
+        dtype=torch.float32,
+    )
+    driver = (MobilDriver if rng.random() < 0.5 else KeepLaneDriver)(env.road)
+    log.watch(env)
+    td = env.reset()
+    for _ in range(round(duration_s / period_s)):
+        td = env.step(driver(td))["next"]
+        assert not td[keys.EVENTS, "hard_crash"].any()
+        assert not td[keys.EVENTS, "out_of_road"].any()
+
+
+def drive_for(vehicle_km: float, most_vehicles: int, duration_s: float, seed: int) -> Log:
+    rng, log = random.Random(seed), Log()
+    while log.vehicle_km < vehicle_km:
+        drive(rng, log, most_vehicles, duration_s)
+    assert log.overlaps == 0
+    assert log.off_road == 0
+    assert log.slowest_mps >= 0.0
+    return log
+
+
+def test_no_overlap_in_100_vehicle_km():
+    drive_for(100.0, most_vehicles=30, duration_s=12.0, seed=0)
+
+
+@pytest.mark.slow
+def test_no_overlap_in_10_000_vehicle_km():
+    drive_for(10_000.0, most_vehicles=60, duration_s=60.0, seed=1)
+
+
+def test_the_recorder_would_see_an_overlap():
+    """A car that nobody sees coming: the ego changes lanes into one beside it."""
+    env = environment(vehicles=2, mobil=False)
+    log = Log()
+    log.watch(env)
+    td = env.reset()
+    td[keys.VEHICLES, "x"][0, 1] = td[keys.VEHICLES, "x"][0, 0]
+    td[keys.VEHICLES, "speed"][0] = 20.0
+    for car, lane in enumerate((0, 1)):
+        td[keys.VEHICLES, "y"][0, car], td[keys.VEHICLES, "target_lane"][0, car] = 4.0 * lane, lane
+    td["action"] = torch.tensor([keys.LEFT])
+    for _ in range(3):
+        td = env.step(td)["next"]
+        td["action"] = torch.tensor([keys.KEEP])
+    assert log.overlaps > 0

@@ -1,0 +1,54 @@
+"""Every example runs as a user would run it, and the one shown in the docs is the one that runs."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+#: What a run must print, so that a script that does nothing is noticed.
+EXAMPLES = {
+    "own_traffic.py": r"mean speed of the others \d+\.\d m/s, \d+ % look away",
+    "own_reward.py": r"random_legal courteous: mean return +-?\d+\.\d, \d+ onsets behind",
+    "own_policy.py": r"largest_gap",
+    "stock_dqn.py": r"loss \d+\.\d+, reward per decision -?\d+\.\d+",
+}
+
+
+def run(name: str, *arguments: str) -> str:
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
+    command = [sys.executable, str(ROOT / "examples" / name), *arguments]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_example_is_run_here():
+    assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_example_runs_and_says_what_it_found(name):
+    arguments = ["2048"] if name == "stock_dqn.py" else []
+    assert re.search(EXAMPLES[name], run(name, *arguments))
+
+
+def test_the_traffic_model_in_the_docs_is_the_one_that_runs():
+    shown = re.search(r"```python\n(class Daydreamers.*?)```", (ROOT / "docs" / "traffic.md").read_text(), re.S)
+    assert shown
+    assert shown.group(1).strip() in (ROOT / "examples" / "own_traffic.py").read_text()
+
+
+def test_the_docs_name_only_files_that_exist():
+    missing = []
+    for page in (ROOT / "docs").glob("*.md"):
+        for name in re.findall(r"`((?:ganlane|tests|examples|conf)/[\w/]+\.(?:py|yaml))`", page.read_text()):
+            if not (ROOT / name).is_file():
+                missing.append(f"{page.name}: {name}")
+    assert not missing

@@ -1,0 +1,159 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ganlane.errors import UserError
+from ganlane.generator.anchored import EXTRA_INPUTS
+from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.sim.random import Stream, episode_key
+from ganlane.sim.road import Road
+from ganlane.sim.spawn import spawn
+from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
+
+SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
+ROAD = Road(3, 4.0)
+
+
+def generator(extra_inputs=0):
+    torch.manual_seed(0)
+    return Generator(GeneratorSizes(**SMALL, extra_inputs=extra_inputs)).requires_grad_(False)
+
+
+def paper(**options):
+    return SocialGanTraffic(generator(), ROAD, **options)
+
+
+def calibrated(**options):
+    return AnchoredGanTraffic(generator(EXTRA_INPUTS), ROAD, **options)
+
+
+MODULES = [paper, calibrated, lambda: paper(execute_k=3)]
+
+
+def begin(module, rows=4, vehicles=9, seed=5):
+    """The first state of the episodes 0 to ``rows`` - 1."""
+    seed, episode = torch.full((rows,), seed), torch.arange(rows)
+    key = episode_key(module.stream, seed, episode)
+    state = spawn(key, vehicles, 3, 4.0)
+    counters = {"seed": seed, "episode": episode, "step": torch.zeros_like(seed)}
+    memory = module.init_memory(state, state.valid, key)
+    return TensorDict({"vehicles": TensorDict(state.as_dict(), [rows]), "traffic": memory, **counters}, [rows])
+
+
+def drive(module, td, steps):
+    for _ in range(steps):
+        td = module(td)
+        td["vehicles"] = td["moved"]
+        td["step"] = td["step"] + 1
+    return td
+
+
+@pytest.mark.parametrize("make", MODULES)
+def test_every_leaf_of_the_memory_is_per_vehicle_and_as_declared(make):
+    module = make()
+    td = begin(module)
+    spec = module.memory_spec(4, 9)
+    assert set(spec) == set(td["traffic"].keys())
+    for _ in range(2):
+        for name, (shape, dtype) in spec.items():
+            assert td["traffic", name].shape == torch.Size(shape), name
+            assert td["traffic", name].dtype == dtype, name
+        td = drive(module, td, 1)
+
+
+@pytest.mark.parametrize("make", MODULES)
+def test_the_state_at_t_is_never_written(make):
+    module = make()
+    td = begin(module)
+    before = td["vehicles"].clone()
+    moved = module(td)["moved"]
+    assert (td["vehicles"] == before).all()
+    assert (moved["x"] > before["x"]).all()
+
+
+@pytest.mark.parametrize("make", MODULES)
+def test_an_episode_is_the_same_alone_and_in_a_batch(make):
+    module = make()
+    together, alone = drive(module, begin(module), 15), drive(module, begin(module)[2:3], 15)
+    for name in ("x", "y", "speed"):
+        torch.testing.assert_close(alone["vehicles", name], together["vehicles", name][2:3], atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("make", MODULES)
+def test_streams_seeds_and_episodes_give_other_drivers(make):
+    module = make()
+    one = begin(module, rows=2)["traffic", "noise"]
+    assert (one[0] != one[1]).all()
+    assert (one != begin(module, rows=2, seed=6)["traffic", "noise"]).all()
+    module.stream = int(Stream.REPORT)
+    assert (one != begin(module, rows=2)["traffic", "noise"]).all()
+
+
+@pytest.mark.parametrize("make", MODULES)
+def test_a_vehicle_that_enters_alone_changes_nobody_elses_memory(make):
+    module = make()
+    td = drive(module, begin(module), 3)
+    who = torch.zeros(4, 9, dtype=torch.bool)
+    who[1, 4] = True
+    key = episode_key(module.stream, td["seed"], td["episode"])
+    from ganlane.sim.vehicles import Vehicles
+
+    fresh = module.init_memory(Vehicles.of(td["vehicles"]), who, key)
+    for name, leaf in fresh.items():
+        assert leaf.shape[:2] == (4, 9), name
+    speed = td["vehicles", "speed"][1, 4]
+    torch.testing.assert_close(fresh["displacement"][1, 4], torch.stack([0.1 * speed, 0.0 * speed]))
+
+
+@pytest.mark.parametrize("make", MODULES)
+def test_who_is_not_valid_is_not_seen(make):
+    module = make()
+    td = begin(module)
+    td["vehicles", "valid"][:, 3] = False
+    other = td.clone()
+    other["vehicles", "x"][:, 3] += 5.0
+    other["vehicles", "speed"][:, 3] = 1.0
+    one, two = module(td)["moved"], module(other)["moved"]
+    rest = [index for index in range(9) if index != 3]
+    torch.testing.assert_close(one["x"][:, rest], two["x"][:, rest])
+
+
+def test_the_ego_is_a_neighbour_of_the_calibrated_drivers():
+    module = calibrated()
+    td = begin(module)
+    other = td.clone()
+    other["vehicles", "x"][:, 0] += 10.0
+    assert (module(td)["moved", "speed"][:, 1:] != module(other)["moved", "speed"][:, 1:]).any()
+
+
+def test_z_of_zero_is_the_same_driving_for_every_stream():
+    one, other = paper(noise_scale=0.0), paper(noise_scale=0.0, stream=Stream.REPORT)
+    start = begin(one)
+    torch.testing.assert_close(
+        drive(one, start.clone(), 5)["vehicles", "x"], drive(other, start.clone(), 5)["vehicles", "x"]
+    )
+
+
+def test_the_calibrated_drivers_follow_their_target_lane():
+    module = calibrated(noise_scale=0.0)
+    td = begin(module, rows=1, vehicles=1)
+    td["vehicles", "y"].zero_()
+    td["vehicles", "target_lane"].fill_(2)
+    assert drive(module, td, 100)["vehicles", "y"].item() == pytest.approx(8.0, abs=1.0)
+
+
+def test_headways_come_from_the_quantiles_given():
+    module = calibrated(headway_quantiles_s=(1.0, 1.1, 1.2, 1.3, 1.4))
+    headway = begin(module, rows=200)["traffic", "headway"]
+    assert headway.min() >= 1.0
+    assert headway.max() <= 1.4
+    assert headway.median().item() == pytest.approx(1.2, abs=0.03)
+
+
+def test_the_other_presets_weights_and_a_wrong_execute_k_are_refused():
+    with pytest.raises(UserError, match="expected 4"):
+        AnchoredGanTraffic(generator(), ROAD)
+    with pytest.raises(UserError, match="expected 0"):
+        SocialGanTraffic(generator(EXTRA_INPUTS), ROAD)
+    with pytest.raises(UserError, match="execute_k=9"):
+        paper(execute_k=9)

@@ -1,0 +1,93 @@
+"""A toy road: keep off the lane that the observation warns of. Its whole state travels in the TensorDict."""
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ganlane.sim.random import draw_keys, episode_key, to_uniform
+
+ACTIONS, LIMIT = 3, 8
+
+
+class ToyRoad(EnvBase):
+    """Each decision one of three actions is right (+1), one crashes (-5), and one does nothing.
+
+    The observation is a random draw [N, 4]: its largest of the first three is right, its smallest crashes. After 8
+    decisions the episode is a goal (+2) if the seed is even and times out otherwise.
+    """
+
+    def __init__(self, environments=8, seed=0):
+        super().__init__(batch_size=[environments])
+        self.seed_number, shape = seed, (environments,)
+        flag = Binary(shape=(*shape, 1), dtype=torch.bool)
+        count = Unbounded(shape=shape, dtype=torch.int64)
+        events = {name: flag.clone() for name in ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")}
+        ego = {"distance": Unbounded(shape=shape), "lane_changes": count.clone()}
+        counters = {name: count.clone() for name in ("seed", "episode", "step")}
+        self.observation_spec = Composite(
+            {
+                "observation": Bounded(0.0, 1.0, shape=(*shape, 4)),
+                "events": Composite(events, shape=shape),
+                "ego": Composite(ego, shape=shape),
+                **counters,
+            },
+            shape=shape,
+        )
+        self.action_spec = Categorical(ACTIONS, shape=shape)
+        self.reward_spec = Unbounded(shape=(*shape, 1))
+        self.done_spec = Composite({n: flag.clone() for n in ("done", "terminated", "truncated")}, shape=shape)
+
+    def _observe(self, seed, episode, step):
+        return to_uniform(draw_keys(episode_key(0, seed, episode), step, 1, [0, 1, 2, 3])).squeeze(1)
+
+    def _reset(self, tensordict=None):
+        rows = self.batch_size[0]
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            seed, episode = torch.full((rows,), self.seed_number), torch.arange(rows)
+        else:
+            # TorchRL hides everything but the mask from an automatic reset: the last step knows the episodes.
+            seed, episode = self.last
+            episode = torch.where(mask.squeeze(-1), episode + rows, episode)
+        step, none = torch.zeros(rows, dtype=torch.int64), torch.zeros(rows, 1, dtype=torch.bool)
+        names = ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")
+        events = TensorDict({name: none.clone() for name in names}, [rows])
+        ego = TensorDict({"distance": torch.zeros(rows), "lane_changes": step.clone()}, [rows])
+        counters = {"seed": seed, "episode": episode, "step": step}
+        observation = self._observe(seed, episode, step)
+        ends = {name: none.clone() for name in ("done", "terminated", "truncated")}
+        return TensorDict({"observation": observation, "events": events, "ego": ego, **counters, **ends}, [rows])
+
+    def _step(self, tensordict):
+        rows, observation, action = self.batch_size[0], tensordict["observation"], tensordict["action"]
+        right, wrong = observation[:, :3].argmax(-1), observation[:, :3].argmin(-1)
+        step = tensordict["step"] + 1
+        crash = action == wrong
+        over = (step >= LIMIT) & ~crash
+        goal = over & (tensordict["seed"] % 2 == 0)
+        timeout = over & ~goal
+        reward = (action == right).float() - 5.0 * crash + 2.0 * goal
+        flags = {"goal": goal, "hard_crash": crash, "out_of_road": crash & False, "timeout": timeout}
+        events = TensorDict({n: f[:, None] for n, f in {**flags, "scene_end": crash & False}.items()}, [rows])
+        ego = {
+            "distance": tensordict["ego", "distance"] + 100.0,
+            "lane_changes": tensordict["ego", "lane_changes"] + (action > 0),
+        }
+        seed, episode = self.last = tensordict["seed"], tensordict["episode"]
+        content = {
+            "observation": self._observe(seed, episode, step),
+            "reward": reward[:, None],
+            "events": events,
+            "ego": TensorDict(ego, [rows]),
+            "seed": seed,
+            "episode": episode,
+            "step": step,
+            "terminated": (crash | goal)[:, None],
+            "truncated": timeout[:, None],
+            "done": (crash | over)[:, None],
+        }
+        return TensorDict(content, [rows])
+
+    def _set_seed(self, seed):
+        self.seed_number = seed

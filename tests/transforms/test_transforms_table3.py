@@ -1,0 +1,107 @@
+"""Table III, entry by entry, on scenes made by hand."""
+
+import pytest
+import torch
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.sim import Road, Vehicles
+from ganlane.traffic import IdmMobilTraffic
+from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardTransform, observation_size
+
+
+def scene(rows, valid=None):
+    """One environment from (x, lane, speed, desired speed) per vehicle, the ego first."""
+    x, lane, speed, desired = (torch.tensor([column], dtype=torch.float64) for column in zip(*rows))
+    zero = torch.zeros_like(x)
+    flags = torch.ones_like(x, dtype=torch.bool) if valid is None else torch.tensor([valid])
+    return Vehicles(
+        x, lane * 4.0, zero, speed, zero, zero + 4.5, zero + 2.5, desired, lane.long(), zero.long(), flags
+    )
+
+
+def observe(form, rows, valid=None, lanes=3, progress=0.0, direction=0):
+    transform = ObservationTransform(Road(lanes), len(rows), form)
+    ones = torch.ones(1, dtype=torch.float64)
+    return transform.observe(scene(rows, valid), progress * ones, torch.tensor([direction]))[0]
+
+
+EGO = (0.0, 1, 20.0, 25.0)
+
+
+def test_the_ego_reports_its_speed_over_its_desired_speed_and_the_lanes_beside_it():
+    middle = observe("table3", [EGO, (50.0, 1, 20.0, 20.0)])
+    assert middle[:3].tolist() == [0.8, 1.0, 1.0]
+    leftmost = observe("table3", [(0.0, 2, 20.0, 25.0), (50.0, 1, 20.0, 20.0)])
+    assert leftmost[1:3].tolist() == [0.0, 1.0]
+    rightmost = observe("table3", [(0.0, 0, 20.0, 25.0), (50.0, 1, 20.0, 20.0)])
+    assert rightmost[1:3].tolist() == [1.0, 0.0]
+
+
+def test_its_own_speed_ratio_is_not_clipped():
+    assert observe("table3", [(0.0, 1, 30.0, 25.0), (50.0, 1, 20.0, 20.0)])[0] == pytest.approx(1.2)
+
+
+def test_another_vehicle_gives_position_over_200_m_speed_over_30_and_half_a_unit_per_lane():
+    values = observe("table3", [EGO, (50.0, 2, 26.0, 20.0)])
+    assert values[3:].tolist() == pytest.approx([0.25, 0.2, 0.5])
+    values = observe("table3", [(0.0, 2, 20.0, 25.0), (-20.0, 0, 14.0, 20.0)])
+    assert values[3:].tolist() == pytest.approx([-0.1, -0.2, -1.0])
+
+
+def test_the_others_come_nearest_first_whatever_their_index():
+    values = observe("table3", [EGO, (90.0, 1, 20.0, 20.0), (-30.0, 1, 20.0, 20.0), (60.0, 1, 20.0, 20.0)])
+    assert values[3::3].tolist() == pytest.approx([-0.15, 0.3, 0.45])
+
+
+def test_far_vehicles_are_clipped_to_one():
+    values = observe("table3", [EGO, (900.0, 1, 60.0, 20.0), (-900.0, 1, 0.0, 20.0)])
+    assert values[3::3].tolist() == [1.0, -1.0]
+    assert values[4].item() == 1.0
+
+
+def test_a_vehicle_that_is_not_valid_reads_far_ahead_and_comes_last():
+    rows = [EGO, (10.0, 1, 26.0, 20.0), (50.0, 1, 26.0, 20.0)]
+    values = observe("table3", rows, valid=[True, False, True])
+    assert values[3:].tolist() == pytest.approx([0.25, 0.2, 0.0, 1.0, 0.0, 0.0])
+
+
+def test_on_a_road_of_one_lane_the_lane_difference_is_zero():
+    values = observe("table3", [(0.0, 0, 20.0, 25.0), (50.0, 0, 20.0, 20.0)], lanes=1)
+    assert values[1:3].tolist() == [0.0, 0.0]
+    assert values[5].item() == 0.0
+
+
+def test_progress_adds_the_egos_own_lane_change():
+    values = observe("table3_progress", [EGO, (50.0, 1, 20.0, 20.0)], progress=0.25, direction=-1)
+    assert values[-2:].tolist() == [0.25, -1.0]
+
+
+def test_the_lane_view_holds_the_nearest_ahead_and_behind_in_three_lanes():
+    rows = [EGO, (50.0, 2, 26.0, 20.0), (90.0, 2, 20.0, 20.0), (-34.5, 1, 14.0, 20.0)]
+    view = observe("lane_view", rows)[3:-2].reshape(6, 3)
+    nothing = [1.0, 0.0, 0.0]
+    gap = 45.5
+    assert view[0].tolist() == pytest.approx([gap / 200, torch.exp(torch.tensor(-gap / 15.0)).item(), 0.2])
+    assert view[3].tolist() == pytest.approx([30.0 / 200, torch.exp(torch.tensor(-2.0)).item(), -0.2])
+    for index in (1, 2, 4, 5):
+        assert view[index].tolist() == nothing
+
+
+@pytest.mark.parametrize("form", list(OBSERVATIONS))
+def test_every_form_has_the_size_it_says_and_a_spec_that_holds(form):
+    base = HighwayEnv(IdmMobilTraffic(), num_envs=3)
+    env = TransformedEnv(base, Compose(ObservationTransform(base.road, 9, form), RewardTransform()))
+    assert env.reset()["observation"].shape == (3, observation_size(form, 9))
+    check_env_specs(env, seed=0)
+
+
+def test_the_papers_form_has_27_numbers_for_nine_vehicles():
+    assert observation_size("table3", 9) == 27
+
+
+def test_an_unknown_form_is_refused_with_the_known_ones():
+    with pytest.raises(UserError, match="table3_progress"):
+        ObservationTransform(Road(), 9, "pixels")

@@ -1,0 +1,162 @@
+"""Frames show what the trajectory says, where it says it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from view_scenes import area, place, straight
+
+from ganlane.errors import UserError
+from ganlane.view import DrawingParameters, FramePainter, WindowParameters, style
+from ganlane.view.window import HEADER_HEIGHT, Window
+
+BARE = DrawingParameters(trail_s=0.0, speeds=False)
+
+
+def road_of(picture):
+    """The picture below the header."""
+    return picture[HEADER_HEIGHT:]
+
+
+def test_a_frame_is_a_picture_of_the_asked_size():
+    frame = FramePainter(straight([0, 30], [1, 1])).draw(5)
+    assert frame.shape == (320, 1280, 3)
+    assert frame.dtype == np.uint8
+    small = FramePainter(straight([0], [1]), WindowParameters(width=640, height=200)).draw(0)
+    assert small.shape == (200, 640, 3)
+
+
+def test_the_ego_stays_at_its_column_and_others_stand_at_their_distance():
+    tint = style.speed_tint(20.0)
+    painter = FramePainter(straight([0, 40], [1, 2], frames=50), drawing=BARE)
+    for frame in (0, 17, 49):
+        picture = road_of(painter.draw(frame))
+        ego, other = place(picture, style.EGO), place(picture, tint)
+        assert ego[0] == pytest.approx(0.38 * 1280, abs=2)
+        assert other[0] - ego[0] == pytest.approx(40 * 1280 / 160, abs=2)
+        # One lane further left is further up, by the exaggerated width of a lane.
+        assert ego[1] - other[1] == pytest.approx(4.0 * 1.5 * 1280 / 160, abs=2)
+
+
+def test_the_road_moves_past_the_ego():
+    painter = FramePainter(straight([0], [1]), drawing=BARE)
+    first, second = painter.draw(0), painter.draw(1)
+    marks = painter.window.row([2.0])[0]
+    a, b = first[round(marks)], second[round(marks)]
+    # 2 m at 8 pixels a metre.
+    assert not np.array_equal(a, b)
+    assert np.array_equal(a[16:], b[:-16])
+
+
+def test_overlapping_vehicles_have_a_red_edge():
+    apart = FramePainter(straight([0, 30], [1, 1]), drawing=BARE).draw(0)
+    together = FramePainter(straight([0, 3], [1, 1]), drawing=BARE).draw(0)
+    assert area(apart, style.CRASH) == 0
+    assert area(together, style.CRASH) > 50
+
+
+def test_a_hard_crash_is_marked_on_the_last_frame_only():
+    painter = FramePainter(straight([0, 3], [1, 1], outcome="hard_crash"), drawing=BARE)
+    before, last = area(painter.draw(18), style.CRASH), area(painter.draw(19), style.CRASH)
+    assert last > before + 500
+
+
+@pytest.mark.parametrize("outcome", ["goal", "out_of_road", "timeout", "scene_end"])
+def test_every_end_is_written_on_the_last_frame(outcome):
+    cut_off, ended = straight([0], [1]), straight([0], [1], outcome=outcome)
+    assert not np.array_equal(FramePainter(cut_off).draw(19), FramePainter(ended).draw(19))
+    assert np.array_equal(FramePainter(cut_off).draw(18), FramePainter(ended).draw(18))
+
+
+def test_lights_show_braking_and_the_lane_to_be_entered():
+    calm = straight([0], [1])
+    braking = replace(calm, acceleration=calm.acceleration - 3.0)
+    signalling = replace(calm, target_lane=calm.target_lane + 1)
+    assert area(road_of(FramePainter(calm, drawing=BARE).draw(0)), style.BRAKE) == 0
+    assert area(road_of(FramePainter(braking, drawing=BARE).draw(0)), style.BRAKE) > 5
+    lit = road_of(FramePainter(signalling, drawing=BARE).draw(0))
+    assert area(lit, style.AMBER, 12) > 5
+    assert place(lit, style.AMBER, 12)[1] < place(lit, style.EGO)[1]
+    # Indicators blink: dark half a second later.
+    assert area(road_of(FramePainter(signalling, drawing=BARE).draw(5)), style.AMBER, 12) == 0
+
+
+def test_trails_lead_to_where_a_vehicle_came_from():
+    scene = straight([0], [1], frames=40)
+    bare = FramePainter(scene, drawing=BARE).draw(39)
+    trailed = FramePainter(scene, drawing=DrawingParameters(trail_s=2.0, speeds=False)).draw(39)
+    rows, columns = np.nonzero((bare != trailed).any(axis=-1))
+    start = 0.38 * 1280 - 2.0 * 20.0 * 8
+    assert columns.min() == pytest.approx(start, abs=4)
+    assert columns.max() < 0.38 * 1280
+    assert rows.max() - rows.min() < 6
+
+
+def test_a_vehicle_that_was_put_elsewhere_leaves_no_trail_across_the_road():
+    scene = straight([0, -50], [1, 2], frames=40)
+    x = scene.x.copy()
+    x[30:, 1] += 60.0
+    scene = replace(scene, x=x)
+    painter = FramePainter(scene, drawing=DrawingParameters(trail_s=3.0, speeds=False))
+    trailed, bare = painter.draw(39), FramePainter(scene, drawing=BARE).draw(39)
+    left_lane = round(float(painter.window.row(8.0)))
+    upper_lane = slice(left_lane - 10, left_lane + 10)
+    changed = np.nonzero((trailed[upper_lane] != bare[upper_lane]).any(axis=(0, 2)))[0]
+    # Only what it drove in the nine frames since the jump, less half its own length.
+    assert len(changed) == pytest.approx((9 * 2.0 - 2.25) * 8, abs=6)
+
+
+def test_padding_is_not_drawn():
+    scene = straight([0, 20], [1, 1])
+    hidden = scene.valid.copy()
+    hidden[:, 1] = False
+    tint = style.speed_tint(20.0)
+    assert area(road_of(FramePainter(scene, drawing=BARE).draw(0)), tint) > 200
+    assert area(road_of(FramePainter(replace(scene, valid=hidden), drawing=BARE).draw(0)), tint) == 0
+
+
+def test_the_leader_line_ends_at_the_leader():
+    scene = straight([0, 50, 20], [1, 1, 2])
+    painter = FramePainter(scene, drawing=DrawingParameters(0.0, False, leader_line=True))
+    drawn, row = painter.draw(0), round(float(painter.window.row(4.0)))
+    columns = np.nonzero(np.abs(drawn[row].astype(int) - style.LEADER).max(axis=-1) < 3)[0]
+    # From the ego's front to the rear of the leader: 45.5 m, the vehicle in the other lane is none.
+    assert len(columns) == pytest.approx(45.5 * 8, abs=4)
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 5, 10])
+def test_any_number_of_lanes_fits_between_header_and_footer(lanes):
+    window = Window(WindowParameters(), lanes, 4.0)
+    upper, lower = window.edges
+    assert HEADER_HEIGHT < upper < lower < 320 - 20
+    vehicles = list(range(lanes))
+    picture = FramePainter(straight([15.0 * v for v in vehicles], vehicles, lanes=lanes)).draw(0)
+    # lanes - 1 broken marks and two edges: rows of the picture that are bright over at least a tenth of it.
+    bright = (np.abs(picture.astype(int) - style.MARK).max(axis=-1) < 6).mean(axis=1) > 0.15
+    runs = np.sum(np.diff(np.concatenate([[0], bright[HEADER_HEIGHT:].astype(int)])) == 1)
+    assert runs == lanes + 1
+
+
+def test_pictures_without_room_are_refused():
+    with pytest.raises(UserError, match="200 x 320"):
+        WindowParameters(width=200)
+    with pytest.raises(UserError, match="-5 m"):
+        WindowParameters(length_m=-5)
+
+
+def test_nine_vehicles_are_drawn_fast_enough_for_60_frames_a_second():
+    generator = np.random.default_rng(0)
+    scene = straight(generator.uniform(-60, 90, 9), generator.integers(0, 3, 9), frames=60)
+    painter = FramePainter(scene)
+    painter.draw(0)
+    # The fastest of three rounds: other work on the machine is no fault of the drawing.
+    rounds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        for frame in range(20, 50):
+            painter.draw(frame)
+        rounds.append(30 / (time.perf_counter() - start))
+    assert max(rounds) > 60

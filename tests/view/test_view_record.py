@@ -1,0 +1,116 @@
+"""A recorded episode is the episode that the environment drove."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import GymEnv
+from view_scenes import straight
+
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
+from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.errors import UserError
+from ganlane.sim.random import Stream
+from ganlane.sim.road import Road
+from ganlane.traffic.idm_mobil import IdmMobilTraffic
+from ganlane.view import record_episode, to_tracks
+
+
+def always(action):
+    return TensorDictModule(lambda step: torch.full_like(step, action), in_keys=["step"], out_keys=["action"])
+
+
+def highway(rows=1, goal_m=150.0, lanes=3, vehicles=5):
+    return HighwayEnv(
+        IdmMobilTraffic(Road(lanes=lanes)),
+        rows,
+        vehicles=vehicles,
+        episode=EpisodeParameters(goal_m=goal_m),
+        stream=Stream.TRAIN,
+    )
+
+
+def test_the_recording_has_a_frame_per_physics_step():
+    env = highway()
+    trajectory = record_episode(env, always(0), seed=4, episode=7, agent="keep_lane", traffic="idm_mobil")
+    state = env.reset(env.reset().update({"seed": torch.tensor([4]), "episode": torch.tensor([7])}))
+    assert trajectory.x[0] == pytest.approx(state["vehicles", "x"][0].double().numpy())
+    while not state["done"].any():
+        state = env.step_mdp(env.step(state.set("action", torch.tensor([0]))))
+    assert len(trajectory) == int(state["step"]) + 1
+    assert trajectory.time_s[-1] == pytest.approx(0.1 * int(state["step"]))
+    assert trajectory.x[-1] == pytest.approx(state["vehicles", "x"][0].double().numpy())
+    assert trajectory.x[-1, 0] >= 150.0 > trajectory.x[-2, 0]
+    assert trajectory.outcome == "goal"
+    assert (trajectory.label.agent, trajectory.label.lanes, trajectory.label.lane_width_m) == ("keep_lane", 3, 4.0)
+
+
+def test_frames_are_one_step_of_driving_apart():
+    trajectory = record_episode(highway(goal_m=60.0), always(0), seed=0, episode=0)
+    moved = np.diff(trajectory.x, axis=0)
+    assert np.abs(moved - 0.1 * trajectory.speed[:-1]).max() < 0.05
+    assert trajectory.frame_s == pytest.approx(0.1)
+    assert not trajectory.overlapping().any()
+    assert not trajectory.jumped().any()
+
+
+def test_the_action_belongs_to_the_frames_it_led_to():
+    trajectory = record_episode(highway(goal_m=40.0), always(0), seed=0, episode=0)
+    assert trajectory.action[0] == -1
+    assert set(trajectory.action[1:]) == {0}
+
+
+def test_a_command_off_the_road_ends_the_recording_at_once():
+    trajectory = record_episode(highway(lanes=1), always(1), seed=0, episode=0)
+    assert trajectory.outcome == "out_of_road"
+    assert len(trajectory) == 1
+
+
+def test_the_batch_makes_no_difference_and_the_hook_is_taken_out_again():
+    env = highway(rows=3, goal_m=60.0)
+    trajectory = record_episode(env, always(0), seed=1, episode=5)
+    alone = record_episode(highway(goal_m=60.0), always(0), seed=1, episode=5)
+    assert np.array_equal(trajectory.x, alone.x)
+    assert env.recorder is None
+
+
+def test_a_recording_can_be_cut_off():
+    trajectory = record_episode(highway(goal_m=5000.0), always(0), seed=0, episode=0, max_time_s=3.0)
+    assert trajectory.outcome == ""
+    assert trajectory.time_s[-1] == pytest.approx(3.0)
+
+
+def test_tracks_have_the_form_of_recorded_traffic():
+    trajectory = straight([0, 30], [0, 2], frames=12)
+    tracks = to_tracks(trajectory, "film")
+    assert tracks.schema == SCHEMA
+    assert validate(tracks, "film").height == 24
+    second = tracks.filter(tracks["vehicle"] == 1)
+    assert second["x"].to_list() == pytest.approx(trajectory.x[:, 1].tolist())
+    assert second["frame"].to_list() == list(range(12))
+    assert set(second["lane"]) == {2}
+
+
+def test_a_recycled_vehicle_begins_a_new_track_and_padding_is_left_out():
+    trajectory = straight([0, 30, 60], [0, 1, 2], frames=12)
+    x, valid = trajectory.x.copy(), trajectory.valid.copy()
+    x[5:, 1] += 300.0
+    valid[:, 2] = False
+    tracks = to_tracks(replace(trajectory, x=x, valid=valid))
+    assert set(tracks["vehicle"]) == {0, 1, 1 + TRACK_STRIDE}
+    assert tracks.filter(tracks["vehicle"] == 1).height == 5
+
+
+def test_tracks_need_frames_a_tenth_of_a_second_apart():
+    coarse = straight([0], [0])
+    with pytest.raises(UserError, match="physics step"):
+        to_tracks(replace(coarse, time_s=coarse.time_s * 10))
+
+
+def test_an_environment_without_the_hook_cannot_be_recorded():
+    with pytest.raises(UserError, match="HighwayEnv"):
+        record_episode(GymEnv("CartPole-v1"), always(0), seed=0, episode=0)

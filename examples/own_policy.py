@@ -49,7 +49,7 @@ def main():
     drivers = {name: DRIVERS[name](road, stream) for name in ("mobil", "keep_lane", "random_legal")}
     drivers["largest_gap"] = LargestGap(road, stream)
     env = HighwayEnv(
-        IdmMobilTraffic(road, stream), num_envs=24, episode=EpisodeParameters(goal_m=800.0), stream=stream
+        IdmMobilTraffic(road, stream), num_envs=24, episode=EpisodeParameters(goal_m=500.0), stream=stream
     )
     env = TransformedEnv(env, RewardTransform())
     frames = [

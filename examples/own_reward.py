@@ -36,7 +36,7 @@ class Courtesy(Transform):
 
 def main():
     """Returns of two drivers under the paper's reward and under the courteous one, on the same episodes."""
-    road, short = Road(lanes=3), EpisodeParameters(goal_m=500.0)
+    road, short = Road(lanes=3), EpisodeParameters(goal_m=300.0)
     for name in ("mobil", "random_legal"):
         driver = DRIVERS[name](road, Stream.REPORT)
         for title, transforms in (("paper", []), ("courteous", [Courtesy()])):

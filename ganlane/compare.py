@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import polars as pl
 from tqdm import tqdm
@@ -43,19 +43,40 @@ def compare(
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other.
     """
     modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
-    rows, parts = min(num_envs, episodes), []
-    with tqdm(total=len(modules) * len(drivers) * episodes, unit="episode", file=sys.stderr, leave=False) as bar:
-        for traffic, module in modules.items():
-            for driver in drivers:
-                bar.set_description(f"{driver.name} on {traffic}")
-                before = bar.n
-                made = make_env(module, env, driver.observation or observation, reward, rows, seed, device)
-                table = run_episodes(
-                    made,
-                    driver.policy,
-                    range(episodes),
-                    seed,
-                    lambda done, _, start=before: bar.update(start + done - bar.n),
-                )
-                parts.append(table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic)))
-    return pl.concat(parts)
+    pairs = [(name, driver) for name in modules for driver in drivers]
+    rows, tables = min(num_envs, episodes), []
+    with _Progress(len(pairs) * episodes) as progress:
+        for traffic, driver in pairs:
+            seen = driver.observation or observation
+            made = make_env(modules[traffic], env, seen, reward, rows, seed, device)
+            report = progress.start(f"{driver.name} on {traffic}")
+            table = run_episodes(made, driver.policy, range(episodes), seed, report)
+            tables.append(table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic)))
+    return pl.concat(tables)
+
+
+class _Progress:
+    """A bar on a terminal, elsewhere a line for every driver and traffic."""
+
+    def __init__(self, total: int) -> None:
+        self._bar = tqdm(total=total, unit="episode", file=sys.stderr, disable=not sys.stderr.isatty())
+        self._finished = 0
+
+    def start(self, title: str) -> Callable[[int, int], None]:
+        """Begin with the next driver and traffic; the function to call as its episodes finish."""
+        before = self._finished
+        self._bar.set_description(title)
+
+        def report(finished: int, wanted: int) -> None:
+            self._finished = before + finished
+            self._bar.update(self._finished - self._bar.n)
+            if self._bar.disable and finished == wanted:
+                print(f"{title}: {wanted} episodes", file=sys.stderr, flush=True)
+
+        return report
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()

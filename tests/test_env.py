@@ -5,9 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from reference.worlds import environment, placed, same_bits, step, vehicles
+from torchrl.collectors import Collector
+from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
+from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.env import EpisodeParameters
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
@@ -59,7 +62,9 @@ def test_training_and_reported_episodes_are_different_ones():
 
 
 def test_row_i_starts_with_episode_first_plus_i():
-    assert environment(num_envs=3, first_episode=2**40).reset()[keys.EPISODE].tolist() == [2**40 + i for i in range(3)]
+    assert environment(num_envs=3, first_episode=2**40).reset()[keys.EPISODE].tolist() == [
+        2**40 + i for i in range(3)
+    ]
 
 
 def test_after_a_reset_nothing_has_happened_yet():
@@ -119,6 +124,26 @@ def test_an_automatic_reset_goes_on_with_episode_i_plus_n():
     assert going_on[keys.EPISODE].tolist() == [0, 4, 2]
     assert going_on[keys.STEP].tolist() == [10, 0, 10]
     assert same_bits(going_on[[0, 2]].exclude("action", "reward"), stepped["next"][[0, 2]].exclude("reward")) == []
+
+
+def test_under_a_transform_and_in_a_collector_every_episode_is_driven_once():
+    env = environment(num_envs=3, goal_m=40.0)
+    driver = KeepLaneDriver(env.road)
+    collector = Collector(
+        TransformedEnv(env, StepCounter()),
+        driver,
+        frames_per_batch=3 * 20,
+        total_frames=3 * 20,
+        auto_register_policy_transforms=False,
+    )
+    batch = next(iter(collector))
+    collector.shutdown()
+    done = batch["next", "done"][..., 0]
+    episodes = batch[keys.EPISODE]
+    for row in range(3):
+        finished = episodes[row][done[row]].tolist()
+        assert len(finished) > 2
+        assert finished == [row + 3 * k for k in range(len(finished))]
 
 
 def test_a_reset_with_seed_and_episode_runs_exactly_those():

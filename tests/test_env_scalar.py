@@ -36,7 +36,7 @@ def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
 
 
 def disturbed(scene: Vehicles, lanes: int, generator: torch.Generator) -> Vehicles:
-    """The scene with everything a little off: in the middle of changes, at odd angles, seen in all ways or not at all."""
+    """The scene with everything a little off: in mid-change, at odd angles, seen in all ways or not at all."""
 
     def between(low: float, high: float) -> torch.Tensor:
         return low + (high - low) * torch.rand(scene.x.shape, generator=generator, dtype=DOUBLE)
@@ -102,7 +102,7 @@ def assert_same(td, row: int, state: scalar.State, outcome: scalar.Outcome, tole
     assert [name for name in keys.END_EVENTS if td[keys.EVENTS, name][row]] == outcome.reasons
     assert td[keys.EVENTS, keys.SOFT_CRASH][row] == outcome.soft_crash
     assert td[keys.EVENTS, keys.SOFT_CRASH_BEHIND][row] == outcome.soft_crash_behind
-    ego = {name: td[keys.EGO, name][row].item() for name in td[keys.EGO].keys()}
+    ego = {name: value[row].item() for name, value in td[keys.EGO].items()}
     assert ego["started_change"] == outcome.started_change
     assert ego["change_direction"] == state.direction
     assert ego["lane_changes"] == state.lane_changes
@@ -130,6 +130,12 @@ def test_the_tensor_code_agrees_with_the_scalar_one_on_100_random_scenes():
 @pytest.mark.slow
 def test_the_tensor_code_agrees_with_the_scalar_one_on_2000_random_scenes():
     compare_random_scenes(scenes=2000, rows=5, duration_s=10.0, seed=1)
+
+
+def test_on_a_ring_they_agree_too():
+    spawn = SpawnParameters(spread_m=170.0, min_spacing_m=20.0)
+    env = environment(lanes=2, num_envs=3, vehicles=12, ring_m=200.0, spawn=spawn, seed=8)
+    compare(env, env.reset(), duration_s=10.0, rng=random.Random(4), choose=stay_on_the_road)
 
 
 def compare_whole_episodes(episodes: int, goal_m: float) -> None:

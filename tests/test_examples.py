@@ -45,6 +45,14 @@ def test_the_traffic_model_in_the_docs_is_the_one_that_runs():
     assert shown.group(1).strip() in (ROOT / "examples" / "own_traffic.py").read_text()
 
 
+def test_links_between_the_pages_lead_somewhere():
+    pages = list((ROOT / "docs").glob("*.md"))
+    links = {(page.name, link) for page in pages for link in re.findall(r"\]\(([^)#]+)", page.read_text())}
+    local = sorted((page, link) for page, link in links if not link.startswith("https:"))
+    assert local
+    assert [(page, link) for page, link in local if not (ROOT / "docs" / link).exists()] == []
+
+
 def test_the_docs_name_only_files_that_exist():
     missing = []
     for page in (ROOT / "docs").glob("*.md"):

@@ -9,10 +9,11 @@ a file and reads it back.
 """
 
 from ganlane.agents.checkpoint import agent_file, load_agent, read_agent, save_agent, transfer
+from ganlane.agents.config import RainbowConfig
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import NetworkConfig, QNetwork
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy
-from ganlane.agents.rainbow import Rainbow, RainbowConfig
+from ganlane.agents.rainbow import Rainbow
 
 __all__ = [
     "ExploringPolicy",

@@ -17,6 +17,7 @@ from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
 
 
 class Driver(TensorDictModuleBase):
@@ -85,8 +86,13 @@ class MobilDriver(Driver):
         self.idm, self.mobil = idm, mobil
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
-        """MOBIL's wish as an action."""
+        """MOBIL's wish as an action, in the decisions in which a second of simulated time is full."""
         wish = mobil_wishes(ego_scene(vehicles, self.road), self.road, self.idm, self.mobil)[:, 0]
+        step, decisions = tensordict.get(keys.STEP), tensordict.get(keys.EGO).get("decisions")
+        # All decisions take the same number of steps, so the last one was at step - step / decisions.
+        last = step - step // decisions.clamp_min(1)
+        due = (decisions == 0) | (step // MOBIL_PERIOD_STEPS != last // MOBIL_PERIOD_STEPS)
+        wish = torch.where(due, wish, 0)
         return torch.where(wish > 0, LEFT, torch.where(wish < 0, RIGHT, keys.KEEP))
 
 

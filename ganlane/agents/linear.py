@@ -13,18 +13,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_ONEDNN = False
+_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
-def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """``x @ weight.T + bias`` for ``x`` [*, I], ``weight`` [O, I] and ``bias`` [O]."""
-    if _ONEDNN and x.device.type == "cpu" and x.dtype == torch.float32 and x.dim() == 2:
-        return _OneDnnLinear.apply(x, weight, bias)
-    return functional.linear(x, weight, bias)
+def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
+    """``x @ weight.T + bias`` for ``x`` [*, I], ``weight`` [O, I] and ``bias`` [O]; then a ReLU, if asked for."""
+    fast = _ONEDNN and x.device.type == "cpu" and x.dtype == torch.float32 and x.dim() == 2
+    if fast and not torch.is_grad_enabled():
+        return _product(x, weight, bias, relu)
+    product = _OneDnnLinear.apply(x, weight, bias) if fast else functional.linear(x, weight, bias)
+    return torch.relu(product) if relu else product
 
 
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
+def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
+    return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
 
 
 class _OneDnnLinear(torch.autograd.Function):

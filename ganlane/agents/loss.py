@@ -1,7 +1,7 @@
 """TorchRL's DQN losses with a lean forward on plain tensors.
 
 :class:`LeanDistributionalLoss` equals :class:`torchrl.objectives.DistributionalDQNLoss` (Bellemare et al. 2017,
-double) to 1e-6 and takes a third of its time; :class:`LeanDQNLoss` does the same for the plain DQN loss. Both keep
+double) to 1e-6 and takes half of its time; :class:`LeanDQNLoss` does the same for the plain DQN loss. Both keep
 TorchRL's parameter containers, so a TorchRL user finds ``value_network_params`` and the target where expected.
 """
 
@@ -16,34 +16,9 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
-from ganlane.agents.network import QNetwork
-
-
-def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
-    """Project the distribution with ``probabilities`` [B, K] at ``values`` [B, K] onto ``support`` [K].
-
-    Values outside the support are clamped to its ends. Each mass is split between its two neighbours in proportion
-    to the nearness of the other (Bellemare et al. 2017, equation 7); the mean is kept but for the clamping.
-    """
-    low, high, atoms = support[0], support[-1], support.numel()
-    place = (values.clamp(low, high) - low) * ((atoms - 1) / (high - low))
-    lower = place.floor().clamp_max(atoms - 2)
-    share = (place - lower) * probabilities
-    index = lower.long()
-    projected = torch.zeros_like(probabilities)
-    projected.scatter_add_(1, index, probabilities - share)
-    return projected.scatter_add_(1, index + 1, share)
-
-
-def outside_support(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
-    """Probability mass that :func:`project` clamps, averaged over the batch, 0-dim."""
-    outside = (values < support[0]) | (values > support[-1])
-    return (probabilities * outside).sum(-1).mean()
-
-
-def pick(rows: Tensor, action: Tensor) -> Tensor:
-    """Rows [B, K] of ``rows`` [B, A, K] at the actions [B]."""
-    return rows.gather(1, action.view(-1, 1, 1).expand(-1, 1, rows.shape[-1])).squeeze(1)
+from ganlane.agents.config import RainbowConfig
+from ganlane.agents.network import QNetwork, Weights
+from ganlane.agents.projection import outside_support, pick, project
 
 
 class _TargetNetwork:
@@ -97,9 +72,10 @@ class LeanDistributionalLoss(_TargetNetwork, DistributionalDQNLoss):
         ``reward`` and ``terminated`` [B, 1]; writes ``td_error`` [B, 1]. Returns ``loss`` [B] and, 0-dim,
         ``clamped_fraction`` (mass of the targets outside the support) and ``mean_q`` (of the best next action).
         """
+        weights = self.network.weights()
         with torch.no_grad():
-            target, clamped, mean_q = self._target(batch)
-        logits = self.network.logits(batch.get("observation"))
+            target, clamped, mean_q = self._target(batch, weights)
+        logits = self.network.logits(batch.get("observation"), weights)
         log_p = pick(logits, batch.get("action")).log_softmax(-1)
         loss = -(target * log_p).sum(-1)
         priority = loss.detach()
@@ -108,11 +84,11 @@ class LeanDistributionalLoss(_TargetNetwork, DistributionalDQNLoss):
         batch.set("td_error", priority[:, None])
         return TensorDict({"loss": loss, "clamped_fraction": clamped, "mean_q": mean_q})
 
-    def _target(self, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def _target(self, batch: TensorDictBase, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
         """Projected distribution of the Bellman targets [B, atoms], its clamped mass, the mean best value."""
         following, support = batch.get(("next", "observation")), self.network.support
         target_logits = self.target_network.logits(following)
-        choosing = self.network.logits(following) if self.double else target_logits
+        choosing = self.network.logits(following, weights) if self.double else target_logits
         best, action = self.network.expected(choosing).max(-1)
         probabilities = pick(target_logits, action).softmax(-1)
         discount = self.gamma ** batch.get("steps_to_next_obs")
@@ -160,3 +136,10 @@ class LeanDQNLoss(_TargetNetwork, DQNLoss):
         discount = self.discount ** batch.get("steps_to_next_obs")
         target = batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
         return target.squeeze(-1), best.mean()
+
+
+def make_loss(network: QNetwork, config: RainbowConfig) -> LeanDistributionalLoss | LeanDQNLoss:
+    """The loss that ``config`` asks for."""
+    if config.distributional:
+        return LeanDistributionalLoss(network, config.gamma, config.double, config.kl_priority)
+    return LeanDQNLoss(network, config.gamma, config.double)

@@ -19,6 +19,9 @@ from torchrl.modules import NoisyLinear
 from ganlane.agents.linear import linear
 from ganlane.errors import UserError
 
+#: Weight and bias of each layer.
+Weights = list[tuple[Tensor, Tensor]]
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -49,7 +52,8 @@ class NetworkConfig:
 class QNetwork(nn.Module):
     """Action values [*, A], as a distribution over ``support`` [atoms] or as plain numbers.
 
-    Noise is added under ``ExplorationType.RANDOM`` alone and stays the same until :func:`redraw_noise`.
+    Noise is added under ``ExplorationType.RANDOM`` alone and stays the same until it is drawn anew
+    (:func:`ganlane.agents.noise.redraw_noise`).
     """
 
     support: Tensor
@@ -68,12 +72,20 @@ class QNetwork(nn.Module):
             return NoisyLinear(inputs, outputs, std_init=self.config.noisy_sigma)
         return nn.Linear(inputs, outputs)
 
-    def logits(self, observation: Tensor) -> Tensor:
-        """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations [*, D]."""
+    def weights(self) -> Weights:
+        """Weight and bias of every layer, the head last, with the present noise (see the class) added."""
+        return [(layer.weight, layer.bias) for layer in (*self.trunk, self.head)]
+
+    def logits(self, observation: Tensor, weights: Weights | None = None) -> Tensor:
+        """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations [*, D].
+
+        ``weights`` of :meth:`weights` save composing them again when several batches see the same noise.
+        """
+        *hidden_layers, head = self.weights() if weights is None else weights
         hidden = observation.to(self.support.dtype)
-        for layer in self.trunk:
-            hidden = torch.relu(linear(hidden, layer.weight, layer.bias))
-        rows = linear(hidden, self.head.weight, self.head.bias).unflatten(-1, (-1, self.config.outputs))
+        for weight, bias in hidden_layers:
+            hidden = linear(hidden, weight, bias, relu=True)
+        rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
         return duel(rows) if self.config.dueling else rows
 
     def forward(self, observation: Tensor) -> Tensor:
@@ -98,36 +110,6 @@ def duel(rows: Tensor) -> Tensor:
     """Join value (row 0) and advantages (the rest) of [*, 1 + A, atoms] into [*, A, atoms] (Wang et al. 2016)."""
     value, advantage = rows[..., :1, :], rows[..., 1:, :]
     return value + advantage - advantage.mean(-2, keepdim=True)
-
-
-def noisy_layers(module: nn.Module) -> list[NoisyLinear]:
-    """Every noisy layer of ``module``, in a fixed order."""
-    return [layer for layer in module.modules() if isinstance(layer, NoisyLinear)]
-
-
-@torch.no_grad()
-def redraw_noise(module: nn.Module, generator: torch.Generator) -> None:
-    """Draw the factorised Gaussian noise of every noisy layer anew.
-
-    In place of TorchRL's ``reset_noise``, which draws from the global generator; one draw serves all layers.
-    """
-    layers = noisy_layers(module)
-    if not layers:
-        return
-    sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
-    normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
-    noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
-    for layer, inputs, outputs in zip(layers, noise[::2], noise[1::2]):
-        torch.outer(outputs, inputs, out=layer.weight_epsilon)
-        layer.bias_epsilon.copy_(outputs)
-
-
-def mean_sigma(module: nn.Module) -> Tensor:
-    """Mean absolute noise parameter over the weights of the noisy layers, 0-dim; 0 without noise."""
-    layers = noisy_layers(module)
-    if not layers:
-        return torch.zeros(())
-    return torch.stack([layer.weight_sigma.detach().abs().mean() for layer in layers]).mean()
 
 
 def parameters_of(network: QNetwork) -> dict[str, Tensor]:

@@ -11,7 +11,8 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ganlane import keys
-from ganlane.agents.network import QNetwork, redraw_noise
+from ganlane.agents.network import QNetwork
+from ganlane.agents.noise import redraw_noise
 
 #: Gives the legal actions, [N, A] bool, of what the environment wrote.
 LegalActions = Callable[[TensorDictBase], Tensor]

@@ -3,87 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss
+from ganlane.agents.config import RainbowConfig
+from ganlane.agents.loss import make_loss
 from ganlane.agents.n_step import NStepWindow
-from ganlane.agents.network import (
-    NetworkConfig,
-    QNetwork,
-    load_parameters,
-    mean_sigma,
-    parameters_of,
-    redraw_noise,
-)
+from ganlane.agents.network import QNetwork, load_parameters, parameters_of
+from ganlane.agents.noise import mean_sigma, redraw_noise
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
 from ganlane.agents.replay import annealed, load_replay_state, make_replay, replay_state
 from ganlane.errors import UserError
-
-
-@dataclass(frozen=True)
-class RainbowConfig:
-    """Hyperparameters; the values are for one update of 256 per 64 decisions.
-
-    Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
-    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon (the share of
-    random legal actions) is used without noisy layers only. ``adam_eps=None`` stands for 0.005 / ``batch_size``.
-    ``warmup`` is the number of transitions before the first update.
-    """
-
-    hidden: tuple[int, ...] = (256, 256)
-    noisy: bool = True
-    dueling: bool = True
-    distributional: bool = True
-    double: bool = True
-    prioritised: bool = True
-    n_step: int = 3
-    gamma: float = 0.99
-    atoms: int = 51
-    v_min: float = -120.0
-    v_max: float = 120.0
-    noisy_sigma: float = 0.5
-    batch_size: int = 256
-    capacity: int = 1_000_000
-    warmup: int = 20_000
-    decisions_per_update: int = 64
-    target_period: int = 500
-    learning_rate: float = 2.5e-4
-    adam_eps: float | None = None
-    gradient_clip: float = 10.0
-    alpha: float = 0.5
-    beta_start: float = 0.4
-    beta_updates: int = 100_000
-    kl_priority: bool = True
-    epsilon_start: float = 1.0
-    epsilon: float = 0.02
-    epsilon_decisions: int = 100_000
-
-    def __post_init__(self) -> None:
-        for name in ("n_step", "atoms", "batch_size", "capacity", "decisions_per_update", "target_period"):
-            if getattr(self, name) < 1:
-                raise UserError(f"agent.{name}={getattr(self, name)}: expected at least 1; give a positive number.")
-        if not 0.0 < self.gamma <= 1.0:
-            raise UserError(f"agent.gamma={self.gamma}: expected a discount above 0 and at most 1.")
-        if self.v_min >= self.v_max or (self.distributional and self.atoms < 2):
-            raise UserError(
-                f"agent.v_min={self.v_min}, agent.v_max={self.v_max}, agent.atoms={self.atoms}: expected v_min below "
-                "v_max and at least 2 atoms; widen the support."
-            )
-        if not self.batch_size <= self.warmup <= self.capacity:
-            raise UserError(
-                f"agent.warmup={self.warmup}: expected at least agent.batch_size={self.batch_size} and at most "
-                f"agent.capacity={self.capacity} transitions."
-            )
-
-    def network(self, observation_size: int, actions: int) -> NetworkConfig:
-        """The network's config for observations of size D and A actions."""
-        shared = {f.name: getattr(self, f.name) for f in fields(NetworkConfig) if hasattr(self, f.name)}
-        return NetworkConfig(observation_size=observation_size, actions=actions, **shared)
 
 
 class Rainbow:
@@ -115,9 +49,9 @@ class Rainbow:
             for i, name in enumerate(("collect", "learn", "replay"))
         }
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)
             self.network = QNetwork(config.network(observation_size, actions)).to(self.device)
-        self.loss = make_loss(self.network, config).to(self.device)
+        self.loss = make_loss(self.network, config)
         self.optimizer = torch.optim.Adam(
             self.network.parameters(),
             lr=config.learning_rate,
@@ -211,6 +145,7 @@ class Rainbow:
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Everything an exact resume needs, as tensors and plain data; noise is redrawn before use, so not here."""
         return {
+            "config": asdict(self.config),
             "network": self.weights(),
             "target": parameters_of(self.loss.target_network),
             "optimizer": self.optimizer.state_dict(),
@@ -220,7 +155,17 @@ class Rainbow:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict`; if it was made without the buffer, the buffer is empty afterwards."""
+        """Restore :meth:`state_dict`; if it was made without the buffer, the buffer is empty afterwards.
+
+        Raises:
+            UserError: it is the state of an agent with other hyperparameters or another observation.
+        """
+        for name, value in asdict(self.config).items():
+            if state["config"].get(name) != value:
+                raise UserError(
+                    f"agent.{name}={value}: the saved agent has {state['config'].get(name)}; give the same to go on "
+                    "from it."
+                )
         load_parameters(self.network, state["network"])
         load_parameters(self.loss.target_network, state["target"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -230,10 +175,3 @@ class Rainbow:
         self.replay.empty()
         if state["replay"] is not None:
             load_replay_state(self.replay, state["replay"])
-
-
-def make_loss(network: QNetwork, config: RainbowConfig) -> LeanDistributionalLoss | LeanDQNLoss:
-    """The loss that ``config`` asks for."""
-    if config.distributional:
-        return LeanDistributionalLoss(network, config.gamma, config.double, config.kl_priority)
-    return LeanDQNLoss(network, config.gamma, config.double)

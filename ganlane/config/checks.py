@@ -24,27 +24,34 @@ def _finite(value: Any) -> bool:
 
 def at_least(low: float) -> Rule:
     """Finite and not below ``low``."""
-    return Rule(lambda value: _finite(value) and value >= low, f"at least {low:g}")
+    return Rule(lambda value: _finite(value) and value >= low, f"at least {_shown(low)}")
 
 
 def above(low: float) -> Rule:
     """Finite and above ``low``."""
-    return Rule(lambda value: _finite(value) and value > low, f"a number above {low:g}")
+    return Rule(lambda value: _finite(value) and value > low, f"a number above {_shown(low)}")
 
 
 def below(high: float) -> Rule:
     """Finite and below ``high``."""
-    return Rule(lambda value: _finite(value) and value < high, f"a number below {high:g}")
+    return Rule(lambda value: _finite(value) and value < high, f"a number below {_shown(high)}")
 
 
 def between(low: float, high: float) -> Rule:
     """From ``low`` to ``high``, both included."""
-    return Rule(lambda value: _finite(value) and low <= value <= high, f"a number from {low:g} to {high:g}")
+    return Rule(
+        lambda value: _finite(value) and low <= value <= high, f"a number from {_shown(low)} to {_shown(high)}"
+    )
 
 
 def number() -> Rule:
     """Finite."""
     return Rule(_finite, "a finite number")
+
+
+def text() -> Rule:
+    """Not empty."""
+    return Rule(lambda value: isinstance(value, str) and value != "", "a text that is not empty")
 
 
 def one_of(names: Iterable[str]) -> Rule:
@@ -104,6 +111,8 @@ def _shown(value: Any) -> str:
     """As one would type it."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
+    if isinstance(value, list):
+        return f"[{','.join(map(_shown, value))}]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

@@ -10,9 +10,10 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from ganlane.config.messages import CONFIG_ERRORS, as_user_error
+from ganlane.config.messages import CONFIG_ERRORS, sentence
 from ganlane.config.overrides import parse, single_runs
 from ganlane.config.store import register
+from ganlane.errors import UserError
 from ganlane.paths import conf_folder
 
 VERSION_BASE = "1.3"
@@ -36,7 +37,7 @@ def typed(composed: DictConfig) -> Any:
     try:
         return OmegaConf.to_object(composed)
     except CONFIG_ERRORS as error:
-        raise as_user_error(error) from error
+        raise UserError(sentence(error)) from error
 
 
 def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Checked:
@@ -57,7 +58,7 @@ def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Che
         with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
             checked = [_check_one(command, run) for run in runs]
     except CONFIG_ERRORS as error:
-        raise as_user_error(error) from error
+        raise UserError(sentence(error)) from error
     return checked[0]
 
 

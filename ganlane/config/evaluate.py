@@ -9,11 +9,27 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.run import GeneratorFile, RunConfig
-from ganlane.config.traffic import TrafficConfig
+from ganlane.config.traffic import (
+    GanCalibratedTrafficConfig,
+    GanTrafficConfig,
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+    TrafficConfig,
+)
 from ganlane.errors import UserError
 
 #: A list of names without repetitions.
 NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
+
+
+def all_traffics() -> dict[str, TrafficConfig]:
+    """The options of the group ``traffic``, by name."""
+    return {
+        "idm": IdmTrafficConfig(),
+        "idm_mobil": IdmMobilTrafficConfig(),
+        "gan": GanTrafficConfig(),
+        "gan_calibrated": GanCalibratedTrafficConfig(),
+    }
 
 
 @dataclass
@@ -28,7 +44,7 @@ class EvaluateConfig(RunConfig):
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
-    traffic_options: dict[str, TrafficConfig] = field(default_factory=dict)
+    traffic_options: dict[str, TrafficConfig] = field(default_factory=all_traffics)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""Hydra's and OmegaConf's errors as one sentence that names the value, what was expected and what to do."""
+"""Errors of Hydra, OmegaConf and the file system as one sentence: the value, what was expected, what to do."""
 
 from __future__ import annotations
 
@@ -7,49 +7,43 @@ from collections.abc import Iterable
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
-from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ganlane.config.checks import did_you_mean
 from ganlane.errors import UserError
 
+#: What Hydra and OmegaConf raise for a configuration that will not do.
+CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
+#: What a path that cannot be read or written to raises.
+FILE_ERRORS = (PermissionError, FileNotFoundError, NotADirectoryError, IsADirectoryError, FileExistsError)
+
 #: OmegaConf's names of types in words.
-_TYPES = {
-    "Integer": "a whole number",
-    "Float": "a number",
-    "Boolean": "true or false",
-    "String": "a text",
-    "int": "a whole number",
-    "float": "a number",
-    "bool": "true or false",
-    "str": "a text",
-}
+_TYPES = {"Integer": "a whole number", "Float": "a number", "bool": "true or false", "String": "a text"}
 _HELP = "run the command with --help to see all keys"
 
 
-def as_user_error(error: Exception) -> UserError:
-    """What to tell the user about an error of Hydra or OmegaConf."""
-    cause = error.__cause__
-    if isinstance(error, MissingConfigException):
-        return UserError(_missing_option(error))
+def sentence(error: BaseException) -> str:
+    """What to tell the user."""
+    if isinstance(error, UserError):
+        return _one_line(error) + "."
+    if isinstance(error, MissingConfigException):  # an OSError, too
+        return _missing_option(error)
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}; check the path and its permissions."
     if isinstance(error, OverrideParseException):
-        return UserError(
-            f"{error.override}: not of the form key=value; quote values with spaces or brackets, {_HELP}."
-        )
-    if isinstance(error, OmegaConfBaseException):
-        return UserError(_omegaconf(error))
-    if isinstance(cause, OmegaConfBaseException):
-        return UserError(_omegaconf(cause))
-    return UserError(_one_line(error) + f"; {_HELP}.")
+        return f"{error.override}: not of the form key=value; quote values with spaces or brackets, {_HELP}."
+    found = error if isinstance(error, OmegaConfBaseException) else error.__cause__
+    return _value(found) if isinstance(found, OmegaConfBaseException) else _composition(error)
 
 
-def _one_line(error: Exception) -> str:
-    """The error's text without line breaks and final stop."""
+def _one_line(error: BaseException | str) -> str:
+    """The text without line breaks and final stop."""
     return re.sub(r"\s+", " ", str(error)).strip().rstrip(".")
 
 
 def option_names(options: Iterable[str] | None) -> list[str]:
-    """Names that a user may choose: schemas and Hydra's own file are not among them."""
-    return sorted(name for name in options or () if not name.endswith("_schema") and name != "hydra_run")
+    """Names that a user may choose: schemas are not among them."""
+    return sorted(name for name in options or () if not name.endswith("_schema"))
 
 
 def _missing_option(error: MissingConfigException) -> str:
@@ -61,21 +55,36 @@ def _missing_option(error: MissingConfigException) -> str:
     return f"{group}={name}: no such option{did_you_mean(name, known)}; choose one of {', '.join(known)}."
 
 
-def _omegaconf(error: OmegaConfBaseException) -> str:
+def _composition(error: BaseException) -> str:
+    """Options that do not fit the command."""
+    text = _one_line(error)
+    group = re.search(r"Could not override '([^']+)'", text)
+    if group:
+        hint = f" (did you mean {group[1]}s=[NAME,NAME]?)" if group[1] in ("agent", "traffic") else ""
+        return f"{group[1]}: not an option of this command{hint}; {_HELP}."
+    sweep = re.search(r"Ambiguous value for argument '([^']+)'", text)
+    if sweep:
+        return f"{sweep[1]}: several values; write key=[a,b] for a list, or add -m for a sweep."
+    return f"{text}; {_HELP}."
+
+
+def _value(error: OmegaConfBaseException) -> str:
     """An unknown key, a value of the wrong type, or whatever else OmegaConf found."""
     key = (error.full_key or str(error.key or "")).removeprefix(".")
-    if isinstance(error, ConfigKeyError) or error.__class__.__name__ == "ConfigAttributeError":
+    if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         return _unknown_key(key, error)
-    text = (error.msg or str(error)).splitlines()[0]
-    wanted = re.search(r"could not be converted to (\w+)", text) or re.search(r"field of type '(\w+)'", text)
-    value = re.search(r"[Vv]alue '(.*?)'", text)
+    text = _one_line(error.msg or str(error))
+    value = re.search(r"[Vv]alue '(.*?)' ", text)
+    wanted = re.search(r"could not be converted to (\w+)", text) or re.search(r"not a valid (bool)", text)
     if wanted and value and wanted[1] in _TYPES:
         return f"{key}={_typed(value[1])}: expected {_TYPES[wanted[1]]}; {_HELP}."
+    if "not Optional" in text or "non-optional" in text:
+        return f"{key}=null: a value is needed; {_HELP}."
     if "ListConfig" in text:
         return f"{key}: expected a list in brackets, for instance {key}=[...]; {_HELP}."
-    if "MISSING" in text or "Missing mandatory" in text:
-        return f"{key}: a value is missing; give {key}=VALUE."
-    return f"{key}: {_one_line(Exception(text))}; {_HELP}."
+    if "not a subclass" in text or text.startswith("Cannot assign"):
+        return f"{key}: holds keys of its own; give {key}.NAME=VALUE; {_HELP}."
+    return f"{key}: {text.partition(' full_key')[0]}; {_HELP}."
 
 
 def _typed(value: str) -> str:
@@ -85,12 +94,10 @@ def _typed(value: str) -> str:
 
 def _unknown_key(key: str, error: OmegaConfBaseException) -> str:
     parent, _, name = key.rpartition(".")
+    if parent.endswith(".parameters"):
+        return f"{key}: to be added with +; write +{key}=VALUE."
     known = sorted(map(str, error.parent_node.keys())) if OmegaConf.is_dict(error.parent_node) else []
     known = [other for other in known if other != "hydra"]
     where = f"{parent} has" if parent else "known are"
     listed = f"; {where} {', '.join(known)}" if known else f"; {_HELP}"
     return f"{key}: no such key{did_you_mean(name, known)}{listed}."
-
-
-#: What Hydra and OmegaConf raise for a configuration that will not do.
-CONFIG_ERRORS = (HydraException, OmegaConfBaseException)

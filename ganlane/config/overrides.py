@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -12,10 +12,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType
 
 from ganlane.errors import UserError
+from ganlane.paths import conf_folder
 
 
-def parse_arguments(arguments: Sequence[str]) -> Namespace:
-    """Hydra's flags and the overrides.
+#: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
+ALIASES = {"render": {"agent": "driver"}}
+
+
+def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
+    """Hydra's flags and the overrides of a command.
 
     Raises:
         UserError: an unknown flag.
@@ -26,15 +31,37 @@ def parse_arguments(arguments: Sequence[str]) -> Namespace:
         raise UserError(f"{message}; run the command with --help or --hydra-help to see the flags.")
 
     parser.error = refuse  # type: ignore[method-assign]
-    return parser.parse_args(list(arguments))
+    flags = parser.parse_args(list(arguments))
+    flags.overrides = [_renamed(override, ALIASES.get(command, {})) for override in flags.overrides]
+    return flags
+
+
+def _renamed(override: str, aliases: Mapping[str, str]) -> str:
+    key, equals, value = override.partition("=")
+    return f"{aliases.get(key, key)}{equals}{value}"
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    """The overrides as Hydra understands them, with those refused that would add or delete keys."""
+    """The overrides as Hydra understands them, with those refused that would add or delete keys or name no option.
+
+    Raises:
+        UserError: as the summary says.
+        hydra.errors.OverrideParseException: one is not of the form key=value.
+    """
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     for override in parsed:
         _refuse_new_keys(override)
+        _refuse_no_option(override)
     return parsed
+
+
+def _refuse_no_option(override: Override) -> None:
+    """A group takes the name of one option."""
+    group = override.key_or_group
+    chosen = override.is_sweep_override() or isinstance(override.value(), str)
+    if not chosen and (conf_folder() / group).is_dir():
+        names = ", ".join(sorted(path.stem for path in (conf_folder() / group).glob("*.yaml")))
+        raise UserError(f"{override.input_line}: expected the name of one option; choose one of {names}.")
 
 
 def _refuse_new_keys(override: Override) -> None:

@@ -2,45 +2,44 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from ganlane.config.folders import OVERRIDES
 from ganlane.config.overrides import parse, without_repetitions
 from ganlane.errors import UserError
 
-#: The command line of a run, in its folder.
-OVERRIDES = "overrides.yaml"
 _RUNS = Path("outputs")
 
 
-def with_resumed(command: str, flags: Namespace) -> list[str]:
+def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list[str]:
     """The overrides with those of the resumed run before them, and its folder as run folder.
 
     Args:
         command: ``train``; other commands have nothing to resume.
-        flags: the command line.
+        overrides: of the command line.
+        multirun: whether it is a sweep.
 
     Raises:
         UserError: the run is not there, or a sweep was to be resumed.
     """
-    overrides = list(flags.overrides)
-    asked = _asked(overrides)
-    if command != "train" or asked in (None, "null", "None", ""):
-        return overrides
-    if flags.multirun:
+    asked = _asked(overrides) if command == "train" else None
+    if asked is None:
+        return list(overrides)
+    if multirun:
         raise UserError(f"resume={asked}: one run is resumed at a time; start without -m.")
-    run = newest_unfinished(_RUNS / command) if asked == "auto" else run_folder(Path(str(asked)))
+    run = newest_unfinished(_RUNS / command) if asked == "auto" else run_folder(Path(asked))
     if run is None:
         return without_repetitions([*overrides, "resume=null"])
     stored = [str(override) for override in OmegaConf.load(run / OVERRIDES)]
     return without_repetitions([*stored, *overrides, f"resume='{run}'", f"hydra.run.dir='{run}'"])
 
 
-def _asked(overrides: list[str]) -> str | None:
+def _asked(overrides: Sequence[str]) -> str | None:
     values = [override.value() for override in parse(overrides) if override.key_or_group == "resume"]
-    return str(values[-1]) if values and values[-1] is not None else None
+    return str(values[-1]) if values and values[-1] not in (None, "") else None
 
 
 def run_folder(path: Path) -> Path:

@@ -17,7 +17,7 @@ class RunConfig:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        check(self, "", seed=between(0, 2**62), threads=at_least(0), device=one_of(("cpu", "cuda")))
+        check(self, "", seed=between(0, 2**53), threads=at_least(0), device=one_of(("cpu", "cuda")))
         if self.device == "cuda":
             _require_cuda()
 

@@ -10,11 +10,14 @@ from omegaconf import OmegaConf
 
 from ganlane.config.agent import AgentConfig, DqnConfig
 from ganlane.config.collector import CollectorConfig
+from ganlane.config.data import DataConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
+from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorConfig
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig
 from ganlane.config.observation import ObservationConfig
+from ganlane.config.render import RenderConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import (
     GanCalibratedTrafficConfig,
@@ -23,10 +26,16 @@ from ganlane.config.traffic import (
     IdmTrafficConfig,
 )
 from ganlane.config.train import TrainConfig
+from ganlane.config.train_generator import TrainGeneratorConfig
 
 #: Group (empty at the root) to schema name to dataclass.
 SCHEMAS: dict[str, dict[str, Any]] = {
-    "": {"train": TrainConfig, "evaluate": EvaluateConfig},
+    "": {
+        "train": TrainConfig,
+        "evaluate": EvaluateConfig,
+        "render": RenderConfig,
+        "train_generator": TrainGeneratorConfig,
+    },
     "env": {"highway": EnvConfig, "dense": DenseEnvConfig},
     "traffic": {
         "idm": IdmTrafficConfig,
@@ -39,6 +48,8 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "observation": {"observation": ObservationConfig},
     "reward": {"paper": RewardConfig},
     "collector": {"single": CollectorConfig},
+    "data": {"scenes": DataConfig},
+    "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},
     "logger": {"csv": LoggerConfig, "tensorboard": TensorBoardLoggerConfig},
 }
 SUFFIX = "_schema"

@@ -5,9 +5,10 @@ The network's output is a residual on an anchor::
     acceleration         = IDM(own desired speed, own headway) + r - mean(r)
     lateral acceleration = 0.3 (target lane centre - y) - 1.1 v_y + q - mean(q)
 
-with ``r = 4 tanh(. / 4)`` and ``q = 2 tanh(. / 2)`` in m/s2, and exponential means over 3 s (a washout). The
-anchor keeps vehicles on the road, apart, and at their own speeds; the network gives them the variety and the
-reactions of recorded drivers. The same :func:`anchored_step` runs in fitting and in simulation.
+with ``r = 4 tanh(. / 4)`` and ``q = 2 tanh(. / 2)`` in m/s2, and exponential means over 3 s (a washout); what
+would sway the body out of its lane is left out. The anchor keeps vehicles on the road, apart, and at their own
+speeds; the network gives them the variety and the reactions of recorded drivers. The same
+:func:`anchored_step` runs in fitting and in simulation.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from ganlane.sim.neighbours import Scene, leader, perceive
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 
+#: The body keeps this far from the lane's edge, and sways freely up to this much less, m.
+_MARGIN_M, _FADE_M = 0.1, 0.3
 #: Numbers per vehicle beside its motion: IDM's acceleration, gap, closing speed, offset to the target lane.
 EXTRA_INPUTS = 4
 
@@ -79,6 +82,22 @@ def washout(residual: Tensor, mean: Tensor, washout_s: float) -> tuple[Tensor, T
     return residual - mean, mean
 
 
+def inside_lane(residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float) -> Tensor:
+    """Lateral ``residual`` [N, M] without what would carry the body out of its lane, m/s2.
+
+    Drivers sway within their lane and stop short of its edge; what pushes outwards fades over the last
+    :data:`_FADE_M` before the place where the vehicle comes to rest by itself is ``room`` off the centre.
+
+    Args:
+        offset: way to the target lane's centre, m.
+        velocity: lateral, m/s; damped away it carries the vehicle another ``velocity / damping``.
+        room: free space on each side of a vehicle in the middle of its lane, m.
+    """
+    rest = velocity / damping - offset
+    outwards = torch.where(residual > 0, rest, -rest)
+    return residual * ((room - outwards) / _FADE_M).clamp(0.0, 1.0)
+
+
 def bounded(outputs: Tensor, largest: tuple[float, float]) -> Tensor:
     """Outputs [..., 2] softly limited to ``largest``, m/s2."""
     limit = outputs.new_tensor(largest)
@@ -113,6 +132,8 @@ def anchored_step(
     seen = observe(history, difference, vehicles, extra_inputs(scene, anchor_x, offset))
     outputs = generator.decode(generator.summarise(seen), noise, seen, 1)[..., 0, :]
     residual, mean = washout(bounded(outputs, p.residual), memory.mean, p.washout_s)
+    room = 0.5 * (road.lane_width_m - vehicles.width) - _MARGIN_M
+    sway = inside_lane(residual[..., 1], offset, velocity[..., 1], room, p.lane_damping)
     velocity_x = velocity[..., 0] + (anchor_x + residual[..., 0]) * PHYSICS_STEP_S
-    velocity_y = velocity[..., 1] + (anchor_y + residual[..., 1]) * PHYSICS_STEP_S
+    velocity_y = velocity[..., 1] + (anchor_y + sway) * PHYSICS_STEP_S
     return moved_by(vehicles, velocity_x, velocity_y), DriverMemory(history, mean, memory.headway)

@@ -25,6 +25,8 @@ def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
 class MotionLSTM(nn.Module):
     """Embedding with ReLU, then an LSTM cell in two parts: the projection of the input, and the recurrence.
 
+    The gates stand in the order input, forget, output, new: the three that share an activation side by side.
+
     Args:
         embedding: width of the embedding.
         hidden: width H of the LSTM's state.
@@ -59,6 +61,7 @@ class MotionLSTM(nn.Module):
 
     @staticmethod
     def _update(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-        take, keep, new, show = gates.chunk(4, dim=-1)
-        cell = torch.sigmoid(keep) * cell + torch.sigmoid(take) * torch.tanh(new)
-        return torch.sigmoid(show) * torch.tanh(cell), cell
+        width = cell.shape[-1]
+        take, keep, show = torch.sigmoid(gates[..., : 3 * width]).chunk(3, dim=-1)
+        cell = keep * cell + take * torch.tanh(gates[..., 3 * width :])
+        return show * torch.tanh(cell), cell

@@ -59,7 +59,7 @@ def rollout_metrics(
 
     Returns:
         ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
-        "relative_energy", "end_s", "windows"}}`` with the kinds of :func:`stretch_errors`.
+        "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds of :func:`stretch_errors`.
     """
     random = torch.Generator().manual_seed(seed)
     collected: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
@@ -86,5 +86,6 @@ def _summary(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dic
         summary[f"ade_m/{kind}"] = float(errors[:short].mean())
         summary[f"fde_m/{kind}"] = float(errors[short - 1])
         summary[f"end_m/{kind}"] = float(errors[-1])
-    relative = by_step["energy"] / by_step["constant_velocity"].clamp_min(1e-6)
-    return summary | {"relative_energy": float(relative.mean()), "end_s": 0.1 * horizon, "windows": float(count[0])}
+    for kind in ("mean", "energy"):
+        summary[f"relative_{kind}"] = float((by_step[kind] / by_step["constant_velocity"].clamp_min(1e-6)).mean())
+    return summary | {"end_s": 0.1 * horizon, "windows": float(count[0])}

@@ -12,12 +12,16 @@ from ganlane.generator.noise import wander
 from ganlane.generator.stretches import PRESENT, RolloutScenes
 from ganlane.generator.windows import OBSERVED_POSITIONS
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.lanes import Visibility
+from ganlane.sim.lanes import ENTRY_M, Visibility
 from ganlane.sim.vehicles import Vehicles
 
 
 def recorded_vehicles(scenes: RolloutScenes, frame: int, desired_speed: Tensor) -> Vehicles:
-    """The recorded vehicles [B, V] at ``frame`` (1 or later), their velocity the last displacement's."""
+    """The recorded vehicles [B, V] at ``frame`` (1 or later), their velocity the last displacement's.
+
+    Each counts in the lane of its centre alone: recorded lanes are narrow and straightened to some decimetres,
+    so by their bodies (here as good as without width) one in ten would stand in two lanes and be braked for.
+    """
     position = scenes.positions[:, frame]
     velocity = (position - scenes.positions[:, frame - 1]) / PHYSICS_STEP_S
     speed = torch.sqrt((velocity * velocity).sum(-1))
@@ -30,10 +34,10 @@ def recorded_vehicles(scenes: RolloutScenes, frame: int, desired_speed: Tensor) 
         speed=speed,
         acceleration=torch.zeros_like(x),
         length=scenes.length,
-        width=scenes.width,
+        width=torch.full_like(x, 2.0 * ENTRY_M),
         desired_speed=desired_speed,
         target_lane=target,
-        visibility=torch.full_like(target, int(Visibility.BODY)),
+        visibility=torch.full_like(target, int(Visibility.CENTRE)),
         valid=scenes.present[:, frame],
     )
 

@@ -17,6 +17,8 @@ from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 #: Recorded followers' median (gap - 2 m) / speed on US-101, s: what is drawn from without other statistics.
 HEADWAY_QUANTILES_S = (0.50, 0.93, 1.27, 1.93, 3.27)
+#: Shortest headway that a recorded driver is credited with, s.
+SHORTEST_HEADWAY_S = 0.1
 #: Gap at standstill that the headway does not count (Table V), m.
 _MIN_GAP_M = 2.0
 #: Desired speed above the present one, m/s: range drawn from in fitting, and the middle used in evaluation.
@@ -52,7 +54,7 @@ def balanced_headway(scenes: RolloutScenes, desired_speed: Tensor, otherwise: Te
     settled = ahead.gap * torch.sqrt((1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0))
     headway = (settled - _MIN_GAP_M) / vehicles.speed.clamp_min(1.0)
     shown = (ahead.gap < FREE_GAP_M) & (headway <= HEADWAY_QUANTILES_S[-1])
-    return torch.where(shown, headway.clamp_min(HEADWAY_QUANTILES_S[0]), otherwise)
+    return torch.where(shown, headway.clamp_min(SHORTEST_HEADWAY_S), otherwise)
 
 
 def fitting_traits(scenes: RolloutScenes, random: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
+
+STRAIGHT = Road()
 
 
 def _separated(
@@ -51,12 +54,12 @@ def boxes_overlap(
     return ~(by_own | by_other)
 
 
-def ego_overlaps(vehicles: Vehicles) -> Tensor:
+def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether the ego (index 0) overlaps each of the others, bool [N, M - 1]."""
     ego = {name: value[:, :1] for name, value in vehicles.as_dict().items()}
     others = {name: value[:, 1:] for name, value in vehicles.as_dict().items()}
     hit = boxes_overlap(
-        others["x"] - ego["x"],
+        road.distance_ahead(ego["x"], others["x"]),
         others["y"] - ego["y"],
         ego["heading"],
         ego["length"],
@@ -68,11 +71,11 @@ def ego_overlaps(vehicles: Vehicles) -> Tensor:
     return hit & others["valid"] & ego["valid"]
 
 
-def pair_overlaps(vehicles: Vehicles) -> Tensor:
+def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether vehicles i and j overlap, bool [N, M, M], false on the diagonal."""
     v = vehicles
     hit = boxes_overlap(
-        v.x[:, None] - v.x[:, :, None],
+        road.distance_ahead(v.x[:, :, None], v.x[:, None]),
         v.y[:, None] - v.y[:, :, None],
         v.heading[:, :, None],
         v.length[:, :, None],

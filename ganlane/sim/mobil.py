@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ganlane.keys import EGO_INDEX
 from ganlane.sim.following import acceleration_behind
 from ganlane.sim.idm import TABLE_V, IdmParameters, idm_acceleration
 from ganlane.sim.lanes import settled
@@ -85,8 +86,13 @@ def on_road(lane: Tensor, road: Road) -> Tensor:
     return (lane >= 0) & (lane <= road.lanes - 1)
 
 
+def without_ego(wish: Tensor) -> Tensor:
+    """``wish`` [N, M] with nothing wished by the ego: nobody can read its mind."""
+    return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
+
+
 def one_at_a_time(scene: Scene, wish: Tensor, road: Road, within_m: float) -> Tensor:
-    """``wish`` (-1, 0, +1 lanes, [N, K]) without those whose lane somebody ahead of them takes within ``within_m``."""
+    """``wish`` (-1, 0, +1 lanes, [N, K]) less those whose lane somebody ahead takes within ``within_m``."""
     target = scene.observers.target_lane + wish
     wants = wish != 0
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
@@ -122,5 +128,8 @@ def mobil_wishes(scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: 
 def mobil_changes(
     scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
 ) -> Tensor:
-    """Lane change that each driver starts: as :func:`mobil_wishes`, with one vehicle per gap."""
-    return one_at_a_time(scene, mobil_wishes(scene, road, idm, mobil), road, mobil.exclusive_m)
+    """Lane change that each driver starts: as :func:`mobil_wishes`, with one vehicle per gap.
+
+    The ego (vehicle 0) decides for itself: here it wishes for nothing, and holds nobody back.
+    """
+    return one_at_a_time(scene, without_ego(mobil_wishes(scene, road, idm, mobil)), road, mobil.exclusive_m)

@@ -51,7 +51,7 @@ TABLE_II = SpawnParameters()
 
 
 def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
-    """How many come before each, by ``value`` [N, M] and then index, among those for which ``same`` [N, M, M] holds."""
+    """How many come before each, by ``value`` [N, M] and then index, among those where ``same`` [N, M, M] holds."""
     index = torch.arange(value.shape[1], device=value.device)
     mine, other = value[:, :, None], value[:, None, :]
     before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
@@ -72,7 +72,7 @@ def _place_keys(key: Tensor, places: int) -> Tensor:
 
 
 def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
-    """Positions in m, [N, M]: in a lane of k, sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank."""
+    """Positions in m, [N, M]: in a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank."""
     same = lane[:, :, None] == lane[:, None, :]
     count = same.sum(-1)
     room = spread_m - spacing_m * (count - 1)

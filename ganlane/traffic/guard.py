@@ -1,7 +1,7 @@
 """The guard: what keeps a generated vehicle on the road, in its lane and off its leader's bumper.
 
 A network that saw relative positions alone drifts: off the road within a minute, and to any speed. The guard
-stands behind it and corrects what it moved. How much of the driving is the guard's is counted and reported.
+stands behind it and corrects what it moved.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from torch import Tensor
 from ganlane.sim.hazard import distance_hazard, literal_hazard, random_side
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.lanes import settled
-from ganlane.sim.mobil import MobilParameters, one_at_a_time, safe_change
+from ganlane.sim.mobil import MobilParameters, one_at_a_time, safe_change, without_ego
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, Stream, normal, uniform
 from ganlane.sim.road import Road
@@ -145,7 +145,7 @@ class CalibratedLaneChange(Overlay):
         comes = u[..., 0] < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
         side = random_side(u[..., 1], vehicles.target_lane, self.road.lanes)
         free = settled(vehicles, self.road) & vehicles.valid
-        return torch.where(memory["wish"] != 0, memory["wish"], torch.where(comes & free, side, 0))
+        return without_ego(torch.where(memory["wish"] != 0, memory["wish"], torch.where(comes & free, side, 0)))
 
     def rewrite(
         self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor

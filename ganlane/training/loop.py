@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -49,17 +50,21 @@ def train(
         UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not evaluated.
     """
     run = Run(env, agent)
-    if resume is not None:
-        run.restore(resume)
+    exact = resume is None or run.restore(resume)
     saver = Saver(run, run_folder, config, metadata or {})
-    log = Logs(Path(run_folder), config, agent.network.config.actions, run.decisions, logs)
-    if run.decisions > 0 and not agent.ready:
-        log.say("resumed without a full replay buffer: filling it before the next update; not bit-exact")
+    with closing(Logs(Path(run_folder), config, agent.network.config.actions, run.decisions, logs)) as log:
+        if not exact:
+            log.say("resumed without the replay buffer: it is filled again before the next update; not bit-exact")
+        stopped_by = _loop(run, config, evaluate, log, saver)
+    return TrainingResult(run.decisions, agent.updates, run.wall_s, run.best, stopped_by, saver.path)
 
+
+def _loop(run: Run, config: TrainingConfig, evaluate: Evaluate | None, log: Logs, saver: Saver) -> int | None:
+    """The algorithm; the number of the signal that ended it early, or None."""
     with StopRequest() as stop:
         while run.decisions < config.total_decisions and stop.signal is None:
             step = collect(run)
-            agent.store(run.window.push(step))
+            run.agent.store(run.window.push(step))
             learn(run)
             log.advance(run.decisions)
             if run.passed(config.log_every):
@@ -69,8 +74,7 @@ def train(
             if saver.due():
                 saver.save()
         saver.save()
-    log.close()
-    return TrainingResult(run.decisions, agent.updates, run.wall_s, run.best, stop.signal, saver.path)
+    return stop.signal
 
 
 @torch.no_grad()

@@ -9,7 +9,12 @@ from typing import TextIO
 from tqdm import tqdm
 
 #: Figures shown beside the rate, and how.
-SHOWN = {"mean_return": "return {:.1f}", "crash_rate": "crashes {:.1%}", "goal_rate": "goals {:.1%}"}
+SHOWN = {
+    "mean_return": "return {:.1f}",
+    "crash_rate": "crashes {:.1%}",
+    "out_of_road_rate": "off the road {:.1%}",
+    "goal_rate": "goals {:.1%}",
+}
 
 
 class Progress:

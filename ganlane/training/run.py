@@ -52,8 +52,11 @@ class Run:
             "counters": counters,
         }
 
-    def restore(self, path: str | Path) -> None:
+    def restore(self, path: str | Path) -> bool:
         """Go on from the checkpoint of a run with as many environments and the same agent.
+
+        Returns:
+            Whether the replay buffer was in it, so that the rest of the run is the one it would have been.
 
         Raises:
             UserError: unreadable, or of another run.
@@ -71,3 +74,4 @@ class Run:
         self.carrier, counters = carrier, state["counters"]
         self.decisions, self.owed, self.best = (counters[name] for name in ("decisions", "owed", "best"))
         self._before_s = counters["wall_s"]
+        return state["agent"]["replay"] is not None

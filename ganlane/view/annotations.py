@@ -31,7 +31,9 @@ def draw_leader_line(picture: Image.Image, window: Window, trajectory: Trajector
 def draw_counts(picture: Image.Image, window: Window, trajectory: Trajectory, frame: int) -> None:
     """How many vehicles are behind and ahead of the picture."""
     columns = window.column(trajectory.x[frame], trajectory.x[frame, 0])
-    width, valid, top = window.parameters.width, trajectory.valid[frame], HEADER_HEIGHT + 6
+    width, valid = window.parameters.width, trajectory.valid[frame]
+    room_above = window.edges[0] - HEADER_HEIGHT > 2 * _SMALL
+    top = HEADER_HEIGHT + 6 if room_above else window.parameters.height - _SMALL - 6
     behind, ahead = int((valid & (columns < 0)).sum()), int((valid & (columns > width)).sum())
     style.put_text(picture, (12, top), f"{behind} behind" if behind else "", _SMALL, style.FAINT)
     style.put_text(picture, (width - 12, top), f"{ahead} ahead" if ahead else "", _SMALL, style.FAINT, 1.0)

@@ -13,6 +13,8 @@ from ganlane.view.window import HEADER_HEIGHT
 
 #: Titles and widths in pixels of the values, for a picture 1280 pixels wide.
 _VALUES = (("time", 90), ("speed", 100), ("return", 90), ("action", 80))
+#: The largest that leaves room for the values, pixels.
+_TITLE_SIZES = (20, 17, 14, 12)
 #: In a narrower picture the scale of the tints is left out.
 _WIDTH_FOR_TINTS = 1000
 _OUTCOMES = {
@@ -42,7 +44,9 @@ class Header:
         still = Image.new("RGB", (self.width, HEADER_HEIGHT), style.HEADER)
         label = self.trajectory.label
         lanes = f"{label.lanes} lane" + ("s" if label.lanes > 1 else "")
-        style.put_text(still, (16, 8), f"{label.agent}  on  {label.traffic}", 20, style.TEXT)
+        title = f"{label.agent}  on  {label.traffic}"
+        fitting = (size for size in _TITLE_SIZES if style.text_mask(title, size).width < self._columns - 24)
+        style.put_text(still, (16, 8), title, next(fitting, _TITLE_SIZES[-1]), style.TEXT)
         style.put_text(still, (16, 34), f"episode {label.episode}, seed {label.seed}, {lanes}", 12, style.FAINT)
         column = self._columns
         for title, width in _VALUES:

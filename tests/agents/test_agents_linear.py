@@ -21,6 +21,15 @@ def test_values_and_gradients_are_those_of_torch(rows, inputs, outputs):
     torch.testing.assert_close(*results, atol=1e-4, rtol=1e-5)
 
 
+@pytest.mark.parametrize("gradients", [True, False])
+def test_the_relu_is_that_of_torch(gradients):
+    torch.manual_seed(0)
+    x, weight, bias = torch.randn(20, 8), torch.randn(6, 8), torch.randn(6)
+    with torch.set_grad_enabled(gradients):
+        output = linear(x, weight, bias, relu=True)
+    torch.testing.assert_close(output, functional.linear(x, weight, bias).relu(), atol=1e-5, rtol=1e-5)
+
+
 def test_other_types_shapes_and_builds_take_the_ordinary_way(monkeypatch):
     torch.manual_seed(0)
     x, weight, bias = torch.randn(2, 3, 4), torch.randn(5, 4), torch.randn(5)

@@ -30,10 +30,11 @@ def test_the_recurrence_is_torchs_own_lstm():
     torch.manual_seed(2)
     lstm = MotionLSTM(5, 7)
     reference = nn.LSTM(5, 7, batch_first=True)
+    order = torch.arange(28).reshape(4, 7)[[0, 1, 3, 2]].flatten()  # torch's: input, forget, new, output
     with torch.no_grad():
-        reference.weight_ih_l0.copy_(lstm.input.weight)
-        reference.bias_ih_l0.copy_(lstm.input.bias)
-        reference.weight_hh_l0.copy_(lstm.recurrent)
+        reference.weight_ih_l0.copy_(lstm.input.weight[order])
+        reference.bias_ih_l0.copy_(lstm.input.bias[order])
+        reference.weight_hh_l0.copy_(lstm.recurrent[order])
         reference.bias_hh_l0.zero_()
     displacement, difference = torch.randn(4, 6, 2), 0.05 * torch.randn(4, 6, 2)
     embedded = torch.relu(lstm.embed(motion_features(displacement, difference)))

@@ -289,8 +289,7 @@ def physics_step(state: State, rules: Rules) -> None:
         for i, change in mobil_changes(view).items():
             state.cars[i] = replace(state.cars[i], target_lane=state.cars[i].target_lane + change)
     state.cars = [
-        driven(car, a, steered(car, car.target_lane * rules.lane_width))
-        for car, a in zip(state.cars, accelerations)
+        driven(car, a, steered(car, car.target_lane * rules.lane_width)) for car, a in zip(state.cars, accelerations)
     ]
     state.step += 1
 

@@ -55,10 +55,11 @@ def environment(
     visibility: Visibility = Visibility.BODY,
     spawn: SpawnParameters | None = None,
     traffic: TrafficModule | None = None,
+    ring_m: float | None = None,
     **others: object,
 ) -> HighwayEnv:
     """A HighwayEnv in float64 unless told otherwise."""
-    road = Road(lanes=lanes)
+    road = Road(lanes=lanes, ring_m=ring_m)
     traffic = traffic or (IdmMobilTraffic(road) if mobil else IdmTraffic(road))
     return HighwayEnv(
         traffic,
@@ -80,6 +81,7 @@ def rules_of(env: HighwayEnv) -> scalar.Rules:
         substeps=env.episode.substeps(),
         goal=env.episode.goal_m,
         timeout_steps=round(env.episode.timeout_s / 0.1),
+        ring=env.road.ring_m,
     )
 
 

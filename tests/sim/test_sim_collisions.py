@@ -63,7 +63,14 @@ def test_overlap_is_the_same_from_either_side():
 def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
     pairs = random_pairs(2000)
     said = boxes_overlap(*pairs)
-    rest = {"speed": 0.0, "acceleration": 0.0, "desired_speed": 25.0, "target_lane": 0, "visibility": 0, "valid": True}
+    rest = {
+        "speed": 0.0,
+        "acceleration": 0.0,
+        "desired_speed": 25.0,
+        "target_lane": 0,
+        "visibility": 0,
+        "valid": True,
+    }
     for index, (dx, dy, heading, length, width, *other) in enumerate(zip(*(value.tolist() for value in pairs))):
         one = scalar.Car(x=0.0, y=0.0, heading=heading, length=length, width=width, **rest)
         two = scalar.Car(x=dx, y=dy, heading=other[0], length=other[1], width=other[2], **rest)

@@ -44,7 +44,9 @@ def test_a_turned_body_takes_more_room():
         assert seen_in(y=0.44, heading=heading, target_lane=0, visibility=Visibility.BODY) == (0, 1)
 
 
-@pytest.mark.parametrize(("y", "lanes"), [(0.0, (0, 0)), (1.9, (0, 0)), (2.1, (1, 1)), (-3.0, (0, 0)), (30.0, (2, 2))])
+@pytest.mark.parametrize(
+    ("y", "lanes"), [(0.0, (0, 0)), (1.9, (0, 0)), (2.1, (1, 1)), (-3.0, (0, 0)), (30.0, (2, 2))]
+)
 def test_seen_by_its_centre_a_car_is_in_one_lane_of_the_road(y, lanes):
     assert seen_in(y=y, target_lane=1, visibility=Visibility.CENTRE) == lanes
 

@@ -130,12 +130,6 @@ def test_farther_than_60_m_apart_both_go():
     assert changes(FAR_EGO, *pair(61.0)) == [0, 1, 0, -1, 0]
 
 
-def test_the_unspoken_wish_of_the_ego_holds_nobody_back():
-    """Traffic sees what the ego does, not what it might want: only the traffic's own changers compete."""
-    ego, slow, other, slow_too = pair(10.0)
-    assert changes(ego, slow, other, slow_too)[2] == -1
-
-
 def test_at_its_decision_mobil_never_asks_more_than_the_safe_deceleration_of_the_new_follower():
     env = environment(lanes=3, num_envs=256, vehicles=20, seed=5)
     scene = Vehicles.of(env.reset()["vehicles"])

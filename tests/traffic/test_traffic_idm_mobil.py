@@ -7,6 +7,7 @@ import torch
 from reference.worlds import DOUBLE, environment, same_bits, step, vehicles
 
 from ganlane import keys
+from ganlane.sim.mobil import MobilParameters
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule
@@ -14,7 +15,8 @@ from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 
 ROAD = Road(lanes=2)
 EGO = {"x": -1000.0, "lane": 0}
-# The second car wants to overtake the third.
+# The second car wants to overtake the third. (With Table IV the third would politely move aside.)
+SELFISH = MobilParameters(politeness_rear=0.0, politeness_side=0.0)
 CARS = (EGO, {"x": 0.0, "lane": 0, "speed": 20.0}, {"x": 54.5, "lane": 0, "speed": 15.0, "desired_speed": 15.0})
 
 
@@ -31,23 +33,39 @@ def two_rows(scene: Vehicles) -> Vehicles:
 
 def test_mobil_overtakes_and_idm_alone_does_not():
     scene = vehicles(*CARS)
-    assert move(IdmMobilTraffic(ROAD), scene)[0].target_lane.tolist() == [[0, 1, 0]]
+    assert move(IdmMobilTraffic(ROAD, mobil=SELFISH), scene)[0].target_lane.tolist() == [[0, 1, 0]]
     assert move(IdmTraffic(ROAD), scene)[0].target_lane.tolist() == [[0, 0, 0]]
+
+
+def test_a_polite_slow_driver_moves_aside_for_the_one_behind():
+    assert move(IdmMobilTraffic(ROAD), vehicles(*CARS))[0].target_lane.tolist() == [[0, 0, 1]]
 
 
 @pytest.mark.parametrize("step", [1, 5, 9, 11])
 def test_mobil_decides_only_when_a_second_is_full(step):
-    assert move(IdmMobilTraffic(ROAD), vehicles(*CARS), step)[0].target_lane.tolist() == [[0, 0, 0]]
-    assert move(IdmMobilTraffic(ROAD), vehicles(*CARS), 20)[0].target_lane.tolist() == [[0, 1, 0]]
+    assert move(IdmMobilTraffic(ROAD, mobil=SELFISH), vehicles(*CARS), step)[0].target_lane.tolist() == [[0, 0, 0]]
+    assert move(IdmMobilTraffic(ROAD, mobil=SELFISH), vehicles(*CARS), 20)[0].target_lane.tolist() == [[0, 1, 0]]
 
 
 def test_each_row_has_a_clock_of_its_own():
-    moved, _ = move(IdmMobilTraffic(ROAD), two_rows(vehicles(*CARS)), [3, 10])
+    moved, _ = move(IdmMobilTraffic(ROAD, mobil=SELFISH), two_rows(vehicles(*CARS)), [3, 10])
     assert moved.target_lane[:, 1].tolist() == [0, 1]
 
 
+def test_an_unspoken_wish_of_the_ego_holds_nobody_back():
+    """Traffic sees what the ego does, not what it might want.
+
+    The ego would go left if it were MOBIL's to drive; the third car, 10 m behind it, wants into the same lane.
+    """
+    slow = {"speed": 15.0, "desired_speed": 15.0}
+    ego, ahead = {"x": 0.0, "lane": 0}, {"x": 54.5, "lane": 0, **slow}
+    other, ahead_of_it = {"x": -10.0, "lane": 2}, {"x": 44.5, "lane": 2, **slow}
+    traffic = IdmMobilTraffic(Road(lanes=3), mobil=SELFISH)
+    assert move(traffic, vehicles(ego, ahead, other, ahead_of_it))[0].target_lane[0, 2] == 1
+
+
 def test_a_car_beside_a_slow_one_overtakes_it_in_the_end():
-    traffic, scene = IdmMobilTraffic(ROAD), vehicles(*CARS)
+    traffic, scene = IdmMobilTraffic(ROAD, mobil=SELFISH), vehicles(*CARS)
     memory = traffic.fresh_memory(scene, torch.zeros(1).long())
     for number in range(300):
         scene, memory = traffic.move(scene, memory, torch.zeros(1).long(), torch.tensor([number]))
@@ -66,7 +84,9 @@ def test_traffic_is_the_same_whatever_the_decision_period_of_the_ego():
         states.append(td)
     assert torch.any(states[0][keys.VEHICLES, "target_lane"] != env.reset()[keys.VEHICLES, "target_lane"])
     for other in states[1:]:
-        assert same_bits(states[0].select(keys.VEHICLES, keys.TRAFFIC), other.select(keys.VEHICLES, keys.TRAFFIC)) == []
+        assert (
+            same_bits(states[0].select(keys.VEHICLES, keys.TRAFFIC), other.select(keys.VEHICLES, keys.TRAFFIC)) == []
+        )
 
 
 @pytest.mark.parametrize("kind", [IdmTraffic, IdmMobilTraffic])

@@ -3,6 +3,10 @@
 import csv
 import os
 import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,6 +17,7 @@ from training.toy import ToyRoad
 from ganlane.agents import Rainbow, RainbowConfig, load_agent
 from ganlane.errors import UserError
 from ganlane.training import TrainingConfig, train
+from ganlane.training.checkpoints import load_checkpoint
 from ganlane.training.run import Run
 from ganlane.training.saver import Saver
 
@@ -185,3 +190,49 @@ def test_training_leaves_the_global_random_state_alone(tmp_path):
     before = torch.get_rng_state()
     train(ToyRoad(8), agent(), settings(160), tmp_path)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_checkpoint_made_before_the_buffer_was_full_is_exact_all_the_same(tmp_path, capsys):
+    whole, resumed = agent(), agent()
+    train(ToyRoad(8), whole, settings(160), tmp_path / "whole")
+    first = train(ToyRoad(8), agent(), settings(40), tmp_path / "parts")
+    train(ToyRoad(8), resumed, settings(160), tmp_path / "parts", resume=first.checkpoint)
+    assert same(whole, resumed)
+    assert "bit-exact" not in capsys.readouterr().err
+
+
+def test_writing_checkpoints_takes_at_most_a_fiftieth_of_the_time(tmp_path, monkeypatch):
+    saver = Saver(Run(ToyRoad(8), agent()), tmp_path, settings(80, checkpoint_every_s=0.0), {})
+    monkeypatch.setattr("ganlane.training.saver.save_checkpoint", lambda path, state: time.sleep(0.1))
+    saver.save()
+    assert saver.pause_s > 5.0
+    assert not saver.due()
+
+
+KILLED = """
+import sys
+sys.path[:0] = [{tests!r}]
+from training.test_training_loop import ToyRoad, agent, settings, train
+import ganlane.training.saver as saver
+saver.PATIENCE = 0.0
+train(ToyRoad(8), agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_s", [0.0, 0.11, 0.53])
+def test_a_run_killed_at_any_moment_leaves_a_checkpoint_to_go_on_from(after_s, tmp_path):
+    folder, tests = tmp_path / "parts", Path(__file__).resolve().parent.parent
+    script = KILLED.format(tests=str(tests), folder=str(folder))
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=tests.parent)
+    while not (folder / "checkpoints" / "last.pt").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    time.sleep(after_s)
+    process.kill()
+    process.wait()
+    resumed, whole = agent(), agent()
+    reached = int(load_checkpoint(folder / "checkpoints" / "last.pt")["counters"]["decisions"])
+    train(ToyRoad(8), resumed, settings(reached + 400), folder, resume=folder / "checkpoints" / "last.pt")
+    train(ToyRoad(8), whole, settings(reached + 400), tmp_path / "whole")
+    assert same(whole, resumed)

@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import sys
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from ganlane.training.config import TrainingConfig
 from ganlane.training.log import CsvLog
 from ganlane.training.meter import Meter
 from ganlane.training.progress import Progress, duration
+from ganlane.training.tensorboard import TensorBoardLog
 
 
 def step(reward, done, crash=None, goal=None, distance=0.0, lane_changes=0, action=0):
@@ -116,6 +118,20 @@ def test_progress_on_a_terminal_is_a_bar():
 
 def test_durations_are_read_as_hours_minutes_seconds():
     assert duration(3723.4) == "1:02:03"
+
+
+def test_tensorboard_gets_every_figure(tmp_path):
+    pytest.importorskip("tensorboard")
+    log = TensorBoardLog(tmp_path)
+    log.write({"decisions": 100, "loss": 0.5})
+    log.close()
+    assert any(path.name.startswith("events") for path in tmp_path.iterdir())
+
+
+def test_a_missing_tensorboard_is_named_with_the_command_that_mends_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(UserError, match=r"pip install 'ganlane\[tensorboard\]'"):
+        TensorBoardLog(tmp_path)
 
 
 # --- checkpoint files

@@ -1,0 +1,56 @@
+"""Run folders: what stands in each, and that a mistake leaves none behind."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ganlane.errors import UserError
+
+#: The command line of a run, in its folder.
+OVERRIDES = "overrides.yaml"
+CONFIG = "config.yaml"
+
+
+@contextmanager
+def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterator[None]:
+    """Remove what a user's mistake leaves of a folder that was not there before, and of the folders above it.
+
+    A sweep's folder stays where some of its runs have results.
+
+    Args:
+        folder: the run's or the sweep's.
+        existed: whether it held something before; by default, whether it is there now.
+    """
+    existed = folder.exists() if existed is None else existed
+    made = [parent for parent in folder.parents if not parent.exists()]
+    try:
+        yield
+    except BaseException as error:
+        is_mistake = isinstance(error, UserError | OSError)
+        if is_mistake and not existed and not any(folder.rglob("results.json")):
+            shutil.rmtree(folder, ignore_errors=True)
+            _remove_empty(made)
+        raise
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove those of ``folders``, innermost first, that hold nothing."""
+    for folder in folders:
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def write_down(composed: Any, folder: Path) -> None:
+    """What was asked for, in the run folder: all values in ``config.yaml``, the command line in ``overrides.yaml``."""
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+
+    from ganlane.files import write_bytes
+
+    asked = [str(override) for override in HydraConfig.get().overrides.task]
+    write_bytes(folder / CONFIG, OmegaConf.to_yaml(composed, resolve=True).encode())
+    write_bytes(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(asked)).encode())

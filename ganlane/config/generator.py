@@ -1,0 +1,136 @@
+"""``generator=...``: the generator's presets, and how long they are fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from ganlane.config.checks import above, at_least, between, check, every, optional
+from ganlane.config.plain import plain_copy
+from ganlane.errors import UserError
+
+if TYPE_CHECKING:
+    from ganlane.generator import CalibratedConfig, LoopConfig, LossWeights, PaperConfig
+
+
+@dataclass
+class LoopOptions:
+    """``generator.loop`` (:class:`ganlane.generator.LoopConfig`)."""
+
+    updates: int = 3000
+    evaluate_every: int = 200
+    patience: int = 8
+    learning_rate: float = 2e-3
+    warmup: int = 100
+    largest_gradient: float = 1.0
+    max_seconds: float | None = None
+
+    def __post_init__(self) -> None:
+        counts = dict.fromkeys(("updates", "evaluate_every", "patience"), at_least(1))
+        positive = dict.fromkeys(("learning_rate", "largest_gradient"), above(0))
+        check(self, "generator.loop", warmup=at_least(0), max_seconds=optional(above(0)), **counts, **positive)
+
+    def parameters(self) -> LoopConfig:
+        """As the fit takes it."""
+        from ganlane.generator import LoopConfig
+
+        return plain_copy(self, LoopConfig)
+
+
+@dataclass
+class CalibratedLoopOptions(LoopOptions):
+    """The calibrated preset's: fewer updates, each through a whole stretch of a scene."""
+
+    updates: int = 450
+    evaluate_every: int = 50
+    warmup: int = 20
+
+
+@dataclass
+class WeightOptions:
+    """``generator.weights`` (:class:`ganlane.generator.LossWeights`)."""
+
+    variety: float = 1.6
+    single: float = 1.0
+    mean: float = 1.0
+    adversarial: float = 0.02
+
+    def __post_init__(self) -> None:
+        check(self, "generator.weights", **dict.fromkeys(("variety", "single", "mean", "adversarial"), at_least(0)))
+        if self.variety == self.single == self.mean == 0:
+            raise UserError("generator.weights: variety, single and mean are all 0; give one of them a weight.")
+
+    def parameters(self) -> LossWeights:
+        """As the fit takes them."""
+        from ganlane.generator import LossWeights
+
+        return plain_copy(self, LossWeights)
+
+
+@dataclass
+class GeneratorConfig:
+    """What both presets have."""
+
+    preset: str = "paper"
+    batch: int = 48
+    mirror: bool = True
+    held_out_stride: int = 3
+
+    def __post_init__(self) -> None:
+        check(self, "generator", batch=at_least(1), held_out_stride=at_least(1))
+
+    def fit_config(self, seed: int) -> PaperConfig | CalibratedConfig:
+        """As :func:`ganlane.generator.fit_generator` takes it."""
+        raise NotImplementedError
+
+
+@dataclass
+class PaperGeneratorConfig(GeneratorConfig):
+    """``generator=paper`` (:class:`ganlane.generator.PaperConfig`): open loop, with a discriminator."""
+
+    group_size: int = 9
+    stride: int = 1
+    samples: int = 6
+    loop: LoopOptions = field(default_factory=LoopOptions)
+    weights: WeightOptions = field(default_factory=WeightOptions)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "generator", group_size=at_least(1), stride=at_least(1), samples=between(1, 100))
+
+    def fit_config(self, seed: int) -> PaperConfig:
+        """As the fit takes it."""
+        from ganlane.generator import PaperConfig
+
+        return plain_copy(
+            self, PaperConfig, loop=self.loop.parameters(), weights=self.weights.parameters(), seed=seed
+        )
+
+
+@dataclass
+class CalibratedGeneratorConfig(GeneratorConfig):
+    """``generator=calibrated`` (:class:`ganlane.generator.CalibratedConfig`): closed loop, whole scenes."""
+
+    preset: str = "calibrated"
+    batch: int = 6
+    held_out_stride: int = 6
+    horizons: list[int] = field(default_factory=lambda: [8, 16, 29])
+    held_out_horizon: int = 29
+    noise_period_s: float = 5.0
+    loop: CalibratedLoopOptions = field(default_factory=CalibratedLoopOptions)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(
+            self,
+            "generator",
+            horizons=every(at_least(1)),
+            held_out_horizon=at_least(8),
+            noise_period_s=at_least(0),
+        )
+
+    def fit_config(self, seed: int) -> CalibratedConfig:
+        """As the fit takes it."""
+        from ganlane.generator import CalibratedConfig
+
+        return plain_copy(self, CalibratedConfig, loop=self.loop.parameters(), seed=seed)

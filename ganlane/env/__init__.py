@@ -1,0 +1,14 @@
+"""HighwayEnv: the simulator as a batched, stateless TorchRL environment. Raw state in, raw state and events out.
+
+    action -> ego driver (target lane) -> [ traffic module -> ego dynamics -> events ] x substeps -> done flags
+
+:mod:`~ganlane.env.highway` is what TorchRL sees: specs, reset, step. :mod:`~ganlane.env.decision` drives one
+decision through its physics steps. :mod:`~ganlane.env.state` says what the state consists of. Observation and
+reward are transforms (:mod:`ganlane.transforms`); without them the environment shows its raw state and pays
+nothing. The state travels in the TensorDict, so it can be copied, saved and branched.
+"""
+
+from ganlane.env.decision import EpisodeParameters
+from ganlane.env.highway import HighwayEnv
+
+__all__ = ["EpisodeParameters", "HighwayEnv"]

@@ -1,0 +1,133 @@
+"""A wrong value gives one sentence that names it, and leaves nothing behind."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from ganlane.__main__ import COMMANDS, main
+from ganlane.config.compose import VERSION_BASE, typed
+from ganlane.config.messages import sentence
+from ganlane.config.store import register
+from ganlane.errors import UserError
+from ganlane.paths import conf_folder
+
+
+def composed(command: str) -> DictConfig:
+    from hydra import compose, initialize_config_dir
+
+    register()
+    with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):
+        config = compose(command, return_hydra_config=True)
+    with open_dict(config):
+        del config["hydra"]
+    return config
+
+
+COMPOSED = {command: composed(command) for command in COMMANDS}
+
+
+def leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """(key, value) of everything that is not a mapping."""
+    found = []
+    for name in node:
+        key, value = f"{prefix}{name}", OmegaConf.select(node, str(name))
+        found += leaves(value, f"{key}.") if isinstance(value, DictConfig) else [(key, value)]
+    return found
+
+
+KEYS = [(command, key, value) for command, config in COMPOSED.items() for key, value in leaves(config)]
+NUMBERS = [(c, k) for c, k, v in KEYS if isinstance(v, (int, float)) and not isinstance(v, bool)]
+FLAGS = [(c, k) for c, k, v in KEYS if isinstance(v, bool)]
+LISTS = [(c, k) for c, k, v in KEYS if isinstance(v, ListConfig)]
+
+
+def changed(command: str, key: str, value: Any) -> DictConfig:
+    config = COMPOSED[command].copy()
+    OmegaConf.update(config, key, value)
+    return config
+
+
+def refuses(command: str, key: str, value: Any) -> str:
+    """The sentence with which a value is refused."""
+    with pytest.raises((UserError, OmegaConfBaseException)) as caught:
+        typed(changed(command, key, value))
+    return sentence(caught.value)
+
+
+def test_there_are_keys_to_try():
+    assert len(NUMBERS) > 80
+    assert FLAGS
+    assert LISTS
+
+
+@pytest.mark.parametrize(("command", "key"), NUMBERS)
+def test_a_number_refuses_words_and_absurd_values(command, key):
+    last = key.rsplit(".", 1)[-1]
+    assert f"{key}=many: expected a" in refuses(command, key, "many")
+    is_whole = isinstance(OmegaConf.select(COMPOSED[command], key), int)
+    assert last in refuses(command, key, -(10**9) if is_whole else float("nan"))
+
+
+@pytest.mark.parametrize(("command", "key"), FLAGS)
+def test_a_switch_refuses_anything_but_true_and_false(command, key):
+    assert refuses(command, key, "perhaps") == (
+        f"{key}=perhaps: expected true or false; run the command with --help to see all keys."
+    )
+
+
+@pytest.mark.parametrize(("command", "key"), LISTS)
+def test_a_list_refuses_a_single_value_and_emptiness(command, key):
+    assert "expected a list in brackets" in refuses(command, key, 3)
+    assert key.rsplit(".", 1)[-1] in refuses(command, key, [])
+
+
+#: Command line to a part of its sentence.
+MISTAKES = {
+    "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
+    "train traffic=ganny": "traffic=ganny: no such option (did you mean 'gan'?)",
+    "train env=[a,b]": "choose one of dense, highway",
+    "train env.idm=3": "env.idm.NAME=VALUE",
+    "train +env.wheels=3": "keys cannot be added",
+    "train ++env.wheels=3": "keys cannot be added",
+    "train ~env.lanes": "keys cannot be deleted",
+    "train lanes": "not of the form key=value",
+    "train --quick": "unrecognized arguments: --quick",
+    "train seed=0,1": "add -m for a sweep",
+    "train -m seed=0,-1": "seed=-1: expected a number from 0",
+    "train -m seed=0,1 traffic=idm,ganny": "traffic=ganny: no such option",
+    "train -m seed=0,1 resume=auto": "one run is resumed at a time",
+    "train resume=nowhere": "resume=nowhere: no checkpoint there",
+    "train env.vehicles=100": "env.vehicles=100 do not fit: 3 lanes x 9 vehicles",
+    "train env.decision_period_s=0.15": "not a multiple of 0.1 s",
+    "train env.front_speed_mps=[12,10]": "two numbers [low, high]",
+    "train agent.warmup=5": "expected at least agent.batch_size=256",
+    "train init=none init.path=mine": "use init=idm_ckpt init.path=mine",
+    "train pretrain.total_decisions=10": "traffic@pretrain.traffic=idm_mobil",
+    "train device=tpu": "device=tpu: expected one of cpu, cuda",
+    "train traffic._target_=nonsense": "expected an import path",
+    "train hydra.nonsense=1": "hydra.nonsense: no such key",
+    "evaluate traffic=gan": "did you mean traffics=[NAME,NAME]?",
+    "evaluate traffics=[gann]": "traffics=gann: no such traffic (did you mean 'gan'?)",
+    "evaluate agents=[mobil,mobil]": "a list of different names",
+    "render format=avi": "format=avi: expected one of gif, mp4, png",
+    "render film.start_s=9 film.end_s=3": "expected more than film.start_s=9",
+    "render out=nowhere/film.gif": "out=nowhere/film.gif: expected a file in a folder that exists",
+    "train_generator generator=gann": "choose one of calibrated, paper, social_gan",
+    "fly": "fly: no such command; choose one of train, evaluate",
+}
+
+
+@pytest.mark.parametrize("line", MISTAKES)
+def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(line.split()) == 2
+    out, err = capsys.readouterr()
+    assert MISTAKES[line] in err
+    assert err.count("\n") == 1
+    assert err.rstrip().endswith(".")
+    assert out == ""
+    assert list(tmp_path.iterdir()) == []

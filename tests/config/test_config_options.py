@@ -1,0 +1,153 @@
+"""Every option composes, says in its YAML what its dataclass says, and knows every key of what it configures."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from ganlane.__main__ import COMMANDS
+from ganlane.agents import RainbowConfig
+from ganlane.config.compose import check
+from ganlane.config.env import EgoConfig, EnvConfig, IdmConfig, MobilConfig
+from ganlane.config.agent import AgentConfig, DqnConfig
+from ganlane.config.generator import (
+    CalibratedGeneratorConfig,
+    CalibratedLoopOptions,
+    LoopOptions,
+    PaperGeneratorConfig,
+    WeightOptions,
+)
+from ganlane.config.observation import FORMS, ObservationConfig
+from ganlane.config.plain import plain_copy
+from ganlane.config.reward import RewardConfig
+from ganlane.config.store import SCHEMAS, SUFFIX, register
+from ganlane.env import EpisodeParameters
+from ganlane.generator import CalibratedConfig, LoopConfig, LossWeights, PaperConfig
+from ganlane.paths import conf_folder
+from ganlane.sim import IdmParameters, MobilParameters, SpawnParameters
+from ganlane.sim.ego import EgoParameters
+from ganlane.transforms import OBSERVATIONS, RewardParameters
+from ganlane.transforms.table3 import ObservationScale
+
+#: Group to a command that has it.
+USED_BY = {"data": "train_generator", "generator": "train_generator"}
+OPTIONS = sorted((path.parent.name, path.stem) for path in conf_folder().glob("*/*.yaml"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_composes_with_its_defaults(command):
+    assert dataclasses.is_dataclass(check(command, []).config)
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_every_option_composes(group, option):
+    # The shipped agent may not be there yet, but its option must compose all the same.
+    check(USED_BY.get(group, "train"), [f"{group}={option}"])
+
+
+@pytest.mark.parametrize(("group", "option"), [pair for pair in OPTIONS if pair[0] != "experiment"])
+def test_yaml_and_dataclass_hold_the_same_values(group, option):
+    composed = check(USED_BY.get(group, "train"), [f"{group}={option}"]).config
+    value = getattr(composed, group)
+    if group == "env" and option == "dense":
+        assert value == type(value)()
+        return
+    expected = type(value)(form=option) if group == "observation" else type(value)()
+    assert value == expected
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_root_yaml_and_dataclass_hold_the_same_values(command):
+    composed = check(command, []).config
+    default = type(composed)()
+    for field in dataclasses.fields(composed):
+        value = getattr(composed, field.name)
+        plain = not dataclasses.is_dataclass(value) and not isinstance(value, dict)
+        if plain or field.name in ("evaluation", "pretrain", "film"):
+            assert value == getattr(default, field.name), field.name
+
+
+def test_no_schema_is_without_its_yaml():
+    register()
+    for group, options in SCHEMAS.items():
+        names = {path.stem for path in (conf_folder() / group).glob("*.yaml")}
+        if group == "observation":
+            assert names == set(FORMS)
+        else:
+            assert set(options) <= names, group
+        assert {name + SUFFIX for name in options} <= {
+            name.removesuffix(".yaml") for name in ConfigStore.instance().list(group or "")
+        }
+
+
+MIRRORS = [
+    (IdmConfig(), IdmParameters, set()),
+    (MobilConfig(), MobilParameters, set()),
+    (EgoConfig(), EgoParameters, {"visibility"}),
+    (EnvConfig(), SpawnParameters, set()),
+    (EnvConfig(), EpisodeParameters, set()),
+    (AgentConfig(), RainbowConfig, set()),
+    (RewardConfig(), RewardParameters, set()),
+    (ObservationConfig(), ObservationScale, set()),
+    (LoopOptions(), LoopConfig, set()),
+    (WeightOptions(), LossWeights, set()),
+    (PaperGeneratorConfig(), PaperConfig, {"sizes", "loop", "weights", "seed"}),
+    (CalibratedGeneratorConfig(), CalibratedConfig, {"sizes", "loop", "seed"}),
+]
+
+
+@pytest.mark.parametrize(("config", "kind", "apart"), MIRRORS, ids=lambda value: getattr(value, "__name__", ""))
+def test_config_offers_every_parameter_with_the_same_default(config, kind, apart):
+    copied = plain_copy(config, kind) if not apart else kind()
+    for field in dataclasses.fields(kind):
+        if field.name in apart:
+            continue
+        assert hasattr(config, field.name), f"{kind.__name__}.{field.name} cannot be set from the command line"
+        given = getattr(config, field.name)
+        assert (tuple(given) if isinstance(given, list) else given) == getattr(kind(), field.name), field.name
+        assert getattr(copied, field.name) == getattr(kind(), field.name)
+
+
+def test_calibrated_loop_is_the_presets_own():
+    assert CalibratedLoopOptions().parameters() == CalibratedConfig().loop
+
+
+def test_observation_forms_are_those_of_the_transform():
+    assert set(FORMS) == set(OBSERVATIONS)
+
+
+def test_dqn_switches_every_component_off():
+    config = DqnConfig()
+    assert not any((config.noisy, config.dueling, config.distributional, config.double, config.prioritised))
+    assert config.n_step == 1
+
+
+def test_dense_traffic_keeps_the_density_for_any_number_of_vehicles():
+    few, many = (check("train", ["env=dense", f"env.vehicles={n}"]).config.env for n in (30, 90))
+    assert many.spread_m / many.vehicles == pytest.approx(few.spread_m / few.vehicles)
+    assert many.spread_m == pytest.approx(3 * few.spread_m)
+
+
+def test_paper_experiment_is_two_phases_and_can_be_shortened():
+    config = check("train", ["experiment=paper", "total_decisions=7", "pretrain.total_decisions=5"]).config
+    assert (config.pretrain.traffic.label(), config.traffic.label()) == ("idm_mobil", "gan")
+    assert (config.pretrain.total_decisions, config.total_decisions) == (5, 7)
+    whole = check("train", ["experiment=paper"]).config
+    assert (whole.pretrain.total_decisions, whole.total_decisions) == (10_000_000, 3_000_000)
+    assert whole.init.path is None
+
+
+def test_a_generator_file_reaches_every_generated_traffic():
+    config = check("evaluate", ["generator.path=mine.safetensors"]).config
+    assert {config.traffic_options[name].path for name in ("gan", "gan_calibrated")} == {"mine.safetensors"}
+    assert check("train", ["traffic=gan", "generator.path=mine.safetensors"]).config.traffic.path == "mine.safetensors"
+
+
+def test_yaml_files_explain_themselves():
+    for path in conf_folder().rglob("*.yaml"):
+        first = [line for line in path.read_text().splitlines() if not line.startswith("# @package")][0]
+        assert first.startswith("# "), path
+        assert OmegaConf.load(path) is not None

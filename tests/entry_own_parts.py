@@ -1,0 +1,34 @@
+"""A user's own traffic model and policy, as a user would write them: nothing of the package is touched."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from ganlane.traffic import TrafficModule
+
+
+class Cruise(TrafficModule):
+    """Everybody drives on at a share of its speed, whatever stands in the way."""
+
+    def __init__(self, road, stream, share: float = 1.0):
+        super().__init__(road, stream)
+        self.share = share
+
+    def move(self, vehicles, memory, key, step):
+        return vehicles.with_(x=vehicles.x + self.share * vehicles.speed * self.dt), memory
+
+
+class Stubborn(TensorDictModuleBase):
+    """Always keeps its lane."""
+
+    in_keys = ["episode"]
+    out_keys = ["action"]
+
+    def forward(self, tensordict):
+        return tensordict.set("action", torch.zeros_like(tensordict["episode"]))
+
+
+def not_a_model(road):
+    """Something that is called like a traffic model but is none."""
+    return road

@@ -1,0 +1,63 @@
+"""The console script: dispatch, help, and a few whole commands in a process of their own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ganlane.__main__ import COMMANDS, main
+from ganlane.config.help import help_text
+from ganlane.paths import conf_folder
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def command(*arguments, cwd):
+    """A command as a user starts it, from a folder that is not the checkout."""
+    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(cwd)}
+    line = [sys.executable, *arguments]
+    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_names_options_keys_and_examples(name, capsys):
+    assert main([name, "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert f"ganlane {name} " in shown
+    assert "seed: 0" in shown
+    assert "exit status" in shown
+
+
+def test_help_of_train_explains_every_traffic_and_start():
+    text = help_text("train")
+    for group in ("traffic", "init", "experiment", "agent", "observation", "reward", "collector", "logger", "env"):
+        for path in (conf_folder() / group).glob("*.yaml"):
+            assert path.stem in text, f"{group}={path.stem}"
+
+
+def test_usage_lists_every_command(capsys):
+    assert main([]) == 0
+    assert all(name in capsys.readouterr().out for name in COMMANDS)
+
+
+def test_help_does_not_wait_for_torch(tmp_path):
+    program = "import sys; from ganlane.__main__ import main; main(['train', '--help']); print('torch' in sys.modules)"
+    assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
+
+
+def test_module_and_console_script_do_the_same(tmp_path):
+    tiny = ["agents=[keep_lane]", "traffics=[idm]", "episodes=1", "env.goal_m=20"]
+    for start in (["-m", "ganlane.evaluate"], ["-m", "ganlane", "evaluate"]):
+        done = command(*start, *tiny, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines()[-1].startswith(f"results: {tmp_path}")
+
+
+def test_a_mistake_ends_the_process_with_status_2(tmp_path):
+    done = command("-m", "ganlane", "train", "env.lanes=0", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "ganlane train: env.lanes=0: expected a number from 1 to 20; give for instance env.lanes=3.\n"
+    assert list(tmp_path.iterdir()) == []

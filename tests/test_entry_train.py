@@ -1,0 +1,160 @@
+"""``ganlane train`` from end to end, with tiny budgets, in process."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from ganlane.agents import read_agent
+from ganlane.train import main
+
+TINY = [
+    "env.goal_m=40",
+    "traffic=idm",
+    "init=none",
+    "observation=table3_progress",
+    "total_decisions=320",
+    "log_every=160",
+    "collector.num_envs=16",
+    "agent.hidden=[16,16]",
+    "agent.batch_size=32",
+    "agent.warmup=64",
+    "agent.capacity=1000",
+    "evaluation.agents=[mobil,random_legal]",
+    "evaluation.episodes=2",
+]
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+
+
+def train(capsys, *arguments):
+    """Run folder and results of a run that succeeds."""
+    assert main([*TINY, *arguments]) == 0
+    path = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: "))
+    return path.parent, json.loads(path.read_text())
+
+
+def decisions(folder):
+    return [int(row["decisions"]) for row in csv.DictReader((folder / "metrics.csv").open())]
+
+
+def test_a_run_leaves_agent_metrics_config_and_table(capsys):
+    folder, results = train(capsys)
+    assert [row["agent"] for row in results["rows"]] == ["trained", "mobil", "random_legal"]
+    assert results["decisions"] == 320
+    assert results["updates"] > 0
+    assert decisions(folder) == [160, 320]
+    weights, config, metadata = read_agent(folder / "agent.safetensors")
+    assert weights
+    assert config.hidden == (16, 16)
+    assert metadata["observation"] == "table3_progress"
+    assert metadata["training"]["decisions"] == 320
+    assert (folder / "config.yaml").is_file()
+
+
+def test_a_finished_run_goes_on_with_more_decisions_and_its_own_command_line(capsys):
+    folder, _ = train(capsys, "seed=5")
+    assert main([f"resume={folder}", "total_decisions=480"]) == 0
+    results = json.loads((folder / "results.json").read_text())
+    assert results["decisions"] == 480
+    assert results["config"]["seed"] == 5
+    assert decisions(folder) == [160, 320, 480]
+
+
+def test_a_run_in_two_parts_ends_like_one_in_a_piece(capsys):
+    whole, _ = train(capsys, "total_decisions=480")
+    parts, _ = train(capsys, "total_decisions=320")
+    assert main([f"resume={parts}", "total_decisions=480"]) == 0
+    one, other = (read_agent(folder / "agent.safetensors")[0] for folder in (whole, parts))
+    assert all((one[name] == other[name]).all() for name in one)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_the_run_can_be_resumed(number, capsys, tmp_path):
+    def stop_when_training():
+        # A moment after the first figures stand in the file, the run is in its loop.
+        while not any(len(path.read_text().splitlines()) > 1 for path in tmp_path.rglob("metrics.csv")):
+            time.sleep(0.01)
+        os.kill(os.getpid(), number)
+
+    watcher = threading.Thread(target=stop_when_training, daemon=True)
+    watcher.start()
+    assert main([*TINY, "total_decisions=10000000"]) == 128 + number
+    watcher.join()
+    err = capsys.readouterr().err
+    assert "go on with: ganlane train resume=" in err
+    (checkpoint,) = tmp_path.rglob("last.pt")
+    reached = decisions(checkpoint.parents[1])[-1]
+    assert main(["resume=auto", f"total_decisions={reached + 320}"]) == 0
+    assert decisions(checkpoint.parents[1])[-1] == reached + 320
+
+
+def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
+    phases = ["traffic@pretrain.traffic=idm_mobil", "pretrain.total_decisions=160"]
+    folder, results = train(capsys, *phases)
+    assert results["phases"]["pretrain"]["decisions"] == 160
+    assert (folder / "pretrain" / "agent.safetensors").is_file()
+    metadata = read_agent(folder / "agent.safetensors")[2]
+    assert metadata["training"]["init"] == str(folder / "pretrain" / "agent.safetensors")
+
+
+def test_a_trained_agent_is_a_start_for_another(capsys):
+    folder, _ = train(capsys)
+    start = ["init=idm_ckpt", f"init.path={folder / 'agent.safetensors'}"]
+    _, results = train(capsys, "total_decisions=16", *start)
+    # Nothing was learnt in 16 decisions: the network is the one it started from.
+    same = read_agent(results["agent"])[0]
+    assert all((same[name] == value).all() for name, value in read_agent(folder / "agent.safetensors")[0].items())
+
+
+def test_a_start_from_another_observation_is_refused(capsys, tmp_path):
+    folder, _ = train(capsys)
+    start = ["init=idm_ckpt", f"init.path={folder / 'agent.safetensors'}", "observation=table3"]
+    before = sorted(tmp_path.rglob("*"))
+    assert main([*TINY, *start]) == 2
+    assert "give observation=table3_progress" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_sweep_gives_every_run_a_folder(capsys, tmp_path):
+    short = [option for option in TINY if not option.startswith(("traffic=", "total_decisions="))]
+    assert main(["-m", *short, "total_decisions=16", "seed=0,1", "traffic=idm,idm_mobil"]) == 0
+    results = sorted(tmp_path.glob("outputs/train_sweeps/*/*/results.json"))
+    assert [path.parent.name for path in results] == ["0", "1", "2", "3"]
+    configs = [json.loads(path.read_text())["config"] for path in results]
+    assert {(c["seed"], c["traffic"]["_target_"]) for c in configs} == {
+        (seed, f"ganlane.traffic.{name}") for seed in (0, 1) for name in ("IdmTraffic", "IdmMobilTraffic")
+    }
+
+
+def test_a_users_own_traffic_trains(capsys):
+    _, results = train(capsys, "traffic._target_=entry_own_parts.Cruise", "total_decisions=16")
+    assert results["rows"][0]["traffic"] == "entry_own_parts.Cruise"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["init=idm_ckpt", "init.path=gone.safetensors"], "agent gone.safetensors: no such file"),
+        (["evaluation.agents=[nobody]"], "agent nobody: unknown"),
+        (["traffic._target_=entry_own_parts.Missing"], "entry_own_parts has no Missing"),
+    ],
+)
+def test_a_mistake_leaves_one_sentence_and_no_file(arguments, part, capsys, tmp_path):
+    assert main([*TINY, *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert part in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

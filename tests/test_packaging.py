@@ -1,0 +1,57 @@
+"""What an installed package holds."""
+
+from __future__ import annotations
+
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import ganlane
+from ganlane.paths import PACKAGE, conf_folder
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:  # pragma: no cover
+    tomllib = pytest.importorskip("tomli")
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_versions_agree():
+    assert PROJECT["project"]["version"] == ganlane.__version__
+
+
+def test_the_console_script_is_the_dispatcher():
+    assert PROJECT["project"]["scripts"]["ganlane"] == "ganlane.__main__:main"
+
+
+def test_a_checkouts_conf_comes_before_a_copy_inside():
+    assert conf_folder() == PACKAGE.parent / "conf"
+
+
+def test_a_conf_folder_of_somebody_else_is_not_ours(tmp_path, monkeypatch):
+    (tmp_path / "conf").mkdir()
+    inside = tmp_path / "package" / "conf" / "traffic"
+    inside.mkdir(parents=True)
+    for file in (inside.parent / "train.yaml", inside / "gan.yaml"):
+        file.touch()
+    monkeypatch.setattr("ganlane.paths.PACKAGE", tmp_path / "package")
+    assert conf_folder() == inside.parent
+
+
+def test_the_wheel_holds_configuration_and_weights(tmp_path):
+    wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling is not installed; CI builds the wheel")
+    (artifact,) = wheel.WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    with zipfile.ZipFile(artifact) as packed:
+        names = set(packed.namelist())
+    missing = [
+        path for path in (ROOT / "conf").rglob("*.yaml") if f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" not in names
+    ]
+    assert not missing
+    shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob("*.safetensors")}
+    assert shipped <= names
+    assert "ganlane/py.typed" in names
+    assert not [name for name in names if name.startswith(("tests/", "outputs/"))]

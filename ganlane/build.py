@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Composite
 from torchrl.envs import Compose, TransformedEnv
 
 from ganlane import keys
@@ -103,6 +104,10 @@ def make_env(
         seed=seed,
         device=device,
     )
+    # TransformedEnv hands on to a reset only what the state spec names; without the counters every reset that asks
+    # for certain episodes would run the first ones.
+    counters = {name: base.observation_spec[name].clone() for name in (keys.SEED, keys.EPISODE)}
+    base.state_spec = Composite(counters, shape=base.batch_size, device=base.device)
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
     return TransformedEnv(base, Compose(seen, RewardTransform(env.decision_period_s, reward.parameters())))
 
@@ -139,8 +144,8 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
         return _imported(name, env, stream, device)
     known = ", ".join((*DRIVERS, *SHIPPED))
     raise UserError(
-        f"agent {name}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the import path "
-        "of a policy."
+        f"agent {name}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the import "
+        "path of a policy."
     )
 
 

@@ -1,12 +1,13 @@
-"""Training runs from plain configs: one phase or two, each resumable, the second starting from the first one's agent."""
+"""Training runs from plain configs: one phase or two, each resumable; the second starts from the first's agent."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -15,8 +16,8 @@ from ganlane import keys
 from ganlane.agents import GreedyPolicy, Rainbow, read_agent, save_agent, transfer
 from ganlane.agents.network import load_parameters
 from ganlane.build import make_env, make_traffic, observation_of
-from ganlane.config.train import TrainConfig
 from ganlane.config.traffic import TrafficConfig
+from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.keys import EGO_INDEX
@@ -61,13 +62,13 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
     """
-    agent = make_agent(config)
+    agent = make_agent(config, trained=phase.init is not None)
     if phase.init is not None and resume is None:
         check_observation(phase.init, config)
         transfer(agent, phase.init)
     traffic = make_traffic(phase.traffic, config.env, Stream.TRAIN)
-    sizes = {"num_envs": config.collector.num_envs, "seed": config.seed, "device": config.device}
-    env = make_env(traffic, config.env, config.observation, config.reward, **sizes)
+    rows = config.collector.num_envs
+    env = make_env(traffic, config.env, config.observation, config.reward, rows, config.seed, config.device)
     result = train(
         env,
         agent,
@@ -83,11 +84,14 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
     return result
 
 
-def make_agent(config: TrainConfig) -> Rainbow:
-    """A fresh agent for the observation of ``config``."""
+def make_agent(config: TrainConfig, trained: bool = False) -> Rainbow:
+    """A fresh agent for the observation of ``config``; one about to be given ``trained`` weights explores little."""
+    rainbow = config.agent.rainbow()
+    if trained:
+        rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
     size = observation_size(config.observation.form, config.env.vehicles)
     legal = LegalActions(Road(config.env.lanes, config.env.lane_width_m))
-    return Rainbow(config.agent.rainbow(), size, seed=config.seed, device=config.device, legal=legal)
+    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal)
 
 
 class LegalActions:
@@ -133,11 +137,12 @@ def _selection(config: TrainConfig, phase: Phase) -> Callable[[GreedyPolicy], Ma
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
         table = run_episodes(env, policy, range(config.selection_episodes), config.seed)
-        crashes = (table["reason"] == "hard_crash").sum()
+        total = table.select("reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash").sum()
+        reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
         return {
-            "mean_reward": float(table["reward"].sum()) / table.height,
+            "mean_reward": reward / table.height,
             "crash_rate": crashes / table.height,
-            "lane_changes_per_km": 1000.0 * table["lane_changes"].sum() / max(table["distance_m"].sum(), 1.0),
+            "lane_changes_per_km": 1000.0 * changes / max(distance_m, 1.0),
         }
 
     return evaluate

@@ -22,6 +22,7 @@ def render(config: RenderConfig, folder: Path) -> str:
     from ganlane.build import make_driver, make_env, make_traffic, set_threads
     from ganlane.sim.random import Stream
     from ganlane.view import DrawingParameters, Film, FramePainter, WindowParameters, record_episode, write_film
+    from ganlane.view.films import film_format
 
     set_threads(config.threads)
     film, label = config.film, config.traffic.label()
@@ -35,11 +36,10 @@ def render(config: RenderConfig, folder: Path) -> str:
     frames = Film(painter, film.fps, film.speedup, film.start_s, film.end_s)
     name = f"{Path(config.driver).stem}_{label}_{config.seed}_{config.episode}.{config.format}"
     out = Path(config.out) if config.out else folder / name
-    path = write_film(frames, out, film.fps, config.format, film.max_bytes, film.scale)
+    path = write_film(frames, out, film.fps, film_format(out, config.format), film.max_bytes, film.scale)
     ending = episode.outcome or "cut off"
-    print(
-        f"{driver.name} on {label}, seed {config.seed}, episode {config.episode}: {ending} after {episode.time_s[-1]:.1f} s"
-    )
+    which = f"{driver.name} on {label}, seed {config.seed}, episode {config.episode}"
+    print(f"{which}: {ending} after {episode.time_s[-1]:.1f} s")
     return f"film: {path}"
 
 

@@ -30,7 +30,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     source = Path(config.data.path) if config.data.path else default_scenes()
     frame = read_scenes(source)
     held_out = config.data.held_out_scenes(frame["scene"].unique().to_list(), HELD_OUT)
-    preset = config.generator.preset
+    preset = config.generator.preset_name()
     with FitProgress() as progress:
         result = fit_generator(
             preset,

@@ -22,8 +22,8 @@ class Cruise(TrafficModule):
 class Stubborn(TensorDictModuleBase):
     """Always keeps its lane."""
 
-    in_keys = ["episode"]
-    out_keys = ["action"]
+    in_keys = ("episode",)
+    out_keys = ("action",)
 
     def forward(self, tensordict):
         return tensordict.set("action", torch.zeros_like(tensordict["episode"]))

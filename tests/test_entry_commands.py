@@ -40,11 +40,14 @@ def test_help_of_train_explains_every_traffic_and_start():
 
 def test_usage_lists_every_command(capsys):
     assert main([]) == 0
-    assert all(name in capsys.readouterr().out for name in COMMANDS)
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in COMMANDS)
 
 
 def test_help_does_not_wait_for_torch(tmp_path):
-    program = "import sys; from ganlane.__main__ import main; main(['train', '--help']); print('torch' in sys.modules)"
+    program = (
+        "import sys; from ganlane.__main__ import main; main(['train', '--help']); print('torch' in sys.modules)"
+    )
     assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
 
 
@@ -59,5 +62,7 @@ def test_module_and_console_script_do_the_same(tmp_path):
 def test_a_mistake_ends_the_process_with_status_2(tmp_path):
     done = command("-m", "ganlane", "train", "env.lanes=0", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "ganlane train: env.lanes=0: expected a number from 1 to 20; give for instance env.lanes=3.\n"
+    assert (
+        done.stderr == "ganlane train: env.lanes=0: expected a number from 1 to 20; give for instance env.lanes=3.\n"
+    )
     assert list(tmp_path.iterdir()) == []

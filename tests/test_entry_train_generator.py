@@ -56,7 +56,10 @@ def test_damaged_recordings_are_refused_by_column(how, part, recordings, capsys,
 
 @pytest.mark.parametrize(
     ("arguments", "part"),
-    [(["data.path=gone.csv"], "gone.csv: no such file"), (["data.path=recordings.csv", "data.held_out=[moon]"], "moon")],
+    [
+        (["data.path=gone.csv"], "gone.csv: no such file"),
+        (["data.path=recordings.csv", "data.held_out=[moon]"], "moon"),
+    ],
 )
 def test_what_is_not_there_is_named(arguments, part, recordings, capsys, tmp_path):
     assert main([*arguments, *FEW]) == 2

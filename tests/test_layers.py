@@ -60,7 +60,9 @@ def test_every_part_has_its_place():
 def test_imports_point_down(path):
     own = part_of(path)
     for other in imported(path) & LEVEL.keys():
-        assert other == own or LEVEL[other] < LEVEL[own] or (LEVEL[other] == LEVEL[own] == 0), f"{own} imports {other}"
+        assert other == own or LEVEL[other] < LEVEL[own] or (LEVEL[other] == LEVEL[own] == 0), (
+            f"{own} imports {other}"
+        )
 
 
 @pytest.mark.parametrize("part", ["sim", "data", "generator", "traffic", "env", "transforms", "agents", "evaluation"])

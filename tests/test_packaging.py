@@ -48,7 +48,9 @@ def test_the_wheel_holds_configuration_and_weights(tmp_path):
     with zipfile.ZipFile(artifact) as packed:
         names = set(packed.namelist())
     missing = [
-        path for path in (ROOT / "conf").rglob("*.yaml") if f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" not in names
+        path
+        for path in (ROOT / "conf").rglob("*.yaml")
+        if f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" not in names
     ]
     assert not missing
     shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob("*.safetensors")}

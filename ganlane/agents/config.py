@@ -13,8 +13,8 @@ class RainbowConfig:
     """Hyperparameters; the values are for one update of 256 per 64 decisions.
 
     Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
-    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon (the share of
-    random legal actions) is used without noisy layers only. ``adam_eps=None`` stands for 0.005 / ``batch_size``.
+    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is
+    the share of random legal actions, which noisy layers alone do not replace (docs/agent.md). ``adam_eps=None`` stands for 0.005 / ``batch_size``.
     ``warmup`` is the number of transitions before the first update.
     """
 
@@ -25,14 +25,14 @@ class RainbowConfig:
     double: bool = True
     prioritised: bool = True
     n_step: int = 3
-    gamma: float = 0.99
-    atoms: int = 51
+    gamma: float = 0.98
+    atoms: int = 101
     v_min: float = -120.0
-    v_max: float = 120.0
+    v_max: float = 100.0
     noisy_sigma: float = 0.5
     batch_size: int = 256
     capacity: int = 1_000_000
-    warmup: int = 20_000
+    warmup: int = 10_000
     decisions_per_update: int = 64
     target_period: int = 500
     learning_rate: float = 2.5e-4
@@ -43,8 +43,8 @@ class RainbowConfig:
     beta_updates: int = 100_000
     kl_priority: bool = True
     epsilon_start: float = 1.0
-    epsilon: float = 0.02
-    epsilon_decisions: int = 100_000
+    epsilon: float = 0.04
+    epsilon_decisions: int = 300_000
 
     def __post_init__(self) -> None:
         for name in ("n_step", "atoms", "batch_size", "capacity", "decisions_per_update", "target_period"):

@@ -84,7 +84,7 @@ class Rainbow:
         """Set the share of random actions after ``decisions``."""
         config = self.config
         share = annealed(config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions)
-        self.policy.epsilon = 0.0 if config.noisy else share
+        self.policy.epsilon = share
 
     def store(self, transition: TensorDict | None) -> None:
         """Add transitions, batch [N], with the keys of :meth:`NStepWindow.push`; None adds nothing."""

@@ -1,1 +1,13 @@
-"""Configuration of the commands: one dataclass per option, its YAML at the same place under conf/."""
+"""Configuration of the commands: one dataclass per option; the YAML at the same place under conf/ holds the values.
+
+``env``, ``traffic``, ``init``, ``agent``, ``observation``, ``reward``, ``collector``, ``logger``, ``data`` and
+``generator`` hold the options of the groups of these names, ``train``, ``evaluate``, ``render`` and
+``train_generator`` the root of each command; ``experiment`` needs no schema, since its options only set the keys of
+the others. The dataclasses are plain, and a notebook uses them without Hydra. Making one checks its ranges
+(``checks``).
+
+``app`` is the frame around every command: ``overrides`` reads the command line, ``resume`` adds that of the run to go
+on with, ``compose`` composes and checks (with ``store``), all before ``folders`` makes anything; ``messages`` says in
+a sentence what is wrong, ``help`` explains, ``targets`` imports a user's own parts by name, and ``plain`` hands
+values on to the packages below.
+"""

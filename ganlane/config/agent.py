@@ -23,14 +23,14 @@ class AgentConfig:
     double: bool = True
     prioritised: bool = True
     n_step: int = 3
-    gamma: float = 0.99
-    atoms: int = 51
+    gamma: float = 0.98
+    atoms: int = 101
     v_min: float = -120.0
-    v_max: float = 120.0
+    v_max: float = 100.0
     noisy_sigma: float = 0.5
     batch_size: int = 256
     capacity: int = 1_000_000
-    warmup: int = 20_000
+    warmup: int = 10_000
     decisions_per_update: int = 64
     target_period: int = 500
     learning_rate: float = 2.5e-4
@@ -41,8 +41,8 @@ class AgentConfig:
     beta_updates: int = 100_000
     kl_priority: bool = True
     epsilon_start: float = 1.0
-    epsilon: float = 0.02
-    epsilon_decisions: int = 100_000
+    epsilon: float = 0.04
+    epsilon_decisions: int = 300_000
 
     def __post_init__(self) -> None:
         counts = ("n_step", "batch_size", "capacity", "warmup", "decisions_per_update", "target_period", "atoms")

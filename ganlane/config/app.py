@@ -1,7 +1,7 @@
 """The frame around every command: Hydra inside; exit statuses and errors of one sentence outside.
 
-Exit statuses: 0 done; 2 a user's mistake (one sentence on stderr, nothing left on disk); 130 stopped by Ctrl-C, 143 by
-SIGTERM (training saves first).
+Exit statuses: 0 done; 2 a user's mistake (one sentence on stderr, nothing left on disk); 130 stopped by Ctrl-C, 143
+by SIGTERM (training saves first).
 """
 
 from __future__ import annotations

@@ -27,4 +27,4 @@ class DataConfig:
         """The scenes not to fit to, of ``scenes`` in the recordings; ``preferred`` where they are all there."""
         if self.held_out is not None:
             return tuple(self.held_out)
-        return tuple(preferred) if set(preferred) <= set(scenes) else tuple(sorted(scenes)[2::3])
+        return tuple(preferred) if set(preferred) <= set(scenes) else tuple(sorted(scenes)[1::3])

@@ -57,7 +57,7 @@ class EvaluateConfig(RunConfig):
             if name not in self.traffic_options and "." not in name:
                 known = ", ".join(self.traffic_options)
                 raise UserError(
-                    f"traffics={name}: no such traffic{did_you_mean(name, self.traffic_options)}; choose among {known}, "
-                    "or give the import path of a model of your own."
+                    f"traffics={name}: no such traffic{did_you_mean(name, self.traffic_options)}; choose among "
+                    f"{known}, or give the import path of a model of your own."
                 )
         return {name: self.traffic_options.get(name) or TrafficConfig(_target_=name) for name in self.traffics}

@@ -45,7 +45,7 @@ def _remove_empty(folders: list[Path]) -> None:
 
 
 def write_down(composed: Any, folder: Path) -> None:
-    """What was asked for, in the run folder: all values in ``config.yaml``, the command line in ``overrides.yaml``."""
+    """What was asked for, in the run folder: ``config.yaml`` has all values, ``overrides.yaml`` the command line."""
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 

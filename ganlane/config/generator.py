@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
-from ganlane.config.checks import above, at_least, between, check, every, optional
+from ganlane.config.checks import above, at_least, between, check, every, one_of, optional
 from ganlane.config.plain import plain_copy
 from ganlane.errors import UserError
 
 if TYPE_CHECKING:
-    from ganlane.generator import CalibratedConfig, LoopConfig, LossWeights, PaperConfig
+    from ganlane.generator import CalibratedConfig, LoopConfig, LossWeights, PaperConfig, Preset
 
 
 @dataclass
@@ -41,8 +41,9 @@ class LoopOptions:
 class CalibratedLoopOptions(LoopOptions):
     """The calibrated preset's: fewer updates, each through a whole stretch of a scene."""
 
-    updates: int = 450
-    evaluate_every: int = 50
+    updates: int = 400
+    evaluate_every: int = 40
+    learning_rate: float = 4e-3
     warmup: int = 20
 
 
@@ -77,7 +78,12 @@ class GeneratorConfig:
     held_out_stride: int = 3
 
     def __post_init__(self) -> None:
-        check(self, "generator", batch=at_least(1), held_out_stride=at_least(1))
+        # Each option is the fit of one preset: generator=calibrated chooses the other, generator.preset does not.
+        check(self, "generator", preset=one_of((type(self).preset,)), batch=at_least(1), held_out_stride=at_least(1))
+
+    def preset_name(self) -> Preset:
+        """The preset, checked."""
+        return cast("Preset", self.preset)
 
     def fit_config(self, seed: int) -> PaperConfig | CalibratedConfig:
         """As :func:`ganlane.generator.fit_generator` takes it."""

@@ -10,11 +10,11 @@ from pathlib import Path
 from ganlane.paths import conf_folder
 
 _FLAGS = """flags
-  -m, --multirun       a sweep over values with commas: ganlane {command} -m seed=0,1,2 (each run in a folder of its own)
+  -m, --multirun       a sweep over values with commas, each run in its own folder: ganlane {command} -m seed=0,1
   --cfg job            print the whole configuration and stop
   --hydra-help         Hydra's own flags; --shell-completion for bash, zsh and fish
 
-exit status: 0 done, 2 a mistake in the configuration, a file or a checkpoint, 130 stopped by Ctrl-C, 143 by SIGTERM"""
+exit status: 0 done, 2 a mistake in configuration, file or checkpoint, 130 stopped by Ctrl-C, 143 by SIGTERM"""
 
 
 def help_text(command: str) -> str:

@@ -14,7 +14,6 @@ from hydra.core.override_parser.types import Override, OverrideType
 from ganlane.errors import UserError
 from ganlane.paths import conf_folder
 
-
 #: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
 ALIASES = {"render": {"agent": "driver"}}
 

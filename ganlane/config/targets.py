@@ -1,4 +1,4 @@
-"""Names of Python objects in a configuration: imported and called with a sentence for everything that can go wrong."""
+"""Names of Python objects in a configuration: imported and called, with a sentence for what can go wrong."""
 
 from __future__ import annotations
 
@@ -37,15 +37,11 @@ def import_target(path: str, key: str) -> Any:
 def call_with(target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str) -> Any:
     """``target(...)`` with all of ``own`` and those of ``offered`` that its signature names.
 
-    A target that takes any keyword (``**options``) gets ``road`` and ``stream`` of what is offered.
-
     Raises:
         UserError: ``own`` holds what the target does not take, or something that it needs is not there.
     """
     parameters = inspect.signature(target).parameters
-    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    wanted = {name for name in offered if name in parameters or (takes_any and name in ("road", "stream"))}
-    arguments = {**{name: offered[name] for name in wanted}, **own}
+    arguments = {**{name: value for name, value in offered.items() if name in parameters}, **own}
     try:
         inspect.signature(target).bind(**arguments)
     except TypeError as error:

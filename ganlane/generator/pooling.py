@@ -18,25 +18,28 @@ RANGE_M = 100.0
 _PAIR_FEATURES = 4
 
 
-def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
+def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | None, Tensor]:
     """The ``neighbours`` nearest other vehicles of each: indices [B, G, K] and whether each is one, [B, G, K].
 
-    ``position`` is [B, G, 2] in m, ``valid`` [B, G]. With too few vehicles to choose from K is G, in order of
-    memory. Padding, the vehicle itself and who is out of :data:`RANGE_M` are marked false.
+    ``position`` is [B, G, 2] in m, ``valid`` [B, G]. With too few vehicles to choose from there are no indices
+    (None) and K is G, everybody in order. Padding, the vehicle itself and who is out of :data:`RANGE_M` are
+    marked false.
     """
     count = position.shape[-2]
     offset = position[..., None, :, :] - position[..., :, None, :]
     alone = torch.eye(count, dtype=torch.bool, device=position.device)
     seen = valid[..., None, :] & ~alone & (offset[..., 0].abs() <= RANGE_M)
     if count - 1 <= neighbours:
-        return torch.arange(count, device=position.device).expand(offset.shape[:-1]), seen
+        return None, seen
     distance = (offset * offset).sum(-1).masked_fill(~seen, torch.inf)
     index = distance.topk(neighbours, dim=-1, largest=False).indices
     return index, seen.gather(-1, index)
 
 
-def gather_vehicles(values: Tensor, index: Tensor) -> Tensor:
-    """Rows [B, G, K, F] of ``values`` [B, G, F] at ``index`` [B, G, K]."""
+def gather_vehicles(values: Tensor, index: Tensor | None) -> Tensor:
+    """Rows [B, G, K, F] of ``values`` [B, G, F] at ``index`` [B, G, K]; all of them, [B, 1, G, F], without one."""
+    if index is None:
+        return values[..., None, :, :]
     batch, count, chosen = index.shape
     flat = index.reshape(batch, count * chosen, 1).expand(-1, -1, values.shape[-1])
     return values.gather(1, flat).reshape(batch, count, chosen, values.shape[-1])
@@ -67,7 +70,7 @@ class PairPooling(nn.Module):
         return (torch.relu(self.second(first)) * seen[..., None]).amax(dim=-2)
 
     @staticmethod
-    def pair_features(position: Tensor, displacement: Tensor, index: Tensor) -> Tensor:
+    def pair_features(position: Tensor, displacement: Tensor, index: Tensor | None) -> Tensor:
         """Relative position and relative displacement [B, G, K, 4] of the neighbours at ``index``, scaled."""
         scale = position.new_tensor((*_POSITION_SCALE_M, *_MOTION_SCALE_M))
         state = torch.cat([position, displacement], dim=-1)

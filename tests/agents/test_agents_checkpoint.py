@@ -27,7 +27,7 @@ def test_a_loaded_agent_drives_like_the_saved_one(saved):
     assert torch.equal(policy(data.clone())["action"], agent().greedy(data.clone())["action"])
     assert metadata["observation"] == "table3"
     assert metadata["training"] == {"decisions": 7}
-    assert metadata["network"]["v_max"] == 120.0
+    assert metadata["network"]["v_max"] == RainbowConfig().v_max
     assert metadata["network"]["observation_size"] == 5
 
 

@@ -110,7 +110,7 @@ def test_the_policy_writes_the_action_alone():
     assert data["action"].dtype == torch.int64
 
 
-def test_without_noise_a_share_epsilon_of_the_actions_is_random_and_legal():
+def test_a_share_epsilon_of_the_actions_is_random_and_legal():
     def legal(tensordict):
         mask = torch.ones(*tensordict.shape, 3, dtype=torch.bool)
         mask[:, 1] = False
@@ -128,8 +128,12 @@ def test_without_noise_a_share_epsilon_of_the_actions_is_random_and_legal():
     assert explorer.policy.epsilon == RainbowConfig().epsilon
 
 
-def test_noisy_agents_draw_no_random_actions():
-    assert agent().policy.epsilon == 0.0
+def test_noisy_agents_draw_random_actions_too_unless_epsilon_is_0():
+    noisy = Rainbow(RainbowConfig(**SMALL), SIZE)
+    assert noisy.policy.epsilon == RainbowConfig().epsilon_start
+    silent = Rainbow(RainbowConfig(**SMALL, epsilon_start=0.0, epsilon=0.0), SIZE)
+    silent.anneal(10**9)
+    assert silent.policy.epsilon == 0.0
 
 
 # --- updates
@@ -296,5 +300,5 @@ def test_impossible_hyperparameters_are_refused(options, name):
 
 
 def test_the_state_of_an_agent_with_other_hyperparameters_is_refused():
-    with pytest.raises(UserError, match=r"agent.gamma=0.9: the saved agent has 0.99"):
+    with pytest.raises(UserError, match=r"agent.gamma=0.9: the saved agent has 0.98"):
         agent(gamma=0.9).load_state_dict(agent().state_dict())

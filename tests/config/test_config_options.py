@@ -10,9 +10,9 @@ from omegaconf import OmegaConf
 
 from ganlane.__main__ import COMMANDS
 from ganlane.agents import RainbowConfig
+from ganlane.config.agent import AgentConfig, DqnConfig
 from ganlane.config.compose import check
 from ganlane.config.env import EgoConfig, EnvConfig, IdmConfig, MobilConfig
-from ganlane.config.agent import AgentConfig, DqnConfig
 from ganlane.config.generator import (
     CalibratedGeneratorConfig,
     CalibratedLoopOptions,
@@ -143,11 +143,13 @@ def test_paper_experiment_is_two_phases_and_can_be_shortened():
 def test_a_generator_file_reaches_every_generated_traffic():
     config = check("evaluate", ["generator.path=mine.safetensors"]).config
     assert {config.traffic_options[name].path for name in ("gan", "gan_calibrated")} == {"mine.safetensors"}
-    assert check("train", ["traffic=gan", "generator.path=mine.safetensors"]).config.traffic.path == "mine.safetensors"
+    assert (
+        check("train", ["traffic=gan", "generator.path=mine.safetensors"]).config.traffic.path == "mine.safetensors"
+    )
 
 
 def test_yaml_files_explain_themselves():
     for path in conf_folder().rglob("*.yaml"):
-        first = [line for line in path.read_text().splitlines() if not line.startswith("# @package")][0]
+        first = next(line for line in path.read_text().splitlines() if not line.startswith("# @package"))
         assert first.startswith("# "), path
         assert OmegaConf.load(path) is not None

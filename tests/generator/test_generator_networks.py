@@ -95,6 +95,14 @@ def test_the_nearest_are_found_as_by_sorting(scene):
             assert set(index[row, own][seen[row, own]].tolist()) == set(others[:8])
 
 
+def test_a_few_vehicles_are_all_each_others_neighbours(scene):
+    _, position, mask = (part[:, :9] for part in scene)
+    index, seen = nearest(position, mask, 8)
+    assert index is None
+    assert (seen.sum(-1)[mask] <= mask.sum(-1, keepdim=True).expand_as(mask)[mask] - 1).all()
+    assert seen[1, 0].tolist() == [False] + [True] * 6 + [False] * 2
+
+
 def test_who_is_out_of_range_has_no_influence():
     position = torch.tensor([[[0.0, 0.0], [RANGE_M + 1.0, 0.0], [RANGE_M - 1.0, 0.0]]])
     _, seen = nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)

@@ -12,6 +12,7 @@ from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim.ego import EgoParameters
 from ganlane.sim.lanes import Visibility
+from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.vehicles import Vehicles
@@ -56,11 +57,12 @@ def environment(
     spawn: SpawnParameters | None = None,
     traffic: TrafficModule | None = None,
     ring_m: float | None = None,
+    stream: int = Stream.TRAIN,
     **others: object,
 ) -> HighwayEnv:
     """A HighwayEnv in float64 unless told otherwise."""
     road = Road(lanes=lanes, ring_m=ring_m)
-    traffic = traffic or (IdmMobilTraffic(road) if mobil else IdmTraffic(road))
+    traffic = traffic or (IdmMobilTraffic(road, stream) if mobil else IdmTraffic(road, stream))
     return HighwayEnv(
         traffic,
         num_envs=num_envs,

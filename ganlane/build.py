@@ -15,7 +15,6 @@ from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Composite
 from torchrl.envs import Compose, TransformedEnv
 
 from ganlane import keys
@@ -104,10 +103,6 @@ def make_env(
         seed=seed,
         device=device,
     )
-    # TransformedEnv hands on to a reset only what the state spec names; without the counters every reset that asks
-    # for certain episodes would run the first ones.
-    counters = {name: base.observation_spec[name].clone() for name in (keys.SEED, keys.EPISODE)}
-    base.state_spec = Composite(counters, shape=base.batch_size, device=base.device)
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
     return TransformedEnv(base, Compose(seen, RewardTransform(env.decision_period_s, reward.parameters())))
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import torch
 from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+# The batches of tests are small: one thread is fastest, and the suite runs in two processes.
+torch.set_num_threads(1)
 
 # Time limits per example fail on a busy machine, and a suite should find the same faults in every run.
 settings.register_profile("ganlane", deadline=None, derandomize=True, database=None)

@@ -13,9 +13,9 @@ class RainbowConfig:
     """Hyperparameters; the values are for one update of 256 per 64 decisions.
 
     Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
-    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is
-    the share of random legal actions, which noisy layers alone do not replace (docs/agent.md). ``adam_eps=None`` stands for 0.005 / ``batch_size``.
-    ``warmup`` is the number of transitions before the first update.
+    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is the share of
+    random legal actions, which noisy layers alone do not replace (docs/agent.md). ``adam_eps=None`` stands for
+    0.005 / ``batch_size``. ``warmup`` is the number of transitions before the first update.
     """
 
     hidden: tuple[int, ...] = (256, 256)

@@ -5,7 +5,7 @@
 ``parameters``. A model of your own needs no more than its import path::
 
     python -m ganlane.evaluate traffics=[my.module.MyTraffic]
-    python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic 'traffic.parameters={pace: 0.9}'
+    python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic +traffic.parameters.pace=0.9
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
@@ -92,6 +92,10 @@ class HighwayEnv(EnvBase):
         n, device = self.batch_size[0], self.device
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
         self.observation_spec = state_spec(n, self.vehicles, self.dtype, memory).to(device)
+        # A TransformedEnv hands on to a reset only what the state spec names; without the counters a reset that asks
+        # for certain episodes would run the first ones.
+        counters = {name: self.observation_spec[name].clone() for name in (keys.SEED, keys.EPISODE)}
+        self.state_spec = Composite(counters, shape=(n,), device=device)
         self.action_spec = Categorical(3, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
         self.done_spec = done_spec(n).to(device)

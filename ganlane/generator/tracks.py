@@ -77,9 +77,12 @@ def split_scenes(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> tuple[
     names = [scene.name for scene in scenes]
     unknown = sorted(set(held_out) - set(names))
     if unknown:
-        raise UserError(f"held-out scenes {unknown}: not among the recorded scenes {names}; choose from these.")
+        raise UserError(f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these.")
     fitted = [scene for scene in scenes if scene.name not in held_out]
     kept = [scene for scene in scenes if scene.name in held_out]
     if not fitted or not kept:
-        raise UserError(f"held-out scenes {list(held_out)}: leave at least one of {names} for each of the two parts.")
+        raise UserError(
+            f"data.held_out={list(held_out)}: of the scenes {names} at least one must be held out and one fitted to; "
+            "name some in data.held_out."
+        )
     return fitted, kept

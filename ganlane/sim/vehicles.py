@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -29,7 +28,7 @@ class Vehicles:
     valid: Tensor
 
     @classmethod
-    def of(cls, mapping: Mapping[str, Tensor] | Any) -> Vehicles:
+    def of(cls, mapping: Any) -> Vehicles:
         """From anything that ``get``s tensors by name, a TensorDict for one."""
         return cls(*(mapping.get(name) for name in VEHICLE_FIELDS))
 

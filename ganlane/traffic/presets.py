@@ -7,7 +7,7 @@ from typing import Any
 
 from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
-from ganlane.generator import load_generator, shipped_generator
+from ganlane.generator import headway_quantiles, load_generator, shipped_generator
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
@@ -100,7 +100,7 @@ def gan_calibrated_traffic(
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
-    options: dict[str, Any] = {"headway_quantiles_s": headway_quantiles(statistics)}
+    options: dict[str, Any] = {"headway_quantiles_s": headway_quantiles(metadata["driving_statistics"])}
     parts: dict[str, TrafficModule] = {
         "generator": AnchoredGanTraffic(generator, road, stream, noise_scale=noise_scale, **options),
         "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes)),
@@ -110,8 +110,3 @@ def gan_calibrated_traffic(
 
 #: Wishes per change that is carried out, measured in the simulation: waiting for a gap costs distance.
 WISH_PER_CHANGE = 1.3
-
-
-def headway_quantiles(statistics: DrivingStatistics) -> tuple[float, ...]:
-    """5, 25, 50, 75 and 95 % quantiles of the recorded followers' headways, s."""
-    return tuple(statistics.headway.quantile(level) for level in (0.05, 0.25, 0.5, 0.75, 0.95))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -45,11 +45,15 @@ class TrafficSequential(TrafficModule):
         self.parts = nn.ModuleDict(parts)
         self.visibility = base.visibility
 
+    def named_parts(self) -> list[tuple[str, TrafficModule]]:
+        """Names and parts, in order."""
+        return [(name, cast(TrafficModule, part)) for name, part in self.parts.items()]
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Run the parts in order."""
         memories = tensordict.get(keys.TRAFFIC)
         kept = {}
-        for name, part in self.parts.items():
+        for name, part in self.named_parts():
             tensordict.set(keys.TRAFFIC, memories.get(name))
             part(tensordict)
             kept[name] = tensordict.get(keys.TRAFFIC)
@@ -58,9 +62,9 @@ class TrafficSequential(TrafficModule):
 
     def init_memory(self, vehicles: Vehicles, who: Tensor, key: Tensor) -> TensorDict:
         """The parts' memories, by name."""
-        memories = {name: part.init_memory(vehicles, who, key) for name, part in self.parts.items()}
+        memories = {name: part.init_memory(vehicles, who, key) for name, part in self.named_parts()}
         return TensorDict(memories, batch_size=[vehicles.x.shape[0]])
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """The parts' specs, by name."""
-        return {name: part.memory_spec(n, m, dtype) for name, part in self.parts.items()}
+        return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}

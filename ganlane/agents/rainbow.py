@@ -143,12 +143,16 @@ class Rainbow:
         return parameters_of(self.network)
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
-        """Everything an exact resume needs, as tensors and plain data; noise is redrawn before use, so not here."""
+        """Everything an exact resume needs, as tensors and plain data; noise is redrawn before use, so not here.
+
+        Without the buffer a resume is not exact anyway, so Adam's moments are kept in bfloat16 alone.
+        """
+        optimizer = self.optimizer.state_dict()
         return {
             "config": asdict(self.config),
             "network": self.weights(),
             "target": parameters_of(self.loss.target_network),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": optimizer if with_replay else _halved(optimizer),
             "generators": {name: generator.get_state() for name, generator in self.generators.items()},
             "updates": self.updates,
             "replay": replay_state(self.replay) if with_replay else None,
@@ -175,3 +179,12 @@ class Rainbow:
         self.replay.empty()
         if state["replay"] is not None:
             load_replay_state(self.replay, state["replay"])
+
+
+def _halved(optimizer: dict[str, Any]) -> dict[str, Any]:
+    """The state of an optimiser with its moments in bfloat16; loading it brings them back to the weights' type."""
+    state = {
+        row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in moments.items()}
+        for row, moments in optimizer["state"].items()
+    }
+    return {**optimizer, "state": state}

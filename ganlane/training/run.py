@@ -9,6 +9,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from ganlane import keys
 from ganlane.agents import Rainbow
 from ganlane.errors import UserError
 from ganlane.training.checkpoints import load_checkpoint, pack, unpack
@@ -42,15 +43,23 @@ class Run:
         return every > 0 and self.decisions // every > (self.decisions - self.environments) // every
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
-        """Tensors and plain data; without the replay buffer it is small, but a resumed run is not bit-exact."""
+        """Tensors and plain data.
+
+        Without the replay buffer it is small, and of the environments only the episodes are kept: a resumed run
+        starts the next ones, and is not bit-exact.
+        """
         counters = {"decisions": self.decisions, "owed": self.owed, "wall_s": self.wall_s, "best": self.best}
-        return {
+        whole = {
             "agent": self.agent.state_dict(with_replay),
             "window": self.window.state_dict(),
             "carrier": pack(self.carrier),
             "meter": self.meter.state_dict(),
             "counters": counters,
         }
+        if with_replay:
+            return whole
+        episodes = self.carrier.select(keys.SEED, keys.EPISODE, strict=False)
+        return {**whole, "carrier": pack(episodes), "window": None, "meter": None}
 
     def restore(self, path: str | Path) -> bool:
         """Go on from the checkpoint of a run with as many environments and the same agent.
@@ -69,9 +78,19 @@ class Run:
                 f"{list(expected)}; use the same number."
             )
         self.agent.load_state_dict(state["agent"])
-        self.window.load_state_dict(state["window"])
-        self.meter.load_state_dict(state["meter"])
-        self.carrier, counters = carrier, state["counters"]
+        if state["window"] is None:
+            self.carrier = self._next_episodes(carrier)
+        else:
+            self.window.load_state_dict(state["window"])
+            self.meter.load_state_dict(state["meter"])
+            self.carrier = carrier
+        counters = state["counters"]
         self.decisions, self.owed, self.best = (counters[name] for name in ("decisions", "owed", "best"))
         self._before_s = counters["wall_s"]
         return state["agent"]["replay"] is not None
+
+    def _next_episodes(self, last: TensorDictBase) -> TensorDictBase:
+        """All environments at the start of the episodes after ``last``, or of their first ones if it has none."""
+        if keys.EPISODE not in last:
+            return self.env.reset()
+        return self.env.reset(last.set(keys.EPISODE, last.get(keys.EPISODE) + self.environments))

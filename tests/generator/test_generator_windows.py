@@ -118,7 +118,7 @@ def test_split_keeps_every_scene_on_one_side():
 
 @pytest.mark.parametrize("held_out", [("nowhere",), (), ("scene-0", "scene-1", "scene-2")])
 def test_a_split_without_two_parts_is_refused(held_out):
-    with pytest.raises(UserError, match="data.held_out="):
+    with pytest.raises(UserError, match=r"data\.held_out="):
         split_scenes(scene_tracks(recording()), held_out)
 
 

@@ -33,6 +33,8 @@ SMALL = {
     "target_period": 20,
     "learning_rate": 3e-3,
     "gamma": 0.8,
+    "epsilon_start": 0.0,
+    "epsilon": 0.0,
 }
 
 

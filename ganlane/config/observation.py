@@ -17,9 +17,9 @@ FORMS = ("table3", "table3_progress", "lane_view", "table3_lane_view")
 
 @dataclass
 class ObservationConfig:
-    """``observation=table3_lane_view`` and the other forms (:class:`ganlane.transforms.ObservationTransform`)."""
+    """``observation=lane_view`` and the other forms (:class:`ganlane.transforms.ObservationTransform`)."""
 
-    form: str = "table3_lane_view"
+    form: str = "lane_view"
     range_m: float = 200.0
     speed_mps: float = 30.0
 

@@ -109,4 +109,4 @@ def gan_calibrated_traffic(
 
 
 #: Wishes per change that is carried out, measured in the simulation: waiting for a gap costs distance.
-WISH_PER_CHANGE = 1.3
+WISH_PER_CHANGE = 2.0

@@ -117,9 +117,9 @@ def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_
     light = settings(856, progress=True)
     result = train(ToyRoad(8), resumed, light, tmp_path, resume=first.checkpoint)
     assert "not bit-exact" in capsys.readouterr().err
-    assert len(resumed.replay) == 56
+    assert len(resumed.replay) == 40  # 7 steps of 8, of which the new window of 3 still holds 2
     assert result.updates == first.updates
-    result = train(ToyRoad(8), resumed, settings(864 + 16), tmp_path, resume=first.checkpoint)
+    result = train(ToyRoad(8), resumed, settings(864 + 32), tmp_path, resume=first.checkpoint)
     assert result.updates == first.updates + 3
 
 

@@ -1,0 +1,105 @@
+"""The generated traffics that ship, with the weights that ship."""
+
+import pytest
+import torch
+
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.generator import shipped_generator
+from ganlane.sim import Road, Vehicles, pair_overlaps
+from ganlane.traffic import Guard
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+
+
+def drive(traffic, n, decisions, visit, first_episode=0):
+    """The state after so many decisions of a keep-lane ego; ``ended`` says whose episode was over by then."""
+    env = HighwayEnv(traffic, num_envs=n, first_episode=first_episode)
+    env.recorder = visit
+    state, ended = env.reset(), torch.zeros(n, 1, dtype=torch.bool)
+    for _ in range(decisions):
+        state["action"] = torch.zeros(n, dtype=torch.int64)
+        state = env.step(state)["next"]
+        ended = ended | state["done"]
+    return state.set("ended", ended)
+
+
+def beyond_the_edge(vehicles: Vehicles, road: Road) -> float:
+    """How far the outermost body reaches past the edge of the road, m; negative inside."""
+    half = 0.5 * vehicles.width
+    left = vehicles.y + half - road.left_edge_m()
+    right = road.right_edge_m() - (vehicles.y - half)
+    return float(torch.maximum(left, right)[:, 1:].max())
+
+
+def test_with_its_guard_gan_traffic_stays_on_the_road_and_without_it_leaves_it():
+    road, worst = Road(), {True: -9.0, False: -9.0}
+    for guard in worst:
+
+        def visit(vehicles, running, guard=guard):
+            worst[guard] = max(worst[guard], beyond_the_edge(vehicles, road))
+
+        drive(gan_traffic(road, guard=guard), 16, 40, visit)
+    assert worst[True] <= 1e-4
+    assert worst[False] > 1.0
+
+
+@pytest.mark.slow
+def test_no_vehicle_leaves_the_road_in_1000_episodes_of_gan_traffic():
+    road, worst, ended = Road(), [-9.0], 0
+
+    def visit(vehicles, running):
+        worst[0] = max(worst[0], beyond_the_edge(vehicles, road))
+
+    for chunk in range(4):
+        state = drive(gan_traffic(road), 250, 600, visit, first_episode=250 * chunk)
+        ended += int(state["ended"].sum())
+    print(f"{ended} of 1000 episodes ended within 600 s; the outermost body stayed {-worst[0]:.2f} m inside the edge")
+    assert worst[0] <= 1e-4
+
+
+def test_calibrated_traffic_neither_overlaps_nor_leaves_the_road_nor_stands_still():
+    road, worst, overlaps, km = Road(), [-9.0], [0], [0.0]
+
+    def visit(vehicles, running):
+        worst[0] = max(worst[0], beyond_the_edge(vehicles, road))
+        overlaps[0] += int(pair_overlaps(vehicles)[:, 1:, 1:].sum())
+        km[0] += float(vehicles.speed[:, 1:].sum()) * 1e-4
+
+    state = drive(gan_calibrated_traffic(road), 16, 60, visit)
+    assert overlaps[0] == 0
+    assert worst[0] <= 0.0
+    speed = state["vehicles", "speed"][:, 1:]
+    assert speed.min() > 5.0
+    # Recorded drivers differ by 2.8 m/s within a frame; a guard that does the driving leaves 0.1.
+    assert speed.std(1).mean() > 1.4
+    assert km[0] > 100
+
+
+def test_calibrated_drivers_keep_different_headways_and_their_own():
+    traffic = gan_calibrated_traffic()
+    env = HighwayEnv(traffic, num_envs=64)
+    state = env.reset()
+    headway = state["traffic", "generator", "headway"]
+    assert headway.std() > 0.3
+    state["action"] = torch.zeros(64, dtype=torch.int64)
+    assert torch.equal(env.step(state)["next", "traffic", "generator", "headway"], headway)
+
+
+def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding():
+    for preset in (gan_traffic, gan_calibrated_traffic):
+        many = drive(preset(), 6, 5, None)
+        alone = drive(preset(), 1, 5, None, first_episode=4)
+        for name in ("x", "y", "speed"):
+            torch.testing.assert_close(many["vehicles", name][4], alone["vehicles", name][0], atol=2e-3, rtol=1e-4)
+
+
+def test_the_paper_chain_has_a_guard_that_can_be_left_out():
+    assert isinstance(dict(gan_traffic().named_parts())["guard"], Guard)
+    assert "guard" not in dict(gan_traffic(guard=False).named_parts())
+
+
+def test_weights_of_the_other_preset_are_refused():
+    with pytest.raises(UserError, match="paper"):
+        gan_traffic(path=shipped_generator("calibrated"))
+    with pytest.raises(UserError, match="no such file"):
+        gan_calibrated_traffic(path="nowhere.safetensors")

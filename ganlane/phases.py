@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import polars as pl
-import torch
-from tensordict import TensorDictBase
-from torch import Tensor
 
-from ganlane import keys
 from ganlane.agents import GreedyPolicy, Rainbow, read_agent, save_agent, transfer
+from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
-from ganlane.build import make_env, make_traffic, observation_of
+from ganlane.build import make_env, make_road, make_traffic, observation_of
 from ganlane.config.traffic import TrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
-from ganlane.keys import EGO_INDEX
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
 from ganlane.training import TensorBoardLog, TrainingConfig, TrainingResult, find_checkpoint, train
 from ganlane.transforms import observation_size
 
@@ -90,20 +86,8 @@ def make_agent(config: TrainConfig, trained: bool = False) -> Rainbow:
     if trained:
         rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
     size = observation_size(config.observation.form, config.env.vehicles)
-    legal = LegalActions(Road(config.env.lanes, config.env.lane_width_m))
+    legal = partial(legal_actions, road=make_road(config.env))
     return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal)
-
-
-class LegalActions:
-    """Which actions stay on the road, [N, 3] bool."""
-
-    def __init__(self, road: Road) -> None:
-        self.road = road
-
-    def __call__(self, tensordict: TensorDictBase) -> Tensor:
-        """From the ego's target lane."""
-        lane = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
-        return torch.stack((lane >= 0, lane < self.road.lanes - 1, lane > 0), dim=1)
 
 
 def check_observation(name: str, config: TrainConfig) -> None:
@@ -157,16 +141,24 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "observation": config.observation.form,
         "observation_scale": scale,
         "environment": environment,
+        "agent": asdict(config.agent),
+        "reward": asdict(config.reward),
         "training": training,
     }
 
 
 def _keep(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
-    """Write the agent of the phase: the best one where the run chose among several, else the last."""
-    best = phase.folder / "checkpoints" / "best.safetensors"
+    """Write the agent of the phase: the best one where the run chose among several, else the last.
+
+    Its metadata hold, beside the description, the length of the run and, for the best one, its figures on the
+    stream kept for selection.
+    """
+    best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)
     if result.best is not None and best.is_file():
-        load_parameters(agent.network, read_agent(best)[0])
-    metadata = describe(config, phase)
+        weights, _, known = read_agent(best)
+        load_parameters(agent.network, weights)
+        chosen = {name: value for name, value in known["training"].items() if name not in metadata["training"]}
+        metadata["selected"] = {**chosen, "episodes": config.selection_episodes, "stream": "select"}
     metadata["training"] |= {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
     save_agent(phase.folder / AGENT_FILE, agent, metadata)
 

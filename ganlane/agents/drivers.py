@@ -39,6 +39,12 @@ class Driver(TensorDictModuleBase):
         return tensordict.set(keys.ACTION, self.act(Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict))
 
 
+def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
+    """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
+    target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
+    return torch.stack((target >= 0, target < road.lanes - 1, target > 0), dim=1)
+
+
 class RandomDriver(Driver):
     """Any of the three actions with equal probability; it soon drives off the road."""
 
@@ -56,12 +62,11 @@ class RandomLegalDriver(RandomDriver):
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """The r-th legal action, r uniform."""
-        target = vehicles.target_lane[:, EGO_INDEX]
-        legal = torch.stack((target >= 0, target < self.road.lanes - 1, target > 0), dim=1)
+        legal = legal_actions(tensordict, self.road)
         wanted = (self._uniform(tensordict) * legal.sum(1)).long()
         rank = legal.cumsum(1) - 1
         chosen = legal & (rank == wanted[:, None])
-        return (chosen.long() * torch.arange(3, device=target.device)).amax(1)
+        return (chosen.long() * torch.arange(3, device=legal.device)).amax(1)
 
 
 class KeepLaneDriver(Driver):

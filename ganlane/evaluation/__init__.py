@@ -7,6 +7,7 @@ bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for
 :func:`text_table` and :func:`markdown_table` print it; :func:`write_results` and :func:`write_episodes` keep it.
 """
 
+from ganlane.evaluation.branching import Branches, branch
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
 from ganlane.evaluation.episodes import run_episodes
 from ganlane.evaluation.layout import markdown_table, text_table
@@ -23,8 +24,10 @@ from ganlane.evaluation.statistics import (
 from ganlane.evaluation.table import evaluation_rows
 
 __all__ = [
+    "Branches",
     "Estimate",
     "NormalizedScore",
+    "branch",
     "clopper_pearson",
     "code_version",
     "evaluation_rows",

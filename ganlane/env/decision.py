@@ -31,7 +31,7 @@ from ganlane.sim.neighbours import Scene
 from ganlane.sim.road import Road
 from ganlane.sim.steering import SteeringParameters
 from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.base import TrafficModule, memory_of
 
 #: Called after every physics step with the vehicles and the rows [N] that were running in it.
 Recorder = Callable[[Vehicles, Tensor], None]
@@ -104,7 +104,7 @@ def begin(world: World, state: TensorDictBase, ordered: Command) -> Substep:
     none = torch.zeros_like(ordered.off_road)
     return Substep(
         vehicles=vehicles,
-        traffic=state.get(keys.TRAFFIC),
+        traffic=memory_of(state),
         scene=ego_scene(vehicles, world.road),
         steering=ego.get("steering"),
         ahead=ego.get("soft_crash"),

@@ -41,6 +41,7 @@ COLUMNS: tuple[tuple[str, Callable[[Row], str]], ...] = (
     ("time-out", _plain("timeout")),
     ("scene end", _plain("scene_end")),
     ("mean reward [95 %]", _number("mean_reward", 1)),
+    ("minus MOBIL, paired", _number("minus_mobil", 1)),
     ("m/s", _number("mean_speed_mps", 1)),
     ("changes/km", _number("lane_changes_per_km", 2)),
     ("% of MOBIL [95 %]", _number("normalized_percent", 0)),
@@ -48,7 +49,7 @@ COLUMNS: tuple[tuple[str, Callable[[Row], str]], ...] = (
 )
 _NAMES = 2
 #: Left out where no row has anything in them.
-_OPTIONAL = ("time-out", "scene end")
+_OPTIONAL = ("time-out", "scene end", "minus MOBIL, paired")
 
 
 def _grid(rows: Sequence[Row]) -> tuple[Cells, list[Cells]]:

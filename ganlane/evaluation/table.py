@@ -11,7 +11,7 @@ import polars as pl
 from ganlane import keys
 from ganlane.evaluation.counts import clopper_pearson, rate_per_1000_km
 from ganlane.evaluation.score import NormalizedScore, no_score, normalized_percent
-from ganlane.evaluation.statistics import mean_interval
+from ganlane.evaluation.statistics import mean_interval, paired_difference
 
 #: The two drivers that give the normalised score its scale.
 SCALE_TOP = "mobil"
@@ -34,6 +34,7 @@ def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
         ``soft_crash_onsets``, ``soft_crash_behind_onsets``; ``mean_reward`` and ``reward_sd``;
         ``mean_speed_mps`` (distance over time of all episodes together); ``lane_changes_per_km``;
         ``distance_km``; ``hard_crash_share``; ``crashes_per_1000_km`` (hard crashes);
+        ``minus_mobil`` (paired difference of the mean reward to MOBIL's on the same episodes);
         ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with ``_ci``
         holds the 95 % interval of its namesake as ``[low, high]``, or None.
     """
@@ -46,7 +47,8 @@ def _row(pair: pl.DataFrame, episodes: pl.DataFrame) -> Row:
     agent, traffic = pair["agent"][0], pair["traffic"][0]
     row: Row = {"agent": agent, "traffic": traffic, "episodes": pair.height}
     row |= _outcomes(pair) | _returns(pair) | _driving(pair)
-    return row | _score_fields(_score(pair, episodes.filter(pl.col("traffic") == traffic)))
+    same_traffic = episodes.filter(pl.col("traffic") == traffic)
+    return row | _lead(pair, same_traffic) | _score_fields(_score(pair, same_traffic))
 
 
 def _outcomes(pair: pl.DataFrame) -> Row:
@@ -89,6 +91,23 @@ def _driving(pair: pl.DataFrame) -> Row:
     }
 
 
+def _lead(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
+    """What the agent earns more than MOBIL on the episodes that both drove; None for MOBIL itself or without it."""
+    mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
+    if pair["agent"][0] == SCALE_TOP or mobil.height == 0:
+        return {"minus_mobil": None, "minus_mobil_ci": None}
+    both = pair.select([*_EPISODE, "reward"]).join(_named(mobil, SCALE_TOP), on=_EPISODE).sort(_EPISODE)
+    if both.height < 2:
+        return {"minus_mobil": None, "minus_mobil_ci": None}
+    lead = paired_difference(_column(both, "reward"), _column(both, SCALE_TOP))
+    return {"minus_mobil": lead.value, "minus_mobil_ci": lead.interval}
+
+
+def _named(driver: pl.DataFrame, name: str) -> pl.DataFrame:
+    """Episodes and rewards of ``driver``, the rewards under its ``name``."""
+    return driver.select([*_EPISODE, pl.col("reward").alias(name)])
+
+
 def _score_fields(score: NormalizedScore) -> Row:
     """The columns of the normalised score."""
     return {
@@ -105,7 +124,7 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
         driver = same_traffic.filter(pl.col("agent") == name)
         if driver.height == 0:
             return no_score(f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing")
-        returns.append(driver.select([*_EPISODE, pl.col("reward").alias(name)]))
+        returns.append(_named(driver, name))
     paired = returns[0].join(returns[1], on=_EPISODE).join(returns[2], on=_EPISODE).sort(_EPISODE)
     if paired.height < 2:
         return no_score("fewer than two episodes are shared by the drivers")

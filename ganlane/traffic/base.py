@@ -20,6 +20,12 @@ from ganlane.sim.vehicles import Vehicles
 MemoryFields = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
 
 
+def memory_of(tensordict: TensorDictBase) -> TensorDictBase:
+    """``traffic`` of ``tensordict``; empty where it is missing, since TorchRL drops empty TensorDicts on the way."""
+    memory = tensordict.get(keys.TRAFFIC, None)
+    return TensorDict({}, batch_size=tensordict.batch_size) if memory is None else memory
+
+
 class TrafficModule(TensorDictModuleBase):
     """Base of all traffic models.
 
@@ -74,7 +80,7 @@ class TrafficModule(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``."""
         vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
-        memory = dict(tensordict.get(keys.TRAFFIC).items())
+        memory = dict(memory_of(tensordict).items())
         key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
         moved, memory = self._call(tensordict, vehicles, memory, key)
         batch = tensordict.batch_size

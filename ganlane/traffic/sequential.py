@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ganlane import keys
 from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.base import TrafficModule, memory_of
 
 
 class Overlay(TrafficModule):
@@ -51,10 +51,10 @@ class TrafficSequential(TrafficModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Run the parts in order."""
-        memories = tensordict.get(keys.TRAFFIC)
+        memories, nothing = memory_of(tensordict), TensorDict({}, batch_size=tensordict.batch_size)
         kept = {}
         for name, part in self.named_parts():
-            tensordict.set(keys.TRAFFIC, memories.get(name))
+            tensordict.set(keys.TRAFFIC, memories.get(name, nothing))
             part(tensordict)
             kept[name] = tensordict.get(keys.TRAFFIC)
         tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))

@@ -130,3 +130,18 @@ def test_the_markdown_table_has_as_many_cells_in_every_line(rows):
     assert len(lines) == 5
     assert len({line.count("|") for line in lines}) == 1
     assert set(lines[1]) <= set("|-: ")
+
+
+def test_the_lead_over_mobil_is_paired_by_episode_whatever_their_order():
+    mobil = episodes("mobil", [10, 200, 30, 400, 50])
+    agent = episodes("agent", [13, 203, 33, 403, 53]).reverse()
+    agent_row, mobil_row = evaluation_rows(pl.concat([agent, mobil]))
+    assert agent_row["minus_mobil"] == pytest.approx(3.0)
+    assert agent_row["minus_mobil_ci"] == pytest.approx([3.0, 3.0])
+    assert mobil_row["minus_mobil"] is None
+
+
+def test_without_mobil_nobody_has_a_lead_over_it():
+    row = evaluation_rows(episodes("agent", [1, 2]))[0]
+    assert row["minus_mobil"] is None
+    assert "minus MOBIL" not in text_table([row])

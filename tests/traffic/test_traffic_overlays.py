@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ganlane.env import HighwayEnv
+from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.hazard import distance_hazard, literal_hazard, literal_mean_wait, random_side
 from ganlane.traffic import (
@@ -183,6 +183,15 @@ def test_the_guard_leaves_sensible_driving_alone():
     after = Vehicles.of(guard(view)["moved"])
     torch.testing.assert_close(after.x, before.x)
     torch.testing.assert_close(after.y, before.y, atol=1e-3, rtol=0)
+
+
+def test_a_model_without_memory_drives_through_rollouts_and_resets():
+    for traffic in (Drift(lateral=0.0), TrafficSequential({"base": Drift(lateral=0.0), "guard": Guard()})):
+        env = HighwayEnv(traffic, num_envs=3, episode=EpisodeParameters(goal_m=60.0))
+        rollout = env.rollout(12, break_when_any_done=False)
+        assert rollout["next", "done"].any()
+        again = env.rollout(3, tensordict=env.reset(), auto_reset=False, break_when_any_done=False)
+        assert again.shape == (3, 3)
 
 
 def test_each_part_of_a_chain_keeps_its_own_memory():

@@ -153,10 +153,17 @@ def _trained(name: str, env: EnvConfig, device: str) -> Driver:
 
 
 def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
-    """The observation that an agent's metadata name."""
-    return ObservationConfig(
-        metadata.get("observation", ObservationConfig().form), **metadata.get("observation_scale", {})
-    )
+    """The observation that an agent's metadata name.
+
+    Raises:
+        UserError: they name none that there is.
+    """
+    try:
+        return ObservationConfig(metadata["observation"], **metadata["observation_scale"])
+    except (KeyError, TypeError) as error:
+        raise UserError(
+            f"the agent's metadata name no observation that is known here ({error}); train it again or give another."
+        ) from error
 
 
 def _imported(name: str, env: EnvConfig, stream: int, device: str) -> Driver:

@@ -73,17 +73,28 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, torch.Tensor], 
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"{path}: no such file; a {kind} checkpoint (.safetensors) was expected there.")
+        raise UserError(f"{path}: no such file; a checkpoint of kind {kind} (.safetensors) was expected there.")
     try:
         with safe_open(str(path), framework="pt") as opened:
             header = (opened.metadata() or {}).get("ganlane")
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise UserError(
-            f"{path}: not a readable safetensors file ({error}); give a {kind} checkpoint that ganlane wrote."
+            f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} that ganlane wrote."
         ) from error
-    metadata = json.loads(header) if header else {}
+    metadata = _plain(header)
     if metadata.get("kind") != kind:
         found = metadata.get("kind", "a file that ganlane did not write")
-        raise UserError(f"{path}: expected a ganlane {kind} checkpoint, found {found}; give a {kind} checkpoint.")
+        raise UserError(
+            f"{path}: expected a ganlane checkpoint of kind {kind}, found {found}; give one that ganlane wrote."
+        )
     return tensors, metadata
+
+
+def _plain(header: str | None) -> dict[str, Any]:
+    """The metadata in a header; empty where there is none, or something else."""
+    try:
+        metadata = json.loads(header or "{}")
+    except ValueError:
+        return {}
+    return metadata if isinstance(metadata, dict) else {}

@@ -17,7 +17,7 @@ from ganlane.build import make_env, make_road, make_traffic, observation_of
 from ganlane.config.traffic import TrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
-from ganlane.evaluation import run_episodes
+from ganlane.evaluation import code_version, run_episodes
 from ganlane.sim.random import Stream
 from ganlane.training import TensorBoardLog, TrainingConfig, TrainingResult, find_checkpoint, train
 from ganlane.transforms import observation_size
@@ -74,6 +74,7 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
         logs=[TensorBoardLog(phase.folder / "tensorboard")] if config.logger.kind == "tensorboard" else [],
         metadata=describe(config, phase),
         resume=resume,
+        identity=identity(config, phase),
     )
     if result.stopped_by is None:
         _keep(agent, config, phase, result)
@@ -132,6 +133,24 @@ def _selection(config: TrainConfig, phase: Phase) -> Callable[[GreedyPolicy], Ma
     return evaluate
 
 
+def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
+    """What a resumed run must share with the one that was stopped."""
+    return {
+        "env": asdict(config.env),
+        "traffic": asdict(phase.traffic),
+        "observation": asdict(config.observation),
+        "reward": asdict(config.reward),
+        "collector": asdict(config.collector),
+        "seed": config.seed,
+    }
+
+
+def length_of(agent: Path) -> dict[str, float]:
+    """Decisions, updates and wall time of the finished phase that left ``agent``."""
+    training = read_agent(agent)[2]["training"]
+    return {name: training[name] for name in ("decisions", "updates", "wall_s")}
+
+
 def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     """Metadata of the agent's files."""
     scale = {"range_m": config.observation.range_m, "speed_mps": config.observation.speed_mps}
@@ -141,6 +160,9 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "observation": config.observation.form,
         "observation_scale": scale,
         "environment": environment,
+        "env": asdict(config.env),
+        "num_envs": config.collector.num_envs,
+        "code": code_version(),
         "agent": asdict(config.agent),
         "reward": asdict(config.reward),
         "training": training,

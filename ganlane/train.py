@@ -27,16 +27,19 @@ TRAINED = "trained"
 
 def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate what came out."""
-    from ganlane.build import make_driver, set_threads
+    from ganlane.build import make_driver, make_traffic, set_threads
     from ganlane.compare import compare
     from ganlane.evaluation import evaluation_rows, text_table, write_episodes, write_results
-    from ganlane.phases import AGENT_FILE, checkpoint_of, phases_of, run_phase
+    from ganlane.phases import AGENT_FILE, checkpoint_of, length_of, phases_of, run_phase
 
     set_threads(config.threads)
+    for traffic in config.all_traffic():  # a mistake in any of them shows before hours of training, not after
+        make_traffic(traffic, config.env)
     others = [make_driver(name, config.env, device=config.device) for name in config.evaluation.agents]
     outcome: dict[str, dict[str, float]] = {}
     for phase in phases_of(config, folder):
         if phase.name == "pretrain" and (phase.folder / AGENT_FILE).is_file():
+            outcome[phase.name] = length_of(phase.folder / AGENT_FILE)
             continue
         result = run_phase(config, phase, checkpoint_of(phase, config.resume))
         if result.stopped_by is not None:

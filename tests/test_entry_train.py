@@ -158,3 +158,41 @@ def test_a_mistake_leaves_one_sentence_and_no_file(arguments, part, capsys, tmp_
     assert part in err
     assert err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("traffic", ["idm", "idm_mobil", "gan", "gan_calibrated"])
+@pytest.mark.parametrize("init", ["none", "idm_ckpt"])
+def test_every_traffic_runs_with_every_start(traffic, init, capsys):
+    budget = ["total_decisions=64", "collector.num_envs=16", "env.goal_m=40", "agent.warmup=256", "log_every=64"]
+    final = ["evaluation.agents=[keep_lane]", "evaluation.episodes=1", "agent.capacity=1000"]
+    assert main([f"traffic={traffic}", f"init={init}", *budget, *final]) == 0
+    results = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: "))
+    assert [row["traffic"] for row in json.loads(results.read_text())["rows"]] == [traffic, traffic]
+
+
+def test_a_mistake_in_the_final_evaluation_shows_before_training_starts(tmp_path, capsys):
+    assert main([*TINY, "traffic@evaluation.traffic=gan", "evaluation.traffic.path=nowhere.safetensors"]) == 2
+    assert "nowhere.safetensors" in capsys.readouterr().err
+    assert not any(tmp_path.rglob("last.pt"))
+
+
+def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monkeypatch):
+    def broken(*arguments, **options):
+        raise PermissionError(13, "Permission denied", "results.json")
+
+    monkeypatch.setattr("ganlane.compare.compare", broken)
+    assert main(TINY) == 2
+    assert any(tmp_path.rglob("agent.safetensors"))
+    assert any(tmp_path.rglob("last.pt"))
+
+
+def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(capsys):
+    folder, _ = train(capsys)
+    asked = (folder / "overrides.yaml").read_text()
+    for change in ("env.vehicles=5", "seed=5", "reward.goal=1000", "collector.num_envs=8"):
+        assert main([f"resume={folder}", "total_decisions=640", change]) == 2
+        message = capsys.readouterr().err
+        assert change.split("=")[0] in message
+        assert "Traceback" not in message
+    assert (folder / "overrides.yaml").read_text() == asked
+    assert main([f"resume={folder}", "total_decisions=640"]) == 0

@@ -32,10 +32,8 @@ def agent_file(name: str | Path) -> Path:
     shipped = text.removesuffix("@0")
     path = FOLDER / f"{shipped}.safetensors" if shipped in SHIPPED else Path(text)
     if not path.is_file():
-        known = ", ".join(SHIPPED)
-        raise UserError(
-            f"agent {text}: no such file ({path}); give a shipped agent ({known}) or a checkpoint's path."
-        )
+        known = ", ".join(sorted(file.stem for file in FOLDER.glob("agent_*.safetensors")))
+        raise UserError(f"agent {text}: no such file ({path}); the agents that ship are {known}; or give a path.")
     return path
 
 
@@ -114,10 +112,11 @@ def transfer(agent: Rainbow, name: str | Path) -> dict[str, Any]:
     theirs, ours = (asdict(c) for c in (config, own))
     differing = [key for key in ours if ours[key] != theirs[key] and key != "noisy_sigma"]
     if differing:
-        key = differing[0]
+        wanted = " ".join(f"agent.{key}={theirs[key]}" for key in differing).replace("(", "[").replace(")", "]")
+        here = ", ".join(str(ours[key]) for key in differing)
         raise UserError(
-            f"agent {name}: it was trained with agent.{key}={theirs[key]}, this one has {ours[key]}; "
-            f"set agent.{key}={theirs[key]} or start with init=none."
+            f"agent {name}: it has another network than this run (here: {here}); start with init=none, or set "
+            f"{wanted}."
         )
     agent.load_weights(weights)
     return metadata

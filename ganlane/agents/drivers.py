@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDictBase
@@ -42,7 +43,8 @@ class Driver(TensorDictModuleBase):
 def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
     target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
-    return torch.stack((target >= 0, target < road.lanes - 1, target > 0), dim=1)
+    lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
+    return torch.stack((target >= 0, target < lanes - 1, target > 0), dim=1)
 
 
 class RandomDriver(Driver):
@@ -101,7 +103,12 @@ class MobilDriver(Driver):
         return torch.where(wish > 0, LEFT, torch.where(wish < 0, RIGHT, keys.KEEP))
 
 
-EGOISTIC = MobilParameters(politeness_rear=0.0, politeness_side=0.0)
+def egoistic_mobil(
+    road: Road, stream: int = Stream.TRAIN, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
+) -> MobilDriver:
+    """MOBIL that cares for nobody but itself: politeness 0."""
+    return MobilDriver(road, stream, idm, replace(mobil, politeness_rear=0.0, politeness_side=0.0))
+
 
 #: Name to a constructor from (road, stream).
 DRIVERS: dict[str, Callable[[Road, int], Driver]] = {
@@ -109,5 +116,5 @@ DRIVERS: dict[str, Callable[[Road, int], Driver]] = {
     "random_legal": RandomLegalDriver,
     "keep_lane": KeepLaneDriver,
     "mobil": MobilDriver,
-    "mobil_egoistic": lambda road, stream: MobilDriver(road, stream, mobil=EGOISTIC),
+    "mobil_egoistic": egoistic_mobil,
 }

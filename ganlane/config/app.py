@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.config.compose import VERSION_BASE, check, typed
-from ganlane.config.folders import cleared_after_mistakes, write_down
+from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
 from ganlane.config.help import print_help
 from ganlane.config.messages import CONFIG_ERRORS, FILE_ERRORS, sentence
 from ganlane.config.overrides import parse_arguments, without_repetitions
@@ -84,7 +84,7 @@ def _hydra(command: str, task: Task, arguments: list[str]) -> None:
     def job(composed: Any) -> None:
         folder = Path(HydraConfig.get().runtime.output_dir)
         try:
-            with cleared_after_mistakes(folder, existed=any(folder.iterdir())):
+            with cleared_after_mistakes(folder, existed=any(folder.iterdir())), put_back_after_mistakes(folder):
                 write_down(composed, folder)
                 last_line = task(typed(composed), folder)
         except UserError as error:

@@ -26,12 +26,11 @@ class IdmConfig:
     min_gap_m: float = 2.0
     headway_s: float = 1.6
     comfortable_deceleration: float = 1.7
-    free_gap_m: float = 10_000.0
     min_acceleration: float = -20.0
     max_acceleration: float = 0.7
 
     def __post_init__(self) -> None:
-        positive = dict.fromkeys(("comfortable_deceleration", "free_gap_m", "max_acceleration"), above(0))
+        positive = dict.fromkeys(("comfortable_deceleration", "max_acceleration"), above(0))
         check(self, "env.idm", min_gap_m=at_least(0), headway_s=at_least(0), min_acceleration=below(0), **positive)
 
     def parameters(self) -> IdmParameters:
@@ -137,6 +136,11 @@ class EnvConfig:
             raise UserError(
                 f"env.lane_width_m={self.lane_width_m:g}: expected more than env.width_m={self.width_m:g}, or "
                 "vehicles in neighbouring lanes touch; widen the lanes."
+            )
+        if self.timeout_s < self.decision_period_s:
+            raise UserError(
+                f"env.timeout_s={self.timeout_s:g}: expected at least env.decision_period_s="
+                f"{self.decision_period_s:g}, or every episode ends in its first step."
             )
         self.spawn_parameters().check(self.vehicles, self.lanes)
         self.episode_parameters().check()

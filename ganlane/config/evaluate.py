@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from ganlane.config.checks import Rule, at_least, between, check, did_you_mean
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
+from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import (
     GanCalibratedTrafficConfig,
@@ -49,6 +49,7 @@ class EvaluateConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self, "", agents=NAMES, traffics=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+        check_pay(self.env, self.reward)
         self.chosen_traffics()
 
     def chosen_traffics(self) -> dict[str, TrafficConfig]:

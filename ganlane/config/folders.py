@@ -13,13 +13,15 @@ from ganlane.errors import UserError
 #: The command line of a run, in its folder.
 OVERRIDES = "overrides.yaml"
 CONFIG = "config.yaml"
+#: Files that cost time to make.
+EARNED = ("results.json", "agent.safetensors", "last.pt")
 
 
 @contextmanager
 def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterator[None]:
     """Remove what a user's mistake leaves of a folder that was not there before, and of the folders above it.
 
-    A sweep's folder stays where some of its runs have results.
+    What a run has earned stays: a folder with results, a trained agent or a checkpoint in it is never removed.
 
     Args:
         folder: the run's or the sweep's.
@@ -31,9 +33,23 @@ def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterato
         yield
     except BaseException as error:
         is_mistake = isinstance(error, UserError | OSError)
-        if is_mistake and not existed and not any(folder.rglob("results.json")):
+        if is_mistake and not existed and not any(any(folder.rglob(name)) for name in EARNED):
             shutil.rmtree(folder, ignore_errors=True)
             _remove_empty(made)
+        raise
+
+
+@contextmanager
+def put_back_after_mistakes(folder: Path) -> Iterator[None]:
+    """Give a resumed run its command line back where going on with another one was refused."""
+    kept = {name: (folder / name).read_bytes() for name in (OVERRIDES, CONFIG) if (folder / name).is_file()}
+    try:
+        yield
+    except (UserError, OSError):
+        from ganlane.files import write_bytes
+
+        for name, content in kept.items():
+            write_bytes(folder / name, content)
         raise
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from ganlane.config.checks import above, at_least, between, check, one_of, optional
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
+from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
@@ -71,10 +71,18 @@ class RenderConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self, "", episode=between(0, 2**53), format=one_of(FORMATS))
+        check_pay(self.env, self.reward)
         if self.format == "mp4":
             require_video()
         if self.out is not None:
             _check_out(Path(self.out))
+            _check_suffix(Path(self.out))
+
+
+def _check_suffix(path: Path) -> None:
+    """The file's name must not promise what it does not hold."""
+    if path.suffix and path.suffix.removeprefix(".").lower() not in FORMATS:
+        raise UserError(f"out={path}: films are {', '.join(FORMATS)}; give the file one of these endings.")
 
 
 def _check_out(path: Path) -> None:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 from ganlane.config.checks import below, check, number
 from ganlane.config.plain import plain_copy
+from ganlane.errors import UserError
 
 if TYPE_CHECKING:
+    from ganlane.config.env import EnvConfig
     from ganlane.transforms import RewardParameters
 
 
@@ -34,3 +36,12 @@ class RewardConfig:
         from ganlane.transforms import RewardParameters
 
         return plain_copy(self, RewardParameters)
+
+
+def check_pay(env: EnvConfig, reward: RewardConfig) -> None:
+    """The speed reward runs from 0 at its base speed to 1 at the ego's desired speed, so that must be the higher."""
+    if env.ego_desired_speed_mps <= reward.base_speed_mps:
+        raise UserError(
+            f"env.ego_desired_speed_mps={env.ego_desired_speed_mps:g}: expected more than reward.base_speed_mps="
+            f"{reward.base_speed_mps:g}, where the speed reward is 0; raise the one or lower the other."
+        )

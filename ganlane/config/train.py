@@ -12,7 +12,7 @@ from ganlane.config.evaluate import NAMES
 from ganlane.config.init import InitConfig
 from ganlane.config.logger import LoggerConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
+from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
@@ -55,7 +55,7 @@ class TrainConfig(RunConfig):
     log_every: int = 10_000
     evaluate_every: int = 0
     selection_episodes: int = 64
-    checkpoint_every_s: float = 120.0
+    checkpoint_every_s: float = 20.0
     checkpoint_replay: bool = True
     resume: str | None = None
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -81,6 +81,12 @@ class TrainConfig(RunConfig):
             selection_episodes=at_least(1),
             checkpoint_every_s=at_least(0),
         )
+        check_pay(self.env, self.reward)
+
+    def all_traffic(self) -> list[TrafficConfig]:
+        """Every traffic that this run drives in."""
+        first = [] if self.pretrain.traffic is None else [self.pretrain.traffic]
+        return [*first, self.traffic, *self.evaluation_traffic().values()]
 
     def evaluation_traffic(self) -> dict[str, TrafficConfig]:
         """The traffic of the final evaluation by its name: training's, unless another one was chosen."""

@@ -77,6 +77,8 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         raise UserError(
             f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one."
         )
+    if not isinstance(metadata.get("driving_statistics"), dict):
+        raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
     generator = _build(path, metadata, tensors)
     if generator.sizes.extra_inputs != PRESET_INPUTS[found]:
         raise UserError(

@@ -20,7 +20,6 @@ class IdmParameters:
     min_gap_m: float = 2.0
     headway_s: float = 1.6
     comfortable_deceleration: float = 1.7
-    free_gap_m: float = 10_000.0
     min_acceleration: float = -20.0
     max_acceleration: float = 0.7
 
@@ -59,7 +58,7 @@ def idm_acceleration(
     Args:
         speed: own speed, m/s, at least 0.
         desired_speed: own desired speed, m/s, above 0.
-        gap: net gap to the leader (bumper to bumper), m; ``parameters.free_gap_m`` where there is none.
+        gap: net gap to the leader (bumper to bumper), m; Table V's 10 000 m where there is none.
             A gap of 0 or less (an overlap) gives the hardest braking.
         leader_speed: m/s; irrelevant where the gap is the free one, but for the approach term.
         headway_s: a time headway per vehicle in place of Table V's.

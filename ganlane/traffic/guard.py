@@ -31,7 +31,8 @@ class GuardParameters:
         hardest_braking: no acceleration below this, m/s2.
         centring_per_s: rate at which the offset from the target lane's centre is pulled in (the P of the PD).
         damping: share of the network's lateral motion that is let through (the D).
-        edge_margin_m: the body stays at least so far inside the edge of the road.
+        edge_margin_m: the body, as it is turned, stays at least so far inside the edge of the road.
+        steepest_rad: largest angle to the road.
     """
 
     headway_s: float = 0.8
@@ -40,6 +41,7 @@ class GuardParameters:
     centring_per_s: float = 0.5
     damping: float = 0.8
     edge_margin_m: float = 0.1
+    steepest_rad: float = 0.2
 
 
 class Guard(Overlay):
@@ -87,11 +89,15 @@ class Guard(Overlay):
         pulled = vehicles.y + g.damping * (moved.y - vehicles.y) + g.centring_per_s * self.dt * offset
         keeps = offset.abs() < 0.5 * self.road.lane_width_m
         y = torch.where(keeps, pulled, moved.y)
-        inside = 0.5 * moved.width + g.edge_margin_m
-        y = torch.maximum(y, torch.zeros_like(y) + self.road.right_edge_m() + inside)
-        y = torch.minimum(y, torch.zeros_like(y) + self.road.left_edge_m() - inside)
+        half = 0.5 * moved.width
+        left, right = self.road.left_edge_m() - g.edge_margin_m, self.road.right_edge_m() + g.edge_margin_m
+        y = torch.minimum(torch.maximum(y, right + half), left - half)
         heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
-        return moved.with_(y=y, heading=torch.where(y == moved.y, moved.heading, heading.clamp(-0.2, 0.2)))
+        heading = torch.where(y == moved.y, moved.heading, heading)
+        # A turned body is wider by half its length times the sine, which the angle exceeds.
+        room = torch.minimum(left - y, y - right) - half
+        steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)
+        return moved.with_(y=y, heading=torch.minimum(torch.maximum(heading, -steepest), steepest))
 
     def rewrite(
         self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor

@@ -11,7 +11,7 @@ from ganlane.sim.hazard import distance_hazard, literal_hazard, random_side
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.lanes import settled
 from ganlane.sim.mobil import MobilParameters, one_at_a_time, safe_change, without_ego
-from ganlane.sim.neighbours import perceive
+from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.random import Purpose, Stream, normal, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -99,7 +99,8 @@ class CalibratedChanges:
             at the rate of the data; waiting for a gap makes the two differ.
         patience_s: a wish that finds no gap for so long is given up.
         safe_deceleration: nobody may be asked to brake harder, by IDM, m/s2.
-        exclusive_m: of several that want into one lane within this distance only the foremost goes.
+        exclusive_m: nobody goes while another is on the way into the same lane within this distance; of several that
+            want to go at once only the foremost does.
     """
 
     per_km: float = 0.92
@@ -147,6 +148,15 @@ class CalibratedLaneChange(Overlay):
         free = settled(vehicles, self.road) & vehicles.valid
         return without_ego(torch.where(memory["wish"] != 0, memory["wish"], torch.where(comes & free, side, 0)))
 
+    def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
+        """Whether somebody near is on the way into ``lane`` [N, M] already; the ego keeps its plans to itself."""
+        vehicles = scene.vehicles
+        target = vehicles.target_lane.to(lane.dtype)
+        under_way = (self.road.lane_of(vehicles.y) != target) & vehicles.valid
+        under_way = torch.cat((torch.zeros_like(under_way[:, :1]), under_way[:, 1:]), dim=1)
+        near = torch.minimum(scene.ahead, scene.behind) < self.changes.exclusive_m
+        return (near & under_way[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
+
     def rewrite(
         self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
     ) -> tuple[Vehicles, dict[str, Tensor]]:
@@ -155,7 +165,8 @@ class CalibratedLaneChange(Overlay):
         scene = perceive(vehicles, self.road)
         lane = (vehicles.target_lane + wish).to(vehicles.x.dtype)
         safe = safe_change(scene, lane, self.idm, self._limits)
-        goes = one_at_a_time(scene, torch.where(safe, wish, 0), self.road, self.changes.exclusive_m)
+        wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
+        goes = one_at_a_time(scene, wanted, self.road, self.changes.exclusive_m)
         waited = torch.where(wish != 0, memory["waited"] + 1, 0)
         given_up = waited >= round(self.changes.patience_s / self.dt)
         rest = torch.where((goes != 0) | given_up, 0, wish)

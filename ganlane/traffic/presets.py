@@ -8,6 +8,7 @@ from typing import Any
 from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
 from ganlane.generator import headway_quantiles, load_generator, shipped_generator
+from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
@@ -50,6 +51,7 @@ def gan_traffic(
     guard: bool = True,
     noise_scale: float = 1.0,
     execute_k: int = 1,
+    idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan``, the paper's: positions only, literal lane changes that are blind, sudden accelerations.
 
@@ -59,6 +61,7 @@ def gan_traffic(
         guard: the guard behind it; without, the closed loop drifts off.
         noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
         execute_k: predicted steps that are driven before predicting again (the paper: 1).
+        idm: of the guard's bounds on acceleration.
 
     Raises:
         UserError: the weights are absent, foreign or of the other preset.
@@ -72,7 +75,7 @@ def gan_traffic(
         "lane_change": LiteralLaneChange(road, stream, literal_changes(statistics, source)),
     }
     if guard:
-        parts["guard"] = Guard(road, stream, GuardParameters())
+        parts["guard"] = Guard(road, stream, GuardParameters(), idm)
     return TrafficSequential(parts)
 
 
@@ -82,6 +85,7 @@ def gan_calibrated_traffic(
     path: str | Path | None = None,
     noise_scale: float = 1.0,
     changes_per_km: float | None = None,
+    idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, traits, lane changes behind a gap check at the recorded rate.
 
@@ -91,6 +95,7 @@ def gan_calibrated_traffic(
         noise_scale: 1 samples as fitted, 0 drives everybody by the mean prediction.
         changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the rate of the
             recordings, which gives that rate in the simulation.
+        idm: of the gap check; the anchor keeps the IDM that the network was fitted on (Table V).
 
     Raises:
         UserError: the weights are absent, foreign or of the other preset.
@@ -103,7 +108,7 @@ def gan_calibrated_traffic(
     options: dict[str, Any] = {"headway_quantiles_s": headway_quantiles(metadata["driving_statistics"])}
     parts: dict[str, TrafficModule] = {
         "generator": AnchoredGanTraffic(generator, road, stream, noise_scale=noise_scale, **options),
-        "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes)),
+        "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes), idm),
     }
     return TrafficSequential(parts)
 

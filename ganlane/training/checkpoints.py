@@ -12,7 +12,7 @@ from ganlane.errors import UserError
 from ganlane.files import atomic_path
 
 KIND = "ganlane training checkpoint"
-VERSION = 1
+VERSION = 2
 #: Where a run keeps its checkpoint, below its folder.
 LAST = Path("checkpoints") / "last.pt"
 

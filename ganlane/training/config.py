@@ -22,7 +22,7 @@ class TrainingConfig:
     log_every: int = 20_000
     evaluate_every: int = 0
     best_metric: str = "mean_reward"
-    checkpoint_every_s: float = 120.0
+    checkpoint_every_s: float = 20.0
     checkpoint_replay: bool = True
     progress: bool = True
 

@@ -32,6 +32,7 @@ def train(
     logs: Sequence[Log] = (),
     metadata: Mapping[str, Any] | None = None,
     resume: str | Path | None = None,
+    identity: Mapping[str, Any] | None = None,
 ) -> TrainingResult:
     """Train ``agent`` in ``env`` until all decisions are made or a signal asks to stop; leave a checkpoint.
 
@@ -44,12 +45,14 @@ def train(
         evaluate: called with the greedy policy every ``config.evaluate_every`` decisions.
         logs: further logs besides the CSV files and the progress.
         metadata: JSON-serialisable, written into the agent's files, e.g. the name of the observation.
+        identity: plain data that makes the run what it is (environment, traffic, reward, seed); a run with another
+            one is not resumed.
         resume: checkpoint to go on from (see :func:`ganlane.training.checkpoints.find_checkpoint`).
 
     Raises:
         UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not evaluated.
     """
-    run = Run(env, agent)
+    run = Run(env, agent, identity)
     exact = resume is None or run.restore(resume)
     saver = Saver(run, run_folder, config, metadata or {})
     with closing(Logs(Path(run_folder), config, agent.network.config.actions, run.decisions, logs)) as log:
@@ -61,6 +64,8 @@ def train(
 
 def _loop(run: Run, config: TrainingConfig, evaluate: Evaluate | None, log: Logs, saver: Saver) -> int | None:
     """The algorithm; the number of the signal that ended it early, or None."""
+    if run.decisions == 0:
+        saver.save()  # so that there is something to go on from, whenever the run is killed
     with StopRequest() as stop:
         while run.decisions < config.total_decisions and stop.signal is None:
             step = collect(run)

@@ -45,7 +45,7 @@ class Progress:
             self._bar.set_postfix_str(text)
             return
         rate = max(row.get("decisions_per_s", 0.0), 1e-9)
-        left = (self.total - row["decisions"]) / rate
+        left = max(self.total - row["decisions"], 0.0) / rate
         head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {duration(left)} left"
         print(f"{head}, {text}" if text else head, file=self.stream, flush=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,12 @@ class Run:
     """State of a run of ``agent`` in ``env``, batch [N].
 
     ``carrier`` is the TensorDict that takes the environments' state from step to step; ``owed`` counts the decisions
-    not yet paid for by an update; ``best`` is the best evaluation so far.
+    not yet paid for by an update; ``best`` is the best evaluation so far. ``identity`` is plain data that a resumed
+    run must share: environment, traffic, reward, seed.
     """
 
-    def __init__(self, env: EnvBase, agent: Rainbow) -> None:
-        self.env, self.agent = env, agent
+    def __init__(self, env: EnvBase, agent: Rainbow, identity: Mapping[str, Any] | None = None) -> None:
+        self.env, self.agent, self.identity = env, agent, dict(identity or {})
         self.environments = env.batch_size.numel()
         self.window = agent.window()
         self.meter = Meter(self.environments, agent.network.config.actions, agent.config.gamma, agent.device)
@@ -55,6 +57,7 @@ class Run:
             "carrier": pack(self.carrier),
             "meter": self.meter.state_dict(),
             "counters": counters,
+            "identity": self.identity,
         }
         if with_replay:
             return whole
@@ -71,6 +74,7 @@ class Run:
             UserError: unreadable, or of another run.
         """
         state = load_checkpoint(path, self.agent.device)
+        refuse_another_run(path, state["identity"], self.identity)
         carrier, expected = unpack(state["carrier"]), self.carrier.batch_size
         if carrier.batch_size != expected:
             raise UserError(
@@ -94,3 +98,25 @@ class Run:
         if keys.EPISODE not in last:
             return self.env.reset()
         return self.env.reset(last.set(keys.EPISODE, last.get(keys.EPISODE) + self.environments))
+
+
+def refuse_another_run(path: str | Path, saved: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+    """Raise :class:`UserError` where the run that was saved is not the one that is asked for."""
+    theirs, ours = flat(saved), flat(asked)
+    for name in (*ours, *theirs):
+        if theirs.get(name) != ours.get(name):
+            raise UserError(
+                f"resume={path}: {name}={ours.get(name)}, but the run was started with {theirs.get(name)}; "
+                "go on with that, or start a new run."
+            )
+
+
+def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested plain data as dotted names; tuples as lists, which is how they come back from a file."""
+    names: dict[str, Any] = {}
+    for name, value in nested.items():
+        if isinstance(value, Mapping) and value:
+            names |= flat(value, f"{above}{name}.")
+        else:
+            names[f"{above}{name}"] = list(value) if isinstance(value, tuple) else value
+    return names

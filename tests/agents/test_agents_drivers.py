@@ -2,7 +2,14 @@
 
 import torch
 
-from ganlane.agents.drivers import DRIVERS, EGOISTIC, KeepLaneDriver, MobilDriver, RandomDriver, RandomLegalDriver
+from ganlane.agents.drivers import (
+    DRIVERS,
+    KeepLaneDriver,
+    MobilDriver,
+    RandomDriver,
+    RandomLegalDriver,
+    egoistic_mobil,
+)
 from ganlane.env import HighwayEnv
 from ganlane.keys import KEEP, LEFT, RIGHT
 from ganlane.sim import Road
@@ -71,5 +78,5 @@ def test_a_polite_mobil_yields_where_an_egoistic_one_cuts_in():
     vehicles["y"][:] = vehicles["target_lane"] * 4.0
     vehicles["speed"][:] = torch.tensor([[20.0, 17.0, 21.0]])
     vehicles["desired_speed"][:] = torch.tensor([[25.0, 20.0, 26.0]])
-    assert MobilDriver(Road(), mobil=EGOISTIC)(state)["action"].item() == LEFT
+    assert egoistic_mobil(Road())(state)["action"].item() == LEFT
     assert MobilDriver(Road())(state)["action"].item() == KEEP

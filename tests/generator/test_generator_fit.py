@@ -121,7 +121,7 @@ def test_wrong_checkpoints_are_refused_in_one_sentence(tmp_path):
     path.write_bytes(b"\x10\x00\x00")
     with pytest.raises(UserError, match="not a readable safetensors"):
         load_generator(path)
-    with pytest.raises(UserError, match="expected a ganlane generator"):
+    with pytest.raises(UserError, match="expected a ganlane checkpoint of kind generator"):
         load_generator(generator_file(path, kind="agent"))
     with pytest.raises(UserError, match="expected 'calibrated'"):
         load_generator(generator_file(path), "calibrated")

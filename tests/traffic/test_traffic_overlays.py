@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.hazard import distance_hazard, literal_hazard, literal_mean_wait, random_side
+from ganlane.sim.lanes import lateral_half_extent
 from ganlane.traffic import (
     AccelerationOverlay,
     CalibratedLaneChange,
@@ -153,7 +154,7 @@ def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_dr
     road = Road()
 
     def visit(vehicles):
-        half = 0.5 * vehicles.width
+        half = lateral_half_extent(vehicles)
         outside = torch.maximum(vehicles.y + half - road.left_edge_m(), road.right_edge_m() - (vehicles.y - half))
         worst.append(outside[:, 1:].max())
 

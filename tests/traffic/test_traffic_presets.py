@@ -7,6 +7,7 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.sim import Road, Vehicles, pair_overlaps
+from ganlane.sim.lanes import lateral_half_extent
 from ganlane.traffic import Guard
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 
@@ -25,7 +26,7 @@ def drive(traffic, n, decisions, visit, first_episode=0):
 
 def beyond_the_edge(vehicles: Vehicles, road: Road) -> float:
     """How far the outermost body reaches past the edge of the road, m; negative inside."""
-    half = 0.5 * vehicles.width
+    half = lateral_half_extent(vehicles)
     left = vehicles.y + half - road.left_edge_m()
     right = road.right_edge_m() - (vehicles.y - half)
     return float(torch.maximum(left, right)[:, 1:].max())

@@ -221,8 +221,10 @@ train(ToyRoad(8), agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("after_s", [0.0, 0.11, 0.53])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("after_s", [pytest.param(0.0, marks=SLOW), 0.11, pytest.param(0.53, marks=SLOW)])
 def test_a_run_killed_at_any_moment_leaves_a_checkpoint_to_go_on_from(after_s, tmp_path):
     folder, tests = tmp_path / "parts", Path(__file__).resolve().parent.parent
     script = KILLED.format(tests=str(tests), folder=str(folder))

@@ -147,6 +147,7 @@ def test_pictures_without_room_are_refused():
         WindowParameters(length_m=-5)
 
 
+@pytest.mark.slow
 def test_nine_vehicles_are_drawn_fast_enough_for_60_frames_a_second():
     generator = np.random.default_rng(0)
     scene = straight(generator.uniform(-60, 90, 9), generator.integers(0, 3, 9), frames=60)

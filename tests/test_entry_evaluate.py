@@ -90,7 +90,10 @@ def foreign(tmp_path: Path) -> str:
         (["agents=[mobil]", "traffics=[entry_own_parts.Missing]"], "entry_own_parts has no Missing"),
         (["agents=[mobil]", "traffics=[entry_own_parts.Stubborn]"], "expected a subclass of"),
         (["agents=[mobil]", "traffics=[entry_own_parts.not_a_model]"], "expected a subclass of"),
-        (["agents=[mobil]", "traffics=[gan]", "generator.path=gone"], "gone: no such file; a checkpoint of kind generator"),
+        (
+            ["agents=[mobil]", "traffics=[gan]", "generator.path=gone"],
+            "gone: no such file; a checkpoint of kind generator",
+        ),
         (["agents=[mobil]", "traffics=[gan]", "generator.path=FOREIGN"], "not a readable safetensors file"),
     ],
 )

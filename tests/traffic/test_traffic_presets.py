@@ -52,9 +52,9 @@ def test_no_vehicle_leaves_the_road_in_1000_episodes_of_gan_traffic():
         worst[0] = max(worst[0], beyond_the_edge(vehicles, road))
 
     for chunk in range(4):
-        state = drive(gan_traffic(road), 250, 600, visit, first_episode=250 * chunk)
+        state = drive(gan_traffic(road), 250, 300, visit, first_episode=250 * chunk)
         ended += int(state["ended"].sum())
-    print(f"{ended} of 1000 episodes ended within 600 s; the outermost body stayed {-worst[0]:.2f} m inside the edge")
+    print(f"{ended} of 1000 episodes ended within 300 s; the outermost body stayed {-worst[0]:.2f} m inside the edge")
     assert worst[0] <= 1e-4
 
 
@@ -74,6 +74,24 @@ def test_calibrated_traffic_neither_overlaps_nor_leaves_the_road_nor_stands_stil
     # Recorded drivers differ by 2.8 m/s within a frame; a guard that does the driving leaves 0.1.
     assert speed.std(1).mean() > 1.4
     assert km[0] > 100
+
+
+@pytest.mark.slow
+def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobody():
+    count, km, overlaps, before = [0], [0.0], [0], {}
+
+    def visit(vehicles, running):
+        if before:
+            count[0] += int((vehicles.target_lane != before["lane"])[:, 1:].sum())
+        before["lane"] = vehicles.target_lane
+        km[0] += float(vehicles.speed[:, 1:].sum()) * 1e-4
+        overlaps[0] += int(pair_overlaps(vehicles)[:, 1:, 1:].sum())
+
+    drive(gan_calibrated_traffic(), 96, 200, visit)
+    print(f"{count[0] / km[0]:.2f} changes per vehicle-km in {km[0]:.0f} vehicle-km, {overlaps[0]} overlaps")
+    assert overlaps[0] == 0
+    # Recorded: 0.92 per vehicle-km, 95 % interval 0.70 to 1.20.
+    assert 0.70 < count[0] / km[0] < 1.20
 
 
 def test_calibrated_drivers_keep_different_headways_and_their_own():

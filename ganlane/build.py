@@ -28,6 +28,7 @@ from ganlane.config.targets import call_with, import_target
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.paths import CHECKPOINTS
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.steering import STEERING
@@ -137,7 +138,7 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
         return _trained(name, env, device)
     if "." in name and all(part.isidentifier() for part in name.split(".")):
         return _imported(name, env, stream, device)
-    known = ", ".join((*DRIVERS, *SHIPPED))
+    known = ", ".join((*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file())))
     raise UserError(
         f"agent {name}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the import "
         "path of a policy."

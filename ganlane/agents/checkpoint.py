@@ -16,10 +16,10 @@ from ganlane.agents.policy import GreedyPolicy
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError
 from ganlane.files import load_weights, save_weights
+from ganlane.paths import CHECKPOINTS
 
 #: Agents that come with the package; others are given by their path.
 SHIPPED = ("agent_idm", "agent_gan")
-FOLDER = Path(__file__).resolve().parent.parent / "checkpoints"
 
 
 def agent_file(name: str | Path) -> Path:
@@ -30,9 +30,9 @@ def agent_file(name: str | Path) -> Path:
     """
     text = str(name)
     shipped = text.removesuffix("@0")
-    path = FOLDER / f"{shipped}.safetensors" if shipped in SHIPPED else Path(text)
+    path = CHECKPOINTS / f"{shipped}.safetensors" if shipped in SHIPPED else Path(text)
     if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in FOLDER.glob("agent_*.safetensors")))
+        known = ", ".join(sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors")))
         raise UserError(f"agent {text}: no such file ({path}); the agents that ship are {known}; or give a path.")
     return path
 

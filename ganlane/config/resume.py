@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,6 +33,7 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
         raise UserError(f"resume={asked}: one run is resumed at a time; start without -m.")
     run = newest_unfinished(_RUNS / command) if asked == "auto" else run_folder(Path(asked))
     if run is None:
+        print(f"resume=auto: no unfinished run below {_RUNS / command}; a new one is started.", file=sys.stderr)
         return without_repetitions([*overrides, "resume=null"])
     stored = [str(override) for override in OmegaConf.load(run / OVERRIDES)]
     return without_repetitions([*stored, *overrides, f"resume='{run}'", f"hydra.run.dir='{run}'"])

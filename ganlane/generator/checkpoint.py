@@ -15,17 +15,17 @@ from ganlane.errors import UserError
 from ganlane.files import load_weights, save_weights
 from ganlane.generator.anchored import EXTRA_INPUTS
 from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.paths import CHECKPOINTS
 
 KIND = "generator"
 Preset = Literal["paper", "calibrated"]
 #: Numbers beside the motion that each preset sees.
 PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
-SHIPPED = Path(ganlane.__file__).parent / "checkpoints"
 
 
 def shipped_generator(preset: Preset) -> Path:
     """Path of the weights that come with the package."""
-    return SHIPPED / f"generator_{preset}.safetensors"
+    return CHECKPOINTS / f"generator_{preset}.safetensors"
 
 
 def save_generator(
@@ -77,14 +77,14 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         raise UserError(
             f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one."
         )
-    if not isinstance(metadata.get("driving_statistics"), dict):
-        raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
     generator = _build(path, metadata, tensors)
     if generator.sizes.extra_inputs != PRESET_INPUTS[found]:
         raise UserError(
             f"{path}: takes {generator.sizes.extra_inputs} further inputs, expected {PRESET_INPUTS[found]} for the "
             f"preset {found}; fit it again."
         )
+    if not isinstance(metadata.get("driving_statistics"), dict):
+        raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
     return generator.eval().requires_grad_(False), metadata
 
 

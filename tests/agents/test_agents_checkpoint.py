@@ -66,7 +66,7 @@ def test_an_unknown_agent_is_refused_with_the_names_there_are():
 
 
 def test_shipped_agents_are_found_by_name(saved, monkeypatch):
-    monkeypatch.setattr(checkpoint, "FOLDER", saved.parent)
+    monkeypatch.setattr(checkpoint, "CHECKPOINTS", saved.parent)
     saved.rename(saved.with_name("agent_idm.safetensors"))
     assert agent_file("agent_idm") == agent_file("agent_idm@0")
     assert load_agent("agent_idm")[1]["observation"] == "table3"

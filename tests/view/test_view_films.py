@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -122,7 +123,8 @@ def test_a_failure_half_way_leaves_nothing(film, tmp_path):
         def __iter__(self):
             return (self[i] for i in range(len(self)))
 
-    for name in ("a.gif", "a.mp4"):
+    names = ["a.gif", "a.mp4"] if find_spec("imageio_ffmpeg") else ["a.gif"]
+    for name in names:
         with pytest.raises(RuntimeError):
             write_film(Broken([0] * 6), tmp_path / name, scale=0.25)
     assert not list(tmp_path.iterdir())

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 class LoopOptions:
     """``generator.loop`` (:class:`ganlane.generator.LoopConfig`)."""
 
-    updates: int = 3000
+    updates: int = 1600
     evaluate_every: int = 200
     patience: int = 8
-    learning_rate: float = 2e-3
+    learning_rate: float = 4e-3
     warmup: int = 100
     largest_gradient: float = 1.0
     max_seconds: float | None = None
@@ -43,7 +43,6 @@ class CalibratedLoopOptions(LoopOptions):
 
     updates: int = 400
     evaluate_every: int = 40
-    learning_rate: float = 4e-3
     warmup: int = 20
 
 

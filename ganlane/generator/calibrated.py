@@ -40,9 +40,7 @@ class CalibratedConfig:
     """
 
     sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS))
-    loop: LoopConfig = field(
-        default_factory=lambda: LoopConfig(updates=400, evaluate_every=40, learning_rate=4e-3, warmup=20)
-    )
+    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=400, evaluate_every=40, warmup=20))
     horizons: tuple[int, ...] = (8, 16, 29)
     held_out_horizon: int = 29
     batch: int = 6

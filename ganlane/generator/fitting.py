@@ -43,7 +43,7 @@ class PaperConfig:
 
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
     weights: LossWeights = field(default_factory=LossWeights)
-    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=1600, learning_rate=4e-3))
+    loop: LoopConfig = field(default_factory=LoopConfig)
     group_size: int = 9
     stride: int = 1
     held_out_stride: int = 3

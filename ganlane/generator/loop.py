@@ -31,10 +31,10 @@ class LoopConfig:
         max_seconds: stop after this long; None is never.
     """
 
-    updates: int = 3000
+    updates: int = 1600
     evaluate_every: int = 200
     patience: int = 8
-    learning_rate: float = 2e-3
+    learning_rate: float = 4e-3
     warmup: int = 100
     largest_gradient: float = 1.0
     max_seconds: float | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import pytest
 from hydra.core.config_store import ConfigStore
@@ -25,7 +26,14 @@ from ganlane.config.plain import plain_copy
 from ganlane.config.reward import RewardConfig
 from ganlane.config.store import SCHEMAS, SUFFIX, register
 from ganlane.env import EpisodeParameters
-from ganlane.generator import CalibratedConfig, LoopConfig, LossWeights, PaperConfig
+from ganlane.generator import (
+    CalibratedConfig,
+    LoopConfig,
+    LossWeights,
+    PaperConfig,
+    load_generator,
+    shipped_generator,
+)
 from ganlane.paths import conf_folder
 from ganlane.sim import IdmParameters, MobilParameters, SpawnParameters
 from ganlane.sim.ego import EgoParameters
@@ -153,3 +161,9 @@ def test_yaml_files_explain_themselves():
         first = next(line for line in path.read_text().splitlines() if not line.startswith("# @package"))
         assert first.startswith("# "), path
         assert OmegaConf.load(path) is not None
+
+
+@pytest.mark.parametrize("options", [PaperGeneratorConfig(), CalibratedGeneratorConfig()], ids=lambda o: o.preset)
+def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(options):
+    shipped = load_generator(shipped_generator(options.preset), options.preset)[1]["config"]
+    assert json.loads(json.dumps(dataclasses.asdict(options.fit_config(seed=0)))) == shipped

@@ -14,7 +14,7 @@ class RainbowConfig:
 
     Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
     ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is the share of
-    random legal actions, which noisy layers alone do not replace (docs/agent.md). ``adam_eps=None`` stands for
+    random legal actions, drawn beside the noise (docs/agent.md). ``adam_eps=None`` stands for
     0.005 / ``batch_size``. ``warmup`` is the number of transitions before the first update.
     """
 

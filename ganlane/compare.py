@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import polars as pl
 from tqdm import tqdm
@@ -13,7 +15,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.evaluation import run_episodes
+from ganlane.evaluation import evaluation_rows, run_episodes, text_table, write_episodes, write_results
 from ganlane.sim.random import Stream
 
 
@@ -53,6 +55,27 @@ def compare(
             table = run_episodes(made, driver.policy, range(episodes), seed, report)
             tables.append(table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic)))
     return pl.concat(tables)
+
+
+def publish(
+    table: pl.DataFrame,
+    folder: Path,
+    config: Mapping[str, Any],
+    seeds: Mapping[str, Any],
+    numbers: Mapping[str, Any] | None = None,
+) -> str:
+    """Print the table of a comparison, write its episodes and ``results.json``; the line that names the latter.
+
+    Args:
+        table: what :func:`compare` returned.
+        folder: of the run.
+        config, seeds: of the run, for the record.
+        numbers: what the record holds beside ``rows``.
+    """
+    rows = evaluation_rows(table)
+    print(text_table(rows))
+    write_episodes(folder, table)
+    return f"results: {write_results(folder, {'rows': rows, **(numbers or {})}, config, seeds)}"
 
 
 class _Progress:

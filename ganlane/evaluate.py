@@ -21,8 +21,7 @@ from ganlane.config.evaluate import EvaluateConfig
 def evaluate(config: EvaluateConfig, folder: Path) -> str:
     """Run, print and keep the table."""
     from ganlane.build import make_driver, set_threads
-    from ganlane.compare import compare
-    from ganlane.evaluation import evaluation_rows, text_table, write_episodes, write_results
+    from ganlane.compare import compare, publish
 
     set_threads(config.threads)
     drivers = [make_driver(name, config.env, device=config.device) for name in config.agents]
@@ -37,12 +36,8 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
         config.num_envs,
         config.device,
     )
-    rows = evaluation_rows(table)
-    print(text_table(rows))
-    write_episodes(folder, table)
     seeds = {"stream": "report", "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    path = write_results(folder, {"rows": rows}, asdict(config), seeds)
-    return f"results: {path}"
+    return publish(table, folder, asdict(config), seeds)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

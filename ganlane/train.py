@@ -28,8 +28,7 @@ TRAINED = "trained"
 def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate what came out."""
     from ganlane.build import make_driver, make_traffic, set_threads
-    from ganlane.compare import compare
-    from ganlane.evaluation import evaluation_rows, text_table, write_episodes, write_results
+    from ganlane.compare import compare, publish
     from ganlane.phases import AGENT_FILE, checkpoint_of, length_of, phases_of, run_phase
 
     set_threads(config.threads)
@@ -58,12 +57,9 @@ def train(config: TrainConfig, folder: Path) -> str:
         config.evaluation.num_envs,
         config.device,
     )
-    rows = evaluation_rows(table)
-    print(text_table(rows))
-    write_episodes(folder, table)
     seeds = {"training": config.seed, "stream": "report", "episodes": [0, config.evaluation.episodes - 1]}
-    numbers = {"rows": rows, **outcome["train"], "phases": outcome, "agent": str(folder / AGENT_FILE)}
-    return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
+    numbers = {**outcome["train"], "phases": outcome, "agent": str(folder / AGENT_FILE)}
+    return publish(table, folder, asdict(config), seeds, numbers)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

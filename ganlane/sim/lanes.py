@@ -60,8 +60,8 @@ def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
 def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRange) -> LaneRange:
     """Lanes in which the others see each vehicle, by its visibility; none for one that is not valid."""
     centre = road.lane_of(vehicles.y)
-    signalled = vehicles.visibility == Visibility.SIGNALLED
-    by_body = vehicles.visibility == Visibility.BODY
+    signalled = vehicles.visibility == int(Visibility.SIGNALLED)
+    by_body = vehicles.visibility == int(Visibility.BODY)
     low = torch.where(signalled, attention.low, torch.where(by_body, body.low, centre))
     high = torch.where(signalled, attention.high, torch.where(by_body, body.high, centre))
     nowhere = torch.inf

@@ -1,0 +1,145 @@
+"""Drive every scene in every simulator and say what tells them apart.
+
+    python -m benchmarks.peers.compare
+
+Prints the tables of docs/peers.md, writes them there, and writes docs/figures/peers.json and docs/figures/peers.png.
+What separates a peer's trace from ganlane's is taken apart into three pieces:
+
+- ``law``: our own driver under the peer's reading of IDM, less ganlane;
+- ``scheme``: the peer, less our own driver under the peer's reading. :mod:`benchmarks.peers.tolerance` bounds it;
+- ``rest``: the peer, less our own driver under the peer's reading and the peer's scheme. Only rounding may remain.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.peers import highway_env_peer, ours, report, sumo_peer
+from benchmarks.peers.scene import OBSTACLE, SCENES, SETTLED_MPS, SLOW_AND_GO, Scene, Trace, settling
+from benchmarks.peers.schemes import LAW, Law, Scheme, equilibrium_gap, integrate
+from benchmarks.peers.simulators import PEERS, Peer, require_peers, versions
+from benchmarks.peers.tolerance import Largest, between, largest, tolerance, unsettled_gap_m
+from ganlane.errors import UserError
+from ganlane.files import write_bytes, write_json
+
+
+class Apart(NamedTuple):
+    """What separates a peer from ganlane in one scene, and what the scheme may account for."""
+
+    direct: Largest
+    law: Largest
+    scheme: Largest
+    allowed: Largest
+    rest: Largest
+
+
+def take_apart(scene: Scene, peer: Peer, ganlane: Trace, driven: Trace) -> Apart:
+    """Law, scheme and rest of the difference between ``driven`` (the peer's trace) and ``ganlane``'s."""
+    read = integrate(scene, Scheme.BALLISTIC, peer.law)
+    return Apart(
+        direct=between(driven, ganlane),
+        law=between(read, ganlane),
+        scheme=between(driven, read),
+        allowed=tolerance(read, scene, peer.scheme, peer.law),
+        rest=between(driven, integrate(scene, peer.scheme, peer.law)),
+    )
+
+
+def settled(speed_mps: float, drive: Callable[[Scene], Trace], law: Law) -> dict[str, float]:
+    """The last gaps of a platoon: their mean, how far one is from the formula of its law, and how far it may be."""
+    trace = drive(settling(speed_mps))
+    expected = equilibrium_gap(speed_mps, law)
+    return {
+        "gap_m": float(trace.gap[-1].mean()),
+        "formula_m": expected,
+        "away_m": largest(trace.gap[-1] - expected),
+        "allowed_m": unsettled_gap_m(trace, law),
+    }
+
+
+def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
+    """All figures, and the traces by scene and simulator."""
+    traces: dict[str, dict[str, Trace]] = {}
+    rows: list[dict[str, Any]] = []
+    for scene in SCENES:
+        mine = ours.drive(scene)
+        traces[scene.name] = {"ganlane": mine, **{peer.name: peer.drive(scene) for peer in PEERS}}
+        for peer in PEERS:
+            apart = take_apart(scene, peer, mine, traces[scene.name][peer.name])._asdict()
+            pieces = {name: piece._asdict() for name, piece in apart.items()}
+            rows.append({"scene": scene.name, "peer": peer.name, **pieces})
+    figures = {"versions": versions(), "traces": rows, "settled": _settled(), "stops": _stops(traces)}
+    return {**figures, "steps": _steps(), "final_gap_at_1_ms_m": finely_stopped_m()}, traces
+
+
+def _settled() -> list[dict[str, Any]]:
+    drivers = [("ganlane", ours.drive, LAW), *((peer.name, peer.drive, peer.law) for peer in PEERS)]
+    return [
+        {"speed_mps": speed, "simulator": name, **settled(speed, drive, law)}
+        for speed in SETTLED_MPS
+        for name, drive, law in drivers
+    ]
+
+
+def _stops(traces: dict[str, dict[str, Trace]]) -> list[dict[str, Any]]:
+    return [
+        {"simulator": name, "final_gap_m": float(trace.gap[-1, 0]), "lowest_mps": float(trace.speed[:, 1].min())}
+        for name, trace in traces[OBSTACLE.name].items()
+    ]
+
+
+def _steps() -> list[dict[str, Any]]:
+    """What the step itself does in the scene 'slow and go'; every simulator against ganlane at 0.1 s."""
+    mine = ours.drive(SLOW_AND_GO)
+    others = {
+        "its own equations at 0.01 s": (every(integrate(SLOW_AND_GO, Scheme.BALLISTIC, dt=0.01), 10), 1),
+        "HighwayEnv at its default 1/15 s": (every(highway_env_peer.drive(SLOW_AND_GO, dt=1 / 15), 3), 2),
+        "SUMO at its default 1 s, Euler": (sumo_peer.drive(SLOW_AND_GO, ballistic=False, dt=1.0), 10),
+        "SUMO at 1 s, ballistic": (sumo_peer.drive(SLOW_AND_GO, dt=1.0), 10),
+    }
+    return [
+        {"other": name, **between(other, every(mine, stride))._asdict()} for name, (other, stride) in others.items()
+    ]
+
+
+def every(trace: Trace, stride: int) -> Trace:
+    """One moment in ``stride``."""
+    return Trace(trace.speed[::stride], trace.position[::stride])
+
+
+def finely_stopped_m() -> float:
+    """The final gap behind the obstacle at steps of a millisecond: the model's own, m."""
+    return float(integrate(OBSTACLE, Scheme.BALLISTIC, dt=0.001).gap[-1, 0])
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the tables, write JSON and plot; 2 after a user's mistake."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="folder of peers.json and peers.png")
+    parser.add_argument("--page", type=Path, default=Path("docs/peers.md"), help="page whose tables are replaced")
+    arguments = parser.parse_args(argv)
+    out = arguments.out
+    try:
+        require_peers()
+        if not arguments.page.is_file():
+            raise UserError(f"{arguments.page}: no such page; run from the repository root or give --page.")
+        figures, traces = collect()
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(report.page(figures))
+    write_json(out / "peers.json", figures)
+    from benchmarks.peers.plot import draw
+
+    draw(traces, figures, out / "peers.png")
+    write_bytes(arguments.page, report.fill(arguments.page.read_text(), figures).encode())
+    print(f"results: {out / 'peers.json'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

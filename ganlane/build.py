@@ -103,6 +103,7 @@ def make_env(
         stream=traffic.stream,
         seed=seed,
         device=device,
+        scenes=env.scenes(traffic.visibility),
     )
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
     return TransformedEnv(base, Compose(seen, RewardTransform(env.decision_period_s, reward.parameters())))

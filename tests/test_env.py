@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.worlds import environment, placed, same_bits, step, vehicles
+from reference.worlds import environment, packed, placed, same_bits, step, vehicles
 from torchrl.collectors import Collector
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -14,7 +14,6 @@ from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.env import EpisodeParameters
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
-from ganlane.sim.spawn import SpawnParameters
 
 KEEP, LEFT, RIGHT = keys.KEEP, keys.LEFT, keys.RIGHT
 FAR = {"x": 2000.0, "lane": 0}
@@ -341,5 +340,5 @@ def test_a_soft_crash_is_no_end():
 
 
 def test_dense_scenes_can_be_asked_for():
-    env = environment(vehicles=20, spawn=SpawnParameters(spread_m=150.0, min_spacing_m=10.0))
+    env = environment(vehicles=20, spawn=packed(150.0, 10.0))
     assert env.reset()[keys.VEHICLES, "x"].shape == (1, 20)

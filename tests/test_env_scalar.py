@@ -7,7 +7,7 @@ import random
 import pytest
 import torch
 from reference import scalar
-from reference.worlds import DOUBLE, environment, placed, rules_of, scalar_state, step
+from reference.worlds import DOUBLE, environment, packed, placed, rules_of, scalar_state, step
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -30,7 +30,7 @@ def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
         mobil=rng.random() < 0.75,
         period_s=rng.choice([0.5, 1.0]),
         abort=rng.random() < 0.3,
-        spawn=SpawnParameters(spread_m=spread, min_spacing_m=spacing),
+        spawn=packed(spread, spacing),
         seed=rng.randrange(10**9),
     )
 

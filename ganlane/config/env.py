@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from ganlane.env import EpisodeParameters
     from ganlane.sim.ego import EgoParameters
     from ganlane.sim.idm import IdmParameters
+    from ganlane.sim.lanes import Visibility
     from ganlane.sim.mobil import MobilParameters
+    from ganlane.sim.scenes import Scenes
     from ganlane.sim.spawn import SpawnParameters
 
 VISIBILITIES = ("centre", "body", "signalled")
@@ -142,8 +144,16 @@ class EnvConfig:
                 f"env.timeout_s={self.timeout_s:g}: expected at least env.decision_period_s="
                 f"{self.decision_period_s:g}, or every episode ends in its first step."
             )
-        self.spawn_parameters().check(self.vehicles, self.lanes)
         self.episode_parameters().check()
+        self._check_start()
+
+    def _check_start(self) -> None:
+        """Refuse first scenes that do not fit on the road, or from which nobody could drive on."""
+        self.spawn_parameters().check(self.vehicles, self.lanes, self.idm.parameters())
+
+    def scenes(self, others_visibility: Visibility | None = None) -> Scenes | None:
+        """Where an episode's vehicles start: None for Table II; ``others_visibility`` is the traffic's."""
+        return None
 
     def spawn_parameters(self) -> SpawnParameters:
         """Table II as the simulator takes it."""

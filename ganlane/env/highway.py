@@ -16,7 +16,8 @@ from ganlane.sim.ego import EgoParameters
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.random import absorb, episode_key
 from ganlane.sim.road import Road
-from ganlane.sim.spawn import SpawnParameters, spawn
+from ganlane.sim.scenes import RandomScenes, Scenes
+from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.steering import STEERING, SteeringParameters
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule
@@ -28,7 +29,7 @@ class HighwayEnv(EnvBase):
     Args:
         traffic: moves the other vehicles; its road is the environment's.
         num_envs: N, the batch size.
-        vehicles: M, the ego included.
+        vehicles: M, the ego included; None: as many as ``scenes`` has, 9 without.
         spawn_parameters: Table II.
         ego: the ego's lane changes and visibility.
         episode: decision period, goal and time-out.
@@ -36,6 +37,8 @@ class HighwayEnv(EnvBase):
         stream: family of episodes (training, selection, report); by default, and at most, the traffic's.
         seed: base of the random numbers; ``set_seed`` changes it for the next full reset.
         first_episode: row i starts with episode ``first_episode + i`` and goes on in steps of N.
+        scenes: where the vehicles of an episode start; None: at random, by ``spawn_parameters``. It also says who is
+            seen how (``visibility``).
         device, dtype: where and in which float type to simulate.
 
     An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with ``seed`` and
@@ -43,8 +46,8 @@ class HighwayEnv(EnvBase):
     after every physics step.
 
     Raises:
-        UserError: the vehicles do not fit on the road, the decision period is not a multiple of 0.1 s, or the
-            traffic belongs to another stream.
+        UserError: the vehicles do not fit on the road or could not brake in time, the decision period is not a
+            multiple of 0.1 s, or the traffic belongs to another stream.
     """
 
     batch_locked = True
@@ -53,7 +56,7 @@ class HighwayEnv(EnvBase):
         self,
         traffic: TrafficModule,
         num_envs: int = 1,
-        vehicles: int = 9,
+        vehicles: int | None = None,
         spawn_parameters: SpawnParameters | None = None,
         ego: EgoParameters | None = None,
         episode: EpisodeParameters | None = None,
@@ -64,6 +67,7 @@ class HighwayEnv(EnvBase):
         first_episode: int = 0,
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
+        scenes: Scenes | None = None,
     ) -> None:
         super().__init__(device=device or torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.traffic = traffic.to(self.device)
@@ -71,7 +75,9 @@ class HighwayEnv(EnvBase):
         self.spawn_parameters = spawn_parameters or SpawnParameters()
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
-        self.vehicles, self.stream, self.dtype = vehicles, traffic.stream, dtype
+        self.stream, self.dtype = traffic.stream, dtype
+        self.scenes = scenes or self._random_scenes(9 if vehicles is None else vehicles)
+        self.vehicles = self.scenes.vehicles
         self.first_episode = first_episode
         self.recorder: Recorder | None = None
         self.world = World(self.road, self.traffic, self.ego, self.episode, idm, steering)
@@ -84,9 +90,16 @@ class HighwayEnv(EnvBase):
                 f"stream={int(stream)}: the traffic was built for stream {traffic.stream}; give both the same one, "
                 "or an episode would depend on two of them."
             )
-        if isinstance(self.road.lanes, int):
-            self.spawn_parameters.check(vehicles, self.road.lanes)
+        if vehicles is not None and vehicles != self.vehicles:
+            raise UserError(
+                f"vehicles={vehicles}: the scene has {self.vehicles}, the ego included; leave this number out."
+            )
+        self.scenes.check(self.road, idm)
         self._make_specs()
+
+    def _random_scenes(self, vehicles: int) -> Scenes:
+        seen = (self.ego.visibility, self.traffic.visibility)
+        return RandomScenes(self.road, vehicles, self.spawn_parameters, *seen)
 
     def _make_specs(self) -> None:
         n, device = self.batch_size[0], self.device
@@ -121,19 +134,12 @@ class HighwayEnv(EnvBase):
         """All rows at the start of their episodes; EnvBase keeps those of the rows that were not asked for."""
         seed, episode = self._last = self._episodes(tensordict)
         key = episode_key(self.stream, seed, episode)
-        vehicles = self._spawn(key)
+        vehicles = self.scenes(key, self.dtype)
         memory = self.traffic.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
         zero = torch.zeros(self.batch_size, dtype=self.dtype, device=self.device)
         rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
         rest |= {name: zero[:, None].bool() for name in DONE_FLAGS}
         return pack(vehicles, fresh_ego(zero), memory, no_events(zero), rest)
-
-    def _spawn(self, key: Tensor) -> Vehicles:
-        lanes, width = self.road.lanes, self.road.lane_width_m
-        assert not isinstance(lanes, Tensor)
-        assert not isinstance(width, Tensor)
-        seen = (self.ego.visibility, self.traffic.visibility)
-        return spawn(key, self.vehicles, lanes, float(width), self.spawn_parameters, self.dtype, *seen)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One decision."""

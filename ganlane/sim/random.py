@@ -41,6 +41,10 @@ class Purpose(IntEnum):
     TRAIT_HEADWAY = 9
     TRAIT_DESIRED_SPEED = 10
     FAULT = 11
+    LATE_REACTION = 12
+    HESITANT_CHANGE = 13
+    ABORTED_CHANGE = 14
+    REPLAY_START = 15
     NOISE = 16  # and the 47 purposes after it: the generator's latent vector, one per dimension
     RECYCLE = 64
 

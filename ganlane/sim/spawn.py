@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
+from ganlane.sim.braking import can_brake, highest_speed, least_gap
+from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Purpose, draw_keys, uniform
 from ganlane.sim.vehicles import Vehicles
@@ -31,8 +33,8 @@ class SpawnParameters:
         """Vehicles that fit into one lane."""
         return int(self.spread_m / self.min_spacing_m) + 1
 
-    def check(self, vehicles: int, lanes: int) -> None:
-        """Raise :class:`UserError` where ``vehicles`` do not fit on ``lanes`` lanes, or overlap by design."""
+    def check(self, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V) -> None:
+        """Raise :class:`UserError` where ``vehicles`` do not fit on ``lanes`` lanes, overlap, or cannot brake."""
         if self.min_spacing_m <= self.length_m:
             raise UserError(
                 f"env.min_spacing_m={self.min_spacing_m:g} is not above the vehicles' length of "
@@ -44,6 +46,32 @@ class SpawnParameters:
                 f"env.vehicles={vehicles} do not fit: {lanes} lanes x {capacity} vehicles "
                 f"(env.spread_m={self.spread_m:g}, env.min_spacing_m={self.min_spacing_m:g}) hold "
                 f"{lanes * capacity}; use fewer vehicles, more lanes or a larger env.spread_m."
+            )
+        if vehicles > 1:
+            for follower in self.worst_followers():
+                self._check_braking(*follower, idm)
+
+    def worst_followers(self) -> tuple[tuple[str, float, float, float], ...]:
+        """Who may start fastest behind whom: key, highest speed, the leader's lowest, highest desired speed, m/s."""
+        front, rear, ego = self.front_speed_mps, self.rear_speed_mps, self.ego_speed_mps
+        others = self.desired_speed_mps[1]
+        return (
+            ("rear_speed_mps", rear[1], min(rear[0], ego[0], front[0]), others),
+            ("ego_speed_mps", ego[1], front[0], self.ego_desired_speed_mps),
+            ("front_speed_mps", front[1], front[0], others),
+        )
+
+    def _check_braking(self, key: str, speed: float, leader: float, desired: float, idm: IdmParameters) -> None:
+        """The fastest vehicle must survive the slowest leader at the smallest spacing, which brakes hard."""
+        gap = self.min_spacing_m - self.length_m
+        if not can_brake(gap, speed, leader, desired, idm):
+            spacing = self.length_m + least_gap(speed, leader, desired, idm)
+            slower = highest_speed(gap, leader, desired, idm)
+            raise UserError(
+                f"env.min_spacing_m={self.min_spacing_m:g} is too little for env.{key} up to {speed:g} m/s: a gap "
+                f"of {gap:g} m nobody can avoid a leader of {leader:g} m/s that brakes at env.idm.min_acceleration="
+                f"{idm.min_acceleration:g} m/s2; raise env.min_spacing_m to {spacing:.1f} or lower env.{key} to "
+                f"{slower:.1f}."
             )
 
 

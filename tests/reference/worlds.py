@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import torch
 from reference import scalar
@@ -11,6 +12,7 @@ from tensordict import TensorDictBase
 from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim.ego import EgoParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
@@ -42,6 +44,18 @@ def vehicles(*cars: dict, lane_width_m: float = 4.0, dtype: torch.dtype = DOUBLE
         kind = dtype if name in keys.VEHICLE_FLOATS else torch.bool if name in keys.VEHICLE_FLAGS else torch.int64
         columns[name] = torch.tensor([[car[name] for car in filled]], dtype=kind)
     return Vehicles(**columns)
+
+
+def packed(spread_m: float, spacing_m: float) -> SpawnParameters:
+    """Table II on another stretch; where cars stand closer, they are no faster than what they can brake from."""
+    table = SpawnParameters(spread_m=spread_m, min_spacing_m=spacing_m)
+    top = 0.95 * (-2.0 * TABLE_V.min_acceleration * (spacing_m - table.length_m)) ** 0.5
+
+    def slower(speeds: tuple[float, float]) -> tuple[float, float]:
+        return min(speeds[0], 0.8 * top), min(speeds[1], top)
+
+    names = ("front_speed_mps", "rear_speed_mps", "ego_speed_mps")
+    return replace(table, **{name: slower(getattr(table, name)) for name in names})
 
 
 def environment(
@@ -103,10 +117,11 @@ def step(env: HighwayEnv, td: TensorDictBase, action: int | Sequence[int] | torc
 
 
 def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
-    """Row ``row`` of an environment's state as scalar cars."""
+    """Row ``row`` of an environment's state as scalar cars; wheels are straight in traffic that has none."""
     fields = {name: td[keys.VEHICLES, name][row].tolist() for name in keys.VEHICLE_FIELDS}
     count = len(fields["x"])
-    steering = td[keys.TRAFFIC, "steering"][row].tolist()
+    wheels = td.get((keys.TRAFFIC, "steering"), None)
+    steering = [0.0] * count if wheels is None else wheels[row].tolist()
     steering[0] = td[keys.EGO, "steering"][row].item()
     cars = [
         scalar.Car(**{name: value[i] for name, value in fields.items()}, steering=steering[i]) for i in range(count)

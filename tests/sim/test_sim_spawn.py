@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.worlds import DOUBLE
+from reference.worlds import DOUBLE, packed
 
 from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps
@@ -122,7 +120,7 @@ def test_float32_and_float64_give_the_same_scene_to_rounding():
 
 @given(data=st.data(), lanes=st.integers(1, 6), spacing=st.floats(5.0, 40.0), spread=st.floats(40.0, 1000.0))
 def test_no_scene_starts_with_an_overlap(data, lanes, spacing, spread):
-    p = dataclasses.replace(SpawnParameters(), min_spacing_m=spacing, spread_m=spread)
+    p = packed(spread, spacing)
     vehicles = data.draw(st.integers(1, min(60, lanes * p.lane_capacity())))
     p.check(vehicles, lanes)
     s = spawn(keys(4, seed=data.draw(st.integers(0, 2**40))), vehicles, lanes, 4.0, p, DOUBLE)

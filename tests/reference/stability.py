@@ -1,0 +1,94 @@
+"""Linear stability of IDM traffic, in plain floats, from the equations: what rings and platoons are tested against.
+
+Car n follows car n - 1; x along the road, s the gap, v its speed, l its leader's. Near the equilibrium
+s_e(v) the acceleration is ``f_s ds + f_v dv + f_l dl``. A wave ``exp(i k n + lambda t)`` obeys, with
+``e = exp(-i k)`` (the leader's phase)::
+
+    lambda^2 = f_s (e - 1) + (f_v + f_l e) lambda
+
+For long waves (k -> 0) the real part of lambda is positive, and the traffic string-unstable, where the slope of
+the equilibrium speed over the gap, ``-f_s / (f_v + f_l)``, exceeds ``(f_l - f_v) / 2``
+(Treiber and Kesting, Traffic Flow Dynamics, 2013, chapter 15).
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+A, B, HEADWAY, MIN_GAP = 0.7, 1.7, 1.6, 2.0  # Table V
+C = 2.0 * math.sqrt(A * B)
+
+
+class Slopes(NamedTuple):
+    """Partial derivatives of IDM's acceleration by gap, own speed and leader's speed."""
+
+    gap: float
+    own: float
+    leader: float
+
+
+def equilibrium(speed: float, desired: float) -> float:
+    """s_e(v), m."""
+    return (MIN_GAP + speed * HEADWAY) / math.sqrt(1.0 - (speed / desired) ** 4)
+
+
+def slopes(speed: float, desired: float) -> Slopes:
+    """At the equilibrium: of ``a (1 - (v/v0)^4 - (s*/s)^2)``, ``s* = d0 + v T + v (v - l) / c``."""
+    wanted, gap = MIN_GAP + speed * HEADWAY, equilibrium(speed, desired)
+    pull = 2.0 * A * wanted / gap**2
+    own = -4.0 * A * speed**3 / desired**4 - pull * (HEADWAY + speed / C)
+    return Slopes(pull * wanted / gap, own, pull * speed / C)
+
+
+def instability(speed: float, desired: float) -> float:
+    """Above 0 where long waves grow."""
+    f = slopes(speed, desired)
+    return -f.gap / (f.own + f.leader) - 0.5 * (f.leader - f.own)
+
+
+def zero_of(function: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function that is positive at ``low`` and negative at ``high`` changes sign."""
+    assert function(low) > 0.0 > function(high)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if function(middle) > 0.0 else (low, middle)
+    return low
+
+
+def critical_speed(desired: float) -> float:
+    """m/s; string-unstable below (down to a crawl), stable above."""
+    return zero_of(lambda v: instability(v, desired), 0.5 * desired, 0.99 * desired)
+
+
+def wave(speed: float, desired: float, k: float, dt: float) -> tuple[complex, complex]:
+    """Factor z per step of the slowest-decaying wave, and speed over displacement (1/s) in it.
+
+    A step is ``v' = v + a dt``, ``x' = x + (v + v') dt / 2``; with ``x' = z x`` follows
+    ``2 (z - 1)^2 = dt^2 f_s (e - 1) (z + 1) + 2 dt (f_v + f_l e) (z - 1)``.
+    """
+    f, e = slopes(speed, desired), cmath.exp(-1j * k)
+    stiff, damp = f.gap * (e - 1.0) * dt * dt, (f.own + f.leader * e) * dt
+    z = max((1.0 + root for root in np.roots([2.0, -2.0 * damp - stiff, -2.0 * stiff])), key=abs)
+    return complex(z), complex(2.0 * (z - 1.0) / (dt * (z + 1.0)))
+
+
+def growth_rate(speed: float, desired: float, cars: int, dt: float) -> tuple[float, int]:
+    """Of the fastest wave that fits on a ring of ``cars``: rate in 1/s, and how often it fits."""
+    rates = [
+        (math.log(abs(wave(speed, desired, 2.0 * math.pi * j / cars, dt)[0])) / dt, j) for j in range(1, cars // 2)
+    ]
+    return max(rates)
+
+
+def step_matrix(speed: float, desired: float, cars: int, dt: float, ring: bool) -> np.ndarray:
+    """One step of (displacements, speeds) [2 cars]; the first follows the last on a ring, else an undisturbed one."""
+    f, one = slopes(speed, desired), np.eye(cars)
+    ahead = np.eye(cars, k=-1)
+    ahead[0, -1] = float(ring)
+    by_x, by_v = f.gap * (ahead - one), f.own * one + f.leader * ahead
+    return np.block([[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]])

@@ -1,0 +1,281 @@
+"""What drivers do in the scenarios that ship: cut-in, stalled car, blocked lane, stop-and-go, dense traffic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+
+from ganlane import keys
+from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.config.compose import check
+from ganlane.config.env import DenseEnvConfig, EnvConfig
+from ganlane.config.scenarios import (
+    BlockedLaneEnvConfig,
+    BlockedLaneOptions,
+    CutInEnvConfig,
+    StalledCarEnvConfig,
+    StopAndGoEnvConfig,
+    StopAndGoOptions,
+)
+from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic import IdmTraffic
+
+ROWS = 16
+TRAFFICS = {"idm": IdmTrafficConfig(), "idm_mobil": IdmMobilTrafficConfig()}
+SCENARIOS = {
+    "cut_in": CutInEnvConfig(),
+    "stalled_car": StalledCarEnvConfig(),
+    "stop_and_go": StopAndGoEnvConfig(),
+    "blocked_lane": BlockedLaneEnvConfig(),
+}
+
+
+@dataclass
+class Drive:
+    """What happened in ``ROWS`` episodes: every physics step, overlaps, hardest braking, how the episodes ended."""
+
+    frames: list[Vehicles] = field(default_factory=list)
+    overlaps: int = 0
+    hardest: float = 0.0
+    events: dict[str, torch.Tensor] = field(default_factory=dict)
+
+    def at(self, seconds: float) -> Vehicles:
+        return self.frames[round(seconds / keys.PHYSICS_STEP_S) - 1]
+
+    def record(self, vehicles: Vehicles, running: torch.Tensor) -> None:
+        self.frames.append(vehicles)
+        self.overlaps += int(pair_overlaps(vehicles)[running].sum()) // 2
+        if running.any():
+            self.hardest = min(self.hardest, vehicles.acceleration[running].min().item())
+
+
+def drive(config: EnvConfig, driver: str, traffic: str, seconds: int) -> Drive:
+    """``ROWS`` episodes side by side, without a goal, until one of them ends."""
+    config = replace(config, goal_m=1e6)
+    env = make_env(make_traffic(TRAFFICS[traffic], config), config, num_envs=ROWS)
+    policy, seen = make_driver(driver, config).policy, Drive()
+    env.base_env.recorder = seen.record
+    td = env.reset()
+    ended = torch.zeros(ROWS, dtype=torch.bool)
+    seen.events = {name: torch.zeros(ROWS, dtype=torch.bool) for name in keys.END_EVENTS}
+    for _ in range(seconds):
+        td = env.step(policy(td))["next"]
+        for name in keys.END_EVENTS:
+            seen.events[name] |= td[keys.EVENTS, name][:, 0] & ~ended
+        ended |= td["done"][:, 0]
+        if ended.any():
+            break
+    return seen
+
+
+# Cut-in
+
+
+@pytest.mark.parametrize("traffic", ["idm", "idm_mobil"])
+@pytest.mark.parametrize("driver", ["mobil", "keep_lane"])
+def test_in_the_cut_in_the_ego_brakes_hard_but_nobody_crashes(driver, traffic):
+    """IDM wants 1.6 s to the other: it starts with 20 m, 3 m/s too fast, and brakes with 5 to 9 m/s2."""
+    seen = drive(SCENARIOS["cut_in"], driver, traffic, 25)
+    assert seen.overlaps == 0
+    assert -10.0 < seen.hardest < -4.0
+    ego = torch.stack([frame.acceleration[:, 0] for frame in seen.frames[:20]])
+    assert (ego.amin(0) < -4.0).all()
+
+
+def test_the_vehicle_that_cuts_in_is_in_the_egos_lane_within_five_seconds():
+    seen = drive(SCENARIOS["cut_in"], "keep_lane", "idm", 5)
+    last = seen.frames[-1]
+    assert ((last.y[:, 1] - last.y[:, 0]).abs() < 0.3).all()
+    assert (last.x[:, 1] - last.x[:, 0] > 4.5).all()
+
+
+def test_after_the_cut_in_a_keep_lane_ego_follows_at_the_others_speed_and_a_mobil_ego_leaves_the_lane():
+    following = drive(SCENARIOS["cut_in"], "keep_lane", "idm", 45).frames[-1]
+    assert (following.speed[:, 0] < 17.5).all()
+    free = drive(SCENARIOS["cut_in"], "mobil", "idm", 45).frames[-1]
+    assert (free.x[:, 0] > following.x[:, 0] + 50.0).all()
+
+
+# Stalled car
+
+
+@pytest.mark.parametrize("traffic", ["idm", "idm_mobil"])
+def test_the_mobil_ego_passes_the_stalled_car_without_a_crash(traffic):
+    seen = drive(SCENARIOS["stalled_car"], "mobil", traffic, 60)
+    assert seen.overlaps == 0
+    assert (seen.frames[-1].x[:, 0] > 300.0).all()
+    assert seen.hardest > -3.0
+
+
+@pytest.mark.parametrize("traffic", ["idm", "idm_mobil"])
+def test_the_keep_lane_ego_stops_two_metres_behind_the_stalled_car(traffic):
+    seen = drive(SCENARIOS["stalled_car"], "keep_lane", traffic, 60)
+    last = seen.frames[-1]
+    gap = last.x[:, 1] - last.x[:, 0] - 4.5
+    assert ((gap > 1.7) & (gap < 2.6)).all()
+    assert (last.speed[:, 0] < 0.1).all()
+    assert seen.overlaps == 0
+
+
+def test_the_stalled_car_stays_in_its_lane_and_all_but_stands():
+    """A vehicle that desires next to nothing creeps 3.5 cm/s: IDM's first step from a stand is 0.07 m/s."""
+    seen = drive(SCENARIOS["stalled_car"], "keep_lane", "idm_mobil", 90)
+    moved = seen.frames[-1].x[:, 1] - seen.frames[0].x[:, 1]
+    assert (moved < 5.0).all()
+    assert (seen.frames[-1].y[:, 1].abs() < 0.7).all()
+    assert all((frame.target_lane[:, 1] == 0).all() for frame in seen.frames[::50])
+
+
+def test_who_keeps_its_lane_behind_a_stalled_car_runs_out_of_time():
+    seen = drive(SCENARIOS["stalled_car"], "keep_lane", "idm", 121)
+    assert seen.events["timeout"].all()
+
+
+# Blocked lane
+
+
+@pytest.mark.parametrize("traffic", ["idm", "idm_mobil"])
+def test_polite_mobil_strands_at_the_closed_lane_and_egoistic_mobil_finds_a_gap(traffic):
+    """With politeness 1 a gap of 55 m costs the follower more than the ego gains, until it stands and cannot go."""
+    polite = drive(SCENARIOS["blocked_lane"], "mobil", traffic, 60)
+    assert ((polite.frames[-1].x[:, 0] < 250.0) & (polite.frames[-1].speed[:, 0] < 0.5)).all()
+    egoistic = drive(SCENARIOS["blocked_lane"], "mobil_egoistic", traffic, 60)
+    assert (egoistic.frames[-1].x[:, 0] > 320.0).all()
+    assert polite.overlaps == egoistic.overlaps == 0
+
+
+@pytest.mark.parametrize("traffic", ["idm", "idm_mobil"])
+def test_between_vehicles_100_m_apart_polite_mobil_finds_a_gap_too(traffic):
+    config = BlockedLaneEnvConfig(scene=BlockedLaneOptions(spacing_m=100.0))
+    seen = drive(config, "mobil", traffic, 60)
+    assert (seen.frames[-1].x[:, 0] > 320.0).all()
+    assert seen.overlaps == 0
+
+
+# Stop-and-go
+
+
+def jam_m(vehicles: Vehicles, lane: int = 0) -> torch.Tensor:
+    """Mean position of the slow (under 2 m/s) vehicles of a lane, [N]."""
+    slow = (vehicles.speed < 2.0) & (vehicles.target_lane == lane)
+    return torch.where(slow, vehicles.x, 0.0).sum(1) / slow.sum(1)
+
+
+def test_the_wave_travels_backwards_while_everybody_drives_forwards():
+    """One wave: cars leave it at its head and join at its tail; linear theory and measurements say 4 to 5 m/s."""
+    config = StopAndGoEnvConfig(scene=StopAndGoOptions(waves=1, per_wave=8))
+    seen = drive(config, "keep_lane", "idm", 24)
+    speed = (jam_m(seen.at(20.0)) - jam_m(seen.at(8.0))) / 12.0
+    assert ((speed < -1.0) & (speed > -8.0)).all()
+    for before, after in zip(seen.frames, seen.frames[1:], strict=False):
+        assert (after.x >= before.x).all()
+
+
+def test_the_ego_stops_for_the_wave_and_drives_on_and_the_scene_brakes_gently():
+    seen = drive(SCENARIOS["stop_and_go"], "keep_lane", "idm", 60)
+    speed = torch.stack([frame.speed[:, 0] for frame in seen.frames])
+    assert (speed.amin(0) < 3.0).all()
+    assert (speed[-1] > 5.0).all()
+    assert seen.hardest > -3.0
+    assert seen.overlaps == 0
+
+
+def test_nobody_crashes_in_stop_and_go_traffic_that_changes_lanes():
+    assert drive(SCENARIOS["stop_and_go"], "mobil", "idm_mobil", 90).overlaps == 0
+
+
+# Dense traffic
+
+
+def test_the_mobil_ego_gets_through_dense_traffic_and_faster_than_one_that_keeps_its_lane():
+    config = DenseEnvConfig()
+    mobil, keeping = (drive(config, driver, "idm_mobil", 60) for driver in ("mobil", "keep_lane"))
+    assert mobil.overlaps == keeping.overlaps == 0
+    assert mobil.frames[-1].x[:, 0].mean() > keeping.frames[-1].x[:, 0].mean()
+
+
+# The seam
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_episodes_differ_and_do_not_depend_on_the_batch(name):
+    config = SCENARIOS[name]
+    traffic = make_traffic(TRAFFICS["idm_mobil"], config)
+    many, one = (make_env(traffic, config, num_envs=count).reset() for count in (50, 1))
+    speed = many[keys.VEHICLES, "speed"]
+    assert len(set(speed[:, 0].tolist())) == 50
+    assert torch.equal(speed[0], one[keys.VEHICLES, "speed"][0])
+    assert torch.equal(many[keys.VEHICLES, "x"][0], one[keys.VEHICLES, "x"][0])
+
+
+def test_any_callable_with_a_check_makes_the_scene():
+    class Mine:
+        vehicles = 2
+
+        def check(self, road, idm):
+            self.checked = road
+
+        def __call__(self, key, dtype):
+            rows = (SceneVehicle(0.0, 0, 10.0), SceneVehicle(50.0, 1, 10.0))
+            return FixedScene(rows, Road(2))(key, dtype)
+
+    mine = Mine()
+    env = HighwayEnv(IdmTraffic(Road(2)), 3, scenes=mine)
+    assert mine.checked == Road(2)
+    assert env.reset()[keys.VEHICLES, "x"].tolist() == [[0.0, 50.0]] * 3
+
+
+def test_a_number_of_vehicles_other_than_the_scenes_is_refused():
+    scene = FixedScene((SceneVehicle(0.0, 0), SceneVehicle(50.0, 1)), Road(2))
+    with pytest.raises(UserError, match="vehicles=9: the scene has 2"):
+        HighwayEnv(IdmTraffic(Road(2)), 1, 9, scenes=scene)
+
+
+def test_a_hopeless_scene_is_refused_when_the_environment_is_made():
+    hopeless = FixedScene((SceneVehicle(0.0, 0, 30.0), SceneVehicle(10.0, 0, 0.0)), Road(2))
+    with pytest.raises(UserError, match=r"the ego at 30 m/s, 5\.5 m behind vehicle 1"):
+        HighwayEnv(IdmTraffic(Road(2)), 1, scenes=hopeless)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "what"),
+    [
+        (["env=cut_in", "env.vehicles=5"], "env.vehicles=5: the scene has 6"),
+        (["env=cut_in", "env.lanes=1"], "env=cut_in needs 2 lanes or more"),
+        (["env=stalled_car", "env.spread_m=300"], "env.spread_m=300"),
+        (["env=cut_in", "env.scene.gap_m=3", "env.scene.speed_mps=36"], "would need 100 m/s2"),
+        (["env=scene"], "env.scene.path: no file"),
+        (["env.min_spacing_m=12"], "raise env.min_spacing_m to 17.8"),
+    ],
+)
+def test_a_mistaken_scenario_is_told_in_a_sentence_before_anything_is_made(overrides, what):
+    with pytest.raises(UserError) as refused:
+        check("evaluate", overrides)
+    assert what in str(refused.value)
+
+
+def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):
+    path = tmp_path / "mine.csv"
+    path.write_text("x_m,lane,speed_mps,desired_speed_mps\n5,1,20,30\n60,2,20,22\n")
+    config = check("evaluate", ["env=scene", f"env.scene.path={path}"]).config.env
+    assert (config.vehicles, config.lanes, config.lane_width_m, config.ego_desired_speed_mps) == (2, 3, 4.0, 30.0)
+    td = make_env(make_traffic(TRAFFICS["idm"], config), config, num_envs=2).reset()
+    assert td[keys.VEHICLES, "x"].tolist() == [[0.0, 55.0]] * 2
+    wider = check("evaluate", ["env=scene", f"env.scene.path={path}", "env.lanes=4"]).config.env
+    assert wider.lanes == 4
+
+
+def test_another_desired_speed_of_the_ego_can_be_asked_for(tmp_path):
+    path = tmp_path / "mine.csv"
+    path.write_text("x_m,lane,speed_mps,desired_speed_mps\n0,0,20,30\n60,1,20,22\n")
+    given = ["env=scene", f"env.scene.path={path}", "env.ego_desired_speed_mps=20"]
+    config = check("evaluate", given).config.env
+    assert config.scenes().rows[0].desired_speed_mps == 20.0

@@ -26,6 +26,8 @@ NAMES = {
     "ganlane.traffic.IdmMobilTraffic": "idm_mobil",
     "ganlane.traffic.presets.gan_traffic": "gan",
     "ganlane.traffic.presets.gan_calibrated_traffic": "gan_calibrated",
+    "ganlane.traffic.presets.idm_faults_traffic": "idm_faults",
+    "ganlane.traffic.ReplayTraffic": "replay",
 }
 
 

@@ -1,13 +1,16 @@
 """Traffic models: TensorDictModules that move the other vehicles, swappable by ``traffic=NAME``.
 
 All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules,
-:mod:`~ganlane.traffic.social_gan` by the generator. Overlays (:mod:`~ganlane.traffic.lane_change`,
-:mod:`~ganlane.traffic.acceleration`) and the :mod:`~ganlane.traffic.guard` stand behind a base model in a
-:class:`TrafficSequential`; :mod:`~ganlane.traffic.presets` builds the chains that ship.
+:mod:`~ganlane.traffic.social_gan` by the generator; :mod:`~ganlane.traffic.replay` plays recordings. Overlays
+(:mod:`~ganlane.traffic.lane_change`, :mod:`~ganlane.traffic.acceleration`, and drivers' faults in
+:mod:`~ganlane.traffic.faults` and :mod:`~ganlane.traffic.lane_change_faults`) and the
+:mod:`~ganlane.traffic.guard` stand behind a base model in a :class:`TrafficSequential`;
+:mod:`~ganlane.traffic.presets` builds the chains that ship.
 """
 
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.faults import BrakingFaults, LateReaction, PhantomBraking, ReactionFaults
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 from ganlane.traffic.lane_change import (
@@ -16,19 +19,38 @@ from ganlane.traffic.lane_change import (
     LiteralChanges,
     LiteralLaneChange,
 )
+from ganlane.traffic.lane_change_faults import (
+    AbortedLaneChange,
+    AbortFaults,
+    HesitantLaneChange,
+    HesitationFaults,
+)
+from ganlane.traffic.recordings import Recordings
+from ganlane.traffic.replay import RecordedScenes, ReplayTraffic
 from ganlane.traffic.sequential import Overlay, TrafficSequential
 
 __all__ = [
+    "AbortFaults",
+    "AbortedLaneChange",
     "AccelerationOverlay",
+    "BrakingFaults",
     "CalibratedChanges",
     "CalibratedLaneChange",
     "Guard",
     "GuardParameters",
+    "HesitantLaneChange",
+    "HesitationFaults",
     "IdmMobilTraffic",
     "IdmTraffic",
+    "LateReaction",
     "LiteralChanges",
     "LiteralLaneChange",
     "Overlay",
+    "PhantomBraking",
+    "ReactionFaults",
+    "RecordedScenes",
+    "Recordings",
+    "ReplayTraffic",
     "SuddenAccelerations",
     "TrafficModule",
     "TrafficSequential",

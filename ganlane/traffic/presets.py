@@ -1,7 +1,8 @@
-"""The two generated traffics that ship: the paper's, and the calibrated one."""
+"""The chains that ship: the paper's generated traffic, the calibrated one, and rule-driven drivers with faults."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,26 @@ from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
 from ganlane.generator import headway_quantiles, load_generator, shipped_generator
 from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.mobil import TABLE_IV, MobilParameters
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
+from ganlane.sim.steering import STEERING, SteeringParameters
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.faults import BrakingFaults, LateReaction, PhantomBraking, ReactionFaults
 from ganlane.traffic.guard import Guard, GuardParameters
+from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.traffic.lane_change import (
     CalibratedChanges,
     CalibratedLaneChange,
     LiteralChanges,
     LiteralLaneChange,
+)
+from ganlane.traffic.lane_change_faults import (
+    AbortedLaneChange,
+    AbortFaults,
+    HesitantLaneChange,
+    HesitationFaults,
 )
 from ganlane.traffic.sequential import TrafficSequential
 from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
@@ -116,3 +127,46 @@ def gan_calibrated_traffic(
 #: Wishes per change that is carried out, measured in the simulation with 9 vehicles: a wish comes only while the
 #: driver is near its lane's centre, and waiting for a gap costs distance. A slow test holds the rate that results.
 WISH_PER_CHANGE = 2.0
+
+
+@dataclass(frozen=True)
+class DriverFaults:
+    """How often drivers make which faults; a rate or share of 0 switches one off."""
+
+    phantom_braking: BrakingFaults = field(default_factory=BrakingFaults)
+    late_reaction: ReactionFaults = field(default_factory=ReactionFaults)
+    hesitant_change: HesitationFaults = field(default_factory=HesitationFaults)
+    aborted_change: AbortFaults = field(default_factory=AbortFaults)
+
+
+def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> TrafficSequential:
+    """``base`` (any traffic model, a chain too) with all four faults laid over it.
+
+    The braking comes after the late reactions, since it is no reaction and late for nobody.
+    """
+    faults, (road, stream) = faults or DriverFaults(), (base.road, base.stream)
+    parts: dict[str, TrafficModule] = {
+        "base": base,
+        "late_reaction": LateReaction(road, stream, faults.late_reaction),
+        "phantom_braking": PhantomBraking(road, stream, faults.phantom_braking),
+        "hesitant_change": HesitantLaneChange(road, stream, faults.hesitant_change),
+        "aborted_change": AbortedLaneChange(road, stream, faults.aborted_change),
+    }
+    return TrafficSequential(parts)
+
+
+def idm_faults_traffic(
+    road: Road | None = None,
+    stream: int = Stream.TRAIN,
+    idm: IdmParameters = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
+    steering: SteeringParameters = STEERING,
+    faults: DriverFaults | None = None,
+) -> TrafficSequential:
+    """``traffic=idm_faults``: ``idm_mobil`` driven by people who now and then err.
+
+    Args:
+        road, stream, idm, mobil, steering: as for :class:`ganlane.traffic.IdmMobilTraffic`.
+        faults: how often, how long and how badly.
+    """
+    return with_faults(IdmMobilTraffic(road, stream, idm, steering, mobil), faults)

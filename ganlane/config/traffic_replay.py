@@ -1,0 +1,21 @@
+"""``traffic=replay``: which recordings are played."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ganlane.config.checks import at_least, check
+from ganlane.config.traffic import TrafficConfig
+
+
+@dataclass
+class ReplayTrafficConfig(TrafficConfig):
+    """``traffic=replay`` (:class:`ganlane.traffic.ReplayTraffic`); ``path`` null: the recordings' folder."""
+
+    _target_: str = "ganlane.traffic.ReplayTraffic"
+    path: str | None = None
+    least_s: float = 4.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, "traffic", least_s=at_least(0.1))

@@ -1,0 +1,299 @@
+"""Replay: recorded scenes around the ego, the same for everybody who asks for the same episode."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+from scipy.stats import chisquare
+from tensordict import TensorDict
+
+from ganlane import keys
+from ganlane.data import SyntheticTraffic, default_scenes, sort, synthetic_scenes, write_scene_csv
+from ganlane.errors import UserError
+from ganlane.sim import Vehicles
+from ganlane.sim.collisions import ego_overlaps
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.random import episode_key
+from ganlane.traffic import Recordings, ReplayTraffic
+
+WIDTH = 3.5
+
+
+def track(vehicle, frames, x, speed, lane, scene="s", length=4.0, width=2.0) -> pl.DataFrame:
+    """A vehicle at a steady speed on a lane's centre."""
+    frame = np.asarray(list(frames))
+    rows = len(frame)
+    return pl.DataFrame(
+        {
+            "scene": [scene] * rows,
+            "vehicle": [vehicle] * rows,
+            "frame": frame,
+            "x": x + speed * 0.1 * frame,
+            "y": [lane * WIDTH] * rows,
+            "speed": [float(speed)] * rows,
+            "lane": [lane] * rows,
+            "length": [length] * rows,
+            "width": [width] * rows,
+        }
+    )
+
+
+def replay(*tracks: pl.DataFrame, least_s: float = 2.0, stream: int = 0) -> ReplayTraffic:
+    return ReplayTraffic(stream, recordings=Recordings.of(sort(pl.concat(tracks)), "test", least_s))
+
+
+def keys_of(episodes, stream: int = 0, seed: int = 0) -> torch.Tensor:
+    number = torch.as_tensor(episodes, dtype=torch.int64)
+    return episode_key(stream, torch.full_like(number, seed), number)
+
+
+def start(traffic: ReplayTraffic, key: torch.Tensor, vehicles: int = 9) -> Vehicles:
+    return traffic.scenes(vehicles)(key, torch.float64)
+
+
+def play(traffic: ReplayTraffic, key: torch.Tensor, step: int, vehicles: int = 9) -> Vehicles:
+    """The vehicles that ``move`` gives ``step`` steps after the start."""
+    scene = start(traffic, key, vehicles)
+    return traffic.move(scene, {}, key, torch.full_like(key, step - 1))[0]
+
+
+# 2.1 s: an episode can only start at frame 0, where five cars stand at 0, 20, 30, 45 and 100 m.
+FIVE = (
+    track(1, range(21), 0.0, 20.0, 0),
+    track(2, range(21), 20.0, 10.0, 0, length=6.0),
+    track(3, range(21), 30.0, 12.0, 1, length=5.0, width=1.8),
+    track(4, range(8), 45.0, 15.0, 2),
+    track(5, range(21), 100.0, 15.0, 2),
+)
+
+
+def test_the_ego_takes_the_place_of_the_vehicle_nearest_the_middle():
+    scene = start(replay(*FIVE), keys_of([0]))
+    # Positions 0, 20, 30, 45, 100: their median is 30.
+    ego = [getattr(scene, name)[0, 0].item() for name in ("x", "y", "speed", "length", "width")]
+    assert ego == [0.0, WIDTH, 12.0, 5.0, 1.8]
+    assert scene.target_lane[0, 0] == 1
+    assert scene.desired_speed[0, 0] == 25.0
+    assert scene.visibility[0].tolist() == [Visibility.BODY] * 9
+
+
+def test_the_replaced_vehicle_is_recorded_long_enough():
+    """The vehicle in the middle leaves after 0.8 s, so the next nearest is taken."""
+    scene = start(replay(*FIVE[:3], FIVE[3], track(6, range(21), 47.0, 15.0, 1), FIVE[4]), keys_of([0]))
+    # Positions 0, 20, 30, 45, 47, 100: the middle is 37.5, and of 30 and 45 the second is too short.
+    assert scene.speed[0, 0] == 12.0
+
+
+def test_its_neighbours_are_the_nearest_in_order():
+    scene = start(replay(*FIVE), keys_of([0]), vehicles=4)
+    assert scene.x[0].tolist() == [0.0, -10.0, 15.0, -30.0]
+    assert scene.y[0].tolist() == [WIDTH, 0.0, 2 * WIDTH, 0.0]
+    assert scene.valid.all()
+
+
+def test_places_without_a_recorded_vehicle_are_not_valid():
+    scene = start(replay(*FIVE), keys_of([0]), vehicles=9)
+    assert scene.valid[0].tolist() == [True] * 5 + [False] * 4
+    for value in scene.as_dict().values():
+        assert torch.isfinite(value.double()).all()
+
+
+def test_vehicles_go_where_they_went_and_one_that_leaves_is_no_longer_valid():
+    traffic, key = replay(*FIVE), keys_of([0])
+    for step in range(1, 21):
+        now = play(traffic, key, step)
+        assert now.x[0, 1:5].tolist() == pytest.approx(
+            [-10.0 + step, 15.0 + 1.5 * min(step, 7), -30.0 + 2.0 * step, 70.0 + 1.5 * step]
+        )
+        assert now.valid[0].tolist() == [True, True, step <= 7, True, True] + [False] * 4
+
+
+def test_the_episode_lasts_as_long_as_the_scene():
+    assert replay(*FIVE).steps_of(keys_of([0, 1, 2])).tolist() == [20, 20, 20]
+    longer = replay(*FIVE, track(7, range(10, 41), 0.0, 10.0, 0))
+    # Whoever the ego replaces, and whenever: the scene ends at frame 40.
+    key = keys_of(range(50))
+    first_frame = 40 - longer.steps_of(key)
+    assert first_frame.unique().tolist() == [*range(0, 1), *range(10, 21)]
+
+
+def test_a_track_with_a_missing_frame_ends_there():
+    holes = [frame for frame in range(21) if frame != 10]
+    traffic = replay(*FIVE[1:3], track(9, holes, 33.0, 12.0, 2))
+    assert play(traffic, keys_of([0]), 9).valid[0, :3].tolist() == [True, True, True]
+    assert play(traffic, keys_of([0]), 12).valid[0, :3].tolist() == [True, False, True]
+
+
+def test_nobody_reacts_to_the_ego():
+    traffic, key = ReplayTraffic(recordings=recorded(3)), keys_of(range(16))
+    scene = start(traffic, key)
+    elsewhere = scene.with_(x=scene.x + 5.0, y=scene.y + 1.0, speed=scene.speed * 0.0)
+    one, other = (traffic.move(at, {}, key, torch.full_like(key, 7))[0] for at in (scene, elsewhere))
+    for name in keys.VEHICLE_FIELDS:
+        assert torch.equal(getattr(one, name)[:, 1:], getattr(other, name)[:, 1:])
+        assert torch.equal(getattr(other, name)[:, 0], getattr(elsewhere, name)[:, 0])
+
+
+def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> Recordings:
+    """Synthetic scenes of which the k-th has 2 + k % 3 lanes and loses its last k seconds."""
+    parts = []
+    for k in range(scenes):
+        made = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=seconds, **others), seed=k)
+        cut = made.filter(pl.col("frame") < round((seconds - 0.5 * k) * 10))
+        parts.append(cut.with_columns(scene=pl.lit(f"scene-{k}")))
+    return Recordings.of(sort(pl.concat(parts)), "synthetic", 4.0)
+
+
+def test_an_episode_is_the_same_in_every_batch_and_slot():
+    traffic = ReplayTraffic(recordings=recorded())
+    together, order = keys_of(range(64)), torch.randperm(64, generator=torch.Generator().manual_seed(0))
+    for step in (1, 30, 60):
+        all_rows = play(traffic, together, step)
+        shuffled = play(traffic, together[order], step)
+        alone = play(traffic, together[17:18], step)
+        for name in keys.VEHICLE_FIELDS:
+            assert torch.equal(getattr(all_rows, name)[order], getattr(shuffled, name))
+            assert torch.equal(getattr(all_rows, name)[17:18], getattr(alone, name))
+
+
+def test_every_scene_is_equally_likely_and_every_start_within_it():
+    traffic, episodes = ReplayTraffic(recordings=recorded()), range(20_000)
+    starts = traffic.start_of(keys_of(episodes))
+    scenes = np.bincount(traffic.scene_of(keys_of(episodes)).numpy(), minlength=4)
+    assert chisquare(scenes).pvalue > 1e-3
+    within = np.bincount(starts[traffic.scene_of(keys_of(episodes)) == 2].numpy())
+    assert chisquare(within[within > 0]).pvalue > 1e-3
+    assert len(starts.unique()) == starts.max() + 1
+
+
+def test_streams_and_seeds_take_other_starts():
+    traffic = ReplayTraffic(recordings=recorded())
+    starts = [
+        traffic.start_of(keys_of(range(200), stream, seed)) for stream, seed in ((0, 0), (1, 0), (2, 0), (0, 1))
+    ]
+    for one in range(4):
+        for other in range(one):
+            assert (starts[one] == starts[other]).float().mean() < 0.1
+
+
+def test_lanes_and_their_width_are_the_scenes_own():
+    traffic, key = ReplayTraffic(recordings=recorded()), keys_of(range(100))
+    road, scene = traffic.road_of(key, torch.float64), traffic.scene_of(key)
+    assert road.lanes.shape == road.lane_width_m.shape == (100, 1)
+    assert torch.equal(road.lanes[:, 0], 2 + scene % 3)
+    assert (road.lane_width_m - 3.5).abs().max() < 0.2
+    now = start(traffic, key)
+    assert (now.target_lane < road.lanes).all()
+    assert traffic.road.lanes == 4
+    assert traffic.scenes_of_episodes(0, range(100)) == [f"scene-{number}" for number in scene.tolist()]
+
+
+def test_every_step_is_what_a_search_through_the_rows_finds():
+    made = sort(synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6), seed=3))
+    # Some come later and some leave early.
+    made = made.filter((pl.col("frame") >= 2 * (pl.col("vehicle") % 4)) & (pl.col("frame") < 70 - pl.col("vehicle")))
+    traffic = ReplayTraffic(recordings=Recordings.of(made, "test", 3.0))
+    key = keys_of(range(12))
+    for row, (scene, steps) in enumerate(zip(traffic.scene_of(key).tolist(), traffic.steps_of(key).tolist())):
+        rows = made.filter(pl.col("scene") == traffic.scene_names[scene])
+        first = rows["frame"].max() - steps
+        here = rows.filter(pl.col("frame") == first)
+        ending = rows.group_by("vehicle").agg(pl.col("frame").max().alias("end"))
+        middle = here["x"].median()
+        stays = here.join(ending, on="vehicle").filter(pl.col("end") >= first + 30)
+        ego = min(stays.to_dicts(), key=lambda car: (abs(car["x"] - middle), car["vehicle"]))
+        others = [car for car in here.to_dicts() if car["vehicle"] != ego["vehicle"]]
+        others.sort(key=lambda car: (np.hypot(car["x"] - ego["x"], car["y"] - ego["y"]), car["vehicle"]))
+        for step in (1, 17, steps):
+            now = play(traffic, key[row : row + 1], step)
+            for slot, car in enumerate(others[:8], start=1):
+                found = rows.filter(
+                    (pl.col("vehicle") == car["vehicle"]) & (pl.col("frame") == first + step)
+                ).to_dicts()
+                assert now.valid[0, slot].item() == bool(found)
+                if found:
+                    seen = (now.x[0, slot] + ego["x"], now.y[0, slot], now.speed[0, slot], now.length[0, slot])
+                    expected = [found[0][name] for name in ("x", "y", "speed", "length")]
+                    assert [value.item() for value in seen] == pytest.approx(expected)
+
+
+def test_heading_and_acceleration_are_those_of_the_path():
+    frame = np.arange(60)
+    time = frame * 0.1
+    path = 10.0 * time + 0.5 * time**2
+    # Accelerating at 1 m/s2 along a line that rises by one in two hundred; beside it somebody stands.
+    moving = track(1, frame, 0.0, 10.0, 0).with_columns(x=path, y=path / 200.0, speed=10.0 + time)
+    samples = Recordings.of(sort(pl.concat([moving, track(2, frame, 30.0, 0.0, 1)])), "test", 3.0).samples
+    heading, acceleration = (samples[:, keys.VEHICLE_FLOATS.index(name)] for name in ("heading", "acceleration"))
+    assert heading[:60].tolist() == pytest.approx([np.arctan(1 / 200.0)] * 60)
+    assert acceleration[:60].tolist() == pytest.approx([1.0] * 60)
+    assert heading[60:].abs().max() == acceleration[60:].abs().max() == 0.0
+
+
+def test_the_module_keeps_its_contract():
+    traffic, key = ReplayTraffic(recordings=recorded(3)), keys_of(range(5))
+    state = TensorDict({keys.VEHICLES: TensorDict(traffic.scenes(9)(key, torch.float32).as_dict(), [5])}, [5])
+    before = state[keys.VEHICLES].clone()
+    state[keys.SEED], state[keys.EPISODE] = torch.zeros(5, dtype=torch.int64), torch.arange(5)
+    state[keys.STEP] = torch.full((5,), 3)
+    traffic(state)
+    assert (state[keys.VEHICLES] == before).all()
+    assert set(state[keys.MOVED].keys()) == set(keys.VEHICLE_FIELDS)
+    for name, value in state[keys.MOVED].items():
+        assert (value.shape, value.dtype) == (before[name].shape, before[name].dtype), name
+    assert traffic.memory_spec(5, 9) == {}
+    assert torch.equal(state[keys.MOVED, "x"][:, 1:], play(traffic, key, 4).x[:, 1:].float())
+
+
+def test_a_scene_file_is_read(tmp_path):
+    made = synthetic_scenes(SyntheticTraffic(scenes=2, seconds=6.0))
+    write_scene_csv(made, tmp_path / "mine.csv")
+    assert ReplayTraffic(path=tmp_path / "mine.csv").scene_names == ("synthetic-0", "synthetic-1")
+
+
+def test_without_recordings_it_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
+    with pytest.raises(UserError, match=r"no recordings found.*traffic.path=FILE.*GANLANE_DATA"):
+        ReplayTraffic()
+
+
+def test_recordings_that_are_too_short_are_refused():
+    with pytest.raises(UserError, match="no vehicle is recorded for 3 s"):
+        replay(*FIVE, least_s=3.0)
+
+
+@pytest.fixture(scope="module")
+def us101() -> ReplayTraffic:
+    try:
+        default_scenes()
+    except UserError as missing:
+        pytest.skip(str(missing))
+    return ReplayTraffic(stream=2)
+
+
+def test_the_us101_scenes_can_all_be_replayed(us101):
+    key = keys_of(range(2000), stream=2)
+    assert len(us101.scene_names) == 11
+    assert set(us101.scene_of(key).tolist()) == set(range(11))
+    scene = us101.scenes(9)(key, torch.float32)
+    # Nobody starts in a crash: the ego's size is that of the vehicle it replaces.
+    assert not ego_overlaps(scene).any()
+    assert set(us101.road_of(key).lanes.unique().tolist()) == {5, 6, 7}
+
+
+def test_how_long_the_us101_scenes_last_and_how_soon_they_empty(us101):
+    key = keys_of(range(2000), stream=2)
+    steps, scene = us101.steps_of(key), us101.scenes(9)(key, torch.float32)
+    assert steps.min() == 40
+    assert 290 <= steps.max() <= 300
+    assert steps.double().mean().item() == pytest.approx(80, abs=3)
+    farthest = torch.hypot(scene.x, scene.y - scene.y[:, :1]).amax(1)
+    assert farthest.median().item() == pytest.approx(24, abs=1)
+    driven = alone = 0
+    for number in range(1, 301):
+        running = number <= steps
+        empty = ~us101.recorded(key, torch.full_like(key, number), 9, torch.float32).valid[:, 1:].any(1)
+        driven, alone = driven + running.sum().item(), alone + (running & empty).sum().item()
+    assert alone / driven == pytest.approx(0.18, abs=0.01)

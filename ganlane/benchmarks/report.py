@@ -1,0 +1,73 @@
+"""A suite's result for a reader: on the terminal, and between two markers of a document."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ganlane.benchmarks.case import Suite
+from ganlane.errors import UserError
+from ganlane.evaluation import code_version, machine
+from ganlane.files import write_bytes
+
+
+def markers(suite: str) -> tuple[str, str]:
+    """The lines between which a suite's tables stand in a document."""
+    return f"<!-- begin bench {suite} -->", f"<!-- end bench {suite} -->"
+
+
+def require_markers(path: Path, suite: str) -> tuple[str, str]:
+    """The document's text up to the first marker, and from the second on, markers included.
+
+    Raises:
+        UserError: there is no such file, or it does not hold the two markers once each and in order.
+    """
+    begin, end = markers(suite)
+    if not path.is_file():
+        raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
+    text = path.read_text(encoding="utf-8")
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise UserError(f"report={path}: expected the lines {begin} and {end} in it, once each; add them.")
+    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
+
+
+def update_document(path: Path, suite: str, content: str) -> None:
+    """Put ``content`` between the markers of a suite, atomically; the rest stays as it is."""
+    before, after = require_markers(path, suite)
+    write_bytes(path, f"{before}\n{content}\n{after}".encode())
+
+
+def machine_sentence(threads: Sequence[int]) -> str:
+    """Where and on which code the figures were taken, without host names or paths."""
+    here, code = machine(), code_version()
+    usable = f"{here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
+    accelerator = f", {here['accelerator']}" if here["accelerator"] else ""
+    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    return (
+        f"{here['cpu']}, {usable}{accelerator}; Python {here['python']}, torch {here['torch']} (threads: "
+        f"{', '.join(map(str, threads))}); ganlane {code['version']}{revision}."
+    )
+
+
+def report_sections(
+    suite: Suite, numbers: Mapping[str, Any], command_line: str, threads: Sequence[int], written: str
+) -> str:
+    """What :func:`update_document` puts between the markers: command, machine, tables, and what was left out."""
+    tables = suite.tables(numbers["rows"], numbers)
+    parts = [
+        f"Written by the command on {written}:\n\n    {command_line}",
+        f"Taken on: {machine_sentence(threads)}",
+        *[table.markdown() for table in tables],
+    ]
+    if numbers["notes"]:
+        parts.append("\n".join(f"- {note}" for note in numbers["notes"]))
+    return "\n" + "\n\n".join(parts) + "\n"
+
+
+def print_report(suite: Suite, numbers: Mapping[str, Any]) -> None:
+    """The tables and the notes on stdout."""
+    for table in suite.tables(numbers["rows"], numbers):
+        print(table.text(), end="\n\n")
+    for note in numbers["notes"]:
+        print(note)

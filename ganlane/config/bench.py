@@ -1,0 +1,109 @@
+"""Root of ``ganlane bench``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from ganlane.config.checks import Rule, between, check, every, one_of
+from ganlane.config.env import EnvConfig
+from ganlane.config.evaluate import NAMES
+from ganlane.config.observation import ObservationConfig
+from ganlane.config.reward import RewardConfig, check_pay
+from ganlane.config.traffic import TrafficConfig
+from ganlane.errors import UserError
+
+SUITES = ("sim",)
+MODES = ("eager", "compiled")
+DEVICES = ("cpu", "cuda")
+_QUICK_BATCH = 64
+
+
+def _different(rule: Rule) -> Rule:
+    """A list of different entries, not empty, of which every one obeys ``rule``."""
+    entries = every(rule)
+    return Rule(
+        lambda values: entries.holds(values) and NAMES.holds(values), f"{entries.expected}, all of them different"
+    )
+
+
+@dataclass
+class BenchConfig:
+    """What to measure, how often, and where to write it down."""
+
+    suite: str = "sim"
+    quick: bool = False
+    batches: list[int] = field(default_factory=lambda: [1, 16, 64, 256, 1024, 4096, 16384])
+    modes: list[str] = field(default_factory=lambda: list(MODES))
+    threads: list[int] = field(default_factory=lambda: [1, 2])
+    devices: list[str] | None = None
+    vehicle_counts: list[int] = field(default_factory=lambda: [9, 15, 30, 60])
+    scaling_batch: int = 1024
+    linear_from: int = 1024
+    memory_batches: list[int] = field(default_factory=lambda: [1024, 4096])
+    repetitions: int = 5
+    seconds: float = 0.5
+    peers: bool = True
+    memory: bool = True
+    report: str | None = None
+    seed: int = 0
+    env: EnvConfig = field(default_factory=EnvConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+
+    def __post_init__(self) -> None:
+        sizes = between(1, 2**20)
+        check(
+            self,
+            "",
+            suite=one_of(SUITES),
+            batches=_different(sizes),
+            modes=_different(one_of(MODES)),
+            threads=_different(between(1, 1024)),
+            vehicle_counts=_different(between(2, 1000)),
+            scaling_batch=sizes,
+            linear_from=sizes,
+            repetitions=between(1, 1000),
+            seconds=between(0.001, 600),
+            seed=between(0, 2**53),
+            memory_batches=Rule(
+                lambda pair: len(pair) == 2 and all(map(sizes.holds, pair)) and pair[0] < pair[1],
+                "two batch sizes, the smaller one first",
+            ),
+        )
+        self._check_devices()
+        check_pay(self.env, self.reward)
+
+    def _check_devices(self) -> None:
+        if self.devices is None:
+            return
+        check(self, "", devices=_different(one_of(DEVICES)))
+        if "cuda" in self.devices and not _has_cuda():
+            raise UserError("devices: torch sees no CUDA device here; leave cuda out or install torch for CUDA.")
+
+    def chosen_devices(self) -> tuple[str, ...]:
+        """Those asked for; by default the CPU, and a GPU where there is one."""
+        if self.devices is not None:
+            return tuple(self.devices)
+        return DEVICES if _has_cuda() else DEVICES[:1]
+
+    def shortened(self) -> BenchConfig:
+        """With ``quick``, at most seconds of measuring: small batches, two short repetitions, no memory."""
+        if not self.quick:
+            return self
+        return replace(
+            self,
+            batches=[batch for batch in self.batches if batch <= _QUICK_BATCH] or [1],
+            threads=self.threads[:1],
+            vehicle_counts=self.vehicle_counts[:2],
+            scaling_batch=min(self.scaling_batch, _QUICK_BATCH),
+            repetitions=min(self.repetitions, 2),
+            seconds=min(self.seconds, 0.01),
+            memory=False,
+        )
+
+
+def _has_cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()

@@ -1,0 +1,89 @@
+"""``ganlane bench`` from end to end, with tiny budgets, in process."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from ganlane.bench import main
+
+TINY = ["quick=true", "batches=[1,3]", "seconds=0.001", "vehicle_counts=[4,6]", "scaling_batch=2", "linear_from=1"]
+LABELS = {"suite", "system", "traffic", "mode", "dtype", "device", "threads", "vehicles", "lanes", "batch"}
+RATES = {"physics_steps_per_s", "decisions_per_s", "vehicle_steps_per_s", "peak_memory_mb"}
+TIMES = {"wall_s", "cpu_s", "repetitions", "spread", "ratio", "ratio_cpu"}
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def run(capsys, *arguments):
+    """Exit status, stdout, stderr."""
+    status = main([*TINY, *arguments])
+    return status, *capsys.readouterr()
+
+
+def test_rows_findings_and_provenance_are_kept(capsys):
+    status, out, _ = run(capsys, "modes=[eager]", "peers=false", "devices=[cpu]")
+    assert status == 0
+    last = out.splitlines()[-1]
+    results = json.loads(Path(last.removeprefix("results: ")).read_text())
+    assert results["rows"][0].keys() >= LABELS | RATES | TIMES
+    speed = [row for row in results["rows"] if row["part"] == "speed"]
+    assert [row["batch"] for row in speed] == [1, 1, 3, 3]
+    assert {row["threads"] for row in speed} == {1}
+    assert all(row["physics_steps_per_s"] > 0 for row in results["rows"])
+    assert [(growth["in"], growth["sizes"]) for growth in results["scaling"]] == [
+        ("batch", [1, 3]),
+        ("batch", [1, 3]),
+        ("vehicles", [4, 6]),
+        ("vehicles", [4, 6]),
+    ]
+    assert 100 < results["memory"]["state_bytes"] < 50_000
+    assert {"ratios", "notes", "config", "code", "machine", "seeds"} <= results.keys()
+    assert "physics steps/s" in out
+
+
+def test_report_rewrites_the_tables_of_a_document(tmp_path, capsys):
+    document = tmp_path / "speed.md"
+    document.write_text("before\n<!-- begin bench sim -->\n<!-- end bench sim -->\nafter\n")
+    status, _, _ = run(capsys, "modes=[eager]", "peers=false", "devices=[cpu]", f"report={document}")
+    assert status == 0
+    text = document.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "python -m ganlane.bench quick=true 'batches=[1,3]'" in text
+    assert "| ganlane physics | eager | cpu | 1 | 3 |" in text
+    assert str(tmp_path) not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["report=gone.md"], "report=gone.md: no such file"),
+        (["suite=train_all"], "suite=train_all: expected one of sim"),
+        (["batches=[1,1]"], "all of them different"),
+        (["batches=[0]"], "batches=[0]: expected a list"),
+        (["modes=[slow]"], "one of eager, compiled"),
+        (["devices=[tpu]"], "one of cpu, cuda"),
+        (["memory_batches=[8,8]"], "two batch sizes, the smaller one first"),
+        (["env.vehicles=100"], "env.vehicles=100 do not fit"),
+    ],
+)
+def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(arguments, part, tmp_path, capsys):
+    status, out, err = run(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert part in err
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
+def test_a_gpu_that_is_not_there_is_refused(capsys):
+    status, _, err = run(capsys, "devices=[cpu,cuda]")
+    assert status == 2
+    assert "no CUDA device" in err

@@ -32,6 +32,8 @@ REWARD_TERMS: Final = "reward_terms"
 SEED: Final = "seed"
 EPISODE: Final = "episode"
 STEP: Final = "step"
+#: The episodes' keys [N] int64 (:func:`ganlane.sim.random.episode_key`), handed to the traffic once a decision.
+EPISODE_KEY: Final = "episode_key"
 ACTION: Final = "action"
 OBSERVATION: Final = "observation"
 REWARD: Final = "reward"
@@ -42,6 +44,8 @@ VEHICLE_FLOATS: Final = ("x", "y", "heading", "speed", "acceleration", "length",
 VEHICLE_INTEGERS: Final = ("target_lane", "visibility")
 #: Boolean fields of ``vehicles``.
 VEHICLE_FLAGS: Final = ("valid",)
+#: What no step changes, for any vehicle.
+FIXED_FIELDS: Final = ("length", "width", "desired_speed")
 VEHICLE_FIELDS: Final = VEHICLE_FLOATS + VEHICLE_INTEGERS + VEHICLE_FLAGS
 
 #: Boolean events; a decision ends for at most one of them.

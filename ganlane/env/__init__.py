@@ -8,7 +8,7 @@ reward are transforms (:mod:`ganlane.transforms`); without them the environment 
 nothing. The state travels in the TensorDict, so it can be copied, saved and branched.
 """
 
-from ganlane.env.decision import EpisodeParameters
 from ganlane.env.highway import HighwayEnv
+from ganlane.env.physics import EpisodeParameters
 
 __all__ = ["EpisodeParameters", "HighwayEnv"]

@@ -5,7 +5,8 @@ order, what each driver sees (:func:`perceive`, :mod:`~ganlane.sim.lanes`, :mod:
 hard it accelerates (:mod:`~ganlane.sim.idm`, :mod:`~ganlane.sim.following`), whether it changes lanes
 (:mod:`~ganlane.sim.mobil`), how it turns the wheel (:mod:`~ganlane.sim.steering`), where the car goes
 (:mod:`~ganlane.sim.bicycle`) and whether it hits something (:mod:`~ganlane.sim.collisions`).
-:mod:`~ganlane.sim.spawn` makes the first scene of an episode, :mod:`~ganlane.sim.random` every random number.
+:mod:`~ganlane.sim.spawn` makes the first scene of an episode, :mod:`~ganlane.sim.recycle` keeps the road populated
+and :mod:`~ganlane.sim.random` makes every random number.
 """
 
 from ganlane.sim.bicycle import advance
@@ -16,6 +17,7 @@ from ganlane.sim.lanes import Visibility
 from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_changes, safe_change
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, follower, leader, perceive
 from ganlane.sim.random import Purpose, Stream, episode_key
+from ganlane.sim.recycle import recycle
 from ganlane.sim.road import Road
 from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
 from ganlane.sim.steering import steer
@@ -48,6 +50,7 @@ __all__ = [
     "mobil_changes",
     "pair_overlaps",
     "perceive",
+    "recycle",
     "safe_change",
     "spawn",
     "steer",

@@ -11,10 +11,10 @@ from torch import Tensor
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
 from ganlane.sim.bicycle import advance
 from ganlane.sim.collisions import dangerously_close
-from ganlane.sim.following import following_acceleration
+from ganlane.sim.following import acceleration_behind
 from ganlane.sim.idm import IdmParameters
-from ganlane.sim.lanes import Visibility
-from ganlane.sim.neighbours import Scene, follower, leader, perceive
+from ganlane.sim.lanes import Visibility, spanned
+from ganlane.sim.neighbours import Neighbour, Scene, follower, leader, perceive
 from ganlane.sim.road import Road
 from ganlane.sim.steering import SteeringParameters, steer
 from ganlane.sim.vehicles import Vehicles
@@ -65,38 +65,40 @@ def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
 
 
 def move_ego(
-    scene: Scene, steering: Tensor, road: Road, idm: IdmParameters, wheel: SteeringParameters, dt: float
+    vehicles: Vehicles, acceleration: Tensor, steering: Tensor, road: Road, wheel: SteeringParameters, dt: float
 ) -> tuple[Vehicles, Tensor]:
     """The ego after ``dt`` seconds (fields [N]) and its steering angle (rad, [N]).
 
-    Along the road it follows IDM, across it its target lane; its driver decides the lane alone.
+    Along the road it takes ``acceleration`` (m/s2, [N]), across it steers for its target lane.
     """
-    ego = scene.observers.at(0)
-    acceleration = following_acceleration(scene, idm)[:, 0]
-    centre = road.centre_of(scene.observers.target_lane, ego.y.dtype)[:, 0]
+    ego = vehicles.at(EGO_INDEX)
+    centre = road.centre_of(vehicles.target_lane[:, :1], ego.y.dtype)[:, 0]
     steering = steer(steering, ego.y, ego.heading, ego.speed, centre, dt, wheel)
     pose = advance(ego.x, ego.y, ego.heading, ego.speed, acceleration, steering, dt)
     return ego.with_(**pose._asdict()), steering
 
 
-def soft_crash_ahead(scene: Scene, ego: EgoParameters) -> Tensor:
-    """Whether the ego is dangerously close to the leader in a lane that its body is in, bool [N]."""
-    close = []
-    for lane in scene.body:
-        ahead = leader(scene, lane)
-        closing = scene.observers.speed - ahead.speed
-        close.append(dangerously_close(ahead.gap, closing, ego.soft_crash_ttc_s, ego.soft_crash_gap_m))
-    return (close[0] | close[1])[:, 0]
+class Surroundings(NamedTuple):
+    """What the ego finds around itself, each [N]: the acceleration that IDM asks for, m/s2, and soft crashes."""
+
+    acceleration: Tensor
+    soft_crash: Tensor
+    soft_crash_behind: Tensor
 
 
-def soft_crash_behind(scene: Scene, ego: EgoParameters) -> Tensor:
-    """The same for the follower, bool [N]."""
-    close = []
-    for lane in scene.body:
-        behind = follower(scene, lane)
-        closing = torch.where(behind.exists, behind.speed - scene.observers.speed, 0.0)
-        close.append(dangerously_close(behind.gap, closing, ego.soft_crash_ttc_s, ego.soft_crash_gap_m))
-    return (close[0] | close[1])[:, 0]
+def look_around(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> Surroundings:
+    """The ego follows in the lanes that it attends to; it is in danger in those that its body is in."""
+    body = spanned(scene.body)
+    ahead = leader(scene, torch.cat((spanned(scene.attention), body), dim=-1))
+    followed, near = (Neighbour(*(number[..., half] for number in ahead)) for half in (slice(0, 3), slice(3, 6)))
+    behind, speed = follower(scene, body), scene.observers.speed[..., None]
+    closing = torch.where(behind.exists, behind.speed - speed, 0.0)
+    limits = (ego.soft_crash_ttc_s, ego.soft_crash_gap_m)
+    return Surroundings(
+        acceleration_behind(scene, followed, idm).amin(-1)[:, 0],
+        dangerously_close(near.gap, speed - near.speed, *limits).any(-1)[:, 0],
+        dangerously_close(behind.gap, closing, *limits).any(-1)[:, 0],
+    )
 
 
 def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ganlane.sim.idm import TABLE_V, IdmParameters, idm_acceleration
+from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import Neighbour, Scene, leader
 
 
@@ -15,9 +16,13 @@ def acceleration_behind(
     parameters: IdmParameters = TABLE_V,
     headway_s: Tensor | float | None = None,
 ) -> Tensor:
-    """IDM acceleration of each observer behind ``ahead``, m/s2, [N, K]."""
+    """IDM acceleration of each observer behind ``ahead`` ([N, K], or [N, K, L] in L lanes), m/s2, of that shape."""
     own = scene.observers
-    return idm_acceleration(own.speed, own.desired_speed, ahead.gap, ahead.speed, parameters, headway_s)
+    speed, desired = own.speed, own.desired_speed
+    if ahead.gap.ndim == 3:
+        speed, desired = speed[..., None], desired[..., None]
+        headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
+    return idm_acceleration(speed, desired, ahead.gap, ahead.speed, parameters, headway_s)
 
 
 def following_acceleration(
@@ -25,8 +30,7 @@ def following_acceleration(
 ) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K].
 
-    In the middle of a lane change a driver stands in two lanes, and the more demanding leader counts.
+    In the middle of a lane change a driver stands in two lanes, or in three, and the most demanding leader counts.
     """
-    right = acceleration_behind(scene, leader(scene, scene.attention.low), parameters, headway_s)
-    left = acceleration_behind(scene, leader(scene, scene.attention.high), parameters, headway_s)
-    return torch.minimum(right, left)
+    ahead = leader(scene, spanned(scene.attention))
+    return acceleration_behind(scene, ahead, parameters, headway_s).amin(-1)

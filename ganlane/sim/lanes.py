@@ -40,6 +40,14 @@ class LaneRange(NamedTuple):
     high: Tensor
 
 
+def spanned(lanes: LaneRange) -> Tensor:
+    """The lanes of a range, [..., 3]: lowest, middle and highest. A body that is turned can stand in three.
+
+    Narrow lanes, long vehicles and one change right after another make that happen.
+    """
+    return torch.stack((lanes.low, torch.minimum(lanes.low + 1, lanes.high), lanes.high), dim=-1)
+
+
 def lateral_half_extent(vehicles: Vehicles) -> Tensor:
     """Half of the lateral space that each body takes, m, its heading included."""
     return 0.5 * (vehicles.width * torch.cos(vehicles.heading) + vehicles.length * torch.sin(vehicles.heading).abs())

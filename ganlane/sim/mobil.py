@@ -31,8 +31,24 @@ class MobilParameters:
 TABLE_IV = MobilParameters()
 
 
+class Prospect(NamedTuple):
+    """Accelerations in lanes where an observer stands or could stand, m/s2, [N, K, L].
+
+    ``own`` is the observer's; ``with_it`` and ``without`` are those of its follower there with the observer in front
+    of it and without, equal where there is no follower.
+    """
+
+    own: Tensor
+    with_it: Tensor
+    without: Tensor
+
+    def of(self, lanes: int | slice) -> Prospect:
+        """Some of the lanes."""
+        return Prospect(*(number[..., lanes] for number in self))
+
+
 class Change(NamedTuple):
-    """What a change into one lane would bring, per observer [N, K]."""
+    """What a change into a lane would bring: the incentive, m/s2, and whether it is safe."""
 
     incentive: Tensor
     safe: Tensor
@@ -43,42 +59,32 @@ def _gap_over(behind: Follower, ahead: Neighbour, length: Tensor) -> Tensor:
     return torch.where(ahead.gap < FREE_GAP_M, behind.gap + length + ahead.gap, FREE_GAP_M)
 
 
-def _follower_gain(scene: Scene, behind: Follower, ahead: Neighbour, idm: IdmParameters) -> tuple[Tensor, Tensor]:
-    """Acceleration of a follower with the vehicle in front of it, and with the vehicle gone, m/s2."""
-    vehicles = scene.observers
-    with_it = idm_acceleration(behind.speed, behind.desired_speed, behind.gap, vehicles.speed, idm)
-    free = ahead.gap >= FREE_GAP_M
-    leader_speed = torch.where(free, behind.speed, ahead.speed)
-    without = idm_acceleration(
-        behind.speed, behind.desired_speed, _gap_over(behind, ahead, vehicles.length), leader_speed, idm
-    )
-    return with_it, without
+def prospect(scene: Scene, lanes: Tensor, idm: IdmParameters) -> Prospect:
+    """The :class:`Prospect` of each observer in ``lanes`` [N, K, L] (float)."""
+    ahead, behind = leader(scene, lanes), follower(scene, lanes)
+    speed, length = (number[..., None] for number in (scene.observers.speed, scene.observers.length))
+    with_it = idm_acceleration(behind.speed, behind.desired_speed, behind.gap, speed, idm)
+    leader_speed = torch.where(ahead.gap >= FREE_GAP_M, behind.speed, ahead.speed)
+    gap = _gap_over(behind, ahead, length)
+    without = idm_acceleration(behind.speed, behind.desired_speed, gap, leader_speed, idm)
+    nobody = ~behind.exists
+    own = acceleration_behind(scene, ahead, idm)
+    return Prospect(own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0))
 
 
-def evaluate_change(
-    scene: Scene, lane: Tensor, own: Tensor, relief: Tensor, idm: IdmParameters, mobil: MobilParameters
-) -> Change:
-    """Incentive and safety of a change into ``lane`` [N, K] (float).
-
-    Args:
-        own: acceleration in the present lane, m/s2.
-        relief: what the old follower gains when the vehicle leaves, m/s2 (0 where there is none).
-    """
-    ahead, behind = leader(scene, lane), follower(scene, lane)
-    new_own = acceleration_behind(scene, ahead, idm)
-    with_it, without = _follower_gain(scene, behind, ahead, idm)
-    burden = torch.where(behind.exists, with_it - without, 0.0)
-    incentive = new_own - own + mobil.politeness_side * burden + mobil.politeness_rear * relief
-    safe_behind = ~behind.exists | (with_it >= -mobil.safe_deceleration)
-    return Change(incentive, safe_behind & (new_own >= -mobil.safe_deceleration))
+def weigh(there: Prospect, here: Prospect, mobil: MobilParameters) -> Change:
+    """MOBIL's criteria for a change from ``here`` [N, K, 1] to ``there`` [N, K, L]."""
+    burden, relief = there.with_it - there.without, here.without - here.with_it
+    incentive = there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
+    return Change(incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration)
 
 
 def safe_change(
     scene: Scene, lane: Tensor, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
 ) -> Tensor:
     """Whether a change into ``lane`` [N, K] (float) asks nobody to brake harder than is safe, bool."""
-    zero = torch.zeros_like(scene.observers.x)
-    return evaluate_change(scene, lane, zero, zero, idm, mobil).safe
+    there = prospect(scene, lane[..., None], idm)
+    return weigh(there, there, mobil).safe[..., 0]
 
 
 def on_road(lane: Tensor, road: Road) -> Tensor:
@@ -91,15 +97,21 @@ def without_ego(wish: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
 
 
-def one_at_a_time(scene: Scene, wish: Tensor, road: Road, within_m: float) -> Tensor:
-    """``wish`` (-1, 0, +1 lanes, [N, K]) less those whose lane somebody ahead takes within ``within_m``."""
-    target = scene.observers.target_lane + wish
-    wants = wish != 0
+def one_at_a_time(
+    scene: Scene, wish: Tensor, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
+) -> Tensor:
+    """``wish`` (-1, 0, +1 lanes, [N, M]) less those who are in the way of somebody ahead who wants the same lane.
+
+    In the way is who is nearer than ``exclusive_m`` (centre to centre), and who would have to brake harder than is
+    safe: neither has looked at the other, since neither is in that lane yet.
+    """
+    vehicles, wants = scene.observers, wish != 0
+    target = vehicles.target_lane + wish
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
-    half = 0.5 * scene.observers.length
-    distance = scene.ahead + half[:, :, None] + half[:, None, :]
-    taken = (same & (distance < within_m)).any(-1)
-    return torch.where(taken, 0, wish)
+    speed, desired = vehicles.speed[:, :, None], vehicles.desired_speed[:, :, None]
+    demand = idm_acceleration(speed, desired, scene.ahead, vehicles.speed[:, None, :], idm)
+    near = (scene.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
+    return torch.where((same & near & (scene.order > 0)).any(-1), 0, wish)
 
 
 def mobil_wishes(scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV) -> Tensor:
@@ -110,16 +122,12 @@ def mobil_wishes(scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: 
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)
-    ahead, behind = leader(scene, lane), follower(scene, lane)
-    own = acceleration_behind(scene, ahead, idm)
-    with_it, without = _follower_gain(scene, behind, ahead, idm)
-    relief = torch.where(behind.exists, without - with_it, 0.0)
-    gains = []
-    for side in (1.0, -1.0):
-        change = evaluate_change(scene, lane + side, own, relief, idm, mobil)
-        allowed = change.safe & on_road(lane + side, road) & (change.incentive > mobil.threshold)
-        gains.append(torch.where(allowed, change.incentive, -torch.inf))
-    left, right = gains
+    lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
+    seen = prospect(scene, lanes, idm)
+    change = weigh(seen.of(slice(1, None)), seen.of(slice(0, 1)), mobil)
+    allowed = change.safe & on_road(lanes[..., 1:].transpose(-1, -2), road).transpose(-1, -2)
+    pays = torch.where(allowed & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
+    left, right = pays.unbind(-1)
     free = settled(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)
@@ -132,4 +140,4 @@ def mobil_changes(
 
     The ego (vehicle 0) decides for itself: here it wishes for nothing, and holds nobody back.
     """
-    return one_at_a_time(scene, without_ego(mobil_wishes(scene, road, idm, mobil)), road, mobil.exclusive_m)
+    return one_at_a_time(scene, without_ego(mobil_wishes(scene, road, idm, mobil)), idm, mobil)

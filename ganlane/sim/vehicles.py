@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ganlane.keys import VEHICLE_FIELDS
+from ganlane.keys import FIXED_FIELDS, VEHICLE_FIELDS
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class Vehicles:
         return Vehicles(*(getattr(self, field.name)[:, which] for field in fields(self)))
 
     def with_first(self, first: Vehicles) -> Vehicles:
-        """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
-        return Vehicles(
-            *(
-                torch.cat((getattr(first, name)[:, None], getattr(self, name)[:, 1:]), dim=1)
-                for name in VEHICLE_FIELDS
-            )
-        )
+        """The same rows with vehicle 0 replaced by ``first`` (fields [N]), but for what never changes."""
+        changing = {
+            name: torch.cat((getattr(first, name)[:, None], getattr(self, name)[:, 1:]), dim=1)
+            for name in VEHICLE_FIELDS
+            if name not in FIXED_FIELDS
+        }
+        return self.with_(**changing)
 
     def where(self, rows: Tensor, other: Vehicles) -> Vehicles:
         """These vehicles in the rows [N] (or [N, 1], [N, M]) where ``rows`` holds, ``other`` elsewhere."""

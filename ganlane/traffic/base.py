@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ganlane import keys
+from ganlane.compiling import compiled
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Stream, episode_key
@@ -30,8 +31,8 @@ class TrafficModule(TensorDictModuleBase):
     """Base of all traffic models.
 
     In keys: ``vehicles`` (the state at t, never written), ``traffic`` (the module's memory), ``seed``,
-    ``episode``, ``step`` ([N] int64). Out keys: ``moved`` (the same fields as ``vehicles``, the others at
-    t + 0.1 s) and ``traffic``. Index 0 is the ego: what the module writes there is overwritten by the
+    ``episode``, ``step`` ([N] int64); ``episode_key`` too, where the caller has worked it out. Out keys: ``moved``
+    (the same fields as ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: what the module writes there is overwritten by the
     environment. Randomness comes from :mod:`ganlane.sim.random` and the counters alone.
 
     A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields` and
@@ -75,13 +76,22 @@ class TrafficModule(TensorDictModuleBase):
         """Memory as if every vehicle had just entered; ``key`` [N] gives random traits."""
         return {}
 
+    def compile_graphs(self) -> None:
+        """Compile what is a pure function on tensors (``env.compile=true``); here :meth:`move`.
+
+        A model whose :meth:`move` asks for the value of a tensor overrides this and compiles the parts between.
+        """
+        self.move = compiled(self.move)  # type: ignore[method-assign]
+
     # Below: TensorDicts in and out, so that models can be chained and stored.
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``."""
         vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
         memory = dict(memory_of(tensordict).items())
-        key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        key = tensordict.get(keys.EPISODE_KEY, None)
+        if key is None:
+            key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
         moved, memory = self._call(tensordict, vehicles, memory, key)
         batch = tensordict.batch_size
         tensordict.set(keys.MOVED, TensorDict._new_unsafe(moved.as_dict(), batch_size=batch))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ganlane.compiling import compiled
 from ganlane.sim.bicycle import advance
 from ganlane.sim.following import following_acceleration
 from ganlane.sim.idm import TABLE_V, IdmParameters
@@ -42,15 +43,14 @@ class IdmTraffic(TrafficModule):
         """Wheels straight."""
         return {"steering": torch.zeros_like(vehicles.x)}
 
-    def change_lanes(self, scene: Scene, step: Tensor) -> Tensor:
-        """Target lanes [N, M] int64 from now on."""
-        return scene.vehicles.target_lane
-
     def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
-        """Decide, accelerate, steer, advance."""
+        """Accelerate, steer, advance."""
         scene = perceive(vehicles, self.road)
-        target = self.change_lanes(scene, step)
-        acceleration = following_acceleration(scene, self.idm)
+        return self.drive(scene, vehicles.target_lane, memory)
+
+    def drive(self, scene: Scene, target: Tensor, memory: dict[str, Tensor]) -> tuple[Vehicles, dict]:
+        """Everybody at t + 0.1 s, on the way to the lanes ``target`` [N, M] int64."""
+        vehicles, acceleration = scene.vehicles, following_acceleration(scene, self.idm)
         centre = self.road.centre_of(target, vehicles.y.dtype)
         v = vehicles
         steering = steer(memory["steering"], v.y, v.heading, v.speed, centre, self.dt, self.steering)
@@ -72,12 +72,25 @@ class IdmMobilTraffic(IdmTraffic):
         super().__init__(road, stream, idm, steering)
         self.mobil = mobil
 
-    def change_lanes(self, scene: Scene, step: Tensor) -> Tensor:
-        """MOBIL's changes in the rows where a second is full."""
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """As IDM; in the rows where a second is full everybody decides first."""
         due = step % MOBIL_PERIOD_STEPS == 0
-        target = scene.vehicles.target_lane
         # On a CPU asking costs nothing and spares nine evaluations in ten; on a GPU it would stall the queue.
         if due.device.type == "cpu" and not bool(due.any()):
-            return target
-        change = mobil_changes(scene, self.road, self.idm, self.mobil)
-        return torch.where(due[:, None], target + change, target)
+            return self.keep_lanes(vehicles, memory)
+        return self.decide(vehicles, memory, due)
+
+    def keep_lanes(self, vehicles: Vehicles, memory: dict[str, Tensor]) -> tuple[Vehicles, dict]:
+        """A step in which nobody decides."""
+        return self.drive(perceive(vehicles, self.road), vehicles.target_lane, memory)
+
+    def decide(self, vehicles: Vehicles, memory: dict[str, Tensor], due: Tensor) -> tuple[Vehicles, dict]:
+        """A step in which the drivers of the rows ``due`` [N] decide."""
+        scene = perceive(vehicles, self.road)
+        change = torch.where(due[:, None], mobil_changes(scene, self.road, self.idm, self.mobil), 0)
+        return self.drive(scene, vehicles.target_lane + change, memory)
+
+    def compile_graphs(self) -> None:
+        """One graph for a step with decisions, one for a step without."""
+        self.keep_lanes = compiled(self.keep_lanes)  # type: ignore[method-assign]
+        self.decide = compiled(self.decide)  # type: ignore[method-assign]

@@ -127,7 +127,8 @@ class CalibratedLaneChange(Overlay):
     ) -> None:
         super().__init__(road, stream)
         self.changes, self.idm = changes or CalibratedChanges(), idm
-        self._limits = MobilParameters(safe_deceleration=self.changes.safe_deceleration)
+        limits = {name: getattr(self.changes, name) for name in ("safe_deceleration", "exclusive_m")}
+        self._limits = MobilParameters(**limits)
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
         """Nobody wishes for anything."""
@@ -166,7 +167,7 @@ class CalibratedLaneChange(Overlay):
         lane = (vehicles.target_lane + wish).to(vehicles.x.dtype)
         safe = safe_change(scene, lane, self.idm, self._limits)
         wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
-        goes = one_at_a_time(scene, wanted, self.road, self.changes.exclusive_m)
+        goes = one_at_a_time(scene, wanted, self.idm, self._limits)
         waited = torch.where(wish != 0, memory["waited"] + 1, 0)
         given_up = waited >= round(self.changes.patience_s / self.dt)
         rest = torch.where((goes != 0) | given_up, 0, wish)

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from ganlane import keys
+from ganlane.compiling import compiled
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule, memory_of
 
@@ -30,6 +31,10 @@ class Overlay(TrafficModule):
     ) -> tuple[Vehicles, dict[str, Tensor]]:
         moved = Vehicles.of(tensordict.get(keys.MOVED))
         return self.rewrite(vehicles, moved, memory, key, tensordict.get(keys.STEP))
+
+    def compile_graphs(self) -> None:
+        """Compile :meth:`rewrite`."""
+        self.rewrite = compiled(self.rewrite)  # type: ignore[method-assign]
 
 
 class TrafficSequential(TrafficModule):
@@ -59,6 +64,11 @@ class TrafficSequential(TrafficModule):
             kept[name] = tensordict.get(keys.TRAFFIC)
         tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
         return tensordict
+
+    def compile_graphs(self) -> None:
+        """Compile every part."""
+        for _, part in self.named_parts():
+            part.compile_graphs()
 
     def init_memory(self, vehicles: Vehicles, who: Tensor, key: Tensor) -> TensorDict:
         """The parts' memories, by name."""

@@ -11,6 +11,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from ganlane import keys
+from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -75,6 +76,10 @@ class ObservationTransform(Transform):
         if with_progress:
             parts.append(torch.stack((progress, direction.to(progress.dtype)), dim=1))
         return torch.cat(parts, dim=1)
+
+    def compile_graphs(self) -> None:
+        """Make one graph of the observation (``env.compile=true``)."""
+        self.observe = compiled(self.observe)  # type: ignore[method-assign]
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict.get(keys.EGO)

@@ -188,14 +188,16 @@ def mobil_wish(view: View, i: int) -> int:
 
 
 def mobil_changes(view: View) -> dict[int, int]:
-    """Car to change, of all but the ego; of several that want into one lane within 60 m the foremost goes."""
+    """Car to change, of all but the ego.
+
+    Of several that want into one lane the one behind waits if it is within 60 m or would have to brake too hard.
+    """
     wishes = {i: mobil_wish(view, i) for i in range(1, len(view.cars))}
     wanted = {i: view.cars[i].target_lane + wish for i, wish in wishes.items() if wish}
 
     def yields(i: int) -> bool:
-        return any(
-            wanted[j] == wanted[i] and view.is_ahead(i, j) and view.distance(i, j) < 60.0 for j in wanted if j != i
-        )
+        rivals = [j for j in wanted if j != i and wanted[j] == wanted[i] and view.is_ahead(i, j)]
+        return any(view.distance(i, j) < 60.0 or view.acceleration(i, j) < -4.0 for j in rivals)
 
     return {i: wishes[i] for i in wanted if not yields(i)}
 

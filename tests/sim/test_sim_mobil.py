@@ -8,7 +8,16 @@ from reference import scalar
 from reference.worlds import environment, rules_of, scalar_state, vehicles
 
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.mobil import TABLE_IV, MobilParameters, evaluate_change, mobil_changes, mobil_wishes, safe_change
+from ganlane.sim.mobil import (
+    TABLE_IV,
+    Change,
+    MobilParameters,
+    mobil_changes,
+    mobil_wishes,
+    prospect,
+    safe_change,
+    weigh,
+)
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -26,6 +35,14 @@ def wish(*cars, lanes: int = 2, mobil: MobilParameters = TABLE_IV) -> int:
     return mobil_wishes(perceive(vehicles(*cars), road), road, mobil=mobil)[0, 0].item()
 
 
+def change_to_the_left(scene) -> Change:
+    """Of the first car, from lane 0 to lane 1."""
+    lanes = torch.tensor([0.0, 1.0]).expand(*scene.vehicles.x.shape, 2)
+    both = prospect(scene, lanes, TABLE_V)
+    assert both.own[0, 0, 0].item() == pytest.approx(OWN, abs=1e-5)
+    return Change(*(number[..., 0] for number in weigh(both.of(slice(1, 2)), both.of(slice(0, 1)), TABLE_IV)))
+
+
 def fast_follower(gap: float) -> dict:
     """On the other lane, at its desired speed of 25 m/s."""
     return {"x": -4.5 - gap, "lane": 1, "speed": 25.0, "desired_speed": 25.0}
@@ -33,8 +50,7 @@ def fast_follower(gap: float) -> dict:
 
 def test_an_empty_lane_beside_a_slow_leader_is_worth_the_gain_in_acceleration():
     scene = perceive(vehicles(SUBJECT, SLOW), Road(lanes=2))
-    zero = torch.zeros_like(scene.vehicles.x)
-    change = evaluate_change(scene, zero + 1.0, zero + OWN, zero, TABLE_V, TABLE_IV)
+    change = change_to_the_left(scene)
     assert change.incentive[0, 0].item() == pytest.approx(FREE - OWN, abs=1e-5)  # 1.784604
     assert change.safe[0, 0]
     assert wish(SUBJECT, SLOW) == 1
@@ -52,8 +68,7 @@ def test_the_incentive_weighs_both_followers():
     old = {"x": -34.5, "lane": 0, "speed": 20.0, "desired_speed": 25.0}
     cars = (SUBJECT, SLOW, fast_follower(60.0), old)
     scene = perceive(vehicles(*cars), Road(lanes=2))
-    zero = torch.zeros_like(scene.vehicles.x)
-    change = evaluate_change(scene, zero + 1.0, zero + OWN, zero + 0.274268, TABLE_V, TABLE_IV)
+    change = change_to_the_left(scene)
     assert change.incentive[0, 0].item() == pytest.approx(0.004678, abs=1e-5)
     # 0.0047 is under the threshold of 0.1, over one of 0, and under it again without the old follower's relief.
     assert wish(*cars) == 0

@@ -1,0 +1,34 @@
+"""``torch.compile`` for the hot functions: several small graphs, which here beat one graph of everything."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from typing import TypeVar
+
+import torch
+
+from ganlane.errors import UserError
+
+F = TypeVar("F", bound=Callable)
+#: Graphs that one function may have: one per batch size, road and set of parameters in a process.
+GRAPHS_PER_FUNCTION = 64
+COMPILERS = ("c++", "g++", "clang++", "cl")
+
+
+def check_compiler() -> None:
+    """Raise :class:`UserError` where torch would find no C++ compiler."""
+    named = os.environ.get("CXX")
+    if not any(shutil.which(name) for name in ((named,) if named else COMPILERS)):
+        looked = f"CXX={named}" if named else ", ".join(COMPILERS)
+        raise UserError(
+            f"compile=true needs a C++ compiler, and there is none (looked for {looked}); install one "
+            "(Debian: apt install g++) or set compile=false."
+        )
+
+
+def compiled(function: F) -> F:
+    """``function``, a pure function on tensors without branches on their values, as one graph per shape."""
+    torch._dynamo.config.cache_size_limit = max(torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION)
+    return torch.compile(function, dynamic=False, fullgraph=True)  # type: ignore[return-value]

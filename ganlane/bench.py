@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
 from ganlane.config.bench import BenchConfig
-from ganlane.config.store import SCHEMAS
 
 if TYPE_CHECKING:
     from ganlane.benchmarks import Suite
@@ -89,7 +88,6 @@ def command_line(folder: Path) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit status."""
-    SCHEMAS[""].setdefault("bench", BenchConfig)
     return run_command("bench", bench, arguments)
 
 

@@ -104,8 +104,12 @@ def make_env(
         seed=seed,
         device=device,
         scenes=env.scenes(traffic.visibility),
+        recycle=env.recycle,
     )
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
+    if env.compile:
+        base.compile()
+        seen.compile_graphs()
     return TransformedEnv(base, Compose(seen, RewardTransform(env.decision_period_s, reward.parameters())))
 
 

@@ -16,7 +16,7 @@ from ganlane.sim.ego import ego_scene
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
-from ganlane.sim.road import Road
+from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
 
@@ -64,7 +64,7 @@ class RandomLegalDriver(RandomDriver):
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """The r-th legal action, r uniform."""
-        legal = legal_actions(tensordict, self.road)
+        legal = legal_actions(tensordict, road_in(tensordict, self.road))
         wanted = (self._uniform(tensordict) * legal.sum(1)).long()
         rank = legal.cumsum(1) - 1
         chosen = legal & (rank == wanted[:, None])
@@ -94,7 +94,8 @@ class MobilDriver(Driver):
 
     def act(self, vehicles: Vehicles, tensordict: TensorDictBase) -> Tensor:
         """MOBIL's wish as an action, in the decisions in which a second of simulated time is full."""
-        wish = mobil_wishes(ego_scene(vehicles, self.road), self.road, self.idm, self.mobil)[:, 0]
+        road = road_in(tensordict, self.road)
+        wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
         step, decisions = tensordict.get(keys.STEP), tensordict.get(keys.EGO).get("decisions")
         # All decisions take the same number of steps, so the last one was at step - step / decisions.
         last = step - step // decisions.clamp_min(1)

@@ -103,6 +103,8 @@ class EnvConfig:
     decision_period_s: float = 1.0
     goal_m: float = 5000.0
     timeout_s: float = 1000.0
+    recycle: bool = False
+    compile: bool = False
     ego: EgoConfig = field(default_factory=EgoConfig)
     idm: IdmConfig = field(default_factory=IdmConfig)
     mobil: MobilConfig = field(default_factory=MobilConfig)

@@ -16,6 +16,8 @@ from ganlane.config.traffic import (
     IdmTrafficConfig,
     TrafficConfig,
 )
+from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
 
 #: A list of names without repetitions.
@@ -29,6 +31,8 @@ def all_traffics() -> dict[str, TrafficConfig]:
         "idm_mobil": IdmMobilTrafficConfig(),
         "gan": GanTrafficConfig(),
         "gan_calibrated": GanCalibratedTrafficConfig(),
+        "idm_faults": IdmFaultsTrafficConfig(),
+        "replay": ReplayTrafficConfig(),
     }
 
 

@@ -24,13 +24,15 @@ DONE_FLAGS = ("done", "terminated", "truncated")
 COUNTERS = (keys.SEED, keys.EPISODE, keys.STEP)
 
 
-def state_spec(n: int, m: int, dtype: torch.dtype, memory: dict[str, Any]) -> Composite:
+def state_spec(n: int, m: int, dtype: torch.dtype, memory: dict[str, Any], own_roads: bool = False) -> Composite:
     """Spec of all that a step writes, but for the done flags and the reward; ``memory`` is the traffic's."""
     vehicles = _fields((n, m), dtype, keys.VEHICLE_FLOATS, keys.VEHICLE_INTEGERS, keys.VEHICLE_FLAGS)
     ego = _fields((n,), dtype, EGO_FLOATS, EGO_INTEGERS, EGO_FLAGS)
     events = _fields((n, 1), dtype, (), EVENT_COUNTS, keys.END_EVENTS)
+    roads = {keys.ROAD: Composite(_fields((n, 1), dtype, ("lane_width_m",), ("lanes",), ()), shape=(n,))}
     return Composite(
         {
+            **(roads if own_roads else {}),
             keys.VEHICLES: Composite(vehicles, shape=(n,)),
             keys.EGO: Composite(ego, shape=(n,)),
             keys.EVENTS: Composite(events, shape=(n,)),

@@ -125,8 +125,8 @@ def mobil_wishes(scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: 
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     seen = prospect(scene, lanes, idm)
     change = weigh(seen.of(slice(1, None)), seen.of(slice(0, 1)), mobil)
-    allowed = change.safe & on_road(lanes[..., 1:].transpose(-1, -2), road).transpose(-1, -2)
-    pays = torch.where(allowed & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
+    exists = torch.stack((on_road(lane + 1.0, road), on_road(lane - 1.0, road)), dim=-1)
+    pays = torch.where(exists & change.safe & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
     left, right = pays.unbind(-1)
     free = settled(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,3 +52,9 @@ class Road:
             return distance
         half = 0.5 * self.ring_m
         return torch.remainder(distance + half, self.ring_m) - half
+
+
+def road_in(state: Any, default: Road) -> Road:
+    """The road of each row as ``state["road"]`` (a TensorDict) has it; ``default`` where it has none."""
+    rows = state.get("road", None)
+    return default if rows is None else Road(rows.get("lanes"), rows.get("lane_width_m"))

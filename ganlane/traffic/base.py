@@ -15,6 +15,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.road import Road
+from ganlane.sim.scenes import Scenes
 from ganlane.sim.vehicles import Vehicles
 
 #: Name to (trailing shape after [N, M], dtype); the dtype None stands for the run's float type.
@@ -52,6 +53,8 @@ class TrafficModule(TensorDictModuleBase):
 
     #: How the vehicles of this model show their lane changes to others.
     visibility: Visibility = Visibility.SIGNALLED
+    #: Whether lanes and lane width differ from row to row (:meth:`road_of`).
+    own_roads: bool = False
     #: Per-vehicle memory; empty for a model without any.
     memory_fields: MemoryFields = {}  # noqa: RUF012
 
@@ -75,6 +78,18 @@ class TrafficModule(TensorDictModuleBase):
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
         """Memory as if every vehicle had just entered; ``key`` [N] gives random traits."""
         return {}
+
+    def road_of(self, key: Tensor, dtype: torch.dtype) -> Road:
+        """The road of the episodes with ``key`` [N]."""
+        return self.road
+
+    def steps_of(self, key: Tensor) -> Tensor | None:
+        """Physics steps [N] int64 after which an episode ends (``scene_end``); None: never."""
+        return None
+
+    def scenes(self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float) -> Scenes | None:
+        """Where the episodes of this traffic start; None: wherever the environment says."""
+        return None
 
     def compile_graphs(self) -> None:
         """Compile what is a pure function on tensors (``env.compile=true``); here :meth:`move`.

@@ -6,6 +6,7 @@ stands behind it and corrects what it moved.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -44,8 +45,15 @@ class GuardParameters:
     steepest_rad: float = 0.2
 
 
+#: Called with the vehicles at t, as the chain moved them, and as the guard lets them move.
+Observer = Callable[[Vehicles, Vehicles, Vehicles], None]
+
+
 class Guard(Overlay):
-    """Bound the acceleration, pull towards the target lane, keep the body on the road."""
+    """Bound the acceleration, pull towards the target lane, keep the body on the road.
+
+    :attr:`observer`, if set, sees what it alters.
+    """
 
     def __init__(
         self,
@@ -56,6 +64,7 @@ class Guard(Overlay):
     ) -> None:
         super().__init__(road, stream)
         self.guard, self.idm = guard or GuardParameters(), idm
+        self.observer: Observer | None = None
 
     def bounds(self, vehicles: Vehicles, target_lane: Tensor) -> tuple[Tensor, Tensor]:
         """Lowest and highest acceleration allowed, m/s2, [N, M]."""
@@ -103,4 +112,7 @@ class Guard(Overlay):
         self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
     ) -> tuple[Vehicles, dict[str, Tensor]]:
         """Along the road, then across it."""
-        return self.across(vehicles, self.along(vehicles, moved)), memory
+        guarded = self.across(vehicles, self.along(vehicles, moved))
+        if self.observer is not None:
+            self.observer(vehicles, moved, guarded)
+        return guarded, memory

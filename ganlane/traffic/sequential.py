@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ganlane import keys
 from ganlane.compiling import compiled
+from ganlane.errors import UserError
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule, memory_of
 
@@ -42,10 +43,15 @@ class TrafficSequential(TrafficModule):
 
     Args:
         parts: name to module, the base model first. Road, stream and visibility are the first one's.
+
+    Raises:
+        UserError: the base model plays recordings.
     """
 
     def __init__(self, parts: dict[str, TrafficModule]) -> None:
         base = next(iter(parts.values()))
+        if base.own_roads:
+            raise UserError("overlays behind replayed traffic: they go where they went; lay faults over a model.")
         super().__init__(base.road, base.stream)
         self.parts = nn.ModuleDict(parts)
         self.visibility = base.visibility

@@ -13,7 +13,7 @@ from torchrl.envs import Transform
 from ganlane import keys
 from ganlane.compiling import compiled
 from ganlane.errors import UserError
-from ganlane.sim.road import Road
+from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.transforms.lane_view import LANE_VIEW_SIZE, lane_view
 from ganlane.transforms.table3 import (
@@ -64,15 +64,15 @@ class ObservationTransform(Transform):
         self.road, self.vehicles, self.form = road, vehicles, form
         self.scale = scale or ObservationScale()
 
-    def observe(self, vehicles: Vehicles, progress: Tensor, direction: Tensor) -> Tensor:
+    def observe(self, vehicles: Vehicles, progress: Tensor, direction: Tensor, road: Road) -> Tensor:
         """The observation [N, D]; ``progress`` and ``direction`` [N] of the ego's own lane change."""
         listed, viewed, with_progress = OBSERVATIONS[self.form]
-        others = other_vehicles(vehicles, self.road, self.scale)
-        parts = [own_state(vehicles, self.road)]
+        others = other_vehicles(vehicles, road, self.scale)
+        parts = [own_state(vehicles, road)]
         if listed:
-            parts.append(as_list(nearest_first(others, distance_to_ego(vehicles, self.road))))
+            parts.append(as_list(nearest_first(others, distance_to_ego(vehicles, road))))
         if viewed:
-            parts.append(lane_view(others, self.road.lanes, self.scale))
+            parts.append(lane_view(others, road.lanes, self.scale))
         if with_progress:
             parts.append(torch.stack((progress, direction.to(progress.dtype)), dim=1))
         return torch.cat(parts, dim=1)
@@ -83,7 +83,8 @@ class ObservationTransform(Transform):
 
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict.get(keys.EGO)
-        observation = self.observe(vehicles, ego.get("change_progress"), ego.get("change_direction"))
+        road = road_in(tensordict, self.road)
+        observation = self.observe(vehicles, ego.get("change_progress"), ego.get("change_direction"), road)
         return tensordict.set(keys.OBSERVATION, observation)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

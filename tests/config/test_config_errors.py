@@ -89,7 +89,7 @@ def test_a_list_refuses_a_single_value_and_emptiness(command, key):
 MISTAKES = {
     "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
     "train traffic=ganny": "traffic=ganny: no such option (did you mean 'gan'?)",
-    "train env=[a,b]": "choose one of dense, highway",
+    "train env=[a,b]": "choose one of blocked_lane",
     "train env.idm=3": "env.idm.NAME=VALUE",
     "train +env.wheels=3": "keys cannot be added",
     "train ++env.wheels=3": "keys cannot be added",

@@ -25,7 +25,7 @@ def scene(rows, valid=None):
 def observe(form, rows, valid=None, lanes=3, progress=0.0, direction=0):
     transform = ObservationTransform(Road(lanes), len(rows), form)
     ones = torch.ones(1, dtype=torch.float64)
-    return transform.observe(scene(rows, valid), progress * ones, torch.tensor([direction]))[0]
+    return transform.observe(scene(rows, valid), progress * ones, torch.tensor([direction]), transform.road)[0]
 
 
 EGO = (0.0, 1, 20.0, 25.0)

@@ -1,0 +1,1 @@
+"""Benchmarks that are run from the repository root and do not ship with the package."""

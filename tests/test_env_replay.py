@@ -1,0 +1,153 @@
+"""The environment on recorded scenes: its roads, its ends, and vehicles that leave within a decision."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+from reference.worlds import same_bits, step
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from ganlane import keys
+from ganlane.agents.drivers import KeepLaneDriver, MobilDriver, RandomLegalDriver
+from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
+from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.sim.random import episode_key
+from ganlane.traffic import Recordings, ReplayTraffic
+from ganlane.transforms import ObservationTransform, RewardTransform
+
+
+@pytest.fixture(scope="module")
+def recordings() -> Recordings:
+    """Scenes of 2, 3 and 4 lanes, each a second shorter than the last; every third driver leaves at 4.5 s."""
+    parts = []
+    for k in range(3):
+        made = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k)
+        made = made.filter((pl.col("vehicle") % 3 > 0) | (pl.col("frame") <= 45))
+        parts.append(made.with_columns(scene=pl.lit(f"scene-{k}")))
+    return Recordings.of(sort(pl.concat(parts)), "synthetic", 5.0)
+
+
+def make(recordings: Recordings, rows: int, period_s: float = 1.0, **others) -> HighwayEnv:
+    traffic = ReplayTraffic(recordings=recordings)
+    return HighwayEnv(traffic, rows, episode=EpisodeParameters(decision_period_s=period_s), **others)
+
+
+def test_the_specs_hold(recordings):
+    check_env_specs(make(recordings, 5))
+
+
+def test_an_episode_is_truncated_at_the_step_where_its_scene_ends(recordings):
+    env = make(recordings, 32)
+    td = env.reset()
+    key = episode_key(0, td[keys.SEED], td[keys.EPISODE])
+    steps, driver = env.traffic.steps_of(key), KeepLaneDriver(env.road)
+    ended = torch.zeros(32, dtype=torch.bool)
+    for _ in range(10):
+        td = env.step(driver(td))["next"]
+        events, now = td[keys.EVENTS], td["done"][:, 0]
+        first = now & ~ended
+        scene_end = events["scene_end"][:, 0]
+        assert torch.equal(td[keys.STEP][first & scene_end], steps[first & scene_end])
+        assert torch.equal(scene_end[first], (td["truncated"] & ~td["terminated"])[first, 0])
+        assert not events["timeout"].any()
+        assert not (scene_end & (events["hard_crash"] | events["goal"])[:, 0]).any()
+        ended |= now
+        td = td.exclude("reward")
+        for flag in ("done", "terminated", "truncated"):
+            td[flag] = torch.zeros_like(td[flag])
+        if ended.all():
+            break
+    assert ended.all()
+
+
+def test_vehicles_leave_in_the_middle_of_a_decision_and_are_then_far_ahead_to_the_agent(recordings):
+    env = make(recordings, 64)
+    seen = TransformedEnv(env, Compose(ObservationTransform(env.road, 9, "table3"), RewardTransform()))
+    valid: list[torch.Tensor] = []
+    env.recorder = lambda vehicles, running: valid.append(vehicles.valid[:, 1:].clone())
+    td = seen.reset()
+    for _ in range(4):
+        td["action"] = torch.zeros(64, dtype=torch.int64)
+        td = seen.step(td)["next"].exclude("reward")
+    record = torch.stack(valid)
+    left = (record[:-1] & ~record[1:]).any(-1).any(-1).nonzero()[:, 0] + 1
+    assert (left % 10 != 0).any()
+    assert not (~record[:-1] & record[1:]).any()
+    absent = (~td[keys.VEHICLES, "valid"][:, 1:]).sum(1)
+    others = td["observation"][:, 3:].reshape(64, 8, 3)
+    assert absent.max() >= 2
+    for row in range(64):
+        tail = others[row, 8 - absent[row] :]
+        assert (tail == torch.tensor([1.0, 0.0, 0.0])).all()
+
+
+def test_every_row_has_the_lanes_of_its_scene(recordings):
+    env = make(recordings, 64)
+    td = env.reset()
+    lanes = 2 + env.traffic.scene_of(episode_key(0, td[keys.SEED], td[keys.EPISODE]))
+    assert torch.equal(td[keys.ROAD, "lanes"][:, 0], lanes)
+    width = td[keys.ROAD, "lane_width_m"][:, 0]
+    for _ in range(2):
+        ego, free = td[keys.VEHICLES, "target_lane"][:, 0], td[keys.EGO, "change_direction"] == 0
+        after = step(env, td, keys.LEFT)
+        left = after[keys.EVENTS, "out_of_road"][:, 0]
+        assert torch.equal(left, (ego == lanes - 1) & free)
+        vehicles, changing = after[keys.VEHICLES], after[keys.EGO, "change_direction"] == 1
+        # The change aims at the next lane's centre on this road.
+        expected = 1.0 - (vehicles["target_lane"][:, 0] * width - vehicles["y"][:, 0]).abs() / width
+        torch.testing.assert_close(after[keys.EGO, "change_progress"][changing], expected[changing].clamp(0, 1))
+        td = after.exclude("reward")
+        for _ in range(3):
+            td = step(env, td).exclude("reward")
+    assert 0 < left.sum() < 64
+
+
+@pytest.mark.parametrize("driver", [MobilDriver, RandomLegalDriver])
+def test_drivers_stay_on_the_road_of_their_row(recordings, driver):
+    env = make(recordings, 48)
+    td, driver = env.reset(), driver(env.road)
+    for _ in range(20):
+        stepped, td = env.step_and_maybe_reset(driver(td))
+        assert not stepped["next", keys.EVENTS, "out_of_road"].any()
+    assert td[keys.EPISODE].min() >= 48
+
+
+def test_the_observation_knows_the_row_s_own_lanes(recordings):
+    env = make(recordings, 64)
+    seen = TransformedEnv(env, ObservationTransform(env.road, 9, "table3"))
+    td = seen.reset()
+    lanes, ego = td[keys.ROAD, "lanes"][:, 0], td[keys.VEHICLES, "target_lane"][:, 0]
+    assert torch.equal(td["observation"][:, 1] > 0, ego < lanes - 1)
+    assert torch.equal(td["observation"][:, 2] > 0, ego > 0)
+    lane = td["observation"][:, 3:].reshape(64, 8, 3)[..., 2] * (lanes - 1)[:, None]
+    assert (lane - lane.round()).abs().max() < 1e-5
+
+
+def test_an_episode_is_the_same_bits_in_every_batch_and_after_automatic_resets(recordings):
+    wide, narrow = make(recordings, 24), make(recordings, 1)
+    ends = {}
+    for env, decisions in ((wide, 12), (narrow, 60)):
+        td, driver, tracks = env.reset(), MobilDriver(env.road), {}
+        for _ in range(decisions):
+            stepped, td = env.step_and_maybe_reset(driver(td))
+            after = stepped["next"].exclude("reward", "action")
+            for row, number in enumerate(after[keys.EPISODE].tolist()):
+                tracks.setdefault(number, []).append(after[row : row + 1].clone())
+        ends[env.batch_size[0]] = tracks
+    common = sorted(set(ends[24]) & set(ends[1]))[:-1]
+    assert len(common) >= 4
+    for number in common:
+        pairs = list(zip(ends[24][number], ends[1][number]))
+        assert len(pairs) >= 4
+        for one, other in pairs:
+            assert same_bits(one, other) == [], number
+
+
+def test_scenes_given_by_hand_come_before_the_recorded_ones(recordings):
+    traffic = ReplayTraffic(recordings=recordings)
+    env = HighwayEnv(traffic, 4, scenes=traffic.scenes(3))
+    assert env.reset()[keys.VEHICLES, "x"].shape == (4, 3)
+    assert np.isfinite(env.rollout(5)[keys.VEHICLES, "x"]).all()

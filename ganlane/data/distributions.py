@@ -63,12 +63,27 @@ def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
     return Durations(describe(times[seen]), int(np.count_nonzero(~seen)), mean, median)
 
 
-def _survival(times: np.ndarray, seen: np.ndarray) -> tuple[float, float | None]:
-    """Restricted mean and median by Kaplan and Meier (1958)."""
+def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Share that lasts longer than each time at which one ended, by Kaplan and Meier (1958).
+
+    Args:
+        duration_s: [C] durations.
+        complete: [C] false where the duration is a lower bound.
+
+    Returns:
+        [E] the times, growing, and [E] the shares, falling.
+    """
+    times, seen = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
     ends = np.unique(times[seen])
-    at_risk = np.count_nonzero(times[:, None] >= ends, axis=0)
-    ending = np.count_nonzero((times[:, None] == ends) & seen[:, None], axis=0)
-    survival = np.cumprod(1.0 - ending / at_risk)
+    at_risk = len(times) - np.searchsorted(np.sort(times), ends)
+    seen_times = np.sort(times[seen])
+    ending = np.searchsorted(seen_times, ends, side="right") - np.searchsorted(seen_times, ends)
+    return ends, np.cumprod(1.0 - ending / at_risk)
+
+
+def _survival(times: np.ndarray, seen: np.ndarray) -> tuple[float, float | None]:
+    """Restricted mean and median."""
+    ends, survival = survival_curve(times, seen)
     edges = np.concatenate(([0.0], ends, [max(times.max(), ends[-1])]))
     mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
     halved = np.flatnonzero(survival <= 0.5)

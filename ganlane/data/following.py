@@ -38,7 +38,16 @@ def follower_headways(frame: pl.DataFrame) -> pl.Series:
     Only rows count in which the leader is at most 70 m ahead and the follower does at least 2 m/s, and only
     tracks with at least 1 s of such rows (design: the trait 'headway').
     """
-    following = pl.col("gap").is_between(0.0, FOLLOWING_GAP_M) & (pl.col("speed") >= SLOWEST_FOLLOWER_MPS)
+    return median_headways(followers(leader_gaps(frame)))
+
+
+def followers(behind: pl.DataFrame) -> pl.DataFrame:
+    """Those rows of :func:`leader_gaps` in which a vehicle follows: a leader within 70 m, and 2 m/s or more."""
+    return behind.filter(pl.col("gap").is_between(0.0, FOLLOWING_GAP_M) & (pl.col("speed") >= SLOWEST_FOLLOWER_MPS))
+
+
+def median_headways(following: pl.DataFrame) -> pl.Series:
+    """The headways of :func:`follower_headways` from the rows of :func:`followers`."""
     headway = (pl.col("gap") - STANDSTILL_GAP_M) / pl.col("speed")
-    per_track = leader_gaps(frame).filter(following).group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
+    per_track = following.group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
     return per_track.filter(pl.col("len") >= FEWEST_FRAMES).sort(TRACK)["headway"]

@@ -60,6 +60,25 @@ def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "sc
     return guess if low <= guess <= high else 0.5 * (low + high)
 
 
+def lane_grid(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> tuple[float, float]:
+    """Lane width, and where the centre of lane 0 lies, where its position is not known beforehand.
+
+    The centre is the median of what each lane's median position says of it; the width is :func:`lane_width`'s.
+
+    Args:
+        y: [R] lateral positions, m, growing with the lane number, from anywhere.
+        lane: [R] lane numbers.
+        scene: name for messages.
+    """
+    numbers, centres = _centres(y, lane)
+    spacing = _median_spacing(y, lane)
+    if spacing is None:
+        centre = float(np.median(y - lane * STANDARD_LANE_WIDTH_M))
+    else:
+        centre = float(np.median(centres - numbers * spacing))
+    return lane_width(y - centre, lane, scene), centre
+
+
 def _best_range(y: NDArray[np.float64], lane: NDArray[np.int64], guess: float) -> tuple[float, float]:
     """Widths within 10 % of the guess that most rows agree with: the range nearest to the guess, if several."""
     # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no upper end.
@@ -76,10 +95,15 @@ def _best_range(y: NDArray[np.float64], lane: NDArray[np.int64], guess: float) -
 
 def _median_spacing(y: NDArray[np.float64], lane: NDArray[np.int64]) -> float | None:
     """Median slope between the lanes' median positions; None with fewer than two lanes."""
-    numbers, rows = np.unique(lane, return_counts=True)
-    numbers = numbers[rows >= _FEWEST_ROWS]
+    numbers, centres = _centres(y, lane)
     if len(numbers) < 2:
         return None
-    centres = np.array([np.median(y[lane == number]) for number in numbers])
     one, other = np.triu_indices(len(numbers), 1)
     return float(np.median((centres[other] - centres[one]) / (numbers[other] - numbers[one])))
+
+
+def _centres(y: NDArray[np.float64], lane: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Lanes with enough rows, and their median positions."""
+    numbers, rows = np.unique(lane, return_counts=True)
+    numbers = numbers[rows >= _FEWEST_ROWS]
+    return numbers, np.array([np.median(y[lane == number]) for number in numbers])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import polars as pl
 
-from ganlane.data.lane_widths import lane_width
+from ganlane.data.lane_widths import lane_width, scene_lane_widths
+from ganlane.data.prepared import is_prepared, prepared_files, read_prepared
 from ganlane.data.schema import SCHEMA, sort, validate
+from ganlane.data.source import RowCount, Scene
 from ganlane.data.tables import FIRST_LINE, read_table
 from ganlane.errors import UserError
 
@@ -27,18 +30,21 @@ COLUMNS: Final = {
 
 
 def read_scenes(path: str | Path) -> pl.DataFrame:
-    """Read a scene CSV into the schema, sorted by scene, vehicle and frame.
+    """Read a scene CSV, or what ``ganlane prepare`` wrote, into the schema, sorted by scene, vehicle and frame.
 
     Lanes are turned round (the highest number of a scene, its rightmost lane, becomes 0), and ``y`` is moved so
     that it is 0 at the centre of that lane. Positions are the file's own: nothing is smoothed.
 
     Args:
         path: CSV with the columns ``scene, vehicle, frame, x, y, v, lane, length, width`` (others are ignored);
-            metres, m/s, 0.1 s a frame; lane 1 leftmost.
+            metres, m/s, 0.1 s a frame; lane 1 leftmost. Or Parquet in the schema: a file ``*.parquet``, or a folder
+            of them.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
+    if is_prepared(path):
+        return read_prepared(path)
     table = read_table(path, COLUMNS).rename({"v": "speed"})
     below = table["lane"] < 1
     if below.any():
@@ -49,6 +55,17 @@ def read_scenes(path: str | Path) -> pl.DataFrame:
     rows = validate(table, str(path))
     turned = [_turn_round(scene, f"{path}, scene {name}") for (name,), scene in rows.group_by("scene")]
     return sort(pl.concat(turned))
+
+
+def scene_csv_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
+    """The scenes of :func:`read_scenes` one by one; ``count`` gets the rows read. Each file is read at once."""
+    for file in prepared_files(path) if is_prepared(path) else [path]:
+        frame = read_scenes(file)
+        if count is not None:
+            count.read += frame.height
+        widths = scene_lane_widths(frame)
+        for (name,), rows in frame.group_by("scene", maintain_order=True):
+            yield Scene(str(name), rows, widths[str(name)])
 
 
 def _turn_round(scene: pl.DataFrame, source: str) -> pl.DataFrame:

@@ -49,13 +49,14 @@ MAX_MEDIAN_LENGTH_M: Final = 12.0
 MAX_SPEED_RATIO: Final = 2.0
 
 
-def validate(frame: pl.DataFrame, source: str, first_line: int = FIRST_LINE) -> pl.DataFrame:
+def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LINE) -> pl.DataFrame:
     """Check a frame against the schema and return its columns in order, rows as they are.
 
     Args:
         frame: rows in the order of the file they come from.
         source: name of the file, for messages.
-        first_line: line of the file that the first row stands on.
+        first_line: line of the file that the first row stands on; None where rows are no lines of a file, and are
+            then counted from 0.
 
     Raises:
         UserError: a missing column, no rows, NaN or null, a frame number that does not grow within its track,
@@ -69,7 +70,7 @@ def validate(frame: pl.DataFrame, source: str, first_line: int = FIRST_LINE) -> 
         raise UserError(f"{source}: no rows; a recording with at least one vehicle was expected.")
     frame = frame.select(_typed(frame[name], kind, source) for name, kind in SCHEMA.items())
     _check_rows(frame, source, first_line)
-    _check_units(frame, source)
+    _check_units(frame, source, first_line)
     return frame
 
 
@@ -85,7 +86,11 @@ def _typed(column: pl.Series, kind: pl.DataType, source: str) -> pl.Series:
         raise UserError(f"{source}, column {column.name}: {column.dtype} found, {kind} expected.") from error
 
 
-def _check_rows(frame: pl.DataFrame, source: str, first_line: int) -> None:
+def _place(row: int, first_line: int | None) -> str:
+    return f"row {row}" if first_line is None else f"line {row + first_line}"
+
+
+def _check_rows(frame: pl.DataFrame, source: str, first_line: int | None) -> None:
     """Report the first row with a fault that shows in the row itself or in its track."""
     step = pl.col("frame").diff().over(TRACK)
     finite = {name: pl.col(name).is_null() | ~pl.col(name).is_finite() for name in ("x", "y", "speed")}
@@ -103,24 +108,30 @@ def _check_rows(frame: pl.DataFrame, source: str, first_line: int) -> None:
         rows = frame.select(bad.fill_null(False).arg_true()).to_series()
         if len(rows):
             value = frame[column][rows[0]]
-            raise UserError(f"{source}, line {rows[0] + first_line}, column {column}: {value} {what}.")
+            raise UserError(f"{source}, {_place(rows[0], first_line)}, column {column}: {value} {what}.")
 
 
-def _check_units(frame: pl.DataFrame, source: str) -> None:
-    """Report positions, speeds or sizes that cannot be in metres and seconds."""
-    step = pl.col("frame").diff().over(TRACK)
-    pace = (pl.col("x").diff().over(TRACK) / (step * FRAME_S)).median()
-    speed, length, moved = frame.select(pl.col("speed").median(), pl.col("length").median(), pace.alias("pace")).row(
-        0
-    )
-    if speed > MAX_MEDIAN_SPEED_MPS:
-        raise UserError(f"{source}, column speed: the median is {speed:.1f}, which cannot be m/s; convert to m/s.")
-    if length > MAX_MEDIAN_LENGTH_M:
-        raise UserError(f"{source}, column length: the median is {length:.1f}, which cannot be m; convert feet to m.")
+def _check_units(frame: pl.DataFrame, source: str, first_line: int | None) -> None:
+    """Report positions, speeds or sizes that cannot be in metres and seconds, and the first row that shows it."""
+    paces = pl.col("x").diff().over(TRACK) / (pl.col("frame").diff().over(TRACK) * FRAME_S)
+    medians = frame.select(pl.col("speed", "length").median(), pace=paces.median())
+    speed, length, moved = medians.row(0)
+    for column, median, bound, unit in (
+        ("speed", speed, MAX_MEDIAN_SPEED_MPS, "m/s; convert to m/s"),
+        ("length", length, MAX_MEDIAN_LENGTH_M, "m; convert feet to m"),
+    ):
+        if median > bound:
+            place = _place(int((frame[column] > bound).arg_max() or 0), first_line)
+            raise UserError(
+                f"{source}, {place}, column {column}: the median is {median:.1f}, which cannot be {unit}."
+            )
     if moved is None or max(abs(moved), abs(speed)) < 1.0:
         return
     if not speed / MAX_SPEED_RATIO < moved < speed * MAX_SPEED_RATIO:
+        agrees = paces.is_between(pl.col("speed") / MAX_SPEED_RATIO, pl.col("speed") * MAX_SPEED_RATIO)
+        row = frame.select((~agrees).fill_null(False).arg_true().first()).item()
         raise UserError(
-            f"{source}, columns x and speed: x moves by {moved:.1f} m per second where speed says {speed:.1f} m/s; "
-            f"expected metres along the direction of travel, m/s and {1 / FRAME_S:.0f} frames a second."
+            f"{source}, {_place(int(row or 0), first_line)}, columns x and speed: x moves by {moved:.1f} m per "
+            f"second where speed says {speed:.1f} m/s; expected metres along the direction of travel, m/s and "
+            f"{1 / FRAME_S:.0f} frames a second."
         )

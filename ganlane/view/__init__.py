@@ -3,13 +3,14 @@
 :func:`record_episode` drives an episode and keeps a :class:`Trajectory`, frame by frame; :class:`FramePainter`
 draws its frames; :class:`Film` chooses them by time, and :func:`write_film` writes mp4, GIF or a PNG strip.
 :func:`to_tracks` gives the episode in the form of recorded traffic. :func:`write_curves` draws the learning
-curves of training runs.
+curves of training runs, :func:`write_recordings` what recordings say about driving.
 """
 
 from ganlane.view.curves import draw_curves, read_metrics, write_curves
 from ganlane.view.films import Film, film_strip, write_film
 from ganlane.view.frames import DrawingParameters, FramePainter
 from ganlane.view.record import Recorder, record_episode
+from ganlane.view.recordings import draw_recordings, write_recordings
 from ganlane.view.trajectory import EpisodeLabel, Trajectory, to_tracks
 from ganlane.view.window import WindowParameters
 
@@ -22,10 +23,12 @@ __all__ = [
     "Trajectory",
     "WindowParameters",
     "draw_curves",
+    "draw_recordings",
     "film_strip",
     "read_metrics",
     "record_episode",
     "to_tracks",
     "write_curves",
     "write_film",
+    "write_recordings",
 ]

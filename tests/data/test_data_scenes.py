@@ -100,11 +100,11 @@ def scaled(column: str, factor: float) -> list[str]:
 @pytest.mark.parametrize(
     ("column", "factor", "told"),
     [
-        ("v", 10.0, "column speed: the median is 100.0"),
-        ("v", 3.6, "x moves by 10.0 m per second where speed says 36.0"),
+        ("v", 10.0, "line 2, column speed: the median is 100.0"),
+        ("v", 3.6, "line 3, columns x and speed: x moves by 10.0 m per second where speed says 36.0"),
         ("x", 3.28, "x moves by 32.8 m per second where speed says 10.0"),
         ("x", -1.0, "x moves by -10.0 m per second"),
-        ("length", 3.28, "column length: the median is 14.8"),
+        ("length", 3.28, "line 2, column length: the median is 14.8"),
         ("y", 3.28, "lanes are 11.48 m apart"),
         ("y", -1.0, "lanes are -3.50 m apart"),
     ],

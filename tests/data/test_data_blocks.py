@@ -1,0 +1,82 @@
+"""Text tables in blocks: whatever the size of a block, the same rows, the same lines, the same faults."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ganlane.data.blocks import LINE, read_blocks
+from ganlane.data.layout import TextTable, csv_table
+from ganlane.data.tables import convert
+from ganlane.errors import UserError
+
+
+def read(path, content: bytes, blanks: bool = False, block_bytes: int = 2**20) -> pl.DataFrame:
+    path.write_bytes(content)
+    table = TextTable(path, ("a", "b", "c"), has_header=not blanks, blanks=blanks)
+    return pl.concat(read_blocks(table, ["c", "a"], block_bytes))
+
+
+@given(
+    rows=st.lists(st.tuples(*[st.integers(-999, 999)] * 3), min_size=1, max_size=12),
+    block_bytes=st.integers(1, 60),
+    blanks=st.booleans(),
+    windows=st.booleans(),
+    ended=st.booleans(),
+)
+def test_the_size_of_a_block_changes_nothing(tmp_path_factory, rows, block_bytes, blanks, windows, ended):
+    lines = [("  {}   {}\t{} " if blanks else "{},{},{}").format(*row) for row in rows]
+    end = "\r\n" if windows else "\n"
+    content = end.join([*([] if blanks else ["a,b,c"]), *lines]) + (end if ended else "")
+    found = read(tmp_path_factory.mktemp("blocks") / "t", content.encode(), blanks, block_bytes)
+    first = 1 if blanks else 2
+    numbers = [tuple(map(int, (c, a))) for c, a, _ in found.select("c", "a", LINE).iter_rows()]
+    assert numbers == [(c, a) for a, _, c in rows]
+    assert found[LINE].to_list() == list(range(first, first + len(rows)))
+
+
+@pytest.mark.parametrize("block_bytes", [3, 2**20])
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        (["1,2,3", "4,5", "7,8,9"], r"line 3, column b: the row ends after 2 of 3 fields"),
+        (["1,2,3", "4,5,6,6", "7,8,9"], r"line 3: 4 fields, expected 3"),
+        (["1,2,3", "4,1,234.5,6", "7,8,9"], r"line 3: 4 fields, expected 3"),
+        (["1,2,3", "", "7,8,9"], r"line 3: the line is empty"),
+        (["1,2,3", '4,"5,6', "7,8,9"], r"line 3: a quotation mark without its counterpart"),
+        (["1,2,3", "4,5,6", "7,8"], r"line 4, column b: the row ends after 2 of 3 fields"),
+    ],
+)
+def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, told, block_bytes):
+    content = "\n".join(["a,b,c", *lines]).encode() + b"\n"
+    with pytest.raises(UserError, match=told):
+        read(tmp_path / "t.csv", content, block_bytes=block_bytes)
+
+
+def test_bytes_that_are_no_text_are_named_by_their_line(tmp_path):
+    with pytest.raises(UserError, match=r"t.csv, line 3: the line is not text"):
+        read(tmp_path / "t.csv", b"a,b,c\n1,2,3\n4,5,\xff\xfe\n")
+
+
+def test_empty_lines_at_the_end_are_no_rows(tmp_path):
+    assert read(tmp_path / "t.csv", b"a,b,c\n1,2,3\n\n \r\n\n", block_bytes=4).height == 1
+
+
+def test_quoted_fields_may_hold_commas(tmp_path):
+    found = read(tmp_path / "t.csv", b'a,b,c\n"1,234",2,"5,678.25"\n7,8,9\n')
+    numbers = convert(found["c"], pl.Float64, tmp_path, found[LINE], thousands=True)
+    assert numbers.to_list() == [5678.25, 9.0]
+
+
+@pytest.mark.parametrize("text", ["1,23", "12,34,567", "1,2345", "1.234,5", ",5"])
+def test_a_comma_that_parts_no_thousands_makes_no_number(tmp_path, text):
+    with pytest.raises(UserError, match="is not a number"):
+        convert(pl.Series("x", [text]), pl.Float64, tmp_path, thousands=True)
+
+
+def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_bytes(b'\xef\xbb\xbf"A", B,c\n1,2,3\n')
+    assert csv_table(path, {"a": pl.Int64, "c": pl.Int64}).names == ("a", "b", "c")

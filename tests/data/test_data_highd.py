@@ -1,0 +1,146 @@
+"""highD recordings, made by hand: two directions of travel, seen as their drivers see them, at 10 Hz."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from reference.recordings import HIGHD_CARS, write_highd
+
+from ganlane.data import SCHEMA, RowCount, highd_scenes, read_highd
+from ganlane.data.resampling import resampling
+from ganlane.errors import UserError
+
+
+@pytest.fixture
+def recording(tmp_path):
+    write_highd(tmp_path)
+    return tmp_path / "01_tracks.csv"
+
+
+def test_each_direction_is_a_scene_with_x_forward_and_lane_0_rightmost(recording):
+    upper, lower = highd_scenes(recording)
+    assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
+    assert upper.frame.schema == lower.frame.schema == SCHEMA
+    assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
+    # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12) and 3.
+    told = {
+        vehicle: (rows["lane"].unique().to_list(), rows["y"][0], rows["speed"][0])
+        for scene in (upper, lower)
+        for (vehicle,), rows in scene.frame.group_by("vehicle")
+    }
+    assert told[1] == ([0], pytest.approx(0.0), 30.0)
+    assert told[2] == ([1], pytest.approx(4.5), 35.0)
+    # Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
+    assert told[3] == ([0], pytest.approx(0.0), 25.0)
+    assert told[4] == ([1], pytest.approx(4.0), 28.0)
+
+
+def test_cars_drive_forward_from_the_centre_of_their_box(recording):
+    for scene in highd_scenes(recording):
+        assert 0.0 <= scene.frame["x"].min() < 4.0
+        for (vehicle,), rows in scene.frame.group_by("vehicle", maintain_order=True):
+            assert (rows["length"].to_list()[0], rows["width"].to_list()[0]) == (5.0, 2.0)
+            pace = np.diff(rows["x"].to_numpy()) / 0.1
+            assert pace == pytest.approx(np.full(len(pace), abs(HIGHD_CARS[vehicle][1])))
+    upper, _ = highd_scenes(recording)
+    at = {vehicle: rows["x"][0] for (vehicle,), rows in upper.frame.group_by("vehicle", maintain_order=True)}
+    # Car 2 starts 20 m further to the left than car 1, that is ahead of it; both are read at 0.1 s, frame 2.5.
+    assert at[2] - at[1] == pytest.approx(20.0 + 0.06 * 5.0)
+
+
+def test_frames_are_a_tenth_of_a_second_apart(recording):
+    frames = read_highd(recording).filter(pl.col("vehicle") == 1)["frame"].to_list()
+    # Recorded are the frames 1 to 200 at 25 Hz, 0.04 to 8 s.
+    assert frames == list(range(1, 81))
+
+
+def test_a_folder_is_read_recording_by_recording(tmp_path):
+    write_highd(tmp_path, "01")
+    write_highd(tmp_path, "02", seconds=4.0)
+    count = RowCount()
+    names = [scene.name for scene in highd_scenes(tmp_path, count)]
+    assert names == [f"highd-{number}-{side}" for number in ("01", "02") for side in ("upper", "lower")]
+    assert (count.read, count.kept) == (4 * 300, 4 * 300)
+
+
+def test_rows_off_the_lanes_are_dropped_and_end_a_track(recording):
+    rows = pl.read_csv(recording)
+    aside = (pl.col("id") == 3) & pl.col("frame").is_between(80, 90)
+    rows.with_columns(laneId=pl.when(aside).then(7).otherwise("laneId")).write_csv(recording)
+    count = RowCount()
+    _, lower = highd_scenes(recording, count)
+    assert dict(count.dropped) == {"off the lanes of its direction": 11}
+    assert sorted(lower.frame["vehicle"].unique()) == [3, 4, 10_003]
+
+
+def damaged(path, column, row, value):
+    table = pl.read_csv(path, infer_schema=False).with_row_index()
+    field = pl.when(pl.col("index") == row).then(pl.lit(value)).otherwise(column).alias(column)
+    table.with_columns(field).drop("index").write_csv(path)
+
+
+@pytest.mark.parametrize(
+    ("column", "row", "value", "told"),
+    [
+        ("x", 10, "left", r"01_tracks.csv, line 12, column x: 'left' is not a number"),
+        ("xVelocity", 3, "NaN", r"01_tracks.csv, line 5, column xvelocity: 'NaN' is not a finite number"),
+        ("frame", 6, "4", r"01_tracks.csv, line 8, column frame: 4 is not after the last frame"),
+        ("id", 250, "77", r"01_tracks.csv, line 252, column id: 77 is not in the tracksMeta file"),
+        ("width", 0, "0", r"01_tracks.csv, line 2, column width: 0.0 is not above 0"),
+    ],
+)
+def test_a_damaged_field_is_named(recording, column, row, value, told):
+    damaged(recording, column, row, value)
+    with pytest.raises(UserError, match=told):
+        read_highd(recording)
+
+
+def test_units_that_cannot_be_are_refused(recording):
+    rows = pl.read_csv(recording)
+    rows.with_columns(xVelocity=3.6 * pl.col("xVelocity")).write_csv(recording)
+    with pytest.raises(UserError, match=r"highd-01-upper.*column speed: the median is 1\d\d"):
+        read_highd(recording)
+    rows.with_columns(xVelocity=-pl.col("xVelocity")).write_csv(recording)
+    with pytest.raises(UserError, match="columns x and speed"):
+        read_highd(recording)
+
+
+def test_what_stands_beside_the_tracks_is_needed_and_checked(recording):
+    meta = recording.with_name("01_recordingMeta.csv")
+    damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
+    with pytest.raises(UserError, match=r"recordingMeta.csv, line 2, column upperLaneMarkings: '8.0;moon'"):
+        read_highd(recording)
+    meta.unlink()
+    with pytest.raises(UserError, match=r"01_recordingMeta.csv: no such file"):
+        read_highd(recording)
+    write_highd(recording.parent)
+    damaged(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
+    with pytest.raises(UserError, match=r"01_tracksMeta.csv, line 3, column drivingDirection: 3 is neither"):
+        read_highd(recording)
+    with pytest.raises(UserError, match=r"no XX_tracks.csv in this folder"):
+        read_highd(recording.parent.parent)
+    with pytest.raises(UserError, match=r"expected highD's XX_tracks.csv"):
+        read_highd(meta)
+
+
+@given(first=st.integers(0, 40), length=st.integers(1, 120), rate=st.sampled_from([10.0, 25.0, 30.0, 50.0]))
+def test_resampling_agrees_with_interpolation_over_time(first, length, rate):
+    frame = np.concatenate((np.arange(length) + first, np.arange(7)))
+    begins = np.r_[True, np.zeros(length - 1, bool), True, np.zeros(6, bool)]
+    values = np.sin(0.3 * frame) + frame
+    new = resampling(begins, frame, rate)
+    one = slice(0, int(np.searchsorted(new.before, length)))
+    inside = [k for k in range(2000) if first / rate - 1e-9 <= k * 0.1 <= (first + length - 1) / rate + 1e-9]
+    assert new.frame[one].tolist() == inside
+    expected = np.interp(0.1 * new.frame[one], frame[:length] / rate, values[:length])
+    np.testing.assert_allclose(new.linear(values)[one], expected, atol=1e-9)
+
+
+def test_at_the_same_rate_resampling_changes_nothing():
+    frame = np.arange(5, 25)
+    new = resampling(np.arange(20) == 0, frame, 10.0)
+    assert new.frame.tolist() == frame.tolist()
+    assert new.nearest(frame).tolist() == frame.tolist()

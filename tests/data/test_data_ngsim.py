@@ -1,0 +1,217 @@
+"""NGSIM files, written out from recordings made up: what is read, in how many pieces, and how damage is told."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+from reference.recordings import LANE_M, START_MS, ngsim_rows, portal_csv, raw_text, traffic
+
+from ganlane.data import SCHEMA, NgsimParameters, RowCount, ngsim_scenes, read_ngsim, read_recordings, validate
+from ganlane.errors import UserError
+
+LATER_MS = START_MS + 900_000
+#: Two periods of one place: the same vehicle and frame numbers again.
+FIRST, SECOND = (scene for _, scene in traffic().group_by("scene", maintain_order=True))
+
+
+def text_file(folder, rows):
+    path = folder / "trajectories-0750am-0805am.txt"
+    path.write_bytes(raw_text(rows).encode())
+    return path
+
+
+def portal_file(folder, content):
+    path = folder / "portal.csv"
+    path.write_text(content)
+    return path
+
+
+def same_driving(read: pl.DataFrame, made: pl.DataFrame) -> None:
+    made = made.sort("vehicle", "frame")
+    for name in ("vehicle", "frame", "lane"):
+        assert read[name].to_list() == made[name].to_list(), name
+    for name, tolerance in {"x": 1e-5, "speed": 1e-5, "length": 1e-5, "width": 1e-5}.items():
+        assert (read[name] - made[name]).abs().max() < tolerance, name
+    # Lane width and the first lane's centre are estimated from positions that wander by 0.15 m.
+    assert (read["y"] - made["y"]).abs().max() < 0.2
+
+
+def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right(tmp_path):
+    scenes = list(ngsim_scenes(text_file(tmp_path, ngsim_rows(FIRST))))
+    assert [scene.name for scene in scenes] == ["trajectories-0750am-0805am-1"]
+    assert scenes[0].frame.schema == SCHEMA
+    assert scenes[0].lanes == 3
+    assert scenes[0].lane_width_m == pytest.approx(LANE_M, abs=0.1)
+    same_driving(scenes[0].frame, FIRST)
+    validate(scenes[0].frame, "read")
+
+
+@pytest.mark.parametrize("block_bytes", [300, 4_000, 2**25])
+@pytest.mark.parametrize("thousands", [True, False])
+def test_the_portals_periods_are_told_apart_by_time_whatever_the_order_and_the_blocks(
+    tmp_path, block_bytes, thousands
+):
+    rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, LATER_MS))).sample(fraction=1.0, shuffle=True, seed=1)
+    path = portal_file(tmp_path, portal_csv(rows, thousands=thousands))
+    count = RowCount()
+    scenes = list(ngsim_scenes(path, NgsimParameters(block_bytes=block_bytes), count))
+    assert [scene.name for scene in scenes] == ["us-101-1", "us-101-2"]
+    same_driving(scenes[0].frame, FIRST)
+    same_driving(scenes[1].frame, SECOND)
+    assert (count.read, count.kept) == (1080, 1080)
+
+
+def test_duplicates_and_other_places_are_dropped_and_counted(tmp_path):
+    rows = ngsim_rows(FIRST)
+    other = rows.head(1).with_columns(v_Vel=pl.lit(9.0))
+    parts = [
+        portal_csv(pl.concat((rows, rows.head(30), other))),
+        *(portal_csv(rows.head(n), place).partition("\n")[2] for place, n in (("lankershim", 7), ("peachtree", 5))),
+    ]
+    count = RowCount()
+    scenes = list(ngsim_scenes(portal_file(tmp_path, "".join(parts)), count=count))
+    same_driving(scenes[0].frame, FIRST)
+    assert dict(count.dropped) == {
+        "location lankershim": 7,
+        "location peachtree": 5,
+        "duplicate": 30,
+        "same vehicle and time, other values": 1,
+    }
+    assert (count.read, count.kept) == (540 + 43, 540)
+
+
+def test_ramps_are_left_out_and_end_a_track(tmp_path):
+    rows = ngsim_rows(FIRST)
+    on_ramp = (pl.col("Vehicle_ID") == 2) & pl.col("Frame_ID").is_between(20, 29)
+    rows = rows.with_columns(Lane_ID=pl.when(on_ramp).then(7).otherwise("Lane_ID"))
+    count = RowCount()
+    (scene,) = ngsim_scenes(text_file(tmp_path, rows), count=count)
+    assert dict(count.dropped) == {"ramp": 10}
+    frames = dict(scene.frame.filter(pl.col("vehicle") % 10_000 == 2).group_by("vehicle").agg("frame").iter_rows())
+    assert sorted(frames) == [2, 10_002]
+    assert frames[2] == list(range(20))
+    assert frames[10_002] == list(range(30, 60))
+
+
+def test_lanes_is_how_many_are_kept_from_the_left(tmp_path):
+    path = text_file(tmp_path, ngsim_rows(FIRST))
+    kept = read_ngsim(path, NgsimParameters(lanes=2))
+    assert kept.height == FIRST.filter(pl.col("lane") >= 1).height
+    assert sorted(kept["lane"].unique()) == [0, 1]
+
+
+def changed(row: int, column: str, value: str) -> list[str]:
+    """The portal's lines with one field changed; ``row`` counts from 0 below the header."""
+    lines = portal_csv(ngsim_rows(FIRST), thousands=False).splitlines()
+    fields = lines[row + 1].split(",")
+    fields[lines[0].split(",").index(column)] = value
+    lines[row + 1] = ",".join(fields)
+    return lines
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "told"),
+    [
+        (3, "local_y", "far", r"line 5, column local_y: 'far' is not a number"),
+        (400, "local_x", "NaN", r"line 402, column local_x: 'NaN' is not a finite number"),
+        (0, "v_vel", "", r"line 2, column v_vel: the field is empty"),
+        (7, "v_vel", "-3.0", r"line 9, column v_vel: -3.0 is below 0"),
+        (8, "v_length", "0", r"line 10, column v_length: 0.0 is not above 0"),
+        (5, "frame_id", "5.5", r"line 7, column frame_id: '5.5' is not a whole number"),
+        (6, "local_y", '"1,2"', r"line 8, column local_y: '1,2' is not a number"),
+        (6, "location", "us-10", r"line 8, column location: 'us-10' is no known place"),
+        (9, "frame_id", "9000000", r"line 11, columns frame_id and global_time: frame 9000000 .* fits no recording"),
+        (9, "frame_id", "7", r"line 11, column frame_id: 7 does not grow with global_time"),
+        (9, "global_time", f"{START_MS + 950}", r"line 11, column global_time: .* is not 100 ms a frame"),
+        (5, "v_acc", "0.0,7", r"line 7: 20 fields, expected 19"),
+        (5, "v_acc", "drop", r"line 7, column time_headway: the row ends after 18 of 19 fields"),
+    ],
+)
+@pytest.mark.parametrize("block_bytes", [1_000, 2**25])
+def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, told, block_bytes):
+    lines = changed(row, column, value)
+    if value == "drop":
+        lines[row + 1] = lines[row + 1].replace(",drop,", ",")
+    path = portal_file(tmp_path, "\n".join(lines) + "\n")
+    with pytest.raises(UserError, match=told) as caught:
+        read_ngsim(path, NgsimParameters(block_bytes=block_bytes))
+    assert str(path) in str(caught.value)
+
+
+def test_a_file_that_breaks_off_is_told_from_a_whole_one(tmp_path):
+    rows = ngsim_rows(FIRST)
+    whole = portal_csv(rows, thousands=False)
+    assert read_ngsim(portal_file(tmp_path, whole.rstrip("\n"))).height == 540
+    with pytest.raises(UserError, match=r"line 541, column lane_id: the file breaks off here, 14 of 19 columns"):
+        read_ngsim(portal_file(tmp_path, ",".join(whole.rstrip("\n").split(",")[:-5])))
+    text = text_file(tmp_path, rows)
+    text.write_bytes(text.read_bytes()[:-30])
+    with pytest.raises(UserError, match=r"line 540, column \w+: the file breaks off here"):
+        read_ngsim(text)
+
+
+def test_frames_of_a_text_file_must_grow_even_across_blocks(tmp_path):
+    rows = ngsim_rows(FIRST)
+    swapped = rows.with_row_index().with_columns(
+        index=pl.when(pl.col("index") == 10).then(11).when(pl.col("index") == 11).then(10).otherwise("index")
+    )
+    path = text_file(tmp_path, swapped.sort("index").drop("index"))
+    for block_bytes in (150, 2**25):
+        with pytest.raises(UserError, match=r"line 12, column frame_id: 10 is before the last frame"):
+            read_ngsim(path, NgsimParameters(block_bytes=block_bytes))
+
+
+@pytest.mark.parametrize(
+    ("columns", "factor", "told"),
+    [
+        (("Local_X", "Local_Y", "v_length", "v_Width", "v_Vel"), 0.3048, "column v_length: .*they look like metres"),
+        (("v_Vel",), 1.09728, "columns local_y and v_vel: vehicles cover 0.91 times"),
+        (("v_Vel",), 0.3048, "columns local_y and v_vel: vehicles cover 3.28 times"),
+        (("v_Vel",), 0.681818, "columns local_y and v_vel: vehicles cover 1.47 times"),
+        (("Local_Y",), 0.3048, "vehicles cover 0.30 times"),
+        (("v_length",), 30.48, "they look like centimetres or inches"),
+    ],
+)
+def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, told):
+    rows = ngsim_rows(FIRST).with_columns(pl.col(name) * factor for name in columns)
+    with pytest.raises(UserError, match=told) as caught:
+        read_ngsim(text_file(tmp_path, rows))
+    assert "line 1" in str(caught.value)
+
+
+def test_missing_columns_and_files_that_are_none_are_refused(tmp_path):
+    without = portal_csv(ngsim_rows(FIRST).drop("v_Vel", "Lane_ID"))
+    with pytest.raises(UserError, match=r"line 1: no column v_vel, lane_id; found vehicle_id"):
+        read_ngsim(portal_file(tmp_path, without))
+    with pytest.raises(UserError, match=r"line 1: 17 columns; expected the 18"):
+        read_ngsim(text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")))
+    with pytest.raises(UserError, match="no such file"):
+        read_ngsim(tmp_path / "nowhere.txt")
+    with pytest.raises(UserError, match="the file is empty"):
+        read_ngsim(portal_file(tmp_path, ""))
+    (tmp_path / "packed.zip").write_bytes(b"PK\x03\x04\xff\xfe\x00" * 40)
+    with pytest.raises(UserError, match=r"packed.zip, line 1: not text"):
+        read_ngsim(tmp_path / "packed.zip")
+    with pytest.raises(UserError, match=r"no rows of us-101, i-80; check data.locations"):
+        read_ngsim(portal_file(tmp_path, portal_csv(ngsim_rows(FIRST), "peachtree")))
+
+
+def test_nothing_is_left_of_what_was_put_aside(tmp_path):
+    path = portal_file(tmp_path, "\n".join(changed(500, "local_y", "far")) + "\n")
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    with pytest.raises(UserError):
+        list(ngsim_scenes(path, NgsimParameters(block_bytes=500), scratch=scratch))
+    assert list(scratch.iterdir()) == []
+
+
+def test_a_small_extract_is_a_period_of_its_own(tmp_path):
+    rows = ngsim_rows(FIRST).filter((pl.col("Vehicle_ID") < 3) & (pl.col("Frame_ID") < 20))
+    assert read_ngsim(portal_file(tmp_path, portal_csv(rows))).height == 40
+
+
+def test_recordings_are_read_whole_by_their_kind(tmp_path):
+    path = text_file(tmp_path, ngsim_rows(FIRST))
+    assert read_recordings("ngsim", path).equals(read_ngsim(path))
+    with pytest.raises(UserError, match="moon: no such kind of recordings; expected scenes, ngsim or highd"):
+        read_recordings("moon", path)

@@ -1,0 +1,166 @@
+"""Preparing recordings: what is written reads back the same, and scenes pooled say what they say together."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from reference.recordings import ngsim_rows, portal_csv, traffic
+
+from ganlane.data import (
+    Bins,
+    Histogram,
+    PooledStatistics,
+    Scene,
+    SyntheticTraffic,
+    cut_into_scenes,
+    describe,
+    describe_durations,
+    driving_statistics,
+    long_report,
+    prepare_recordings,
+    read_scenes,
+    scene_lane_widths,
+    short_report,
+    survival_curve,
+    synthetic_scenes,
+    write_prepared,
+    write_scene_csv,
+)
+from ganlane.errors import UserError
+
+
+def pooled(frame: pl.DataFrame) -> PooledStatistics:
+    statistics = PooledStatistics()
+    widths = scene_lane_widths(frame)
+    for (name,), rows in frame.group_by("scene", maintain_order=True):
+        statistics.add(Scene(name, rows, widths[name]))
+    return statistics
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_scenes_one_by_one_say_what_they_say_together(seed):
+    frame = synthetic_scenes(seed=seed)
+    together, apart = driving_statistics(frame), pooled(frame)
+    assert apart.exposure.__dict__ == pytest.approx(together.exposure.__dict__)
+    assert apart.lane_changes.count == together.lane_changes.count
+    assert apart.lane_changes.per_vehicle_km == pytest.approx(together.lane_changes.per_vehicle_km)
+    assert apart.lane_changes.srlc == pytest.approx(together.lane_changes.srlc)
+    assert apart.lane_changes.duration == together.lane_changes.duration
+    for name in ("speed", "acceleration_raw", "acceleration_smoothed", "headway"):
+        one, other = apart.describe(name), getattr(together, name)
+        assert (one.count, one.mean, one.sd) == pytest.approx((other.count, other.mean, other.sd)), name
+        assert one.quantiles == pytest.approx(other.quantiles, abs=0.02), name
+
+
+@given(st.lists(st.floats(-30.0, 30.0), min_size=2, max_size=300), st.integers(1, 5))
+def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
+    histogram = Histogram(Bins(-20.0, 20.0, 400))
+    for part in np.array_split(np.array(values), parts):
+        histogram.add(part)
+    found, exact = histogram.describe(), describe(values)
+    assert (found.count, found.mean) == (exact.count, pytest.approx(exact.mean, abs=1e-9))
+    assert found.sd == pytest.approx(exact.sd, abs=1e-5)
+    ordered = np.clip(np.sort(values), -20.0, 20.0)
+    for level, value in ((0.25, found.quantile(0.25)), (0.5, found.quantile(0.5)), (0.95, found.quantile(0.95))):
+        # Between the neighbours of the exact place, and a bin's width more.
+        at = level * len(ordered)
+        low, high = ordered[max(int(np.floor(at)) - 1, 0)], ordered[min(int(np.ceil(at)), len(ordered) - 1)]
+        assert low - 0.1 - 1e-9 <= value <= high + 0.1 + 1e-9
+
+
+def test_a_histogram_of_nothing_says_nothing():
+    assert Histogram(Bins(0.0, 1.0, 10)).describe() == describe([])
+
+
+def test_the_survival_curve_takes_censored_times_as_lower_bounds():
+    # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one ends at 3 (2/3 of
+    # 4/5), one is cut off at 4, the last ends at 5.
+    times, shares = survival_curve([3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False])
+    assert times.tolist() == [1.0, 3.0, 5.0]
+    assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
+    found = describe_durations([3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False])
+    assert found.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
+
+
+def test_what_is_written_reads_back_the_same(tmp_path):
+    made = synthetic_scenes(seed=5)
+    csv = tmp_path / "mine.csv"
+    write_scene_csv(made, csv)
+    prepared = prepare_recordings("scenes", csv, tmp_path / "out")
+    assert prepared.files == ("synthetic-0.parquet", "synthetic-1.parquet")
+    assert read_scenes(tmp_path / "out").equals(read_scenes(csv))
+    assert read_scenes(tmp_path / "out" / prepared.files[1])["scene"].unique().to_list() == ["synthetic-1"]
+    assert prepared.written == prepared.count.kept == made.height
+    again = prepare_recordings("scenes", tmp_path / "out", tmp_path / "again")
+    assert again.to_dict()["rows"] == prepared.to_dict()["rows"]
+
+
+def test_long_recordings_are_cut_into_scenes_when_written_and_measured_whole(tmp_path):
+    csv = tmp_path / "mine.csv"
+    write_scene_csv(synthetic_scenes(seed=5), csv)
+    whole = prepare_recordings("scenes", csv, tmp_path / "whole").statistics.lane_changes
+    cut = prepare_recordings("scenes", csv, tmp_path / "cut", scene_s=4.0)
+    assert cut.statistics.lane_changes == whole
+    scenes = read_scenes(tmp_path / "cut")
+    per_scene = scenes.group_by("scene", maintain_order=True).agg(pl.col("frame").n_unique())
+    assert per_scene["scene"].to_list() == [f"synthetic-{k}-00{part}" for k in range(2) for part in range(3)]
+    assert per_scene["frame"].to_list() == [40, 40, 20] * 2
+    assert cut_into_scenes(scenes, 100.0)["scene"].n_unique() == 6
+
+
+def test_reports_tell_rows_rates_and_durations(tmp_path):
+    path = tmp_path / "portal.csv"
+    path.write_text(portal_csv(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0"))))
+    path.write_text(path.read_text() + path.read_text().splitlines()[5] + "\n")
+    prepared = prepare_recordings("ngsim", path, tmp_path / "out")
+    for report in (short_report(prepared), long_report(prepared, "portal.csv", "report.png")):
+        assert "541 read, 540 kept, 540 written" in report
+        assert "dropped: 1 (duplicate)" in report
+        assert "lane changes: 0; 0.000 per vehicle and km of road (equation 9)" in report
+    assert "| us-101-1 | 540 | 9 | 6 | 3 |" in long_report(prepared, "portal.csv", "report.png")
+
+
+def test_nothing_stands_at_out_unless_everything_was_written(tmp_path):
+    lines = portal_csv(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0")), thousands=False).splitlines()
+    (tmp_path / "bad.csv").write_text("\n".join([*lines, lines[-1].replace(",", ",x", 1)]))
+    with pytest.raises(UserError, match="line 542"):
+        prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.csv"]
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "precious").write_text("")
+    with pytest.raises(UserError, match=r"out: there already; choose another folder with out=FOLDER"):
+        prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
+    assert (tmp_path / "out" / "precious").exists()
+
+
+def test_a_recording_of_parked_cars_is_refused(tmp_path):
+    parked = synthetic_scenes().with_columns(speed=pl.lit(0.0), x=pl.col("x").first().over("scene", "vehicle"))
+    write_prepared(parked, tmp_path / "parked.parquet")
+    with pytest.raises(UserError, match="no scene in which anybody drives"):
+        prepare_recordings("scenes", tmp_path / "parked.parquet", tmp_path / "out")
+
+
+def test_a_scene_in_two_files_is_refused(tmp_path):
+    write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
+    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet")
+    with pytest.raises(UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
+        read_scenes(tmp_path)
+
+
+def test_damaged_parquet_is_refused(tmp_path):
+    path = tmp_path / "x.parquet"
+    with pytest.raises(UserError, match="no such file"):
+        read_scenes(path)
+    path.write_bytes(b"PAR1 not really")
+    with pytest.raises(UserError, match="not a readable Parquet file"):
+        read_scenes(path)
+    made = synthetic_scenes()
+    write_prepared(made.drop("speed"), path)
+    with pytest.raises(UserError, match=r"x.parquet: no column speed"):
+        read_scenes(path)
+    write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
+    with pytest.raises(UserError, match=r"x.parquet, row 0, column x: nan is not a finite number"):
+        read_scenes(path)

@@ -15,10 +15,8 @@ from ganlane.benchmarks.sim_tables import sim_tables
 from ganlane.benchmarks.systems import (
     Scenario,
     first_state,
-    has_switch,
     start_environment,
     start_physics,
-    with_switch,
 )
 from ganlane.benchmarks.tables import Table
 from ganlane.config.env import DenseEnvConfig, EnvConfig
@@ -57,21 +55,13 @@ class SimSuite:
     def __init__(self, options: SimOptions) -> None:
         self.notes: list[str] = []
         self.memory = options.memory
-        env = with_switch(options.scenario.env, "recycle", True)
-        self.options = replace(options, scenario=replace(options.scenario, env=env), modes=self._modes(options))
+        env = replace(options.scenario.env, recycle=True)
+        self.options = replace(options, scenario=replace(options.scenario, env=env))
         self.has_peer = options.peers and highway_env_version() is not None
         if options.peers and not self.has_peer:
             self.notes.append(MISSING)
         if not self._grows():
             self.notes.append("Not measured: growth with the vehicles; their number belongs to the scene.")
-        if not has_switch(env, "recycle"):
-            self.notes.append("The environment has no key env.recycle: vehicles that fall behind are not put back.")
-
-    def _modes(self, options: SimOptions) -> tuple[str, ...]:
-        if COMPILED in options.modes and not has_switch(options.scenario.env, "compile"):
-            self.notes.append("Not measured: compiled; the environment has no key env.compile.")
-            return tuple(mode for mode in options.modes if mode != COMPILED)
-        return options.modes
 
     # What is timed
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -18,8 +17,9 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.env.decision import World, command, drive
-from ganlane.keys import PHYSICS_STEP_S
+from ganlane.env import HighwayEnv
+from ganlane.env.decision import Decision
+from ganlane.sim.random import episode_key
 from ganlane.sim.vehicles import Vehicles
 
 #: Actions are drawn before the clock starts and used again after so many decisions.
@@ -37,20 +37,9 @@ class Scenario:
     seed: int = 0
 
 
-def has_switch(env: EnvConfig, name: str) -> bool:
-    """Whether the environment can be told ``env.NAME=true``."""
-    return name in {field.name for field in fields(env)}
-
-
-def with_switch(env: EnvConfig, name: str, on: bool) -> EnvConfig:
-    """``env`` with ``env.NAME`` set, where it has that key; as it is otherwise."""
-    changed: dict[str, Any] = {name: on}
-    return replace(env, **changed) if has_switch(env, name) else env
-
-
 def build(scenario: Scenario, mode: str, device: str, batch: int) -> TransformedEnv:
     """The environment of a scenario."""
-    env = with_switch(scenario.env, "compile", mode == COMPILED)
+    env = replace(scenario.env, compile=mode == COMPILED)
     traffic = make_traffic(scenario.traffic, env)
     return make_env(traffic, env, scenario.observation, scenario.reward, batch, scenario.seed, device)
 
@@ -62,23 +51,27 @@ def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Run
     every step moves every row.
     """
     env = build(scenario, mode, device, batch)
-    state, world = env.reset(), env.base_env.world
-    substeps = world.episode.substeps()
+    state, base = env.reset(), env.base_env
+    substeps = base.rules.episode.substeps()
 
     def run(decisions: int) -> int:
-        _, step = bare_steps(world, state, decisions * substeps)
+        _, step = bare_steps(base, state, decisions * substeps)
         return int((step - state.get(keys.STEP)).sum())
 
     return run
 
 
-def bare_steps(world: World, state: TensorDictBase, steps: int) -> tuple[Vehicles, Tensor]:
-    """``steps`` physics steps from ``state`` as one long decision: the vehicles, and the counter of steps [N]."""
-    endless = replace(world.episode, decision_period_s=steps * PHYSICS_STEP_S, goal_m=math.inf, timeout_s=1e9)
-    vehicles, ego = Vehicles.of(state.get(keys.VEHICLES)), state.get(keys.EGO)
+def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehicles, Tensor]:
+    """``steps`` physics steps from ``state`` as one long decision: the vehicles, and the counter of steps [N].
+
+    The length of the decision stands outside the rules, so that compiled graphs serve whatever it is.
+    """
+    rules = env.rules._replace(episode=replace(env.rules.episode, goal_m=math.inf, timeout_s=1e9))
+    vehicles, ego = Vehicles.of(state.get(keys.VEHICLES)), dict(state.get(keys.EGO).items())
     keep = torch.full_like(state.get(keys.STEP), keys.KEEP)
-    world = world._replace(episode=endless)
-    at = drive(world, state, command(world, keep, vehicles, ego), None)
+    start, _ = env.physics.begin(rules, keep, vehicles, ego, state.get(keys.STEP))
+    key = episode_key(env.stream, state.get(keys.SEED), state.get(keys.EPISODE))
+    at, _ = Decision(env.traffic, env.physics, rules).drive(state, start, key, substeps=steps)
     return at.vehicles, at.step
 
 

@@ -46,10 +46,11 @@ def torch_threads(threads: int) -> Iterator[None]:
 
 
 def take(case: Case, run: Runner, decisions: int) -> Sample:
-    """One turn of ``decisions`` per row."""
+    """One turn of ``decisions`` per row; no gradients are kept, as in collecting."""
     synchronize(case)
     wall, cpu = time.perf_counter(), time.process_time()
-    physics_steps = run(decisions)
+    with torch.inference_mode():
+        physics_steps = run(decisions)
     synchronize(case)
     wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu
     return Sample(wall_s, cpu_s, decisions * case.labels.batch, physics_steps)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -30,45 +29,50 @@ class Decision:
         self.traffic, self.physics, self.rules = traffic, physics, rules
 
     def drive(
-        self, state: TensorDictBase, at: Substep, key: Tensor, recorder: Recorder | None = None
+        self,
+        state: TensorDictBase,
+        at: Substep,
+        key: Tensor,
+        recorder: Recorder | None = None,
+        substeps: int | None = None,
     ) -> tuple[Substep, TensorDictBase]:
-        """All physics steps of a decision from ``at``, and the traffic's memory after it; ``key`` [N] of the episodes."""
-        view, start = self._view(state, key), at.step
-        for count in range(self.rules.episode.substeps()):
+        """All physics steps of a decision from ``at``, and the traffic's memory after it.
+
+        Args:
+            state: where the decision began.
+            at: its first moment.
+            key: of the episodes, [N] int64.
+            recorder: told of every step.
+            substeps: other than the decision period has.
+        """
+        memory, start = memory_of(state), at.step
+        counters = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.EPISODE_KEY: key}
+        for count in range(substeps or self.rules.episode.substeps()):
             running = at.running
-            if _known(running) and not bool(running.any()):
+            if known_false(running.any()):
                 break
-            at = self._step(view, at, start + count)
+            # The traffic's clock goes on in rows that ended: had it stopped there at a moment of decision, the
+            # traffic would take its drivers to be deciding for the rest of the time, for nothing.
+            at, memory = self._step(at, memory, {**counters, keys.STEP: start + count})
             if recorder is not None:
                 recorder(at.vehicles, running)
-        return at, view.get(keys.TRAFFIC)
+        return at, memory
 
-    def _view(self, state: TensorDictBase, key: Tensor) -> TensorDictBase:
-        """What a traffic module reads, but for the vehicles."""
-        counters = {name: state.get(name) for name in (keys.SEED, keys.EPISODE)}
-        fields = {keys.TRAFFIC: memory_of(state), keys.EPISODE_KEY: key, **counters}
-        return TensorDict._new_unsafe(fields, batch_size=state.batch_size)
-
-    def _step(self, view: TensorDictBase, at: Substep, step: Tensor) -> Substep:
-        """One physics step; ``view`` takes the traffic's new memory. Rows that ended stay as they are.
-
-        The traffic's clock ``step`` [N] goes on in rows that ended: had it stopped there at a moment of decision, the
-        traffic would take all of its drivers to be deciding for the rest of the time, for nothing.
-        """
-        view.set(keys.VEHICLES, _as_tensordict(at.vehicles, view))
-        view.set(keys.STEP, step)
-        before = view.get(keys.TRAFFIC)
-        self.traffic(view)
-        everybody = _known(at.running) and bool(at.running.all())
+    def _step(
+        self, at: Substep, memory: TensorDictBase, counters: dict[str, Tensor]
+    ) -> tuple[Substep, TensorDictBase]:
+        """One physics step, and the traffic's memory after it. Rows that ended stay as they are."""
+        size = memory.batch_size
+        vehicles = TensorDict._new_unsafe(at.vehicles.as_dict(), batch_size=size)
+        seen = TensorDict._new_unsafe({keys.VEHICLES: vehicles, keys.TRAFFIC: memory, **counters}, batch_size=size)
+        after = self.traffic(seen)
+        everybody = known_false((~at.running).any())
+        kept = after.get(keys.TRAFFIC)
         if not everybody:
-            view.set(keys.TRAFFIC, where(at.running, view.get(keys.TRAFFIC), before))
-        return self.physics.advance(self.rules, at, Vehicles.of(view.get(keys.MOVED)), everybody)
+            kept = where(at.running, kept, memory)
+        return self.physics.advance(self.rules, at, Vehicles.of(after.get(keys.MOVED)), everybody), kept
 
 
-def _as_tensordict(vehicles: Vehicles, like: TensorDictBase) -> TensorDictBase:
-    return TensorDict._new_unsafe(vehicles.as_dict(), batch_size=like.batch_size)
-
-
-def _known(mask: Tensor) -> bool:
-    """Whether a mask may be asked for: on a CPU that is free and spares work; on a GPU it would stall the queue."""
-    return mask.device.type == "cpu"
+def known_false(flag: Tensor) -> bool:
+    """Whether ``flag`` is known to be false: on a CPU asking is free and spares work; a GPU would stall."""
+    return flag.device.type == "cpu" and not bool(flag)

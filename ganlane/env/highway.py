@@ -11,7 +11,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
-from ganlane.env.decision import Decision, Recorder
+from ganlane.env.decision import Decision, Recorder, known_false
 from ganlane.env.physics import EpisodeParameters, Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
@@ -19,6 +19,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.sim.ego import EgoParameters
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.random import absorb, episode_key
+from ganlane.sim.recycle import out_of_range
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.scenes import RandomScenes, Scenes
 from ganlane.sim.spawn import SpawnParameters
@@ -205,6 +206,6 @@ class HighwayEnv(EnvBase):
 
     def _recycled(self, rules: Rules, at: Substep) -> Vehicles:
         """The vehicles after a decision; in rows that go on moved round the ego where it has left them behind."""
-        if not self.recycle:
+        if not self.recycle or known_false(out_of_range(at.vehicles, rules.road).any()):
             return at.vehicles
         return self.physics.recycle(at.vehicles, rules.road, rules.idm).where(at.running, at.vehicles)

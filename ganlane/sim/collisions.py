@@ -56,19 +56,33 @@ def boxes_overlap(
 
 def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether the ego (index 0) overlaps each of the others, bool [N, M - 1]."""
-    ego = {name: value[:, :1] for name, value in vehicles.as_dict().items()}
-    others = {name: value[:, 1:] for name, value in vehicles.as_dict().items()}
+    v = vehicles
+    dx = road.distance_ahead(v.x[:, :1], v.x[:, 1:])
+    both = v.valid[:, 1:] & v.valid[:, :1]
+    if _all_apart(dx, v):
+        return torch.zeros_like(both)
     hit = boxes_overlap(
-        road.distance_ahead(ego["x"], others["x"]),
-        others["y"] - ego["y"],
-        ego["heading"],
-        ego["length"],
-        ego["width"],
-        others["heading"],
-        others["length"],
-        others["width"],
+        dx,
+        v.y[:, 1:] - v.y[:, :1],
+        v.heading[:, :1],
+        v.length[:, :1],
+        v.width[:, :1],
+        v.heading[:, 1:],
+        v.length[:, 1:],
+        v.width[:, 1:],
     )
-    return hit & others["valid"] & ego["valid"]
+    return hit & both
+
+
+def _all_apart(dx: Tensor, vehicles: Vehicles) -> bool:
+    """Whether in no row anybody is near enough to the ego along the road for boxes to matter.
+
+    On a CPU asking costs little, and a small batch is spared most of its tests; a graph, or a GPU's queue, would be
+    broken by it.
+    """
+    if torch.compiler.is_compiling() or dx.device.type != "cpu":
+        return False
+    return not bool((dx.abs() < vehicles.length.amax() + vehicles.width.amax()).any())
 
 
 def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from ganlane.sim.idm import TABLE_V, IdmParameters, idm_acceleration

@@ -39,6 +39,10 @@ class LaneRange(NamedTuple):
     low: Tensor
     high: Tensor
 
+    def columns(self, which: slice) -> LaneRange:
+        """Those of a slice of the vehicles."""
+        return self if which == slice(None) else LaneRange(self.low[:, which], self.high[:, which])
+
 
 def spanned(lanes: LaneRange) -> Tensor:
     """The lanes of a range, [..., 3]: lowest, middle and highest. A body that is turned can stand in three.
@@ -56,7 +60,8 @@ def lateral_half_extent(vehicles: Vehicles) -> Tensor:
 def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
     """Lanes that each body enters by more than :data:`ENTRY_M`."""
     reach = lateral_half_extent(vehicles) - ENTRY_M
-    return LaneRange(road.lane_of(vehicles.y - reach), road.lane_of(vehicles.y + reach))
+    edges = torch.stack((vehicles.y - reach, vehicles.y + reach))
+    return LaneRange(*road.lane_of(edges).unbind())
 
 
 def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:

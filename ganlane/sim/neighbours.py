@@ -97,8 +97,8 @@ def perceive(vehicles: Vehicles, road: Road, observers: slice = slice(None)) -> 
     return Scene(
         observers=vehicles.columns(observers),
         vehicles=vehicles,
-        body=LaneRange(*(lane[:, observers] for lane in body)),
-        attention=LaneRange(*(lane[:, observers] for lane in attention)),
+        body=body.columns(observers),
+        attention=attention.columns(observers),
         presence=presence(vehicles, road, body, attention),
         distance=distance,
         bumpers=half[:, observers, None] + half[:, None, :],

@@ -25,10 +25,9 @@ SAFE_DECELERATION = 4.0
 
 
 def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Tensor:
-    """-1 where a vehicle is more than ``range_m`` ahead of the ego, +1 where as far behind, else 0; [N, M] float."""
+    """Whether a vehicle is more than ``range_m`` ahead of the ego or behind it, bool [N, M]."""
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
-    away = (distance.abs() > range_m) & vehicles.valid
-    return torch.where(away, -torch.sign(distance), 0.0)
+    return (distance.abs() > range_m) & vehicles.valid
 
 
 def _room(scene: Scene, idm: IdmParameters, safe: float) -> Tensor:
@@ -48,7 +47,8 @@ def recycle(
 
     The room is judged with all of them moved: who then has to wait leaves the others only more of it.
     """
-    side = out_of_range(vehicles, road, range_m)
-    moved = vehicles.with_(x=vehicles.x + 2.0 * range_m * side)
+    away = out_of_range(vehicles, road, range_m)
+    distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
+    moved = vehicles.with_(x=torch.where(away, vehicles.x - 2.0 * range_m * torch.sign(distance), vehicles.x))
     room = _room(perceive(moved, road), idm, safe_deceleration)
-    return vehicles.with_(x=torch.where((side != 0) & room, moved.x, vehicles.x))
+    return vehicles.with_(x=torch.where(away & room, moved.x, vehicles.x))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,8 +10,7 @@ from torch import Tensor
 from ganlane.keys import FIXED_FIELDS, VEHICLE_FIELDS
 
 
-@dataclass(frozen=True)
-class Vehicles:
+class Vehicles(NamedTuple):
     """Fields of ``vehicles`` (:mod:`ganlane.keys`), each of shape [N, M] (or [N] for one vehicle per row)."""
 
     x: Tensor
@@ -29,29 +27,33 @@ class Vehicles:
 
     @classmethod
     def of(cls, mapping: Any) -> Vehicles:
-        """From anything that ``get``s tensors by name, a TensorDict for one."""
-        return cls(*(mapping.get(name) for name in VEHICLE_FIELDS))
+        """From a mapping of names to tensors, a TensorDict for one."""
+        named = dict(mapping.items())
+        return cls(*(named[name] for name in VEHICLE_FIELDS))
 
     def as_dict(self) -> dict[str, Tensor]:
         """Name to tensor, without copies."""
-        return {name: getattr(self, name) for name in VEHICLE_FIELDS}
+        return self._asdict()
 
     def with_(self, **changed: Tensor) -> Vehicles:
         """The same vehicles with some fields replaced."""
-        return replace(self, **changed)
+        return self._replace(**changed)
 
     def at(self, index: int) -> Vehicles:
         """Vehicle ``index`` of every row, fields [N]."""
-        return Vehicles(*(getattr(self, field.name)[:, index] for field in fields(self)))
+        return Vehicles(*(field[:, index] for field in self))
 
     def columns(self, which: slice) -> Vehicles:
         """A slice of the vehicles of every row, fields [N, K]."""
-        return Vehicles(*(getattr(self, field.name)[:, which] for field in fields(self)))
+        if which == slice(None):
+            return self
+        return Vehicles(*(field[:, which] for field in self))
 
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N]), but for what never changes."""
+        is_first = torch.arange(self.x.shape[1], device=self.x.device) == 0
         changing = {
-            name: torch.cat((getattr(first, name)[:, None], getattr(self, name)[:, 1:]), dim=1)
+            name: torch.where(is_first, getattr(first, name)[:, None], getattr(self, name))
             for name in VEHICLE_FIELDS
             if name not in FIXED_FIELDS
         }
@@ -60,4 +62,4 @@ class Vehicles:
     def where(self, rows: Tensor, other: Vehicles) -> Vehicles:
         """These vehicles in the rows [N] (or [N, 1], [N, M]) where ``rows`` holds, ``other`` elsewhere."""
         mask = rows[:, None] if rows.ndim == 1 else rows
-        return Vehicles(*(torch.where(mask, getattr(self, name), getattr(other, name)) for name in VEHICLE_FIELDS))
+        return Vehicles(*(torch.where(mask, mine, theirs) for mine, theirs in zip(self, other)))

@@ -28,13 +28,20 @@ def memory_of(tensordict: TensorDictBase) -> TensorDictBase:
     return TensorDict({}, batch_size=tensordict.batch_size) if memory is None else memory
 
 
+def _put(tensordict: TensorDictBase, key: str, fields: dict[str, Tensor]) -> None:
+    """``tensordict[key] = fields`` without the checks, which cost as much as a step of a small batch."""
+    nested = TensorDict._new_unsafe(fields, batch_size=tensordict.batch_size)
+    tensordict._set_str(key, nested, validated=True, inplace=False, non_blocking=False)
+
+
 class TrafficModule(TensorDictModuleBase):
     """Base of all traffic models.
 
     In keys: ``vehicles`` (the state at t, never written), ``traffic`` (the module's memory), ``seed``,
     ``episode``, ``step`` ([N] int64); ``episode_key`` too, where the caller has worked it out. Out keys: ``moved``
-    (the same fields as ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: what the module writes there is overwritten by the
-    environment. Randomness comes from :mod:`ganlane.sim.random` and the counters alone.
+    (the same fields as ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: what the module
+    writes there is overwritten by the environment. Randomness comes from :mod:`ganlane.sim.random` and the counters
+    alone.
 
     A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields` and
     fills them in :meth:`fresh_memory`::
@@ -108,9 +115,8 @@ class TrafficModule(TensorDictModuleBase):
         if key is None:
             key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
         moved, memory = self._call(tensordict, vehicles, memory, key)
-        batch = tensordict.batch_size
-        tensordict.set(keys.MOVED, TensorDict._new_unsafe(moved.as_dict(), batch_size=batch))
-        tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(memory, batch_size=batch))
+        _put(tensordict, keys.MOVED, moved.as_dict())
+        _put(tensordict, keys.TRAFFIC, memory)
         return tensordict
 
     def _call(

@@ -18,29 +18,34 @@ CAR_LENGTH_M = 4.5
 LANE_VIEW_SIZE = 18
 
 
-def _nearest(others: Others, mask: Tensor, sign: float, scale: ObservationScale) -> Tensor:
-    """(gap over range, nearness, relative speed) of the nearest of ``mask``, [N, 3]; (1, 0, 0) without one."""
-    distance = torch.where(mask, sign * others.position, 2.0)
-    nearest = distance.amin(1, keepdim=True)
-    speeds = torch.where(mask & (distance == nearest), others.speed, torch.inf).amin(1, keepdim=True)
-    there = nearest <= 1.0
-    gap_m = (nearest * scale.range_m - CAR_LENGTH_M).clamp_min(0.0)
-    gap = torch.where(there, gap_m / scale.range_m, 1.0)
-    nearness = torch.where(there, torch.exp(-gap_m / NEARNESS_M), 0.0)
-    return torch.cat((gap, nearness, torch.where(there, speeds, 0.0)), dim=1)
+#: Lane to the left, own, to the right, each ahead (+1) and behind (-1).
+_SIDES = (1.0, 1.0, 0.0, 0.0, -1.0, -1.0)
+_WAYS = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
+#: Stands for a distance, or a speed, of nobody.
+_NOBODY = 1e9
+
+
+def _lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
+    """Lanes between the ego and each of the others, [N, M - 1]."""
+    widest = (lanes - 1).clamp_min(1) if isinstance(lanes, Tensor) else max(lanes - 1, 1)
+    return torch.round(others.lane * widest)
 
 
 def lane_view(others: Others, lanes: int | Tensor, scale: ObservationScale) -> Tensor:
-    """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed)."""
-    if isinstance(lanes, Tensor):
-        widest = (lanes - 1).clamp_min(1)
-        offset = torch.round(others.lane * widest)
-    else:
-        offset = torch.round(others.lane * max(lanes - 1, 1))
-    in_sight = others.valid & (others.position.abs() < 1.0)
-    views = []
-    for side in (1, 0, -1):
-        in_lane = in_sight & (offset == side)
-        views.append(_nearest(others, in_lane & (others.position > 0), 1.0, scale))
-        views.append(_nearest(others, in_lane & (others.position <= 0), -1.0, scale))
-    return torch.cat(views, dim=1)
+    """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) for nobody.
+
+    The gap is over the range of sight; somebody beside the ego counts as behind.
+    """
+    side, way = (others.position.new_tensor(each)[:, None] for each in (_SIDES, _WAYS))
+    distance = others.position[:, None, :] * way
+    in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
+    there = (distance > 0) | ((distance == 0) & (way < 0))
+    counts = in_sight & there & (_lane_offset(others, lanes)[:, None, :] == side)
+    distance = torch.add(distance, ~counts, alpha=_NOBODY)
+    nearest = distance.amin(-1, keepdim=True)
+    speed = torch.add(others.speed[:, None, :], distance > nearest, alpha=_NOBODY).amin(-1, keepdim=True)
+    found = nearest <= 1.0
+    gap_m = (nearest * scale.range_m - CAR_LENGTH_M).clamp_min(0.0)
+    gap = torch.where(found, gap_m / scale.range_m, 1.0)
+    nearness = torch.where(found, torch.exp(-gap_m / NEARNESS_M), 0.0)
+    return torch.cat((gap, nearness, torch.where(found, speed, 0.0)), dim=-1).flatten(1)

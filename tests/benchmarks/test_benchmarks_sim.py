@@ -29,13 +29,7 @@ def _no_peer(monkeypatch):
     monkeypatch.setattr(sim_module, "highway_env_version", lambda: None)
 
 
-@pytest.fixture
-def _compilable(monkeypatch):
-    """The environment as if it could be compiled, whether it can or not."""
-    monkeypatch.setattr(sim_module, "has_switch", lambda env, name: True)
-
-
-@pytest.mark.usefixtures("_no_peer", "_compilable")
+@pytest.mark.usefixtures("_no_peer")
 def test_every_batch_is_run_bare_and_whole_in_every_mode_and_thread_count():
     groups = suite(batches=(1, 8), modes=("eager", "compiled"), threads=(1, 2)).groups()
     speed = [case.labels for group in groups for case in group.cases if case.labels.part == "speed"]
@@ -87,7 +81,7 @@ def test_a_scene_set_by_hand_has_no_other_number_of_vehicles():
     assert any("growth with the vehicles" in note for note in by_hand.notes)
 
 
-@pytest.mark.usefixtures("_no_peer", "_compilable")
+@pytest.mark.usefixtures("_no_peer")
 def test_what_cannot_be_compiled_is_left_out_with_the_reason(monkeypatch):
     def start(scenario, mode, device, batch):
         if mode == "compiled":

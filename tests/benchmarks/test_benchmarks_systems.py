@@ -11,10 +11,8 @@ from ganlane.benchmarks.systems import (
     bare_steps,
     build,
     first_state,
-    has_switch,
     start_environment,
     start_physics,
-    with_switch,
 )
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
@@ -30,7 +28,7 @@ def scenario(traffic=None, **env):
 def test_bare_physics_moves_everybody_as_the_environment_does():
     env = build(scenario(), "eager", "cpu", 5)
     start = env.reset()
-    vehicles, step = bare_steps(env.base_env.world, start, 30)
+    vehicles, step = bare_steps(env.base_env, start, 30)
     state = start
     for _ in range(3):
         state.set(keys.ACTION, torch.full((5,), keys.KEEP))
@@ -61,13 +59,6 @@ def test_a_shorter_decision_has_fewer_physics_steps():
 
 def test_the_state_holds_the_observation():
     assert first_state(scenario(), 2)[keys.OBSERVATION].shape[0] == 2
-
-
-def test_a_switch_that_is_not_there_changes_nothing():
-    env = EnvConfig()
-    assert not has_switch(env, "no_such_key")
-    assert with_switch(env, "no_such_key", True) is env
-    assert with_switch(env, "lanes", True) != env
 
 
 def test_actions_are_the_same_for_the_same_seed():

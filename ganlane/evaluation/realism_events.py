@@ -1,0 +1,63 @@
+"""What must not happen in traffic, counted when it begins."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.lanes import lateral_half_extent
+from ganlane.sim.neighbours import leader, perceive
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+
+#: A body that reaches further beyond the edge is off the road, m: rounding does not count.
+EDGE_M: Final = 0.01
+#: Slower than this with nobody so near ahead, a vehicle stands still for no reason, m/s and m.
+STANDING_MPS: Final = 1.0
+FREE_M: Final = 50.0
+#: Standing still is looked for once a second.
+_SECOND: Final = 10
+
+
+class EventCounter:
+    """Counts onsets; index 0 (the ego's) and vehicles that are not valid do not count.
+
+    Attributes:
+        overlaps: pairs of vehicles whose boxes began to overlap.
+        off_road: vehicles whose body began to reach beyond the edge of the road.
+        standstills: vehicles that began to stand still in free flow.
+    """
+
+    def __init__(self, road: Road) -> None:
+        self.road = road
+        self.overlaps = self.off_road = self.standstills = 0
+        self._before: dict[str, Tensor] = {}
+
+    def begin(self) -> None:
+        """Another batch of episodes begins."""
+        self._before = {}
+
+    def count(self, vehicles: Vehicles, step: int) -> None:
+        """Look at the vehicles after a physics step."""
+        others = vehicles.columns(slice(1, None))
+        self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
+        half = lateral_half_extent(others) - EDGE_M
+        left, right = self.road.left_edge_m(), self.road.right_edge_m()
+        outside = (others.y + half > left) | (others.y - half < right)
+        self.off_road += self._onsets("off_road", outside & others.valid)
+        if step % _SECOND == _SECOND - 1:
+            self.standstills += self._onsets("standstill", self._standing(vehicles)[:, 1:])
+
+    def _standing(self, vehicles: Vehicles) -> Tensor:
+        slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
+        ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
+        return slow & (ahead.gap > FREE_M)
+
+    def _onsets(self, name: str, now: Tensor) -> int:
+        """How many of ``now`` were not so when last looked at."""
+        before = self._before.get(name, torch.zeros_like(now))
+        self._before[name] = now
+        return int((now & ~before).sum())

@@ -1,0 +1,183 @@
+"""From where everybody drives: the recorded scenes, or, without recordings, spawned ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
+from ganlane.errors import UserError
+from ganlane.evaluation.realism_card import (
+    FLOORS,
+    Driven,
+    Report,
+    drive_all,
+    driven_of,
+    fit_excess,
+    measure_recordings,
+)
+from ganlane.evaluation.realism_folds import Fold, mean_options, merged
+from ganlane.evaluation.realism_long import LongRunParameters, spawned_frame
+from ganlane.evaluation.realism_quantities import QUANTITIES, Measured, measure
+from ganlane.evaluation.realism_recordings import SHORTEST_S, Recording, recordings_of
+from ganlane.evaluation.realism_reference import SHIPPED_REFERENCE, Reference, quantiles_of, rate, reference_of
+from ganlane.evaluation.realism_simulation import Factory, StartOptions
+from ganlane.sim.road import Road
+from ganlane.sim.spawn import SpawnParameters
+
+#: Without recordings: vehicles of an episode, its seconds, and episodes per repeat.
+_SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8
+
+
+@dataclass(frozen=True)
+class Starts:
+    """What was driven from the same starts, and what it is held against.
+
+    Attributes:
+        kind: ``recorded`` or ``spawned``.
+        scenes: started from.
+        held_out: by fold, the scenes that desired speeds were not fitted on.
+        options: by traffic, how it was driven; over several folds the mean of what was fitted.
+        driven: by name, the traffic of the card first, then its rivals, then :data:`FLOORS` (recorded starts only).
+        recorded: by quantity, [units, bins] of the same scenes (spawned starts: of all).
+        seen: what else those scenes show (lane changes, quantiles).
+        reference: all recordings.
+    """
+
+    kind: str
+    scenes: list[str]
+    held_out: list[list[str]]
+    options: Mapping[str, StartOptions]
+    driven: Mapping[str, Driven]
+    recorded: Mapping[str, np.ndarray]
+    seen: Mapping[str, Any]
+    reference: Reference
+
+    @property
+    def paired(self) -> bool:
+        """Whether the recorded units are those that were driven."""
+        return self.kind == "recorded"
+
+    def said(self) -> dict[str, Any]:
+        """What ``results.json`` says of it."""
+        excess = {name: each.desired_above_mps for name, each in self.options.items() if name not in FLOORS}
+        return {
+            "starts": self.kind,
+            "scenes": self.scenes,
+            "held_out": self.held_out,
+            "desired_above_mps": excess,
+            "recordings": self.reference.source,
+            "recorded_lane_changes_per_vehicle_km": self.reference.rate(),
+        }
+
+
+def recorded_starts(
+    folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str, report: Report
+) -> Starts:
+    """Everybody from the recorded scenes.
+
+    Args:
+        folds: who starts from which scenes; scenes that are too short are passed over.
+        frame: the recordings, in the schema.
+        options: how everybody is driven.
+        fit: whether to fit every traffic's desired speeds on a fold's other scenes, or take those of ``options``.
+        source: where the recordings come from.
+        report: told what begins.
+
+    Raises:
+        UserError: a fold names what is no scene, or no scene is long enough.
+    """
+    widths = scene_lane_widths(frame)
+    every = recordings_of(frame, widths)
+    names = [each.name for each in every]
+    _check_names([name for fold in folds for name in fold.held_out], names, source)
+    long = [each for each in every if len(each.x) * FRAME_S >= SHORTEST_S]
+    parts, driving, chosen = [], [], []
+    for fold in folds:
+        scenes = [each for each in long if each.name in fold.starts]
+        if not scenes:
+            continue
+        others = [each for each in long if each.name not in fold.held_out] if fit else []
+        driving.append(desired_speeds(fold.makers, others, options, report))
+        parts.append(drive_all(fold.makers, scenes, driving[-1], report))
+        chosen += scenes
+    if not parts:
+        raise UserError(f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all.")
+    seen = driving_statistics(frame, widths)
+    whole = {
+        "lane_changes": seen.lane_changes.count,
+        "vehicle_km": seen.exposure.vehicle_km,
+        "speed_spread_mps": seen.speed_sd_in_frame or 0.0,
+    }
+    reference = reference_of(measure_recordings(every), names, whole, source)
+    rows = [names.index(each.name) for each in chosen]
+    return Starts(
+        kind="recorded",
+        scenes=[each.name for each in chosen],
+        held_out=[list(fold.held_out) for fold in folds],
+        options=mean_options(driving, options),
+        driven={name: merged([part[name] for part in parts]) for name in parts[0]},
+        recorded={name: reference.counts[name][rows] for name in QUANTITIES},
+        seen=_seen(measure_recordings(chosen)),
+        reference=reference,
+    )
+
+
+def _check_names(held_out: Sequence[str], names: Sequence[str], source: str) -> None:
+    for name in held_out:
+        if name not in names:
+            raise UserError(f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}.")
+
+
+def _seen(measured: Measured) -> dict[str, Any]:
+    changes, km = sum(measured.lane_changes.values()), sum(measured.vehicle_km.values())
+    return rate(changes, km) | {"quantiles": quantiles_of(measured)}
+
+
+def desired_speeds(
+    makers: Mapping[str, Factory], fitted: Sequence[Recording], common: StartOptions, report: Report
+) -> dict[str, StartOptions]:
+    """How each traffic is driven: desired speeds fitted to ``fitted``, if there are any; floors as ``common``."""
+    chosen = {name: common for name in FLOORS}
+    for name, make in makers.items():
+        chosen[name] = common
+        if fitted:
+            report(f"{name}: fitting desired speeds on {len(fitted)} scenes")
+            chosen[name] = replace(common, desired_above_mps=fit_excess(make, fitted, common))
+    return chosen
+
+
+def spawned_starts(
+    makers: Mapping[str, Factory],
+    road: Road,
+    spawn: SpawnParameters,
+    repeats: int,
+    seed: int,
+    report: Report,
+    path: Path = SHIPPED_REFERENCE,
+) -> Starts:
+    """Without recordings: everybody from the same spawned scenes, held against the histograms that ship.
+
+    Args:
+        makers: traffics by name, the card's own first.
+        road, spawn: where and how vehicles start (Table II at the paper's density).
+        repeats: 8 episodes of 30 vehicles and 30 s each.
+        seed: of the random numbers.
+        report: told what begins.
+        path: the histograms.
+    """
+    reference, rows = Reference.load(path), _SPAWNED_ROWS * repeats
+    report(f"no recordings here: spawned starts against {path.name}; give data.path=FILE for the fair comparison")
+    parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
+    scenes = [f"spawned-{row}" for row in range(rows)]
+    widths, driven = dict.fromkeys(scenes, float(road.lane_width_m)), {}
+    for name, make in makers.items():
+        report(f"{name} from {rows} spawned starts")
+        driven[name] = driven_of(measure(spawned_frame(make, road, parameters, rows), widths), scenes)
+    seen = rate(reference.lane_changes, reference.vehicle_km) | {"quantiles": reference.quantiles}
+    return Starts("spawned", [], [], {}, driven, reference.counts, seen, reference)

@@ -1,0 +1,172 @@
+"""Long runs without an ego: what is counted, on traffic of which it is known."""
+
+import pytest
+import torch
+
+from ganlane.evaluation.realism_checks import card_checks
+from ganlane.evaluation.realism_drivers import ConstantVelocity, RandomDriving
+from ganlane.evaluation.realism_events import EventCounter
+from ganlane.evaluation.realism_guard import GuardMeter, watched
+from ganlane.evaluation.realism_long import LongRunParameters, long_run, spawned, spawned_frame
+from ganlane.evaluation.realism_long_summary import totals
+from ganlane.sim.random import episode_key
+from ganlane.sim.road import Road
+from ganlane.traffic import Guard, IdmTraffic, TrafficModule
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+
+SHORT = LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0)
+
+
+def start(road, vehicles=9):
+    key = episode_key(2, torch.zeros(3, dtype=torch.int64), torch.arange(3))
+    return spawned(IdmTraffic(road), LongRunParameters(vehicles=vehicles), key)
+
+
+def test_all_but_the_ego_are_there_and_start_as_the_simulators_episodes_do():
+    vehicles = start(Road())
+    assert vehicles.x.shape == (3, 10)
+    assert not vehicles.valid[:, 0].any()
+    assert vehicles.valid[:, 1:].all()
+    assert ((vehicles.desired_speed[:, 1:] >= 18.0) & (vehicles.desired_speed[:, 1:] <= 26.0)).all()
+    spread = start(Road(), 30).x.amax() - start(Road(), 30).x.amin()
+    # 31 places at the paper's density, on 200 m for 9, around the ego's.
+    assert 400 < spread < 1378
+
+
+def test_constant_velocity_keeps_every_speed_and_changes_no_lane():
+    run = long_run(ConstantVelocity, Road(), SHORT)
+    assert run["vehicle_km"] >= 1.0
+    assert run["lane_changes"] == run["off_road"] == run["standstills_in_free_flow"] == 0
+    assert run["acceleration_quantiles"]["0.95"] == pytest.approx(0.0, abs=0.01)
+    assert run["speeds"]["10 s"]["mean_speed_mps"] == pytest.approx(
+        1000 * run["vehicle_km"] / (20 * 6 * run["episodes"]), rel=1e-3
+    )
+    assert run["speeds"]["60 s"] == {"mean_speed_mps": None, "spread_mps": None, "episodes": 0}
+    assert run["guard_share"] is None
+
+
+def test_blind_driving_overlaps_and_careful_driving_does_not():
+    random = long_run(RandomDriving, Road(), LongRunParameters(9, 5.0, 30.0))
+    assert random["overlaps"] > 0
+    assert random["lane_changes"] > 0
+    low, high = random["overlaps_per_1000_vehicle_km_ci"]
+    assert low < random["overlaps_per_1000_vehicle_km"] < high
+    assert long_run(IdmTraffic, Road(), LongRunParameters(9, 5.0, 30.0))["overlaps"] == 0
+
+
+def test_the_same_numbers_come_out_again_and_others_of_another_seed():
+    runs = [long_run(RandomDriving, Road(), LongRunParameters(6, 1.0, 20.0, seed=seed)) for seed in (0, 0, 1)]
+    assert runs[0] == runs[1]
+    assert runs[0] != runs[2]
+
+
+def test_events_are_counted_when_they_begin():
+    road = Road()
+    vehicles, counter = start(road), EventCounter(road)
+    x = 100.0 * torch.arange(10.0).expand(3, 10)
+    apart = vehicles.with_(x=x, y=torch.zeros_like(x), speed=torch.full_like(x, 20.0))
+    touching = apart.with_(x=torch.where(torch.arange(10) == 2, x - 98.0, x))
+    outside = apart.with_(y=torch.where(torch.arange(10) == 3, -1.0, 0.0).expand(3, 10))
+    for at in (apart, touching, touching, apart, touching):
+        counter.count(at, 0)
+    # In each of three rows the second and the first vehicle meet, twice.
+    assert (counter.overlaps, counter.off_road) == (6, 0)
+    for at in (outside, outside):
+        counter.count(at, 0)
+    assert counter.off_road == 3
+
+
+def test_standing_in_a_queue_is_no_standstill_but_standing_alone_is():
+    road = Road()
+    vehicles = start(road)
+    x = 20.0 * torch.arange(10.0).expand(3, 10)
+    queue = vehicles.with_(x=x, y=torch.zeros_like(x), speed=torch.zeros_like(x))
+    counter = EventCounter(road)
+    counter.count(queue, 8)
+    assert counter.standstills == 0
+    counter.count(queue, 9)
+    # Only the foremost has nobody ahead.
+    assert counter.standstills == 3
+    counter.count(queue, 19)
+    assert counter.standstills == 3
+
+
+def test_the_ego_which_is_not_there_meets_nobody():
+    road = Road()
+    vehicles, counter = start(road), EventCounter(road)
+    x = 100.0 * torch.arange(10.0).expand(3, 10)
+    on_top = vehicles.with_(x=torch.where(torch.arange(10) == 0, x[:, 1:2], x), y=torch.zeros_like(x))
+    counter.count(on_top, 0)
+    assert counter.overlaps == 0
+
+
+class Swerver(TrafficModule):
+    """Brakes hard with vehicle 1, moves vehicle 2 aside."""
+
+    def move(self, vehicles, memory, key, step):
+        index = torch.arange(vehicles.x.shape[1])
+        speed = vehicles.speed - torch.where(index == 1, 2.0, 0.0)
+        return vehicles.with_(speed=speed, y=vehicles.y + torch.where(index == 2, 0.5, 0.0)), memory
+
+
+def test_the_guard_meter_counts_what_the_guard_alters_and_lets_go_afterwards():
+    guard, meter = Guard(Road()), GuardMeter()
+    vehicles = start(Road())
+    x = 200.0 * torch.arange(10.0).expand(3, 10)
+    vehicles = vehicles.with_(x=x, speed=torch.full_like(x, 15.0))
+    moved, _ = Swerver().move(vehicles, {}, torch.zeros(3), torch.zeros(3))
+    assert meter.share is None
+    with watched(guard, meter):
+        guarded, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
+    assert guard.observer is None
+    # Vehicle 1 brakes with 20 m/s2, vehicle 2 moves by 0.5 m of which a fifth is damped; the other seven do neither.
+    assert meter.share == pytest.approx(2 / 9)
+    unwatched, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
+    assert torch.equal(unwatched.x, guarded.x)
+
+
+def test_the_share_is_told_for_traffic_with_a_guard_alone():
+    short = LongRunParameters(4, 0.1, 10.0)
+    assert 0.0 < long_run(gan_traffic, Road(), short)["guard_share"] < 1.0
+    assert long_run(lambda road: gan_traffic(road, guard=False), Road(), short)["guard_share"] is None
+    assert long_run(gan_calibrated_traffic, Road(), short)["overlaps"] == 0
+
+
+def test_totals_add_counts_up_and_know_nothing_of_nothing():
+    runs = [long_run(RandomDriving, Road(), LongRunParameters(n, 2.0, 20.0)) for n in (5, 9)]
+    total = totals(runs)
+    km = sum(run["vehicle_km"] for run in runs)
+    overlaps = sum(run["overlaps"] for run in runs)
+    assert total["overlaps_per_1000_vehicle_km"] == pytest.approx(1000 * overlaps / km)
+    assert total["off_road"] == sum(run["off_road"] for run in runs)
+    assert totals([])["off_road"] is None
+    assert totals([])["lane_changes_per_vehicle_km"] is None
+
+
+def test_spawned_trajectories_are_whole_tracks_in_the_schema():
+    frame = spawned_frame(IdmTraffic, Road(), LongRunParameters(5, most_s=10.0), 2)
+    assert frame.height == 2 * 5 * 101
+    assert frame["unit"].unique().sort().to_list() == ["spawned-0", "spawned-1"]
+
+
+def test_checks_hold_runs_against_the_recordings():
+    run = long_run(IdmTraffic, Road(), SHORT)
+    quantities = {
+        name: {"against": {"rival": {"verdict": "closer"}}}
+        for name in ("speed_spread", "acceleration", "time_headway", "time_to_collision", "lane_change_duration")
+    }
+    quantiles = [{"acceleration": {"0.05": low, "0.95": 1.0}} for low in (-1.0, -1.2)]
+    rate = {"per_vehicle_km_ci": [0.7, 1.2]}
+    checks = card_checks(quantities, *quantiles, rate, 2.8, [run])
+    assert checks["acceleration_quantiles_within_30_percent"] is True
+    assert checks["compared_with"]["rival"]["acceleration"] == "closer"
+    (told,) = checks["long_runs"]
+    assert told["nobody_off_the_road"] is told["overlaps_under_1_per_1000_vehicle_km"] is True
+    assert told["lane_changes_inside_recorded_interval"] is False
+    assert told["guard_under_5_percent"] is None
+    assert (
+        card_checks(quantities, quantiles[0], {"acceleration": {"0.05": -2.0, "0.95": 1.0}}, rate, 2.8, [])[
+            "acceleration_quantiles_within_30_percent"
+        ]
+        is False
+    )

@@ -11,7 +11,10 @@ COMMANDS = {
     "train": "train an agent on a traffic, then evaluate it beside others",
     "evaluate": "agents x traffics on the same episodes, as one table",
     "render": "an episode of an agent on a traffic as a film",
+    "prepare": "recordings into one schema, with a report of what they show",
     "train_generator": "fit a generator to recorded traffic",
+    "realism": "how close a traffic comes to recorded driving",
+    "bench": "speed and memory, beside a peer measured in the same run",
 }
 
 

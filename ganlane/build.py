@@ -33,7 +33,7 @@ from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.steering import STEERING
 from ganlane.traffic import TrafficModule
-from ganlane.transforms import ObservationTransform, RewardTransform, observation_size
+from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform, observation_size
 
 
 def set_threads(threads: int) -> None:
@@ -110,7 +110,10 @@ def make_env(
     if env.compile:
         base.compile()
         seen.compile_graphs()
-    return TransformedEnv(base, Compose(seen, RewardTransform(env.decision_period_s, reward.parameters())))
+    errors = observation.sensor_parameters()
+    sensors = [] if errors is None else [SensorTransform(errors, traffic.stream, env.decision_period_s)]
+    pay = RewardTransform(env.decision_period_s, reward.parameters())
+    return TransformedEnv(base, Compose(*sensors, seen, pay))
 
 
 @dataclass(frozen=True)

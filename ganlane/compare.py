@@ -15,8 +15,16 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.evaluation import evaluation_rows, run_episodes, text_table, write_episodes, write_results
+from ganlane.evaluation import (
+    crashes_by_scene,
+    evaluation_rows,
+    run_episodes,
+    text_table,
+    write_episodes,
+    write_results,
+)
 from ganlane.sim.random import Stream
+from ganlane.traffic import ReplayTraffic, TrafficModule
 
 
 def compare(
@@ -42,7 +50,8 @@ def compare(
         num_envs: episodes side by side, at most.
 
     Returns:
-        What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other.
+        What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
+        with ``scene``, the recorded scene of an episode, where one of the traffics replays (null for the others).
     """
     modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
@@ -53,8 +62,35 @@ def compare(
             made = make_env(modules[traffic], env, seen, reward, rows, seed, device)
             report = progress.start(f"{driver.name} on {traffic}")
             table = run_episodes(made, driver.policy, range(episodes), seed, report)
-            tables.append(table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic)))
-    return pl.concat(tables)
+            named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
+            tables.append(_with_scenes(named, modules[traffic], seed))
+    return pl.concat(tables, how="diagonal")
+
+
+def _with_scenes(table: pl.DataFrame, traffic: TrafficModule, seed: int) -> pl.DataFrame:
+    """The episodes with the name of the recorded ``scene`` of each, if there is one."""
+    if not isinstance(traffic, ReplayTraffic):
+        return table
+    scenes = traffic.scenes_of_episodes(seed, table["episode"].to_list())
+    return table.with_columns(pl.Series("scene", scenes, pl.String))
+
+
+def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
+    """Crashes per km of each agent on each traffic that replays recorded scenes; none for other traffics.
+
+    Returns:
+        Per pair ``agent, traffic, per_km, per_km_ci`` (bootstrap over whole scenes) and ``scenes``, see
+        :func:`ganlane.evaluation.crashes_by_scene`.
+    """
+    if "scene" not in table.columns:
+        return []
+    found = []
+    recorded = table.filter(pl.col("scene").is_not_null())
+    for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
+        crashes = crashes_by_scene(episodes, episodes["scene"].to_list())
+        per_km = {"per_km": crashes.per_km.value, "per_km_ci": crashes.per_km.interval}
+        found.append({"agent": agent, "traffic": traffic, **per_km, "scenes": crashes.rows})
+    return found
 
 
 def publish(
@@ -66,6 +102,8 @@ def publish(
 ) -> str:
     """Print the table of a comparison, write its episodes and ``results.json``; the line that names the latter.
 
+    Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
+
     Args:
         table: what :func:`compare` returned.
         folder: of the run.
@@ -75,7 +113,9 @@ def publish(
     rows = evaluation_rows(table)
     print(text_table(rows))
     write_episodes(folder, table)
-    return f"results: {write_results(folder, {'rows': rows, **(numbers or {})}, config, seeds)}"
+    recorded = recorded_crashes(table)
+    known = {"rows": rows, **({"crashes_by_scene": recorded} if recorded else {}), **(numbers or {})}
+    return f"results: {write_results(folder, known, config, seeds)}"
 
 
 class _Progress:

@@ -22,6 +22,12 @@ class FitProgress:
         self._bar: tqdm | None = None
         self._best = math.inf
 
+    def next_fit(self, name: str) -> None:
+        """Told that another fit begins: everything starts anew."""
+        self.__exit__(None, None, None)
+        self._bar, self._best = None, math.inf
+        print(name, file=sys.stderr, flush=True)
+
     def __call__(self, progress: Progress) -> None:
         """Called by the fit after every update."""
         if sys.stderr.isatty():
@@ -30,16 +36,15 @@ class FitProgress:
             self._best = progress.best
             left = progress.seconds / progress.update * (progress.updates - progress.update)
             head = f"{progress.update} of {progress.updates} updates, at most {left:.0f} s left"
-            print(
-                f"{head}, held-out score {progress.score:.4f}, best {progress.best:.4f}", file=sys.stderr, flush=True
-            )
+            scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
+            print(f"{head}, {scores}", file=sys.stderr, flush=True)
 
     def _move_bar(self, progress: Progress) -> None:
         if self._bar is None:
             self._bar = tqdm(total=progress.updates, desc="fit", unit="update", file=sys.stderr)
         self._bar.update(progress.update - self._bar.n)
         if progress.score is not None:
-            self._bar.set_postfix_str(f"held-out score {progress.score:.4f}, best {progress.best:.4f}")
+            self._bar.set_postfix_str(f"validation score {progress.score:.4f}, best {progress.best:.4f}")
 
     def __enter__(self) -> FitProgress:
         return self

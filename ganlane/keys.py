@@ -14,6 +14,8 @@ N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI un
 ``ego.*``                                  [N]         what the environment remembers of the ego
 ``traffic.*``                              free        the traffic module's own memory
 ``seed, episode, step``                    [N] i64     what every random number follows from; step: 0.1 s each
+``road.lanes``                             [N, 1] i64  only where every row has a road of its own (replay)
+``road.lane_width_m``                      [N, 1]      the same, m
 ``events.*``                               [N, 1]      what the last decision led to
 ``action``                                 [N] i64     0 keep, 1 left, 2 right
 =========================================  ==========  ==================================================

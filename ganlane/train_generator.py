@@ -2,9 +2,13 @@
 
     ganlane train_generator data=scenes data.path=recordings.csv
     ganlane train_generator generator=calibrated data.path=recordings.csv seed=1
+    ganlane train_generator generator=paper data=scenes folds=5
     ganlane evaluate traffics=[gan] generator.path=outputs/train_generator/RUN/generator_paper.safetensors
 
 Writes generator_PRESET.safetensors (weights, metrics, lane-change statistics) and results.json into its run folder.
+With folds=5 five more generators are fitted, each without the scenes of its fold, and results.json pools their errors
+on these; with ablations=true the preset is also fitted with one part changed at a time. resume=FOLDER goes on with
+what an earlier run has fitted.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ganlane.config.app import run_command
 from ganlane.config.train_generator import TrainGeneratorConfig
@@ -23,28 +28,55 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     from ganlane.build import set_threads
     from ganlane.data import default_scenes, read_scenes
     from ganlane.evaluation import write_results
+    from ganlane.evaluation.provenance import code_version
     from ganlane.fit_report import FitProgress, metrics_table, results_of
-    from ganlane.generator import HELD_OUT, fit_generator
+    from ganlane.generator import (
+        HELD_OUT,
+        ablate,
+        ablation_table,
+        cross_validate,
+        fit_generator,
+        fit_key,
+        fold_tables,
+        scene_tracks,
+        split_for_fit,
+    )
 
     set_threads(config.threads)
     source = Path(config.data.path) if config.data.path else default_scenes()
     frame = read_scenes(source)
     held_out = config.data.held_out_scenes(frame["scene"].unique().to_list(), HELD_OUT)
     preset = config.generator.preset_name()
+    fit_config = config.generator.fit_config(config.seed)
+    fits = Path(config.resume or folder) / "fits"
+    numbers: dict[str, Any] = {}
+    if config.ablations:
+        with FitProgress() as progress:
+            rows = ablate(preset, frame, fit_config, held_out, fits, progress.next_fit, progress)
+        print(ablation_table(rows))
+        numbers["ablations"] = rows
+    if config.folds:
+        with FitProgress() as progress:
+            folds = cross_validate(preset, frame, fit_config, config.folds, fits, progress.next_fit, progress)
+        print(fold_tables(folds))
+        numbers["folds"] = folds
+    key = fit_key(preset, fit_config, split_for_fit(scene_tracks(frame), held_out))
     with FitProgress() as progress:
         result = fit_generator(
             preset,
             frame,
             held_out=held_out,
-            config=config.generator.fit_config(config.seed),
+            config=fit_config,
             source=str(source),
+            resume_path=fits / f"generator_{key}.pt",
             on_progress=progress,
         )
     print(metrics_table(result.metrics))
     weights = folder / f"generator_{preset}.safetensors"
-    result.save(weights)
+    result.save(weights, numbers.get("folds"), code_version())
     print(f"weights: {weights}")
-    path = write_results(folder, results_of(result), asdict(config), {"seed": config.seed, "held_out": held_out})
+    numbers = results_of(result) | numbers
+    path = write_results(folder, numbers, asdict(config), {"seed": config.seed, "held_out": held_out})
     return f"results: {path}"
 
 

@@ -22,6 +22,12 @@ def command(*arguments, cwd):
     return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment)
 
 
+@pytest.fixture
+def empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_names_options_keys_and_examples(name, capsys):
     assert main([name, "--help"]) == 0
@@ -42,6 +48,37 @@ def test_usage_lists_every_command(capsys):
     assert main([]) == 0
     shown = capsys.readouterr().out
     assert all(name in shown for name in COMMANDS)
+
+
+@pytest.mark.parametrize("flags", [[], ["--resolve"]], ids=["as_is", "resolved"])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_cfg_shows_the_config_and_leaves_nothing_behind(name, flags, empty_folder, capsys):
+    assert main([name, "--cfg", "job", *flags]) == 0
+    shown = capsys.readouterr()
+    assert "seed: 0" in shown.out
+    assert shown.err == ""
+    assert list(empty_folder.iterdir()) == []
+
+
+def test_cfg_shows_the_chosen_options_and_values(empty_folder, capsys):
+    assert main(["train", "--cfg", "job", "env=dense", "env.lanes=5"]) == 0
+    assert {"  vehicles: 30", "  lanes: 5"} <= set(capsys.readouterr().out.splitlines())
+    assert main(["render", "--cfg", "job", "agent=keep_lane"]) == 0
+    assert "driver: keep_lane" in capsys.readouterr().out.splitlines()
+
+
+def test_cfg_of_an_unknown_key_ends_with_status_2(empty_folder, capsys):
+    assert main(["train", "--cfg", "job", "no_such_key=1"]) == 2
+    assert "no_such_key: no such key" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flags", [["--cfg", "job"], ["--cfg", "job", "--resolve"], ["--info"]], ids=" ".join)
+def test_hydras_views_of_the_config_work_in_a_fresh_process(flags, tmp_path):
+    """There nothing has filled the ConfigStore before."""
+    done = command("-m", "ganlane.train", *flags, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "seed: 0" in done.stdout
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_help_does_not_wait_for_torch(tmp_path):

@@ -12,7 +12,7 @@ import ganlane
 PACKAGE = Path(ganlane.__file__).parent
 #: From the bottom up; what stands in one line may import each other's neighbours to the left only within itself.
 ORDER = [
-    {"keys", "errors", "files", "paths"},
+    {"keys", "errors", "files", "paths", "compiling"},
     {"data", "sim"},
     {"generator"},
     {"traffic"},
@@ -24,7 +24,7 @@ ORDER = [
     {"view"},
     {"config"},
     {"build"},
-    {"compare", "phases", "fit_report", "api", "gym"},
+    {"compare", "phases", "fit_report", "benchmarks", "api", "gym"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
     {"__main__"},
 ]

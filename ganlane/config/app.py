@@ -20,6 +20,7 @@ from ganlane.config.help import print_help
 from ganlane.config.messages import CONFIG_ERRORS, FILE_ERRORS, sentence
 from ganlane.config.overrides import parse_arguments, without_repetitions
 from ganlane.config.resume import with_resumed
+from ganlane.config.store import register
 from ganlane.errors import UserError
 from ganlane.paths import conf_folder
 
@@ -61,7 +62,9 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     if flags.help:
         print_help(command)
     elif flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
-        _hydra(command, task, arguments)
+        as_given = parse_arguments("", arguments).overrides
+        hydras = dict(zip(as_given, flags.overrides))
+        _hydra(command, task, [hydras.get(argument, argument) for argument in arguments])
     else:
         overrides = with_resumed(command, flags.overrides, flags.multirun)
         checked = check(command, overrides, flags.multirun)
@@ -78,6 +81,8 @@ def _hydra(command: str, task: Task, arguments: list[str]) -> None:
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
+    # A run has composed once already, to be checked; --cfg and --info come here first.
+    register()
     mistakes: list[UserError] = []
     here = os.getpid()
 

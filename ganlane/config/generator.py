@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 class LoopOptions:
     """``generator.loop`` (:class:`ganlane.generator.LoopConfig`)."""
 
-    updates: int = 1600
-    evaluate_every: int = 200
+    updates: int = 1200
+    evaluate_every: int = 150
     patience: int = 8
     learning_rate: float = 4e-3
     warmup: int = 100
@@ -41,9 +41,9 @@ class LoopOptions:
 class CalibratedLoopOptions(LoopOptions):
     """The calibrated preset's: fewer updates, each through a whole stretch of a scene."""
 
-    updates: int = 400
-    evaluate_every: int = 40
-    warmup: int = 20
+    updates: int = 800
+    evaluate_every: int = 80
+    warmup: int = 40
 
 
 @dataclass
@@ -96,19 +96,30 @@ class PaperGeneratorConfig(GeneratorConfig):
     group_size: int = 9
     stride: int = 1
     samples: int = 6
+    history_noise: float = 0.0
+    predicted: int = 8
+    neighbours: int = 8
+    differences: bool = True
     loop: LoopOptions = field(default_factory=LoopOptions)
     weights: WeightOptions = field(default_factory=WeightOptions)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "generator", group_size=at_least(1), stride=at_least(1), samples=between(1, 100))
+        counts = {"group_size": at_least(1), "stride": at_least(1), "samples": between(1, 100)}
+        sizes = {"predicted": between(1, 50), "neighbours": between(0, 100)}
+        check(self, "generator", history_noise=at_least(0), **counts, **sizes)
 
     def fit_config(self, seed: int) -> PaperConfig:
         """As the fit takes it."""
-        from ganlane.generator import PaperConfig
+        from ganlane.generator import GeneratorSizes, PaperConfig
 
         return plain_copy(
-            self, PaperConfig, loop=self.loop.parameters(), weights=self.weights.parameters(), seed=seed
+            self,
+            PaperConfig,
+            sizes=plain_copy(self, GeneratorSizes),
+            loop=self.loop.parameters(),
+            weights=self.weights.parameters(),
+            seed=seed,
         )
 
 
@@ -118,10 +129,14 @@ class CalibratedGeneratorConfig(GeneratorConfig):
 
     preset: str = "calibrated"
     batch: int = 6
-    held_out_stride: int = 6
+    held_out_stride: int = 3
     horizons: list[int] = field(default_factory=lambda: [8, 16, 29])
+    shares: list[float] = field(default_factory=lambda: [3.0, 1.0, 1.0])
     held_out_horizon: int = 29
     noise_period_s: float = 5.0
+    washout_s: float = 3.0
+    further_inputs: bool = True
+    traits: bool = True
     loop: CalibratedLoopOptions = field(default_factory=CalibratedLoopOptions)
 
     def __post_init__(self) -> None:
@@ -130,6 +145,8 @@ class CalibratedGeneratorConfig(GeneratorConfig):
             self,
             "generator",
             horizons=every(at_least(1)),
+            shares=every(at_least(0)),
+            washout_s=above(0),
             held_out_horizon=at_least(8),
             noise_period_s=at_least(0),
         )

@@ -9,22 +9,34 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from ganlane.config.agent import AgentConfig, DqnConfig
+from ganlane.config.bench import BenchConfig
 from ganlane.config.collector import CollectorConfig
-from ganlane.config.data import DataConfig
+from ganlane.config.data import DataConfig, HighdDataConfig, NgsimDataConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorConfig
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig
 from ganlane.config.observation import ObservationConfig
+from ganlane.config.prepare import PrepareConfig
+from ganlane.config.realism import RealismConfig
 from ganlane.config.render import RenderConfig
 from ganlane.config.reward import RewardConfig
+from ganlane.config.scenarios import (
+    BlockedLaneEnvConfig,
+    CutInEnvConfig,
+    FileSceneEnvConfig,
+    StalledCarEnvConfig,
+    StopAndGoEnvConfig,
+)
 from ganlane.config.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
     IdmMobilTrafficConfig,
     IdmTrafficConfig,
 )
+from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
 
@@ -34,21 +46,34 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "train": TrainConfig,
         "evaluate": EvaluateConfig,
         "render": RenderConfig,
+        "bench": BenchConfig,
+        "prepare": PrepareConfig,
         "train_generator": TrainGeneratorConfig,
+        "realism": RealismConfig,
     },
-    "env": {"highway": EnvConfig, "dense": DenseEnvConfig},
+    "env": {
+        "highway": EnvConfig,
+        "dense": DenseEnvConfig,
+        "cut_in": CutInEnvConfig,
+        "stalled_car": StalledCarEnvConfig,
+        "stop_and_go": StopAndGoEnvConfig,
+        "blocked_lane": BlockedLaneEnvConfig,
+        "scene": FileSceneEnvConfig,
+    },
     "traffic": {
         "idm": IdmTrafficConfig,
         "idm_mobil": IdmMobilTrafficConfig,
         "gan": GanTrafficConfig,
         "gan_calibrated": GanCalibratedTrafficConfig,
+        "idm_faults": IdmFaultsTrafficConfig,
+        "replay": ReplayTrafficConfig,
     },
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
     "observation": {"observation": ObservationConfig},
     "reward": {"paper": RewardConfig},
     "collector": {"single": CollectorConfig},
-    "data": {"scenes": DataConfig},
+    "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},
     "logger": {"csv": LoggerConfig, "tensorboard": TensorBoardLoggerConfig},
 }

@@ -4,10 +4,12 @@ The path of a number: :func:`run_episodes` drives the episodes 0 to E - 1 and gi
 :func:`evaluation_rows` turns the rows of several agents and traffics into the evaluation's table, with
 bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for crashes
 (:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
+on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resamples whole scenes;
 :func:`text_table` and :func:`markdown_table` print it; :func:`write_results` and :func:`write_episodes` keep it.
 """
 
 from ganlane.evaluation.branching import Branches, branch
+from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
 from ganlane.evaluation.episodes import run_episodes
 from ganlane.evaluation.layout import markdown_table, text_table
@@ -25,11 +27,13 @@ from ganlane.evaluation.table import evaluation_rows
 
 __all__ = [
     "Branches",
+    "CrashesByScene",
     "Estimate",
     "NormalizedScore",
     "branch",
     "clopper_pearson",
     "code_version",
+    "crashes_by_scene",
     "evaluation_rows",
     "interquartile_mean",
     "machine",

@@ -43,7 +43,8 @@ class AnchorParameters:
         lane_stiffness: pull to the target lane's centre, 1/s2.
         lane_damping: of the lateral velocity, 1/s; with the stiffness critically damped.
         residual: largest residual along and across the road.
-        washout_s: time over which the residual's mean is taken away.
+        washout_s: time over which the residual's mean is taken away; infinite leaves it there (an ablation).
+        further_inputs: whether the network sees :func:`extra_inputs`; without, they read as 0 (an ablation).
     """
 
     idm: IdmParameters = field(default_factory=lambda: IdmParameters(min_acceleration=-8.0))
@@ -51,6 +52,7 @@ class AnchorParameters:
     lane_damping: float = 1.1
     residual: tuple[float, float] = (4.0, 2.0)
     washout_s: float = 3.0
+    further_inputs: bool = True
 
 
 ANCHOR = AnchorParameters()
@@ -129,7 +131,8 @@ def anchored_step(
     offset = road.centre_of(vehicles.target_lane, vehicles.y.dtype) - vehicles.y
     velocity = displacement / PHYSICS_STEP_S
     anchor_y = p.lane_stiffness * offset - p.lane_damping * velocity[..., 1]
-    seen = observe(history, difference, vehicles, extra_inputs(scene, anchor_x, offset))
+    extra = extra_inputs(scene, anchor_x, offset)
+    seen = observe(history, difference, vehicles, extra if p.further_inputs else torch.zeros_like(extra))
     outputs = generator.decode(generator.summarise(seen), noise, seen, 1)[..., 0, :]
     residual, mean = washout(bounded(outputs, p.residual), memory.mean, p.washout_s)
     room = 0.5 * (road.lane_width_m - vehicles.width) - _MARGIN_M

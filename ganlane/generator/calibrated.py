@@ -6,21 +6,22 @@ step by step relative to the error that constant velocity has there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
 
-from ganlane.generator.anchored import EXTRA_INPUTS
+from ganlane.errors import UserError
+from ganlane.generator.anchored import ANCHOR, EXTRA_INPUTS, AnchorParameters
 from ganlane.generator.loop import LoopConfig, descend
 from ganlane.generator.losses import distance, energy_score, masked_mean
 from ganlane.generator.metrics import Metrics
 from ganlane.generator.networks import Generator, GeneratorSizes
 from ganlane.generator.rollout_metrics import closed_form_errors, rollout_metrics
 from ganlane.generator.rollouts import rollout
-from ganlane.generator.stretches import RolloutScenes, SceneSource, cut_stretches
+from ganlane.generator.stretches import RolloutScenes, SceneSource, cut_stretches, scene_sources
 from ganlane.generator.tracks import SceneTracks
-from ganlane.generator.traits import fitting_traits
+from ganlane.generator.traits import common_traits, fitting_traits, typical_traits
 
 
 @dataclass(frozen=True)
@@ -30,31 +31,53 @@ class CalibratedConfig:
     Attributes:
         sizes: of the generator.
         loop: how long.
-        horizons: steps rolled out, in equal shares of the updates one after the other.
+        horizons: steps rolled out; every update draws one of them.
+        shares: how often each is drawn, in proportion.
         held_out_horizon: steps rolled out in evaluation.
         batch: stretches of scenes per update.
-        held_out_stride: frames between the starts of the held-out stretches.
+        held_out_stride: frames between the starts of the stretches in evaluation.
         noise_period_s: how fast each driver's latent vector wanders.
         mirror: swap left and right in half of the updates.
+        washout_s: time over which the residual's mean is taken away; infinite is without washout. The simulation
+            takes that of :data:`ganlane.generator.ANCHOR`.
+        further_inputs: whether the network sees gap, closing speed, IDM's acceleration and lane offset.
+        traits: whether every driver has a headway and a desired speed of its own.
         seed: of weights, batches, traits and noise.
     """
 
     sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS))
-    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=400, evaluate_every=40, warmup=20))
+    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40))
     horizons: tuple[int, ...] = (8, 16, 29)
+    shares: tuple[float, ...] = (3.0, 1.0, 1.0)
     held_out_horizon: int = 29
     batch: int = 6
-    held_out_stride: int = 6
+    held_out_stride: int = 3
     noise_period_s: float = 5.0
     mirror: bool = True
+    washout_s: float = ANCHOR.washout_s
+    further_inputs: bool = True
+    traits: bool = True
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if len(self.shares) != len(self.horizons) or sum(self.shares) <= 0:
+            raise UserError(
+                f"shares={list(self.shares)}: give one share of the updates for each of the horizons "
+                f"{list(self.horizons)}, not all 0."
+            )
+
+    @property
+    def anchor(self) -> AnchorParameters:
+        """The anchor as the fit drives with it."""
+        return replace(ANCHOR, washout_s=self.washout_s, further_inputs=self.further_inputs)
 
 
 class CalibratedTask:
     """The anchored generator on whole scenes; see :class:`ganlane.generator.loop.FitTask`.
 
     Args:
-        fitted, held_out: recorded scenes.
+        fitted: scenes to fit to.
+        validation: scenes that choose when to stop.
         lane_widths: of every scene by its name, m.
         config: how.
     """
@@ -62,7 +85,7 @@ class CalibratedTask:
     def __init__(
         self,
         fitted: list[SceneTracks],
-        held_out: list[SceneTracks],
+        validation: list[SceneTracks],
         lane_widths: dict[str, float],
         config: CalibratedConfig,
     ):
@@ -74,14 +97,14 @@ class CalibratedTask:
             "generator": torch.optim.Adam(self.generator.parameters())
         }
         self.random = torch.Generator().manual_seed(config.seed)
-        self.sources = [SceneSource.of(scene, lane_widths[scene.name]) for scene in fitted]
-        self.held_out = [SceneSource.of(scene, lane_widths[scene.name]) for scene in held_out]
+        self.lane_widths, self.validation = lane_widths, validation
+        self.sources = scene_sources(fitted, lane_widths)
         self.cuts = self._similar_cuts(max(config.horizons))
         self.scale = self._constant_velocity_errors(max(config.horizons))
 
     def update(self, number: int) -> dict[str, float]:
         """One rollout through a batch of stretches, and one step: of the mean driver and of two samples in turn."""
-        scenes = self._batch(self._horizon(number))
+        scenes = self._batch(self._horizon())
         if number % 2:
             name, scores = "energy", energy_score(*self._two_samples(scenes), scenes.future)
         else:
@@ -91,20 +114,26 @@ class CalibratedTask:
         return {name: float(loss.detach())}
 
     def evaluate(self) -> float:
-        """Error for z = 0 and energy score on the held-out scenes, both relative to constant velocity's error."""
-        metrics = self.metrics()["all"]
+        """Error for z = 0 and energy score on the validation scenes, both relative to constant velocity's error."""
+        metrics = self.metrics(self.validation)["all"]
         return 0.5 * (metrics["relative_mean"] + metrics["relative_energy"])
 
-    def metrics(self) -> Metrics:
-        """Errors on the held-out scenes, all and each."""
+    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
+        """Errors on ``scenes``, all and each."""
         config = self.config
         return rollout_metrics(
-            self.generator, self.held_out, config.held_out_horizon, config.held_out_stride, config.noise_period_s
+            self.generator,
+            scene_sources(scenes, self.lane_widths),
+            config.held_out_horizon,
+            config.held_out_stride,
+            config.noise_period_s,
+            parameters=config.anchor,
+            traits=typical_traits if config.traits else common_traits,
         )
 
-    def _horizon(self, number: int) -> int:
-        share = len(self.config.horizons) * number // self.config.loop.updates
-        return self.config.horizons[share]
+    def _horizon(self) -> int:
+        drawn = torch.multinomial(torch.tensor(self.config.shares, dtype=torch.float32), 1, generator=self.random)
+        return self.config.horizons[int(drawn)]
 
     def _similar_cuts(self, horizon: int) -> list[tuple[SceneSource, int]]:
         """All stretches that can be cut, in order of the vehicles in them: neighbours pad each other little."""
@@ -126,15 +155,18 @@ class CalibratedTask:
         flip = self.config.mirror and float(torch.rand((), generator=self.random)) < 0.5
         return scenes.mirrored() if flip else scenes
 
+    def _traits(self, scenes: RolloutScenes) -> tuple[Tensor, Tensor]:
+        return fitting_traits(scenes, self.random) if self.config.traits else common_traits(scenes)
+
     def _mean_driver(self, scenes: RolloutScenes) -> Tensor:
         """One rollout [B, H, V, 2] with random traits and z = 0."""
-        headway, desired = fitting_traits(scenes, self.random)
+        headway, desired = self._traits(scenes)
         quiet = headway.new_zeros(*headway.shape, self.config.sizes.noise)
-        return rollout(self.generator, scenes, headway, desired, quiet)
+        return rollout(self.generator, scenes, headway, desired, quiet, parameters=self.config.anchor)
 
     def _two_samples(self, scenes: RolloutScenes) -> tuple[Tensor, Tensor]:
         """Two rollouts [B, H, V, 2] with the same traits and different latent vectors, in one pass."""
-        headway, desired = fitting_traits(scenes, self.random)
+        headway, desired = self._traits(scenes)
         shape = (2 * len(headway), headway.shape[1], self.config.sizes.noise)
         fresh = torch.randn(scenes.future.shape[1] + 1, *shape, generator=self.random)
         course = rollout(
@@ -145,6 +177,7 @@ class CalibratedTask:
             fresh[0],
             fresh[1:],
             self.config.noise_period_s,
+            self.config.anchor,
         )
         one, other = course.chunk(2)
         return one, other

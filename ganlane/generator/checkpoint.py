@@ -21,6 +21,7 @@ KIND = "generator"
 Preset = Literal["paper", "calibrated"]
 #: Numbers beside the motion that each preset sees.
 PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
+_NAMED_LATER = {"differences"}
 
 
 def shipped_generator(preset: Preset) -> Path:
@@ -37,6 +38,8 @@ def save_generator(
     data: Mapping[str, Any],
     metrics: Mapping[str, Any],
     driving_statistics: Mapping[str, Any],
+    folds: Mapping[str, Any] | None = None,
+    code: Mapping[str, Any] | None = None,
 ) -> None:
     """Save the generator with its description, atomically.
 
@@ -48,6 +51,8 @@ def save_generator(
         data: the recordings: file, scenes fitted and held out, counts.
         metrics: on the held-out scenes.
         driving_statistics: ``ganlane.data.DrivingStatistics.to_dict()`` of the recordings, for the overlays.
+        folds: what :func:`ganlane.generator.cross_validation.cross_validate` gave, if it was called.
+        code: the code's version in more detail than the package's number.
     """
     metadata = {
         "preset": preset,
@@ -56,6 +61,8 @@ def save_generator(
         "data": dict(data),
         "metrics": dict(metrics),
         "driving_statistics": dict(driving_statistics),
+        "folds": None if folds is None else dict(folds),
+        "code": {} if code is None else dict(code),
         "ganlane": ganlane.__version__,
     }
     save_weights(path, KIND, generator.state_dict(), metadata)
@@ -89,11 +96,13 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
 
 
 def _build(path: str | Path, metadata: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Generator:
-    """Networks of the stored sizes with the stored weights."""
-    sizes = metadata.get("sizes")
-    names = {field.name for field in fields(GeneratorSizes)}
-    if not isinstance(sizes, dict) or set(sizes) != names or not all(_is_size(value) for value in sizes.values()):
-        raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(names)}); fit it again.")
+    """Networks of the stored sizes with the stored weights; sizes named later have their defaults in older files."""
+    sizes: Any = metadata.get("sizes")
+    kinds = {field.name: type(field.default) for field in fields(GeneratorSizes)}
+    needed = set(kinds) - _NAMED_LATER
+    whole = isinstance(sizes, dict) and needed <= set(sizes) <= set(kinds)
+    if not whole or not all(_is_size(value, kinds[name]) for name, value in sizes.items()):
+        raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(kinds)}); fit it again.")
     try:
         with torch.random.fork_rng(devices=[]):
             generator = Generator(GeneratorSizes(**sizes))
@@ -105,6 +114,6 @@ def _build(path: str | Path, metadata: Mapping[str, Any], tensors: Mapping[str, 
     return generator
 
 
-def _is_size(value: Any) -> bool:
-    """A whole number that a layer can have; bounded, so that a damaged file cannot ask for all memory."""
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 4096
+def _is_size(value: Any, kind: type) -> bool:
+    """A switch, or a whole number that a layer can have: bounded, so a damaged file cannot ask for all memory."""
+    return isinstance(value, int) and type(value) is kind and (kind is bool or 0 <= value <= 4096)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+import sklearn
 import torch
 from sklearn.cluster import KMeans
 from torch import Tensor
 
-from ganlane.generator.windows import OBSERVED_POSITIONS, Windows
+from ganlane.generator.cache import cached, content_hash
+from ganlane.generator.windows import PRESENT, Windows
 
 
 @dataclass(frozen=True)
@@ -57,15 +59,29 @@ def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
 def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
     """Split the vehicles of every (scene, start) into k-means groups of about ``size`` and pad them.
 
-    The split looks at the last observed positions alone, and is the same for the same ``seed``.
+    The split looks at the last observed positions alone, and is the same for the same ``seed``. It takes most of the
+    time, so each scene's is kept (:mod:`ganlane.generator.cache`).
     """
-    now = windows.positions[:, OBSERVED_POSITIONS - 1]
-    change = np.flatnonzero(np.diff(windows.scene) | np.diff(windows.start)) + 1
+    now = windows.positions[:, PRESENT]
     labels, used = np.empty(len(now), dtype=np.int64), 0
-    for rows in np.split(np.arange(len(now)), change):
-        labels[rows] = used + kmeans_labels(now[rows], size, seed)
+    for rows in np.split(np.arange(len(now)), np.flatnonzero(np.diff(windows.scene)) + 1):
+        labels[rows] = used + _scene_labels(now[rows], windows.start[rows], size, seed)
         used = int(labels[rows].max()) + 1
     return _pad(windows, now, labels)
+
+
+def _scene_labels(now: np.ndarray, start: np.ndarray, size: int, seed: int) -> np.ndarray:
+    """Group number [W] of every window of one scene."""
+
+    def compute() -> dict[str, np.ndarray]:
+        labels, used = np.empty(len(now), dtype=np.int64), 0
+        for rows in np.split(np.arange(len(now)), np.flatnonzero(np.diff(start)) + 1):
+            labels[rows] = used + kmeans_labels(now[rows], size, seed)
+            used = int(labels[rows].max()) + 1
+        return {"labels": labels}
+
+    settings = {"size": size, "seed": seed, "k-means": sklearn.__version__}
+    return cached("groups", content_hash(settings, now, start), compute)["labels"]
 
 
 def _pad(windows: Windows, now: np.ndarray, labels: np.ndarray) -> Groups:

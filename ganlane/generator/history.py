@@ -16,12 +16,18 @@ class History(NamedTuple):
     """Kept motions of [N, M] vehicles.
 
     Attributes:
-        projections: [N, M, observed - 1, 4H], input projections of the last motions, oldest first.
+        motions: observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest first. They are not
+            one tensor, since all of it would have to be copied to move on by a step.
         displacement: [N, M, 2], the displacement of the newest of them, m per 0.1 s.
     """
 
-    projections: Tensor
+    motions: tuple[Tensor, ...]
     displacement: Tensor
+
+    @property
+    def projections(self) -> Tensor:
+        """The motions as one tensor [N, M, observed - 1, 4H]."""
+        return torch.stack(self.motions, dim=-2)
 
 
 def displacement_of(vehicles: Vehicles) -> Tensor:
@@ -36,14 +42,13 @@ def displacement_of(vehicles: Vehicles) -> Tensor:
 def start(generator: Generator, displacement: Tensor) -> History:
     """The past of a vehicle that has always moved by ``displacement`` [N, M, 2] a step."""
     one = generator.encoder.project(displacement, torch.zeros_like(displacement))
-    motions = generator.sizes.observed - 1
-    return History(one[..., None, :].expand(*one.shape[:-1], motions, -1).contiguous(), displacement)
+    return History((one,) * (generator.sizes.observed - 1), displacement)
 
 
 def recorded(generator: Generator, displacements: Tensor) -> History:
     """The past after the recorded ``displacements`` [N, M, observed - 1, 2]; its oldest motion stands twice."""
-    motions = generator.project(displacements)
-    return History(torch.cat([motions[..., :1, :], motions], dim=-2), displacements[..., -1, :])
+    motions = generator.project(displacements).unbind(dim=-2)
+    return History((motions[0], *motions), displacements[..., -1, :])
 
 
 def push(generator: Generator, history: History, displacement: Tensor) -> tuple[History, Tensor]:
@@ -53,8 +58,7 @@ def push(generator: Generator, history: History, displacement: Tensor) -> tuple[
     """
     difference = displacement - history.displacement
     new = generator.encoder.project(displacement, difference)
-    moved_on = torch.cat([history.projections[..., 1:, :], new[..., None, :]], dim=-2)
-    return History(moved_on, displacement), difference
+    return History((*history.motions[1:], new), displacement), difference
 
 
 def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor | None = None) -> Observation:
@@ -62,7 +66,7 @@ def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Ten
     if extra is None:
         extra = difference[..., :0]
     position = torch.stack([vehicles.x, vehicles.y], dim=-1)
-    return Observation(history.projections, history.displacement, difference, position, vehicles.valid, extra)
+    return Observation(history.motions, history.displacement, difference, position, vehicles.valid, extra)
 
 
 def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehicles:

@@ -1,4 +1,4 @@
-"""The fitting loop that both presets share: updates, evaluations on held-out scenes, early stopping, resuming."""
+"""The fitting loop that both presets share: updates, evaluations on validation scenes, early stopping, resuming."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class LoopConfig:
 
     Attributes:
         updates: updates at most; the learning rate falls to 0 over them.
-        evaluate_every: updates between two evaluations on the held-out scenes.
+        evaluate_every: updates between two evaluations on the validation scenes.
         patience: evaluations without improvement before stopping.
         learning_rate: of Adam, after the warm-up.
         warmup: updates over which the learning rate rises.
@@ -31,8 +31,8 @@ class LoopConfig:
         max_seconds: stop after this long; None is never.
     """
 
-    updates: int = 1600
-    evaluate_every: int = 200
+    updates: int = 1200
+    evaluate_every: int = 150
     patience: int = 8
     learning_rate: float = 4e-3
     warmup: int = 100
@@ -75,7 +75,7 @@ class FitTask(Protocol):
         """Do update ``number`` and return its losses."""
 
     def evaluate(self) -> float:
-        """Score on the held-out scenes; lower is better."""
+        """Score on the validation scenes; lower is better."""
 
 
 def learning_rate(config: LoopConfig, number: int) -> float:
@@ -91,24 +91,28 @@ class FitLoop:
         task: what is fitted.
         config: how long.
         resume_path: file in which the state is kept after every evaluation, and from which it goes on.
+
+    ``seconds`` is the time that the updates took, in earlier runs of the same fit too.
     """
 
     def __init__(self, task: FitTask, config: LoopConfig, resume_path: str | Path | None = None):
         self.task, self.config = task, config
         self.path = None if resume_path is None else Path(resume_path)
         self.done, self.waited, self.best_update, self.best = 0, 0, 0, math.inf
+        self.seconds = 0.0
         self.best_weights: dict[str, dict[str, Tensor]] = {}
         if self.path is not None and self.path.exists():
             self.load_state_dict(load_resume(self.path))
 
     def run(self, on_progress: OnProgress | None = None) -> None:
         """Fit, then put the best weights into the task's networks."""
-        begun, score = time.monotonic(), None
+        begun, earlier, score = time.monotonic(), self.seconds, None
         while self.done < self.config.updates and self.waited < self.config.patience:
             self._set_learning_rate()
             losses = self.task.update(self.done)
             self.done += 1
             seconds = time.monotonic() - begun
+            self.seconds = earlier + seconds
             late = self.config.max_seconds is not None and seconds > self.config.max_seconds
             if self.done % self.config.evaluate_every == 0 or self.done == self.config.updates or late:
                 score = self._evaluate()
@@ -140,6 +144,7 @@ class FitLoop:
         return {
             "counters": [self.done, self.waited, self.best_update],
             "best": self.best,
+            "seconds": self.seconds,
             "best_weights": self.best_weights,
             "modules": {name: module.state_dict() for name, module in self.task.modules.items()},
             "optimisers": {name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()},
@@ -163,6 +168,7 @@ class FitLoop:
             ) from error
         self.done, self.waited, self.best_update = state["counters"]
         self.best, self.best_weights = state["best"], state["best_weights"]
+        self.seconds = state["seconds"]
         self.task.random.set_state(state["random"])
 
 

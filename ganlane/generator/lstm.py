@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+
+from ganlane.generator.dense import apply, dense
 
 #: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the networks' units.
 DISPLACEMENT_SCALE_M = (1.0, 0.05)
@@ -30,11 +33,12 @@ class MotionLSTM(nn.Module):
     Args:
         embedding: width of the embedding.
         hidden: width H of the LSTM's state.
+        differences: whether it is shown the displacements' differences; without, they read as 0 (an ablation).
     """
 
-    def __init__(self, embedding: int, hidden: int):
+    def __init__(self, embedding: int, hidden: int, differences: bool = True):
         super().__init__()
-        self.hidden = hidden
+        self.hidden, self.differences = hidden, differences
         self.embed = nn.Linear(MOTION_FEATURES, embedding)
         self.input = nn.Linear(embedding, 4 * hidden)
         self.recurrent = nn.Parameter(torch.empty(4 * hidden, hidden))
@@ -45,15 +49,16 @@ class MotionLSTM(nn.Module):
 
     def project(self, displacement: Tensor, difference: Tensor) -> Tensor:
         """The input's share [..., 4H] in the gates; depends on this motion alone, so it can be kept."""
-        return self.input(torch.relu(self.embed(motion_features(displacement, difference))))
+        shown = difference if self.differences else torch.zeros_like(difference)
+        return apply(self.input, apply(self.embed, motion_features(displacement, shown), relu=True))
 
     def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]); returns the new state."""
-        return self._update(projected + hidden @ self.recurrent.T, cell)
+        return self._update(dense(hidden, self.recurrent).add_(projected), cell)
 
-    def encode(self, projections: Tensor) -> Tensor:
-        """Last hidden state [..., H] after the projections [..., T, 4H], from a state of zeros."""
-        steps = projections.unbind(dim=-2)
+    def encode(self, projections: Tensor | Sequence[Tensor]) -> Tensor:
+        """Last hidden state [..., H] after the projections [..., T, 4H], or T of [..., 4H], from a state of zeros."""
+        steps = projections.unbind(dim=-2) if isinstance(projections, Tensor) else projections
         hidden, cell = self._update(steps[0], torch.zeros_like(steps[0][..., : self.hidden]))
         for projected in steps[1:]:
             hidden, cell = self.step(projected, hidden, cell)
@@ -63,5 +68,10 @@ class MotionLSTM(nn.Module):
     def _update(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         width = cell.shape[-1]
         take, keep, show = torch.sigmoid(gates[..., : 3 * width]).chunk(3, dim=-1)
-        cell = keep * cell + take * torch.tanh(gates[..., 3 * width :])
-        return show * torch.tanh(cell), cell
+        cell = keep * cell + take * _tanh(gates[..., 3 * width :])
+        return show * _tanh(cell), cell
+
+
+def _tanh(x: Tensor) -> Tensor:
+    """The hyperbolic tangent by way of the sigmoid, which on a CPU takes a quarter of the time of ``torch.tanh``."""
+    return 2.0 * torch.sigmoid(2.0 * x) - 1.0

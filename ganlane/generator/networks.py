@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from ganlane.generator.dense import apply
 from ganlane.generator.lstm import DIFFERENCE_SCALE_M, MotionLSTM
 from ganlane.generator.pooling import PairPooling
 
@@ -23,10 +25,11 @@ class GeneratorSizes:
         pooled: width of its result.
         context: width of the layer between encoder and decoder.
         noise: width Z of the latent vector; below ``hidden``.
-        neighbours: how many of the nearest vehicles are pooled.
+        neighbours: how many of the nearest vehicles are pooled; 0 is no pooling (an ablation).
         extra_inputs: numbers per vehicle beside its motion (0 for the paper's preset, positions only).
         observed: displacements that are observed (the paper's ``o_l``).
         predicted: displacements that are predicted (the paper's ``p_l``).
+        differences: whether the displacements' differences are inputs too; false is an ablation.
     """
 
     embedding: int = 64
@@ -39,6 +42,7 @@ class GeneratorSizes:
     extra_inputs: int = 0
     observed: int = 8
     predicted: int = 8
+    differences: bool = True
 
 
 class Observation(NamedTuple):
@@ -47,7 +51,7 @@ class Observation(NamedTuple):
     Attributes:
         projections: [B, G, observed - 1, 4H], input projections of the observed motions
             (:meth:`Generator.project`), oldest first. A motion is a displacement and its difference to the one
-            before, so 8 displacements are 7 motions.
+            before, so 8 displacements are 7 motions. Or as many tensors [B, G, 4H].
         displacement: [B, G, 2], the last displacement, m per 0.1 s.
         difference: [B, G, 2], its difference to the one before, m.
         position: [B, G, 2], m, relative to any common point.
@@ -55,7 +59,7 @@ class Observation(NamedTuple):
         extra: [B, G, extra_inputs].
     """
 
-    projections: Tensor
+    projections: Tensor | Sequence[Tensor]
     displacement: Tensor
     difference: Tensor
     position: Tensor
@@ -73,13 +77,13 @@ class Generator(nn.Module):
     def __init__(self, sizes: GeneratorSizes):
         super().__init__()
         self.sizes = sizes
-        self.encoder = MotionLSTM(sizes.embedding, sizes.hidden)
+        self.encoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
         self.pooling = PairPooling(sizes.hidden, sizes.pooling, sizes.pooled, sizes.neighbours)
         inputs = sizes.hidden + sizes.pooled + sizes.extra_inputs
         self.context = nn.Sequential(
             nn.Linear(inputs, sizes.context), nn.ReLU(), nn.Linear(sizes.context, sizes.hidden - sizes.noise)
         )
-        self.decoder = MotionLSTM(sizes.embedding, sizes.hidden)
+        self.decoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
         self.head = nn.Linear(sizes.hidden, 2)
 
     def project(self, displacements: Tensor) -> Tensor:
@@ -96,7 +100,8 @@ class Generator(nn.Module):
         """Context [B, G, H - Z] of every vehicle: its own motion, its neighbours, its further inputs."""
         hidden = self.encoder.encode(seen.projections)
         pooled = self.pooling(hidden, seen.position, seen.displacement, seen.valid)
-        return self.context(torch.cat([hidden, pooled, seen.extra], dim=-1))
+        first, _, second = self.context
+        return apply(second, apply(first, torch.cat([hidden, pooled, seen.extra], dim=-1), relu=True))
 
     def decode(self, context: Tensor, noise: Tensor, seen: Observation, steps: int) -> Tensor:
         """Output of the decoder's first ``steps`` steps [..., steps, 2], in units of ``DIFFERENCE_SCALE_M``.
@@ -110,7 +115,7 @@ class Generator(nn.Module):
         displacement, difference, outputs = seen.displacement, seen.difference, []
         for _ in range(steps):
             hidden, cell = self.decoder.step(self.decoder.project(displacement, difference), hidden, cell)
-            outputs.append(self.head(hidden))
+            outputs.append(apply(self.head, hidden))
             difference = outputs[-1] * scale
             displacement = displacement + difference
         return torch.stack(outputs, dim=-2)

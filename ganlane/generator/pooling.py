@@ -1,8 +1,8 @@
 """Social pooling over pairs of vehicles: masked, padded, the nearest only, the first layer split in two.
 
 The original (Gupta et al. 2018) loops over scenes and runs a layer on the concatenation of relative position
-and the other's state for every pair. That layer is linear, so it is the sum of a part per vehicle (computed
-once for each) and a part per pair (four numbers wide).
+and the other's state for every pair. That layer is linear and looks at differences of positions, so it is a part of
+the other less a part of one's own: computed once for each vehicle, subtracted for every pair.
 """
 
 from __future__ import annotations
@@ -10,12 +10,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from ganlane.generator.dense import apply
+
 #: Relative position and relative displacement, in these units (m, m per 0.1 s), along and across the road.
 _POSITION_SCALE_M = (20.0, 4.0)
 _MOTION_SCALE_M = (0.4, 0.05)
 #: Who is further away than this, along the road, has no influence.
 RANGE_M = 100.0
 _PAIR_FEATURES = 4
+#: Taken from what does not count: far below everything that does.
+_BEYOND = 1e9
 
 
 def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | None, Tensor]:
@@ -52,7 +56,7 @@ class PairPooling(nn.Module):
         hidden: width H of the vehicles' states.
         inner: width of the first layer.
         pooled: width P of the result.
-        neighbours: how many of the nearest count.
+        neighbours: how many of the nearest count; with 0 everybody is alone.
     """
 
     def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
@@ -64,14 +68,24 @@ class PairPooling(nn.Module):
 
     def forward(self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor) -> Tensor:
         """Pooled states [B, G, P] of states [B, G, H], positions and displacements [B, G, 2] and mask [B, G]."""
+        if self.neighbours == 0:
+            return hidden.new_zeros(*hidden.shape[:-1], self.second.out_features)
         index, seen = nearest(position, valid, self.neighbours)
-        pairs = self.pair_features(position, displacement, index)
-        first = torch.relu(self.per_pair(pairs) + gather_vehicles(self.per_vehicle(hidden), index))
-        return (torch.relu(self.second(first)) * seen[..., None]).amax(dim=-2)
+        # Positions from the first vehicle: far down the road differences of large numbers would lose digits.
+        state = _scaled(position - position[..., :1, :], displacement)
+        own = nn.functional.linear(state, self.per_pair.weight)
+        others = gather_vehicles(apply(self.per_vehicle, hidden) + own + self.per_pair.bias, index)
+        first = (others - own[..., None, :]).relu_()
+        second = apply(self.second, first).add_(~seen[..., None], alpha=-_BEYOND)
+        return torch.relu(second.amax(dim=-2))
 
     @staticmethod
     def pair_features(position: Tensor, displacement: Tensor, index: Tensor | None) -> Tensor:
         """Relative position and relative displacement [B, G, K, 4] of the neighbours at ``index``, scaled."""
-        scale = position.new_tensor((*_POSITION_SCALE_M, *_MOTION_SCALE_M))
-        state = torch.cat([position, displacement], dim=-1)
-        return (gather_vehicles(state, index) - state[..., None, :]) / scale
+        state = _scaled(position, displacement)
+        return gather_vehicles(state, index) - state[..., None, :]
+
+
+def _scaled(position: Tensor, displacement: Tensor) -> Tensor:
+    scale = position.new_tensor((*_POSITION_SCALE_M, *_MOTION_SCALE_M))
+    return torch.cat([position, displacement], dim=-1) / scale

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
+from ganlane.generator.anchored import ANCHOR, AnchorParameters
 from ganlane.generator.losses import distance, energy_score
 from ganlane.generator.metrics import Metrics
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollouts import rollout
-from ganlane.generator.stretches import PRESENT, RolloutScenes, SceneSource, cut_stretches
+from ganlane.generator.stretches import RolloutScenes, SceneSource, cut_stretches
 from ganlane.generator.traits import typical_traits
-from ganlane.generator.windows import PREDICTED_STEPS
+from ganlane.generator.windows import PREDICTED_STEPS, PRESENT
 
+#: Headways and desired speeds [B, V] that the vehicles of a stretch drive with.
+Traits = Callable[[RolloutScenes], tuple[Tensor, Tensor]]
 #: Stretches rolled out in one pass; bounds the memory.
 _CHUNK = 16
 
@@ -27,21 +32,33 @@ def closed_form_errors(scenes: RolloutScenes) -> Tensor:
 
 @torch.no_grad()
 def stretch_errors(
-    generator: Generator, scenes: RolloutScenes, noise_period_s: float, random: torch.Generator
+    generator: Generator,
+    scenes: RolloutScenes,
+    noise_period_s: float,
+    random: torch.Generator,
+    parameters: AnchorParameters = ANCHOR,
+    traits: Traits = typical_traits,
 ) -> dict[str, Tensor]:
     """Errors [B, H, V] in m: z = 0 (``mean``), one sample (``single``), ``constant_velocity``, and ``energy``.
 
     Target lanes are the present ones and the traits look at the present alone, so nothing of the future leaks in.
     """
     scenes = scenes.without_intentions()
-    headway, desired = typical_traits(scenes)
+    headway, desired = traits(scenes)
     fresh = torch.randn(
         scenes.future.shape[1] + 1, 2 * len(headway), headway.shape[1], generator.sizes.noise, generator=random
     )
     quiet = torch.zeros_like(fresh[:, : len(headway)])
     noise = torch.cat([quiet, fresh], dim=1)
     course = rollout(
-        generator, scenes.repeated(3), headway.repeat(3, 1), desired.repeat(3, 1), noise[0], noise[1:], noise_period_s
+        generator,
+        scenes.repeated(3),
+        headway.repeat(3, 1),
+        desired.repeat(3, 1),
+        noise[0],
+        noise[1:],
+        noise_period_s,
+        parameters,
     )
     mean, one, other = course.chunk(3)
     return {
@@ -53,7 +70,14 @@ def stretch_errors(
 
 
 def rollout_metrics(
-    generator: Generator, sources: list[SceneSource], horizon: int, stride: int, noise_period_s: float, seed: int = 0
+    generator: Generator,
+    sources: list[SceneSource],
+    horizon: int,
+    stride: int,
+    noise_period_s: float,
+    seed: int = 0,
+    parameters: AnchorParameters = ANCHOR,
+    traits: Traits = typical_traits,
 ) -> Metrics:
     """Errors on stretches of held-out scenes, for all and for each scene.
 
@@ -67,7 +91,8 @@ def rollout_metrics(
         cuts = [(source, row) for row in source.starts(horizon, stride)]
         for chunk in (cuts[at : at + _CHUNK] for at in range(0, len(cuts), _CHUNK)):
             scenes = cut_stretches(chunk, horizon)
-            part = (stretch_errors(generator, scenes, noise_period_s, random), scenes.scored)
+            errors = stretch_errors(generator, scenes, noise_period_s, random, parameters, traits)
+            part = (errors, scenes.scored)
             collected["all"].append(part)
             collected.setdefault(source.scene.name, []).append(part)
     return {name: _summary(parts, horizon) for name, parts in collected.items()}

@@ -1,6 +1,8 @@
-"""Whole recorded scenes driven on by the model: everybody jointly, step by step."""
+"""Whole recorded scenes driven on by a model: everybody jointly, step by step."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -9,8 +11,8 @@ from ganlane.generator.anchored import ANCHOR, AnchorParameters, DriverMemory, a
 from ganlane.generator.history import recorded
 from ganlane.generator.networks import Generator
 from ganlane.generator.noise import wander
-from ganlane.generator.stretches import PRESENT, RolloutScenes
-from ganlane.generator.windows import OBSERVED_POSITIONS
+from ganlane.generator.stretches import RolloutScenes
+from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.lanes import ENTRY_M, Visibility
 from ganlane.sim.vehicles import Vehicles
@@ -42,6 +44,28 @@ def recorded_vehicles(scenes: RolloutScenes, frame: int, desired_speed: Tensor) 
     )
 
 
+#: One step: the vehicles 0.1 s later, given them now and the number of the step.
+Move = Callable[[Vehicles, int], Vehicles]
+
+
+def drive(scenes: RolloutScenes, desired_speed: Tensor, move: Move) -> Tensor:
+    """Positions [B, H, V, 2] in m when ``move`` drives everybody jointly for H steps after the observed frames.
+
+    Vehicles that come later start when they appear, at their first recorded place and with the velocity of their
+    first displacement, and are driven from there on. One whose recording ends vanishes at that frame.
+    """
+    vehicles, course = recorded_vehicles(scenes, PRESENT, desired_speed), []
+    appeared = scenes.present.cumsum(dim=1) > 0
+    for step in range(scenes.positions.shape[1] - OBSERVED_POSITIONS):
+        moved = move(vehicles, step)
+        entering = recorded_vehicles(scenes, PRESENT + step + 1, desired_speed)
+        vehicles = moved.where(appeared[:, PRESENT + step], entering).with_(
+            valid=entering.valid, target_lane=entering.target_lane
+        )
+        course.append(torch.stack([vehicles.x, vehicles.y], dim=-1))
+    return torch.stack(course, dim=1)
+
+
 def rollout(
     generator: Generator,
     scenes: RolloutScenes,
@@ -52,9 +76,7 @@ def rollout(
     noise_period_s: float = 5.0,
     parameters: AnchorParameters = ANCHOR,
 ) -> Tensor:
-    """Positions [B, H, V, 2] in m when the model drives the observed vehicles jointly for H steps.
-
-    Vehicles that come later are replayed from the moment they appear, and one whose recording ends vanishes.
+    """Positions [B, H, V, 2] in m when the model drives everybody jointly (:func:`drive`).
 
     Args:
         generator: of the calibrated preset.
@@ -66,13 +88,13 @@ def rollout(
     """
     past = scenes.positions[:, :OBSERVED_POSITIONS].diff(dim=1).transpose(1, 2)
     history = recorded(generator, past[..., :-1, :])
-    memory = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway)
-    vehicles, driven, road, course = recorded_vehicles(scenes, PRESENT, desired_speed), scenes.driven, scenes.road, []
-    for step in range(scenes.positions.shape[1] - OBSERVED_POSITIONS):
+    memory, road = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway), scenes.road
+
+    def move(vehicles: Vehicles, step: int) -> Vehicles:
+        nonlocal memory, noise
         moved, memory = anchored_step(generator, vehicles, road, memory, noise, parameters)
-        replayed = recorded_vehicles(scenes, PRESENT + step + 1, desired_speed)
-        vehicles = moved.where(driven, replayed).with_(valid=replayed.valid, target_lane=replayed.target_lane)
-        course.append(torch.stack([vehicles.x, vehicles.y], dim=-1))
         if fresh is not None:
             noise = wander(noise, fresh[step], noise_period_s)
-    return torch.stack(course, dim=1)
+        return moved
+
+    return drive(scenes, desired_speed, move)

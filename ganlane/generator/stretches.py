@@ -9,12 +9,10 @@ import torch
 from torch import Tensor
 
 from ganlane.generator.tracks import SceneTracks
-from ganlane.generator.windows import OBSERVED_POSITIONS
+from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.road import Road
 
-#: Row of the last observed position.
-PRESENT = OBSERVED_POSITIONS - 1
 #: A recorded driver's target lane is the one it will be in after this time (fitting), s.
 INTENTION_S = 2.0
 
@@ -124,6 +122,11 @@ class SceneSource:
         """Rows at which 9 + ``horizon`` frames begin in which the model has somebody to drive."""
         rows = range(0, len(self.positions) - OBSERVED_POSITIONS - horizon + 1, stride)
         return [row for row in rows if self.scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
+
+
+def scene_sources(scenes: list[SceneTracks], lane_widths: dict[str, float]) -> list[SceneSource]:
+    """Sources of all ``scenes``; ``lane_widths`` in m by the scenes' names."""
+    return [SceneSource.of(scene, lane_widths[scene.name]) for scene in scenes]
 
 
 def cut_stretches(cuts: list[tuple[SceneSource, int]], horizon: int) -> RolloutScenes:

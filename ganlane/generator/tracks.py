@@ -66,23 +66,3 @@ def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
         raise UserError("trajectory frame: no rows; give recordings of at least 1.7 s.")
     names = sorted(frame["scene"].unique().to_list())
     return [_one_scene(name, frame.filter(pl.col("scene") == name)) for name in names]
-
-
-def split_scenes(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> tuple[list[SceneTracks], list[SceneTracks]]:
-    """(fitted, held out), split by the scenes' names.
-
-    Raises:
-        UserError: a held-out name is not among the scenes, or one of the two parts is empty.
-    """
-    names = [scene.name for scene in scenes]
-    unknown = sorted(set(held_out) - set(names))
-    if unknown:
-        raise UserError(f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these.")
-    fitted = [scene for scene in scenes if scene.name not in held_out]
-    kept = [scene for scene in scenes if scene.name in held_out]
-    if not fitted or not kept:
-        raise UserError(
-            f"data.held_out={list(held_out)}: of the scenes {names} at least one must be held out and one fitted to; "
-            "name some in data.held_out."
-        )
-    return fitted, kept

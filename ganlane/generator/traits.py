@@ -10,7 +10,9 @@ from torch import Tensor
 
 from ganlane.data import DrivingStatistics
 from ganlane.generator.rollouts import recorded_vehicles
-from ganlane.generator.stretches import PRESENT, RolloutScenes
+from ganlane.generator.stretches import RolloutScenes
+from ganlane.generator.windows import PRESENT
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
 
 #: Levels of the headway quantiles.
@@ -23,6 +25,8 @@ SHORTEST_HEADWAY_S = 0.1
 _MIN_GAP_M = 2.0
 #: Desired speed above the present one, m/s: range drawn from in fitting, and the middle used in evaluation.
 DESIRED_EXCESS_MPS = (1.0, 11.0)
+#: Everybody's desired speed where there are no traits: the middle of Table II's, m/s.
+COMMON_SPEED_MPS = 22.0
 #: In fitting the headways are scattered by this factor's logarithm, so that the network sees drivers off balance.
 _SCATTER = 0.25
 
@@ -67,6 +71,12 @@ def fitting_traits(scenes: RolloutScenes, random: torch.Generator) -> tuple[Tens
     low, high = DESIRED_EXCESS_MPS
     desired = _present_speed(scenes) + low + (high - low) * u[0]
     return balanced_headway(scenes, desired, headway_from_uniform(u[1])) * scatter, desired
+
+
+def common_traits(scenes: RolloutScenes) -> tuple[Tensor, Tensor]:
+    """What everybody has where there are no traits (an ablation), [B, V] each: Table V's headway, 22 m/s."""
+    headway = torch.full_like(scenes.length, TABLE_V.headway_s)
+    return headway, torch.full_like(headway, COMMON_SPEED_MPS)
 
 
 def typical_traits(scenes: RolloutScenes) -> tuple[Tensor, Tensor]:

@@ -47,6 +47,10 @@ class Purpose(IntEnum):
     REPLAY_START = 15
     NOISE = 16  # and the 47 purposes after it: the generator's latent vector, one per dimension
     RECYCLE = 64
+    SENSED_POSITION = 65
+    SENSED_LATERAL = 66
+    SENSED_SPEED = 67
+    SENSED_DROPOUT = 68
 
 
 def _shift(h: Tensor, bits: int) -> Tensor:

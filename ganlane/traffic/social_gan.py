@@ -34,8 +34,8 @@ _MOST_NOISE = int(Purpose.RECYCLE) - int(Purpose.NOISE)
 class GeneratedTraffic(TrafficModule):
     """What both presets share: the history and the latent vectors.
 
-    Memory: ``projections`` [N, M, observed - 1, 4H] (input projections of the last motions), ``displacement``
-    [N, M, 2] (the newest of them, m), ``noise`` [N, M, Z].
+    Memory: ``motion_0``, ``motion_1`` and so on, [N, M, 4H] each (input projections of the last observed - 1 motions,
+    oldest first), ``displacement`` [N, M, 2] (the newest of them, m), ``noise`` [N, M, Z].
 
     Args:
         generator: the fitted network (:func:`ganlane.generator.load_generator`).
@@ -67,21 +67,30 @@ class GeneratedTraffic(TrafficModule):
             )
         self.generator = generator
         self.noise_period_s, self.noise_scale = noise_period_s, noise_scale
+        self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
 
     @property
     def memory_fields(self) -> MemoryFields:  # type: ignore[override]
         """Trailing shapes of the memory."""
         sizes = self.generator.sizes
-        motions = (sizes.observed - 1, 4 * sizes.hidden)
-        return {"projections": (motions, None), "displacement": ((2,), None), "noise": ((sizes.noise,), None)}
+        motions: MemoryFields = {name: ((4 * sizes.hidden,), None) for name in self.motions}
+        return {**motions, "displacement": ((2,), None), "noise": ((sizes.noise,), None)}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
         """Straight driving at the present speed, and latent vectors of this episode."""
         along = vehicles.speed * PHYSICS_STEP_S
         history = start(self.generator, torch.stack([along, torch.zeros_like(along)], dim=-1))
         noise = normal(key, -1, vehicles.x.shape[1], self.purposes, vehicles.x.dtype)
-        return {"projections": history.projections, "displacement": history.displacement, "noise": noise}
+        return {**self.kept(history), "noise": noise}
+
+    def history(self, memory: dict[str, Tensor]) -> History:
+        """The past of all drivers."""
+        return History(tuple(memory[name] for name in self.motions), memory["displacement"])
+
+    def kept(self, history: History) -> dict[str, Tensor]:
+        """The past as it stands in the memory; its motions are moved on by name, not copied."""
+        return {**dict(zip(self.motions, history.motions)), "displacement": history.displacement}
 
     def next_noise(self, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> Tensor:
         """The latent vectors [N, M, Z] for this step."""
@@ -141,9 +150,9 @@ class SocialGanTraffic(GeneratedTraffic):
         """Predict, and drive the first displacement (or what is left of the plan)."""
         noise = self.next_noise(memory, key, step)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
-        history = History(memory["projections"], memory["displacement"])
+        history = self.history(memory)
         moved, history, plan = paper_step(self.generator, vehicles, history, self.noise_scale * noise, plan)
-        kept = {**history._asdict(), "noise": noise}
+        kept = {**self.kept(history), "noise": noise}
         return moved, kept if plan is None else {**kept, "plan": plan.ahead, "plan_left": plan.left}
 
 
@@ -190,13 +199,12 @@ class AnchoredGanTraffic(GeneratedTraffic):
     def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
         """One :func:`~ganlane.generator.anchored.anchored_step`."""
         noise = self.next_noise(memory, key, step)
-        history = History(memory["projections"], memory["displacement"])
-        driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
+        driver = DriverMemory(self.history(memory), memory["residual_mean"], memory["headway"])
         moved, driver = anchored_step(
             self.generator, vehicles, self.road, driver, self.noise_scale * noise, self.parameters
         )
         return moved, {
-            **driver.history._asdict(),
+            **self.kept(driver.history),
             "noise": noise,
             "residual_mean": driver.mean,
             "headway": driver.headway,

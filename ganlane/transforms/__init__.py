@@ -4,9 +4,20 @@ Each reads TensorDict keys that :class:`ganlane.env.HighwayEnv` writes and adds 
 stands in the same place::
 
     TransformedEnv(env, Compose(MyObservation(env), RewardTransform()))
+
+:class:`SensorTransform`, before the observation, puts sensor errors between the true state and what the agent sees.
 """
 
 from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, observation_size
 from ganlane.transforms.reward import RewardParameters, RewardTransform
+from ganlane.transforms.sensors import SensorParameters, SensorTransform
 
-__all__ = ["OBSERVATIONS", "ObservationTransform", "RewardParameters", "RewardTransform", "observation_size"]
+__all__ = [
+    "OBSERVATIONS",
+    "ObservationTransform",
+    "RewardParameters",
+    "RewardTransform",
+    "SensorParameters",
+    "SensorTransform",
+    "observation_size",
+]

@@ -16,6 +16,7 @@ from ganlane.errors import UserError
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.transforms.lane_view import LANE_VIEW_SIZE, lane_view
+from ganlane.transforms.sensors import perceived
 from ganlane.transforms.table3 import (
     ObservationScale,
     as_list,
@@ -41,7 +42,7 @@ def observation_size(name: str, vehicles: int) -> int:
 
 
 class ObservationTransform(Transform):
-    """Write ``observation`` [N, D] from the raw state.
+    """Write ``observation`` [N, D] from the raw state, the others as ``perceived`` has them where it is there.
 
     Args:
         road: the environment's.
@@ -64,13 +65,23 @@ class ObservationTransform(Transform):
         self.road, self.vehicles, self.form = road, vehicles, form
         self.scale = scale or ObservationScale()
 
-    def observe(self, vehicles: Vehicles, progress: Tensor, direction: Tensor, road: Road) -> Tensor:
-        """The observation [N, D]; ``progress`` and ``direction`` [N] of the ego's own lane change."""
+    def observe(
+        self, vehicles: Vehicles, progress: Tensor, direction: Tensor, road: Road, seen: Vehicles | None = None
+    ) -> Tensor:
+        """The observation [N, D].
+
+        Args:
+            vehicles: the true state; without ``seen`` also what the ego sees of the others.
+            progress, direction: of the ego's own lane change, [N].
+            road: where it drives.
+            seen: the others as the ego perceives them, and where it was itself when it did (column 0).
+        """
+        seen = vehicles if seen is None else seen
         listed, viewed, with_progress = OBSERVATIONS[self.form]
-        others = other_vehicles(vehicles, road, self.scale)
+        others = other_vehicles(seen, road, self.scale)
         parts = [own_state(vehicles, road)]
         if listed:
-            parts.append(as_list(nearest_first(others, distance_to_ego(vehicles, road))))
+            parts.append(as_list(nearest_first(others, distance_to_ego(seen, road))))
         if viewed:
             parts.append(lane_view(others, road.lanes, self.scale))
         if with_progress:
@@ -84,7 +95,9 @@ class ObservationTransform(Transform):
     def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict.get(keys.EGO)
         road = road_in(tensordict, self.road)
-        observation = self.observe(vehicles, ego.get("change_progress"), ego.get("change_direction"), road)
+        observation = self.observe(
+            vehicles, ego.get("change_progress"), ego.get("change_direction"), road, perceived(tensordict, vehicles)
+        )
         return tensordict.set(keys.OBSERVATION, observation)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
+from ganlane.sim.road import road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.view.trajectory import EpisodeLabel, Trajectory
 
@@ -100,9 +101,9 @@ def _listening(env: EnvBase, recorder: Recorder) -> Iterator[None]:
         base.recorder = before
 
 
-def _label(env: EnvBase, agent: str, traffic: str, seed: int, episode: int) -> EpisodeLabel:
-    """The label of row 0, with the road as the environment has it."""
-    road = innermost(env).road
+def _label(env: EnvBase, state: TensorDictBase, agent: str, traffic: str, seed: int, episode: int) -> EpisodeLabel:
+    """The label of row 0, with its road: a replayed scene's stands in ``state``, else it is the environment's."""
+    road = road_in(state, innermost(env).road)
     lanes, width = (torch.as_tensor(value).flatten()[0].item() for value in (road.lanes, road.lane_width_m))
     return EpisodeLabel(agent, traffic, seed, episode, int(lanes), float(width))
 
@@ -131,13 +132,14 @@ def record_episode(
     recorder = Recorder()
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _listening(env, recorder):
         state = env.reset(start_of(env, [episode], seed))
+        label = _label(env, state, agent, traffic, seed, episode)
         recorder.add(state[keys.VEHICLES], 0.0)
         outcome, done = "", False
         while not done and recorder.time_s[-1] < max_time_s - 1e-6:
             state = _decide(env, policy(state), recorder)
             done = bool(state["done"][0])
             outcome = _outcome(state) if done else ""
-    return recorder.trajectory(_label(env, agent, traffic, seed, episode), outcome)
+    return recorder.trajectory(label, outcome)
 
 
 def _decide(env: EnvBase, state: TensorDictBase, recorder: Recorder) -> TensorDictBase:

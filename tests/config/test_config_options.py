@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 from hydra.core.config_store import ConfigStore
@@ -13,6 +14,7 @@ from ganlane.__main__ import COMMANDS
 from ganlane.agents import RainbowConfig
 from ganlane.config.agent import AgentConfig, DqnConfig
 from ganlane.config.compose import check
+from ganlane.config.data import NgsimDataConfig
 from ganlane.config.env import EgoConfig, EnvConfig, IdmConfig, MobilConfig
 from ganlane.config.generator import (
     CalibratedGeneratorConfig,
@@ -21,10 +23,18 @@ from ganlane.config.generator import (
     PaperGeneratorConfig,
     WeightOptions,
 )
-from ganlane.config.observation import FORMS, ObservationConfig
+from ganlane.config.observation import FORMS, ObservationConfig, SensorsConfig
 from ganlane.config.plain import plain_copy
 from ganlane.config.reward import RewardConfig
 from ganlane.config.store import SCHEMAS, SUFFIX, register
+from ganlane.config.traffic_faults import (
+    AbortFaultsConfig,
+    BrakingFaultsConfig,
+    HesitationFaultsConfig,
+    IdmFaultsTrafficConfig,
+    ReactionFaultsConfig,
+)
+from ganlane.data import NgsimParameters
 from ganlane.env import EpisodeParameters
 from ganlane.generator import (
     CalibratedConfig,
@@ -37,11 +47,15 @@ from ganlane.generator import (
 from ganlane.paths import conf_folder
 from ganlane.sim import IdmParameters, MobilParameters, SpawnParameters
 from ganlane.sim.ego import EgoParameters
-from ganlane.transforms import OBSERVATIONS, RewardParameters
+from ganlane.traffic import AbortFaults, BrakingFaults, HesitationFaults, ReactionFaults
+from ganlane.traffic.presets import DriverFaults
+from ganlane.transforms import OBSERVATIONS, RewardParameters, SensorParameters
 from ganlane.transforms.table3 import ObservationScale
 
 #: Group to a command that has it.
 USED_BY = {"data": "train_generator", "generator": "train_generator"}
+#: What an option cannot do without.
+NEEDS = {("env", "scene"): [f"env.scene.path={Path(__file__).parents[1] / 'reference' / 'scene.csv'}"]}
 OPTIONS = sorted((path.parent.name, path.stem) for path in conf_folder().glob("*/*.yaml"))
 
 
@@ -53,15 +67,16 @@ def test_every_command_composes_with_its_defaults(command):
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes(group, option):
     # The shipped agent may not be there yet, but its option must compose all the same.
-    check(USED_BY.get(group, "train"), [f"{group}={option}"])
+    check(USED_BY.get(group, "train"), [f"{group}={option}", *NEEDS.get((group, option), [])])
 
 
 @pytest.mark.parametrize(("group", "option"), [pair for pair in OPTIONS if pair[0] != "experiment"])
 def test_yaml_and_dataclass_hold_the_same_values(group, option):
-    composed = check(USED_BY.get(group, "train"), [f"{group}={option}"]).config
+    needed = NEEDS.get((group, option), [])
+    composed = check(USED_BY.get(group, "train"), [f"{group}={option}", *needed]).config
     value = getattr(composed, group)
-    if group == "env" and option == "dense":
-        assert value == type(value)()
+    if needed:
+        assert value == type(value)(scene=value.scene)
         return
     expected = type(value)(form=option) if group == "observation" else type(value)()
     assert value == expected
@@ -100,10 +115,16 @@ MIRRORS = [
     (AgentConfig(), RainbowConfig, set()),
     (RewardConfig(), RewardParameters, set()),
     (ObservationConfig(), ObservationScale, set()),
+    (SensorsConfig(), SensorParameters, set()),
+    (NgsimDataConfig(), NgsimParameters, {"block_bytes"}),
     (LoopOptions(), LoopConfig, set()),
     (WeightOptions(), LossWeights, set()),
     (PaperGeneratorConfig(), PaperConfig, {"sizes", "loop", "weights", "seed"}),
     (CalibratedGeneratorConfig(), CalibratedConfig, {"sizes", "loop", "seed"}),
+    (BrakingFaultsConfig(), BrakingFaults, set()),
+    (ReactionFaultsConfig(), ReactionFaults, set()),
+    (HesitationFaultsConfig(), HesitationFaults, set()),
+    (AbortFaultsConfig(), AbortFaults, set()),
 ]
 
 
@@ -123,8 +144,22 @@ def test_calibrated_loop_is_the_presets_own():
     assert CalibratedLoopOptions().parameters() == CalibratedConfig().loop
 
 
+def test_faults_of_the_command_line_reach_the_traffic():
+    assert IdmFaultsTrafficConfig().arguments() == {"faults": DriverFaults()}
+    mild = IdmFaultsTrafficConfig(late_reaction=ReactionFaultsConfig(per_hour=0.0)).faults()
+    assert mild.late_reaction == ReactionFaults(per_hour=0.0)
+    assert mild.phantom_braking == BrakingFaults()
+
+
 def test_observation_forms_are_those_of_the_transform():
     assert set(FORMS) == set(OBSERVATIONS)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_sensors_are_perfect_unless_an_error_is_asked_for(form):
+    assert check("train", [f"observation={form}"]).config.observation.sensors is None
+    late = check("train", [f"observation={form}", "observation.sensors.delay_s=2"]).config.observation
+    assert late == ObservationConfig(form, sensors=SensorsConfig(delay_s=2.0))
 
 
 def test_dqn_switches_every_component_off():

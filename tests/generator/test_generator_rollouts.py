@@ -80,14 +80,26 @@ def test_a_rollout_is_the_same_with_more_padding(sources, generator):
     torch.testing.assert_close(padded[:, :, :7], course)
 
 
-def test_vehicles_that_come_later_are_replayed(sources, generator):
-    scenes = cut_stretches([(sources[0], 0)], horizon=5)
-    scenes.present[:, :7, 2] = False
-    assert not scenes.driven[0, 2]
+def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(sources, generator):
+    scenes = cut_stretches([(sources[0], 0)], horizon=9)
+    scenes.present[:, :12, 2] = False
     headway, desired = typical_traits(scenes)
     course = rollout(generator, scenes, headway, desired, torch.zeros(1, 7, 4))
-    torch.testing.assert_close(course[:, :, 2], scenes.future[:, :, 2])
+    torch.testing.assert_close(course[:, :4, 2], scenes.future[:, :4, 2])
+    assert not torch.allclose(course[:, 4:, 2], scenes.future[:, 4:, 2], atol=1e-5)
     assert not scenes.scored[0, :, 2].any()
+
+
+def test_where_a_later_vehicle_goes_is_not_told(sources, generator):
+    scenes = cut_stretches([(sources[0], 0)], horizon=9)
+    scenes.present[:, :12, 2] = False
+    altered = type(scenes)(**{name: value.clone() for name, value in vars(scenes).items()})
+    altered.positions[:, 14:, 2] += 5.0
+    courses = []
+    for stretch in (scenes, altered):
+        headway, desired = typical_traits(stretch)
+        courses.append(rollout(generator, stretch, headway, desired, torch.zeros(1, 7, 4)))
+    torch.testing.assert_close(courses[0], courses[1])
 
 
 def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(sources, generator):

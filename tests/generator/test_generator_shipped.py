@@ -1,5 +1,6 @@
 import json
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 
@@ -8,11 +9,13 @@ from ganlane.errors import UserError
 from ganlane.generator.calibrated import CalibratedConfig
 from ganlane.generator.checkpoint import load_generator, shipped_generator
 from ganlane.generator.fitting import PaperConfig
+from ganlane.generator.folds import split_scenes
 from ganlane.generator.groups import group_windows
 from ganlane.generator.metrics import open_loop
 from ganlane.generator.rollout_metrics import rollout_metrics
+from ganlane.generator.scores import worse_parts
 from ganlane.generator.stretches import SceneSource
-from ganlane.generator.tracks import scene_tracks, split_scenes
+from ganlane.generator.tracks import scene_tracks
 from ganlane.generator.windows import cut_windows
 
 CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}
@@ -47,6 +50,47 @@ def test_the_calibrated_preset_beats_constant_velocity_on_scenes_it_was_not_fitt
     held_out = metadata["metrics"]["all"]
     assert held_out["ade_m/mean"] < 0.91 * held_out["ade_m/constant_velocity"]
     assert held_out["end_m/mean"] < 0.75 * held_out["end_m/constant_velocity"]
+
+
+def folds_of(preset):
+    """Errors pooled over five folds, each forecast by a generator that never saw its scenes."""
+    _, metadata = load_generator(shipped_generator(preset), preset)
+    return metadata["folds"]
+
+
+@pytest.mark.parametrize(
+    ("preset", "least"),
+    [("paper", {"mean": 15, "single": 5, "best_of_20": 35}), ("calibrated", {"mean": 9})],
+)
+def test_pooled_over_folds_the_errors_stay_under_constant_velocitys(preset, least):
+    scores = folds_of(preset)["open_loop"]
+    for kind, percent in least.items():
+        assert scores["ade_change_percent"][kind] <= -percent, kind
+    assert len(scores["folds"]) == 5
+    assert worse_parts(scores, "mean") == []
+    assert scores["direction_whole_window"]["share_right"]["mean"] >= 0.9
+
+
+def test_after_five_seconds_the_calibrated_preset_is_at_most_three_quarters_of_constant_velocity_off():
+    rollout = folds_of("calibrated")["rollout"]
+    assert rollout["tracks"] > 400
+    assert rollout["ratio_to_constant_velocity"]["mean"] <= 0.75
+
+
+@pytest.mark.parametrize("preset", CONFIGS)
+def test_the_docs_show_the_figures_that_the_weights_carry(preset):
+    page = (Path(__file__).parents[2] / "docs" / "generator_results.md").read_text()
+    scores = folds_of(preset)["open_loop"]
+    for kind, text in (("mean", "mean prediction"), ("single", "a single sample"), ("best_of_20", "best of 20")):
+        row = next(line for line in page.splitlines() if line.startswith(f"| `generator_{preset}`, {text}"))
+        figures = (f"{scores['ade_m'][kind]:.3f}", f"{scores['fde_m'][kind]:.3f}")
+        assert all(figure in row for figure in (*figures, f"{scores['ade_change_percent'][kind]:+.1f} %"))
+
+
+@pytest.mark.parametrize("preset", CONFIGS)
+def test_fitting_the_shipped_weights_took_less_than_half_an_hour(preset):
+    _, metadata = load_generator(shipped_generator(preset), preset)
+    assert 0 < metadata["metrics"]["fit"]["seconds"] < 1800
 
 
 def test_the_stated_errors_of_the_paper_preset_are_those_of_the_shipped_weights(recordings):

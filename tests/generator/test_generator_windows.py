@@ -4,8 +4,9 @@ import pytest
 
 from ganlane.data.schema import SCHEMA
 from ganlane.errors import UserError
+from ganlane.generator.folds import split_scenes
 from ganlane.generator.groups import group_windows, kmeans_labels
-from ganlane.generator.tracks import scene_tracks, split_scenes
+from ganlane.generator.tracks import scene_tracks
 from ganlane.generator.windows import OBSERVED_POSITIONS, WINDOW_FRAMES, cut_windows
 
 

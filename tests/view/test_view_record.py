@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import polars as pl
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 from view_scenes import straight
 
+from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
+from ganlane.traffic import Recordings, ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import record_episode, to_tracks
 
@@ -47,6 +50,23 @@ def test_the_recording_has_a_frame_per_physics_step():
     assert trajectory.x[-1, 0] >= 150.0 > trajectory.x[-2, 0]
     assert trajectory.outcome == "goal"
     assert (trajectory.label.agent, trajectory.label.lanes, trajectory.label.lane_width_m) == ("keep_lane", 3, 4.0)
+
+
+def test_the_label_has_the_road_of_the_replayed_scene():
+    """Three scenes of 2, 3 and 4 lanes: the environment's own road has the lanes of the widest."""
+    parts = [
+        synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=7.0), seed=k).with_columns(
+            scene=pl.lit(f"{2 + k} lanes")
+        )
+        for k in range(3)
+    ]
+    traffic = ReplayTraffic(recordings=Recordings.of(sort(pl.concat(parts)), "synthetic", 5.0))
+    env = HighwayEnv(traffic, 1, vehicles=5)
+    names = traffic.scenes_of_episodes(0, range(10))
+    for lanes in (2, 3, 4):
+        episode = names.index(f"{lanes} lanes")
+        label = record_episode(env, always(0), seed=0, episode=episode, max_time_s=1.0).label
+        assert label.lanes == lanes
 
 
 def test_frames_are_one_step_of_driving_apart():

@@ -1,0 +1,88 @@
+"""k folds by scene, and within a fold the scenes that choose when to stop: never the ones that are reported."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from ganlane.errors import UserError
+from ganlane.generator.tracks import SceneTracks
+from ganlane.generator.windows import WINDOW_FRAMES, count_windows
+
+#: Share of the windows at hand that the validation scenes hold at least.
+VALIDATION_SHARE = 1 / 12
+
+
+class Split(NamedTuple):
+    """Scenes by what they are for: fitted to, choosing when to stop, and reported."""
+
+    fitted: list[SceneTracks]
+    validation: list[SceneTracks]
+    held_out: list[SceneTracks]
+
+    @property
+    def names(self) -> dict[str, list[str]]:
+        """Names of the scenes of each part."""
+        return {part: [scene.name for scene in scenes] for part, scenes in self._asdict().items()}
+
+
+def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]:
+    """Names of the scenes of every fold: the largest first, each into the fold with the fewest windows so far.
+
+    Raises:
+        UserError: fewer than 2 folds, or more than scenes less one (a fold needs others to fit to and to stop by).
+    """
+    usable = [scene for scene in scenes if count_windows(scene, WINDOW_FRAMES)]
+    if not 2 <= folds <= len(usable) or len(usable) < 3:
+        raise UserError(
+            f"folds={folds}: {len(usable)} recorded scenes have windows to predict; choose 2 to {len(usable)} folds "
+            "of at least 3 scenes."
+        )
+    names: list[list[str]] = [[] for _ in range(folds)]
+    held = [0] * folds
+    for scene in sorted(usable, key=lambda scene: (-count_windows(scene, WINDOW_FRAMES), scene.name)):
+        fold = held.index(min(held))
+        names[fold].append(scene.name)
+        held[fold] += count_windows(scene, WINDOW_FRAMES)
+    return [tuple(sorted(fold)) for fold in names]
+
+
+def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split:
+    """The three parts of a fit that reports ``held_out``.
+
+    Of the other scenes the smallest choose when to stop: as few as hold a twelfth of the others' windows. Where
+    there is but one other scene it does both.
+
+    Raises:
+        UserError: a held-out name is not among the scenes, or nothing is left to fit to or to report.
+    """
+    others, kept = split_scenes(scenes, held_out)
+    validation: list[SceneTracks] = []
+    wanted, held = VALIDATION_SHARE * sum(count_windows(scene, WINDOW_FRAMES) for scene in others), 0
+    for scene in sorted(others, key=lambda scene: (count_windows(scene, WINDOW_FRAMES), scene.name))[:-1]:
+        if held >= wanted and held:
+            break
+        validation.append(scene)
+        held += count_windows(scene, WINDOW_FRAMES)
+    chosen = {scene.name for scene in validation} if held else set()
+    fitted = [scene for scene in others if scene.name not in chosen]
+    return Split(fitted, [scene for scene in others if scene.name in chosen] or fitted, kept)
+
+
+def split_scenes(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> tuple[list[SceneTracks], list[SceneTracks]]:
+    """(others, held out), split by the scenes' names.
+
+    Raises:
+        UserError: a held-out name is not among the scenes, or one of the two parts is empty.
+    """
+    names = [scene.name for scene in scenes]
+    unknown = sorted(set(held_out) - set(names))
+    if unknown:
+        raise UserError(f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these.")
+    others = [scene for scene in scenes if scene.name not in held_out]
+    kept = [scene for scene in scenes if scene.name in held_out]
+    if not others or not kept:
+        raise UserError(
+            f"data.held_out={list(held_out)}: of the scenes {names} at least one must be held out and one fitted to; "
+            "name some in data.held_out."
+        )
+    return others, kept

@@ -1,0 +1,11 @@
+"""Tests of the generator leave the user's cache alone."""
+
+import pytest
+
+from ganlane.generator.cache import VARIABLE
+
+
+@pytest.fixture(autouse=True)
+def no_cache(monkeypatch):
+    """Nothing is kept unless a test names a folder."""
+    monkeypatch.setenv(VARIABLE, "")

@@ -1,0 +1,69 @@
+from dataclasses import replace
+
+import pytest
+
+from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.generator.calibrated import CalibratedConfig
+from ganlane.generator.cross_validation import cross_validate
+from ganlane.generator.fitting import PaperConfig
+from ganlane.generator.fold_tables import fold_tables
+from ganlane.generator.loop import LoopConfig
+from ganlane.generator.networks import GeneratorSizes
+
+SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
+LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)
+PAPER = PaperConfig(SIZES, loop=LOOP, stride=6, samples=2, batch=4)
+DRIVER = replace(SIZES, extra_inputs=4)
+CALIBRATED = CalibratedConfig(DRIVER, LOOP, (4,), (1.0,), held_out_horizon=8, batch=2, held_out_stride=20)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=6.5))
+
+
+def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(frame, tmp_path):
+    scores = cross_validate("paper", frame, PAPER, 3, tmp_path)
+    assert {name for split in scores["splits"] for name in split["held_out"]} == set(scores["open_loop"]["scenes"])
+    for split in scores["splits"]:
+        assert not set(split["held_out"]) & {*split["fitted"], *split["validation"]}
+    pooled = scores["open_loop"]
+    assert pooled["windows"] == sum(row["windows"] for row in pooled["folds"].values()) > 0
+    kinds = {"mean", "single", "best_of_20", "constant_velocity", "constant_acceleration", "ridge", "idm"}
+    assert kinds <= set(pooled["ade_m"])
+    assert "best_of_20" in fold_tables(scores)
+
+
+def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, tmp_path):
+    first = cross_validate("paper", frame, PAPER, 3, tmp_path)
+    updates = []
+    again = cross_validate("paper", frame, PAPER, 3, tmp_path, on_progress=updates.append)
+    assert again == first
+    assert not updates
+    cross_validate("paper", frame, replace(PAPER, seed=1), 3, tmp_path, on_progress=updates.append)
+    assert len(updates) == 3 * LOOP.updates
+
+
+def test_an_interrupted_fold_goes_on(frame, tmp_path):
+    whole = cross_validate("paper", frame, PAPER, 3, tmp_path / "whole")
+
+    def stop(progress):
+        if progress.update == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        cross_validate("paper", frame, PAPER, 3, tmp_path / "parts", on_progress=stop)
+    updates = []
+    resumed = cross_validate("paper", frame, PAPER, 3, tmp_path / "parts", on_progress=updates.append)
+    assert len(updates) == 3 * LOOP.updates - 2
+    assert resumed["open_loop"]["ade_m"]["mean"] == pytest.approx(whole["open_loop"]["ade_m"]["mean"], rel=1e-4)
+
+
+def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(frame, tmp_path):
+    scores = cross_validate("calibrated", frame, CALIBRATED, 3, tmp_path)
+    rollout = scores["rollout"]
+    assert rollout["tracks"] == 15
+    assert list(rollout["rmse_m"]["mean"]) == ["1 s", "2 s", "3 s", "4 s", "5 s"]
+    assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
+    assert scores["open_loop"]["windows"] > rollout["windows"]
+    assert "Social-GAN (published)" in fold_tables(scores)

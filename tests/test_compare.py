@@ -1,0 +1,68 @@
+"""The comparison on recorded scenes: each episode's scene beside it, and crashes per km by scene in the record."""
+
+from __future__ import annotations
+
+import json
+
+import polars as pl
+import pytest
+
+from ganlane.build import make_driver
+from ganlane.compare import compare, publish, recorded_crashes
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.config.traffic_replay import ReplayTrafficConfig
+from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.evaluation import crashes_by_scene
+from ganlane.sim.random import Stream
+from ganlane.traffic import ReplayTraffic
+
+EPISODES = 12
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
+    write_scene_csv(path, synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def table(recordings):
+    env = EnvConfig(goal_m=60.0)
+    traffics = {"idm": IdmTrafficConfig(), "replay": ReplayTrafficConfig(path=str(recordings))}
+    drivers = [make_driver(name, env) for name in ("keep_lane", "random_legal")]
+    return compare(drivers, traffics, env, episodes=EPISODES, seed=5, num_envs=4)
+
+
+def test_every_replayed_episode_stands_beside_the_scene_that_it_ran_in(table, recordings):
+    scenes = ReplayTraffic(Stream.REPORT, recordings).scenes_of_episodes(5, range(EPISODES))
+    assert len(set(scenes)) == 3
+    for agent in ("keep_lane", "random_legal"):
+        found = table.filter(pl.col("traffic") == "replay", pl.col("agent") == agent).sort("episode")
+        assert found["scene"].to_list() == scenes
+    assert table.filter(pl.col("traffic") == "idm")["scene"].is_null().all()
+
+
+def test_the_record_holds_crashes_by_scene_for_replayed_traffic(table, tmp_path, capsys):
+    publish(table, tmp_path, {}, {})
+    record = json.loads((tmp_path / "results.json").read_text())
+    assert len(record["rows"]) == 4
+    assert [(row["agent"], row["traffic"]) for row in record["crashes_by_scene"]] == [
+        ("keep_lane", "replay"),
+        ("random_legal", "replay"),
+    ]
+    for row in record["crashes_by_scene"]:
+        own = table.filter(pl.col("traffic") == "replay", pl.col("agent") == row["agent"])
+        expected = crashes_by_scene(own, own["scene"].to_list())
+        assert row["per_km"] == pytest.approx(expected.per_km.value)
+        assert row["per_km_ci"] == pytest.approx(expected.per_km.interval)
+        assert sum(scene["episodes"] for scene in row["scenes"]) == EPISODES
+        assert sum(scene["distance_km"] for scene in row["scenes"]) == pytest.approx(own["distance_m"].sum() / 1000)
+
+
+def test_other_traffics_have_no_scenes(table, tmp_path, capsys):
+    others = table.filter(pl.col("traffic") == "idm").drop("scene")
+    assert recorded_crashes(others) == []
+    publish(others, tmp_path, {}, {})
+    assert "crashes_by_scene" not in json.loads((tmp_path / "results.json").read_text())

@@ -1,0 +1,388 @@
+"""Sensor errors reach what the agent sees of the others, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference.worlds import leaves, same_bits
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from ganlane import keys
+from ganlane.agents import read_agent
+from ganlane.agents.drivers import MobilDriver
+from ganlane.build import make_env, make_traffic, observation_of
+from ganlane.config.env import EnvConfig
+from ganlane.config.observation import ObservationConfig, SensorsConfig
+from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.errors import UserError
+from ganlane.evaluate import main as evaluate
+from ganlane.evaluation.branching import branch
+from ganlane.sim import Road, Vehicles
+from ganlane.sim.random import Stream, episode_key
+from ganlane.traffic import IdmMobilTraffic
+from ganlane.train import main as train
+from ganlane.training.checkpoints import pack, unpack
+from ganlane.transforms import ObservationTransform, RewardTransform, SensorParameters, SensorTransform
+from ganlane.transforms.sensors import measure
+
+EVERYTHING = SensorParameters(1.0, 0.5, 2.0, dropout=0.2, delay_s=2.0)
+#: Own speed and lanes, which no sensor error touches.
+OWN = 3
+
+
+def world(sensors, num_envs=3, goal_m=5000.0, period_s=1.0, form="table3", seed=11):
+    """IDM-MOBIL traffic with these sensors; None: without the transform."""
+    episode = EpisodeParameters(decision_period_s=period_s, goal_m=goal_m)
+    base = HighwayEnv(IdmMobilTraffic(), num_envs=num_envs, episode=episode, seed=seed)
+    between = [] if sensors is None else [SensorTransform(sensors, base.stream, period_s)]
+    seen = ObservationTransform(base.road, 9, form)
+    return TransformedEnv(base, Compose(*between, seen, RewardTransform(period_s)))
+
+
+def action(td):
+    """A fixed function of the episode and the decision: some lane changes, few of them legal."""
+    number = (td[keys.EPISODE] * 7 + td[keys.EGO, "decisions"] * 5) % 11
+    return torch.where(number == 1, keys.LEFT, torch.where(number == 2, keys.RIGHT, keys.KEEP))
+
+
+def drive(env, decisions, td=None):
+    """The states of a run without resets, the first one included."""
+    states = [env.reset() if td is None else td]
+    for _ in range(decisions):
+        states.append(step_mdp(env.step(states[-1].clone().set("action", action(states[-1])))))
+    return states
+
+
+def scene(rows, count):
+    """``rows`` copies of a row of cars, 10 m from each other on the middle lane, at 20 m/s."""
+    x = 10.0 * torch.arange(count, dtype=torch.float64).expand(rows, count)
+    zero, valid = torch.zeros_like(x), torch.ones_like(x, dtype=torch.bool)
+    return Vehicles(x, zero + 4, zero, zero + 20, zero, zero, zero, zero, zero.long(), zero.long(), valid)
+
+
+def many(sensors, rows=5000, count=5):
+    """The errors of many measurements of one scene: (along, across, speed) [rows, count], and who is seen."""
+    true, numbers = scene(rows, count), torch.arange(rows)
+    seen = measure(true, episode_key(Stream.TRAIN, numbers * 0, numbers), numbers % 10, sensors)
+    return (seen.x - true.x, seen.y - true.y, seen.speed - true.speed), seen.valid
+
+
+NOISY = SensorParameters(position_noise_m=2.0, lateral_noise_m=0.5, speed_noise_mps=3.0)
+
+
+def test_errors_are_gaussian_without_bias_and_of_the_size_asked_for():
+    for error, deviation in zip(many(NOISY)[0], (2.0, 0.5, 3.0)):
+        others = error[:, 1:] / deviation
+        n = others.numel()
+        # Four standard errors of a mean, a standard deviation and a fourth moment.
+        assert others.mean().item() == pytest.approx(0.0, abs=4 / math.sqrt(n))
+        assert others.std().item() == pytest.approx(1.0, abs=4 / math.sqrt(2 * n))
+        assert (others**4).mean().item() == pytest.approx(3.0, abs=4 * math.sqrt(96 / n))
+
+
+def test_errors_of_position_lane_and_speed_and_of_two_vehicles_are_independent():
+    along, across, speed = many(NOISY)[0]
+    columns = [along[:, 1], across[:, 1], speed[:, 1], along[:, 2], across[:, 2], speed[:, 2]]
+    correlations = torch.corrcoef(torch.stack(columns)) - torch.eye(6)
+    assert correlations.abs().max().item() < 4.5 / math.sqrt(len(along))
+
+
+def test_an_error_is_drawn_anew_at_every_measurement():
+    true, zero = scene(1000, 2), torch.zeros(1000, dtype=torch.int64)
+    key = episode_key(Stream.TRAIN, zero, zero)
+    seen = measure(true, key, 10 * torch.arange(1000), NOISY).x[:, 1] - true.x[:, 1]
+    assert seen.unique().numel() > 990
+    lagged = torch.corrcoef(torch.stack((seen[1:], seen[:-1])))[0, 1]
+    assert abs(lagged.item()) < 4.5 / math.sqrt(1000)
+
+
+def test_so_many_vehicles_drop_out_whatever_the_other_errors():
+    for sensors in (SensorParameters(dropout=0.3), SensorParameters(1.0, 1.0, 1.0, dropout=0.3)):
+        errors, seen = many(sensors)
+        lost = (~seen[:, 1:]).double()
+        assert lost.mean().item() == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / lost.numel()))
+        assert all((error == 0).all() for error in errors) == (sensors.position_noise_m == 0)
+    error = many(SensorParameters(position_noise_m=1.0, dropout=0.3))[0][0][:, 1:]
+    assert abs(torch.corrcoef(torch.stack((error.flatten(), lost.flatten())))[0, 1].item()) < 4.5 / math.sqrt(20000)
+
+
+def test_the_ego_knows_itself_without_error():
+    errors, seen = many(EVERYTHING)
+    assert all((error[:, 0] == 0).all() for error in errors)
+    assert seen[:, 0].all()
+
+
+def test_nobody_is_seen_at_a_dropout_of_one_and_a_vehicle_that_is_not_there_never():
+    env = world(SensorParameters(dropout=1.0))
+    for td in drive(env, 3):
+        nobody = torch.tensor([1.0, 0.0, 0.0]).repeat(8)
+        assert torch.equal(td["observation"][:, OWN:], nobody.expand(3, 24))
+        assert td[keys.VEHICLES, "valid"].all()
+    true = scene(4, 3)
+    absent = true.with_(valid=torch.tensor([[True, False, True]]).expand(4, 3))
+    seen = measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), NOISY)
+    assert torch.equal(seen.valid, absent.valid)
+
+
+def test_perfect_sensors_show_the_present_observation_bit_for_bit():
+    plain, perfect = (drive(world(sensors), 8) for sensors in (None, SensorParameters()))
+    for one, other in zip(plain, perfect):
+        assert same_bits(one, other.exclude("perceived")) == []
+
+
+@settings(max_examples=20)
+@given(st.floats(0, 5), st.floats(0, 3), st.floats(0, 5), st.floats(0, 1), st.integers(0, 3), st.integers(0, 2**40))
+def test_the_true_state_reward_and_own_part_of_the_observation_are_untouched(along, across, speed, dropout, k, seed):
+    sensors = SensorParameters(along, across, speed, dropout, delay_s=float(k))
+    for one, other in zip(*(drive(world(use, 2, seed=seed), 3) for use in (None, sensors))):
+        bare = other.exclude("perceived", "sensors", "observation")
+        assert same_bits(one.exclude("observation"), bare) == []
+        assert torch.equal(one["observation"][:, :OWN], other["observation"][:, :OWN])
+        assert (other["observation"][:, OWN:].abs() <= 1).all()
+
+
+def test_the_reward_is_paid_on_the_true_state():
+    plain, blurred = world(None), world(EVERYTHING)
+    one, other = plain.reset(), blurred.reset()
+    for _ in range(6):
+        one, other = (env.step(td.set("action", action(td))) for env, td in ((plain, one), (blurred, other)))
+        assert torch.equal(one["next", "reward"], other["next", "reward"])
+        one, other = step_mdp(one), step_mdp(other)
+
+
+@pytest.mark.parametrize("form", ["table3", "lane_view", "table3_lane_view"])
+@pytest.mark.parametrize("k", [1, 3])
+def test_a_delay_of_k_decisions_shows_the_others_as_they_were_k_decisions_ago(form, k):
+    plain = [td["observation"] for td in drive(world(None, form=form), 8)]
+    late = [td["observation"] for td in drive(world(SensorParameters(delay_s=float(k)), form=form), 8)]
+    others = slice(OWN, None if form == "table3" else -2)
+    for number, observation in enumerate(late):
+        # Until a measurement is old enough, the first one is delivered.
+        assert torch.equal(observation[:, others], plain[max(number - k, 0)][:, others])
+        assert torch.equal(observation[:, :OWN], plain[number][:, :OWN])
+    assert not torch.equal(late[-1], plain[-1])
+
+
+def test_noise_belongs_to_the_measurement_and_comes_as_late_as_it():
+    noise = {"position_noise_m": 1.0, "speed_noise_mps": 1.0, "lateral_noise_m": 1.0, "dropout": 0.1}
+    prompt = [td["observation"][:, OWN:] for td in drive(world(SensorParameters(**noise)), 6)]
+    late = [td["observation"][:, OWN:] for td in drive(world(SensorParameters(**noise, delay_s=2.0)), 6)]
+    for number in range(7):
+        assert torch.equal(late[number], prompt[max(number - 2, 0)])
+
+
+def test_a_delay_may_be_any_multiple_of_the_decision_period():
+    env = world(SensorParameters(delay_s=0.6), period_s=0.2)
+    assert env.reset()["sensors", "x"].shape == (3, 3, 9)
+    for delay_s, period_s in ((0.5, 1.0), (1.0, 0.3), (-1.0, 1.0)):
+        with pytest.raises(UserError, match=r"observation.sensors.delay_s=.*multiple of the decision period"):
+            SensorTransform(SensorParameters(delay_s=delay_s), 0, period_s)
+
+
+def test_a_state_without_the_delayed_measurements_is_refused():
+    td = world(None).reset()
+    env = world(EVERYTHING)
+    with pytest.raises(UserError, match="start from a reset"):
+        env.step(td.set("action", action(td)))
+
+
+def episodes(env, decisions):
+    """Episode to what it saw, over a run with automatic resets; unfinished episodes are left out."""
+    tracks, finished, td = {}, set(), env.reset()
+    for _ in range(decisions):
+        td["action"] = action(td)
+        for row, episode in enumerate(td[keys.EPISODE].tolist()):
+            tracks.setdefault(episode, []).append(td["observation"][row].clone())
+        stepped, td = env.step_and_maybe_reset(td)
+        after = stepped["next"]
+        for row, episode in enumerate(after[keys.EPISODE].tolist()):
+            if after["done"][row]:
+                tracks[episode].append(after["observation"][row].clone())
+                finished.add(episode)
+    return {episode: torch.stack(tracks[episode]) for episode in finished}
+
+
+def test_an_episode_is_seen_alike_in_any_batch_and_after_automatic_resets():
+    in_32 = episodes(world(EVERYTHING, 32, goal_m=140.0), 12)
+    in_5, alone = (episodes(world(EVERYTHING, rows, goal_m=140.0), 40) for rows in (5, 1))
+    for some, at_least in ((in_5, 12), (alone, 3)):
+        common = some.keys() & in_32.keys()
+        assert len(common) >= at_least
+        assert max(common) >= at_least - 1
+        for episode in common:
+            assert torch.equal(some[episode], in_32[episode]), episode
+
+
+def test_an_episode_that_is_asked_for_by_number_is_seen_as_it_was():
+    in_32 = episodes(world(EVERYTHING, 32, goal_m=140.0), 12)
+    env = world(EVERYTHING, 1)
+    wanted = max(in_32)
+    td = env.reset(TensorDict({"seed": torch.tensor([11]), "episode": torch.tensor([wanted])}, [1]))
+    for expected, state in zip(in_32[wanted], drive(env, 3, td)):
+        assert torch.equal(state["observation"][0], expected)
+
+
+def test_a_partial_reset_leaves_the_measurements_of_the_other_rows():
+    env = world(EVERYTHING, 3)
+    before = drive(env, 4)[-1]
+    mask = torch.tensor([[False], [True], [False]])
+    after = env.reset(before.clone().set("_reset", mask))
+    fresh = after["sensors", "x"][1]
+    assert (fresh == fresh[:1]).all()
+    assert torch.equal(after["perceived", "x"][1], fresh[0])
+    for row in (0, 2):
+        assert same_bits(after[row].exclude("_reset", "action"), before[row].exclude("action")) == []
+    # Row 1 saw its measurements of four decisions before; now all of them are of its new first scene.
+    assert not torch.equal(before["sensors", "x"][1], fresh)
+
+
+def test_the_streams_of_training_and_report_have_errors_of_their_own():
+    true, zero = scene(1, 3), torch.zeros(1, dtype=torch.int64)
+    seen = [measure(true, episode_key(stream, zero, zero), zero, NOISY).x for stream in (Stream.TRAIN, Stream.REPORT)]
+    assert not torch.equal(*seen)
+
+
+@pytest.mark.parametrize("sensors", [NOISY, SensorParameters(dropout=0.5), EVERYTHING])
+def test_the_specs_hold(sensors):
+    check_env_specs(world(sensors), seed=0)
+
+
+def looking():
+    """Turns left where the car that is listed first is near: a policy that depends on what is seen."""
+    turn = lambda seen: torch.where(seen[:, OWN].abs() < 0.1, keys.LEFT, keys.KEEP)  # noqa: E731
+    return TensorDictModule(turn, ["observation"], ["action"])
+
+
+def test_a_saved_state_is_resumed_with_what_was_still_to_be_delivered():
+    env = world(EVERYTHING)
+    middle = drive(env, 3)[-1]
+    resumed = drive(world(EVERYTHING), 4, unpack(pack(middle)))
+    for one, other in zip(drive(env, 4, middle), resumed):
+        assert same_bits(one, other) == []
+
+
+def test_branching_goes_on_with_the_sensors_of_the_state():
+    env, policy = world(EVERYTHING, 6), looking()
+    state = drive(env, 3)[-1]
+    before = state.clone()
+    branches = branch(env, state, policy, decisions=6)
+    assert same_bits(state.exclude("action"), before.exclude("action")) == []
+    expected, td = torch.zeros(6, 1), state.clone().set("action", torch.zeros(6, dtype=torch.int64))
+    running = torch.ones(6, 1, dtype=torch.bool)
+    for _ in range(6):
+        stepped = env.step(td)
+        expected += torch.where(running, stepped["next", "reward"], 0.0)
+        running &= ~stepped["next", "done"]
+        td = policy(step_mdp(stepped))
+    assert torch.equal(branches.returns[keys.KEEP], expected[:, 0])
+
+
+def test_mobil_reads_the_true_state():
+    plain, blurred = world(None), world(EVERYTHING)
+    driver = MobilDriver(Road())
+    one, other = plain.reset(), blurred.reset()
+    for _ in range(10):
+        one, other = driver(one), driver(other)
+        assert torch.equal(one["action"], other["action"])
+        one, other = step_mdp(plain.step(one)), step_mdp(blurred.step(other))
+
+
+def built(sensors):
+    road = EnvConfig()
+    return make_env(make_traffic(IdmTrafficConfig(), road), road, ObservationConfig(sensors=sensors), num_envs=2)
+
+
+def transforms_of(env):
+    return [type(transform).__name__ for transform in env.transform.transforms]
+
+
+def test_no_transform_is_inserted_without_errors_and_one_with_any():
+    for sensors in (None, SensorsConfig()):
+        assert transforms_of(built(sensors)) == ["ObservationTransform", "RewardTransform"]
+    env = built(SensorsConfig(delay_s=1.0, dropout=0.1))
+    assert transforms_of(env) == ["SensorTransform", "ObservationTransform", "RewardTransform"]
+    assert env.transform[0].parameters == SensorParameters(delay_s=1.0, dropout=0.1)
+    check_env_specs(env, seed=0)
+
+
+def test_the_errors_are_those_of_the_traffics_stream():
+    road = EnvConfig()
+    traffic = make_traffic(IdmMobilTrafficConfig(), road, Stream.REPORT)
+    env = make_env(traffic, road, ObservationConfig(sensors=SensorsConfig(position_noise_m=1.0)))
+    assert env.transform[0].stream == Stream.REPORT
+
+
+def test_metadata_that_know_nothing_of_sensors_go_on_naming_an_observation():
+    known = {"observation": "table3", "observation_scale": {"range_m": 150.0, "speed_mps": 30.0}}
+    assert observation_of(known) == ObservationConfig("table3", 150.0, 30.0)
+    assert observation_of(known).sensor_parameters() is None
+
+
+def test_an_agent_keeps_its_form_and_scale_and_gets_the_sensors_of_the_command():
+    command = ObservationConfig("table3", sensors=SensorsConfig(delay_s=1.0))
+    assert command.read_by(None) == command
+    agents = ObservationConfig("lane_view", 150.0)
+    assert command.read_by(agents) == ObservationConfig("lane_view", 150.0, sensors=SensorsConfig(delay_s=1.0))
+
+
+ERRORS = ["observation.sensors.delay_s=1", "observation.sensors.position_noise_m=0.5"]
+
+
+def in_process(tmp_path, monkeypatch, capsys, *arguments):
+    """Exit status, rows of the results, stderr."""
+    monkeypatch.chdir(tmp_path)
+    short = ["env.goal_m=60", "episodes=3", "traffics=[idm_mobil]"]
+    status = evaluate([*short, *arguments])
+    out, err = capsys.readouterr()
+    path = (out.splitlines() or [""])[-1].removeprefix("results: ")
+    return status, json.loads(Path(path).read_text()) if status == 0 else None, err
+
+
+def test_evaluate_takes_sensor_errors_from_the_command_line(tmp_path, monkeypatch, capsys):
+    status, results, _ = in_process(tmp_path, monkeypatch, capsys, "agents=[mobil,keep_lane]", *ERRORS)
+    assert status == 0
+    assert [row["episodes"] for row in results["rows"]] == [3, 3]
+    assert results["config"]["observation"]["sensors"]["delay_s"] == 1.0
+
+
+def test_a_delay_between_two_decisions_is_a_users_mistake(tmp_path, monkeypatch, capsys):
+    wrong = ["agents=[keep_lane]", "observation.sensors.delay_s=0.5"]
+    status, _, err = in_process(tmp_path, monkeypatch, capsys, *wrong)
+    assert status == 2
+    assert "observation.sensors.delay_s=0.5: expected a multiple of the decision period" in err
+
+
+TINY = [
+    *("env.goal_m=40", "traffic=idm", "init=none", "log_every=160", "collector.num_envs=16", "agent.hidden=[16,16]"),
+    *("agent.batch_size=32", "agent.warmup=64", "agent.capacity=1000"),
+    *("evaluation.agents=[keep_lane]", "evaluation.episodes=2", *ERRORS),
+]
+
+
+def test_training_with_sensor_errors_in_two_parts_ends_like_one_in_a_piece(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folders = []
+    for total in (240, 160):
+        assert train([*TINY, f"total_decisions={total}"]) == 0
+        folders.append(Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: ")).parent)
+    assert train([f"resume={folders[1]}", "total_decisions=240"]) == 0
+    one, other = (read_agent(folder / "agent.safetensors")[0] for folder in folders)
+    assert one.keys() == other.keys()
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_every_leaf_of_the_state_is_in_the_spec():
+    env = world(EVERYTHING)
+    named = {"/".join(key) if isinstance(key, tuple) else key for key in env.observation_spec.keys(True, True)}
+    state = env.reset().exclude("done", "terminated", "truncated")
+    assert {"/".join(k) if isinstance(k, tuple) else k for k, _ in leaves(state)} == named

@@ -8,7 +8,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.env.physics import Physics, Rules, Substep
+from ganlane.env.physics import Physics, Substep
+from ganlane.env.rules import Rules
 from ganlane.env.state import where
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule, memory_of

@@ -12,7 +12,8 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.env.decision import Decision, Recorder, known_false
-from ganlane.env.physics import EpisodeParameters, Physics, Rules, Substep, outcome
+from ganlane.env.physics import Physics, Substep, outcome
+from ganlane.env.rules import EpisodeParameters, Rules
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX

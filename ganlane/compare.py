@@ -45,7 +45,7 @@ def compare(
         drivers: see :func:`ganlane.build.make_driver`; each gets an environment with its own observation.
         traffics: name to config.
         env, reward: the same for all.
-        observation: for drivers that name none.
+        observation: for drivers that name none; its sensors for all.
         episodes, seed, stream: which episodes.
         num_envs: episodes side by side, at most.
 
@@ -58,7 +58,7 @@ def compare(
     rows, tables = min(num_envs, episodes), []
     with _Progress(len(pairs) * episodes) as progress:
         for traffic, driver in pairs:
-            seen = driver.observation or observation
+            seen = (observation or ObservationConfig()).read_by(driver.observation)
             made = make_env(modules[traffic], env, seen, reward, rows, seed, device)
             report = progress.start(f"{driver.name} on {traffic}")
             table = run_episodes(made, driver.policy, range(episodes), seed, report)

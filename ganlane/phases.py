@@ -93,12 +93,13 @@ def make_agent(config: TrainConfig, trained: bool = False) -> Rainbow:
 
 def check_observation(name: str, config: TrainConfig) -> None:
     """Refuse to start from an agent that was trained on another observation."""
-    theirs, ours = observation_of(read_agent(name)[2]), config.observation
-    for key, value in asdict(theirs).items():
-        if value != getattr(ours, key):
+    theirs = asdict(config.observation.read_by(observation_of(read_agent(name)[2])))
+    ours = asdict(config.observation)
+    for key, value in theirs.items():
+        if value != ours[key]:
             option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
             raise UserError(
-                f"init.path={name}: this agent was trained with {option}, the run has {getattr(ours, key)}; "
+                f"init.path={name}: this agent was trained with {option}, the run has {ours[key]}; "
                 f"give {option} or start with init=none."
             )
 
@@ -159,6 +160,7 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     return {
         "observation": config.observation.form,
         "observation_scale": scale,
+        "sensors": asdict(config.observation)["sensors"],
         "environment": environment,
         "env": asdict(config.env),
         "num_envs": config.collector.num_envs,

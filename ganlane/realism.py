@@ -3,9 +3,10 @@
     ganlane realism traffic=gan_calibrated
     ganlane realism traffic=gan data.path=recordings.csv 'against=[idm_mobil,gan_calibrated]'
     ganlane realism traffic=idm traffic._target_=my.module.MyTraffic vehicle_km=100
+    ganlane realism traffic=gan_calibrated scenes=all report=docs/realism.md figures=docs/figures
     ganlane realism traffic=idm quick=true
 
-Writes results.json, distributions.png and drift.png into its run folder. Without recordings on the machine it uses
+Writes results.json, distributions.png, distances.png and drift.png into its run folder. Without recordings on the machine it uses
 the histograms that ship, and says so.
 """
 
@@ -129,8 +130,8 @@ def i80_beside(config: RealismConfig, path: Path | None) -> dict[str, Path]:
     return files
 
 
-def long_runs(config: RealismConfig, make: Factory) -> list[dict[str, Any]]:
-    """One long run per number of vehicles."""
+def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
+    """One long run of a traffic per number of vehicles."""
     from ganlane.build import make_road
     from ganlane.evaluation.realism_long import LongRunParameters, long_run
 
@@ -139,28 +140,63 @@ def long_runs(config: RealismConfig, make: Factory) -> list[dict[str, Any]]:
         parameters = LongRunParameters(vehicles, config.vehicle_km, config.long_s, config.seed, spawn)
 
         def report(km: float, vehicles: int = vehicles) -> None:
-            _say(f"long run of {vehicles} vehicles: {km:.0f} of {config.vehicle_km:g} vehicle-km")
+            _say(f"{name}, long run of {vehicles} vehicles: {km:.0f} of {config.vehicle_km:g} vehicle-km")
 
         runs.append(long_run(make, make_road(config.env), parameters, report))
     return runs
 
 
-def draw(starts: Starts, runs: Sequence[Mapping[str, Any]], folder: Path) -> None:
+def draw(
+    starts: Starts, runs: Sequence[Mapping[str, Any]], quantities: Mapping[str, Any], traffic: str, folder: Path
+) -> list[Path]:
     """The figures, into ``folder``."""
     from ganlane.evaluation.realism_card import FLOORS
     from ganlane.evaluation.realism_quantities import QUANTITIES, UNITS
     from ganlane.view.realism import draw_distributions, draw_drift, write_figure
+    from ganlane.view.realism_distances import draw_distances
 
     edges = {name: bins.edges for name, bins in QUANTITIES.items()}
     simulated = {
-        traffic: {name: counts.sum(0) for name, counts in driven.counts.items()}
-        for traffic, driven in starts.driven.items()
-        if traffic not in FLOORS
+        name: {quantity: counts.sum(0) for quantity, counts in driven.counts.items()}
+        for name, driven in starts.driven.items()
+        if name not in FLOORS
     }
     recorded = {name: counts.sum(0) for name, counts in starts.recorded.items()}
-    write_figure(draw_distributions(edges, recorded, simulated, UNITS), folder / "distributions.png")
+    pictures = {
+        "distributions": draw_distributions(edges, recorded, simulated, UNITS),
+        "distances": draw_distances(quantities, traffic),
+    }
     if runs:
-        write_figure(draw_drift(runs, starts.reference.spread_mps), folder / "drift.png")
+        pictures["drift"] = draw_drift(runs, starts.reference.spread_mps)
+    return [write_figure(picture, folder / f"{name}.png") for name, picture in pictures.items()]
+
+
+def show(config: RealismConfig, folder: Path, numbers: Mapping[str, Any], tables: list[str], drawn: list[Path]) -> None:
+    """The tables on stdout; tables and figures where a document wants them."""
+    from datetime import date
+
+    from ganlane.evaluation.realism_document import document_text, update_document
+    from ganlane.files import write_bytes
+
+    print(*tables, sep="\n\n")
+    if config.report is not None:
+        text = document_text(tables, numbers, command_line(folder), date.today().isoformat())
+        update_document(Path(config.report), numbers["traffic"], text)
+    for path in drawn if config.figures is not None else []:
+        write_bytes(Path(str(config.figures)) / f"realism_{path.name}", path.read_bytes())
+
+
+def command_line(folder: Path) -> str:
+    """How the run in ``folder`` was started, without where its document and figures went."""
+    import shlex
+
+    from omegaconf import OmegaConf
+
+    from ganlane.config.folders import OVERRIDES
+
+    asked = [str(override) for override in OmegaConf.load(folder / OVERRIDES)]
+    kept = [override for override in asked if not override.startswith(("report=", "figures=", "hydra."))]
+    return shlex.join(["python", "-m", "ganlane.realism", *kept])
 
 
 def publish(starts: Starts) -> None:
@@ -174,38 +210,45 @@ def publish(starts: Starts) -> None:
     _say(f"wrote {SHIPPED_REFERENCE}")
 
 
+def check_targets(config: RealismConfig, path: Path | None) -> None:
+    """Raise :class:`UserError` where something cannot be written in the end, before anything is driven."""
+    from ganlane.evaluation.realism_document import require_markers
+
+    if config.publish and path is None:
+        raise UserError("publish=true: the file that ships is made from recordings; give data.path=FILE.")
+    if config.report is not None:
+        require_markers(Path(config.report), config.traffic.label())
+    if config.figures is not None and not Path(config.figures).is_dir():
+        raise UserError(f"figures={config.figures}: no such folder; make it, or name another.")
+
+
 def realism(config: RealismConfig, folder: Path) -> str:
     """Drive, measure, print, draw, keep."""
     from ganlane.build import set_threads
     from ganlane.evaluation import write_results
     from ganlane.evaluation.realism_card import from_starts, quantity_rows
     from ganlane.evaluation.realism_checks import card_checks
+    from ganlane.evaluation.realism_document import card_text
     from ganlane.evaluation.realism_i80 import i80_cards
     from ganlane.evaluation.realism_long_summary import totals
-    from ganlane.evaluation.realism_table import checks_text, long_table, quantities_table, starts_table
 
     config = config.shortened()
     set_threads(config.threads)
     makers, path, traffic = makers_of(config), scenes_path(config), config.traffic.label()
-    if config.publish and path is None:
-        raise UserError("publish=true: the file that ships is made from recordings; give data.path=FILE.")
+    check_targets(config, path)
     files = i80_beside(config, path)
     starts = drive_from_starts(config, makers, path)
     own, reference = starts.driven[traffic], starts.reference
     others = {name: each for name, each in starts.driven.items() if name != traffic}
     quantities = quantity_rows(own, others, starts.recorded, reference, starts.paired, resamples=config.resamples)
     driving = {"recorded": starts.seen, **from_starts(starts.driven)}
-    print(quantities_table(quantities, traffic), starts_table(driving), sep="\n\n")
     site = i80_cards(makers, files, starts.options, config.resamples, _say)
-    for name, rows in site.items():
-        print(f"\nI-80, {name}", quantities_table(rows, traffic), sep="\n")
-    runs = long_runs(config, makers[traffic])
-    if runs:
-        print("", long_table(runs), sep="\n")
+    far = makers if config.long_against else {traffic: makers[traffic]}
+    every = {name: long_runs(config, name, make) for name, make in far.items()}
+    runs = every.pop(traffic)
     quantiles = (driving[traffic]["quantiles"], starts.seen["quantiles"])
     checks = card_checks(quantities, *quantiles, reference.rate(), reference.spread_mps, runs)
-    print("", checks_text(checks), sep="\n")
-    draw(starts, runs, folder)
+    drawn = draw(starts, runs, quantities, traffic, folder)
     if config.publish:
         publish(starts)
     numbers = {
@@ -216,8 +259,10 @@ def realism(config: RealismConfig, folder: Path) -> str:
         "i80": site,
         **totals(runs),
         "long_runs": runs,
+        "long_runs_against": every,
         "checks": checks,
     }
+    show(config, folder, numbers, card_text(numbers, {traffic: runs, **every}), drawn)
     seeds = {"stream": "report", "seed": config.seed}
     return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
 

@@ -23,7 +23,7 @@ EPISODES = 12
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
-    write_scene_csv(path, synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0))
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
     return path
 
 

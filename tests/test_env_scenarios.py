@@ -170,7 +170,7 @@ def jam_m(vehicles: Vehicles, lane: int = 0) -> torch.Tensor:
 
 
 def test_the_wave_travels_backwards_while_everybody_drives_forwards():
-    """One wave: cars leave it at its head and join at its tail; linear theory and measurements say 4 to 5 m/s."""
+    """One wave: cars leave it at its head and join at its tail."""
     config = StopAndGoEnvConfig(scene=StopAndGoOptions(waves=1, per_wave=8))
     seen = drive(config, "keep_lane", "idm", 24)
     speed = (jam_m(seen.at(20.0)) - jam_m(seen.at(8.0))) / 12.0

@@ -2,9 +2,10 @@
 
 ``env``, ``traffic``, ``init``, ``agent``, ``observation``, ``reward``, ``collector``, ``logger``, ``data`` and
 ``generator`` hold the options of the groups of these names, ``train``, ``evaluate``, ``render``, ``prepare``,
-``train_generator``, ``realism`` and ``bench`` the root of each command; ``experiment`` needs no schema, since its options only set the keys of
-the others. Environments that start in a scene set by hand stand in ``scenarios``, ``scene`` and ``scene_file``,
-traffics with faults and recorded traffic in ``traffic_faults`` and ``traffic_replay``. The dataclasses are plain, and a notebook uses them without Hydra. Making one checks its ranges
+``train_generator``, ``realism`` and ``bench`` the root of each command; ``experiment`` needs no schema, since its
+options only set the keys of the others. Environments that start in a scene set by hand stand in ``scenarios``,
+``scene`` and ``scene_file``, traffics with faults and recorded traffic in ``traffic_faults`` and
+``traffic_replay``. The dataclasses are plain, and a notebook uses them without Hydra. Making one checks its ranges
 (``checks``).
 
 ``app`` is the frame around every command: ``overrides`` reads the command line, ``resume`` adds that of the run to go

@@ -37,10 +37,13 @@ class RealismConfig(RunConfig):
     long_vehicles: list[int] = field(default_factory=lambda: [9, 30])
     vehicle_km: float = 3000.0
     long_s: float = 600.0
+    long_against: bool = False
     i80: bool | None = None
     resamples: int = 2000
     quick: bool = False
     publish: bool = False
+    report: str | None = None
+    figures: str | None = None
     env: EnvConfig = field(default_factory=EnvConfig)
     data: DataConfig = field(default_factory=DataConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)

@@ -85,9 +85,11 @@ class GanCalibratedTrafficConfig(TrafficConfig):
 
     _target_: str = "ganlane.traffic.presets.gan_calibrated_traffic"
     path: str | None = None
-    noise_scale: float = 1.0
+    noise_scale: float = 1.5
+    noise_period_s: float = 3.0
     changes_per_km: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "traffic", noise_scale=at_least(0), changes_per_km=optional(at_least(0)))
+        rules = {"noise_scale": at_least(0), "noise_period_s": at_least(0), "changes_per_km": optional(at_least(0))}
+        check(self, "traffic", **rules)

@@ -1,11 +1,14 @@
-"""The two ends of the scale: driving at random, and going on as one began."""
+"""The two ends of the scale, driving at random and going on as one began; and IDM with headways of its own."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from ganlane.generator.traits import headway_from_uniform
+from ganlane.sim.following import following_acceleration
 from ganlane.sim.hazard import random_side
+from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -65,3 +68,26 @@ class RandomDriving(TrafficModule):
             target_lane=target,
         )
         return moved, memory
+
+
+class HeadwayIdm(TrafficModule):
+    """IDM in the lane, every driver with a headway of its own: what is left of generated traffic without a network.
+
+    A control, not one of the rules that ship: Table V gives everybody the same headway. Memory: ``headway`` [N, M]
+    in s, drawn as the recorded ones are distributed, or shown at a recorded start.
+    """
+
+    memory_fields = {"headway": ((), None)}  # noqa: RUF012
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+        """A headway for everybody."""
+        u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
+        return {"headway": headway_from_uniform(u)}
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step along the road."""
+        v = vehicles
+        wanted = following_acceleration(perceive(v, self.road), headway_s=memory["headway"])
+        speed = (v.speed + wanted * self.dt).clamp_min(0.0)
+        x = v.x + 0.5 * (v.speed + speed) * self.dt
+        return v.with_(x=x, speed=speed, acceleration=(speed - v.speed) / self.dt), memory

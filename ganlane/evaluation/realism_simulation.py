@@ -21,6 +21,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
+from ganlane.evaluation.realism_headways import with_shown_headways
 from ganlane.evaluation.realism_recordings import Recording, frame_of
 from ganlane.evaluation.realism_script import Script, enter, enters, leave, parked
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
@@ -129,10 +130,10 @@ def step_traffic(
 def _renewed(
     traffic: TrafficModule, state: Vehicles, memory: TensorDictBase | None, enters: Tensor, key: Tensor
 ) -> TensorDictBase:
-    """The traffic's memory, fresh for those who enter."""
+    """The traffic's memory, fresh for those who enter, with the headways that they show."""
     if memory is not None and not bool(enters.any()):
         return memory
-    fresh = traffic.init_memory(state, enters, key)
+    fresh = with_shown_headways(traffic.init_memory(state, enters, key), state, traffic.road, enters)
     if memory is None:
         return fresh
 

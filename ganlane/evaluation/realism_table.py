@@ -12,6 +12,11 @@ def _number(value: float | None, digits: int = 3) -> str:
     return _NOTHING if value is None else f"{value:.{digits}f}"
 
 
+def short_name(traffic: str) -> str:
+    """A traffic's name without the path that it is imported from."""
+    return traffic.rpartition(".")[2]
+
+
 def _with_interval(row: Mapping[str, Any], name: str, digits: int = 3) -> str:
     interval = row.get(f"{name}_ci")
     text = _number(row.get(name), digits)
@@ -32,9 +37,9 @@ def _aligned(lines: Sequence[Sequence[str]]) -> str:
 def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
     """Distances, one quantity a line: the traffic, the scale, and the others with the difference to each."""
     others = list(next(iter(quantities.values()))["against"])
-    heading = ["distance to recorded", f"{traffic} [95 %]", "ceiling", "constant v", "random"]
+    heading = ["distance to recorded", f"{short_name(traffic)} [95 %]", "ceiling", "constant v", "random"]
     for other in others:
-        heading += [other, f"minus {other} [95 %]", ""]
+        heading += [short_name(other), f"minus {short_name(other)} [95 %]", ""]
     lines = [heading]
     for name, row in quantities.items():
         scale = (_number(row[key]) for key in ("ceiling", "constant_velocity", "floor"))
@@ -52,13 +57,13 @@ def starts_table(driving: Mapping[str, Any]) -> str:
     for name, row in driving.items():
         low, high = (row["quantiles"]["acceleration"][level] for level in ("0.05", "0.95"))
         rate = _with_interval(row, "per_vehicle_km", 2)
-        lines.append([name, rate, _number(row["vehicle_km"], 1), f"{_number(low, 2)}, {_number(high, 2)}"])
+        lines.append([short_name(name), rate, _number(row["vehicle_km"], 1), f"{_number(low, 2)}, {_number(high, 2)}"])
     return _aligned(lines)
 
 
-def long_table(runs: Sequence[Mapping[str, Any]]) -> str:
-    """The long runs, one column each."""
-    rows: list[list[str]] = [["long runs without an ego", *(f"{run['vehicles']} vehicles" for run in runs)]]
+def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
+    """The long runs of a traffic, one column each."""
+    rows: list[list[str]] = [[f"{short_name(traffic)}, long runs", *(f"{run['vehicles']} vehicles" for run in runs)]]
     plain = ("off_road", "standstills_in_free_flow")
     rows.append(["vehicle-km", *(_number(run["vehicle_km"], 0) for run in runs)])
     rows.append(["changes per vehicle-km", *(_with_interval(run, "lane_changes_per_vehicle_km", 2) for run in runs)])
@@ -84,7 +89,7 @@ def checks_text(checks: Mapping[str, Any]) -> str:
     near = "acceleration_quantiles_within_30_percent"
     lines = [f"{near.replace('_', ' ')}: {words[checks[near]]}"]
     for other, verdicts in checks["compared_with"].items():
-        lines.append(f"than {other}: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
+        lines.append(f"than {short_name(other)}: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
     for run in checks["long_runs"]:
         told = ", ".join(
             f"{name.replace('_', ' ')}: {words[value]}" for name, value in run.items() if name != "vehicles"

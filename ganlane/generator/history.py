@@ -42,7 +42,8 @@ def displacement_of(vehicles: Vehicles) -> Tensor:
 def start(generator: Generator, displacement: Tensor) -> History:
     """The past of a vehicle that has always moved by ``displacement`` [N, M, 2] a step."""
     one = generator.encoder.project(displacement, torch.zeros_like(displacement))
-    return History((one,) * (generator.sizes.observed - 1), displacement)
+    # Copies, although they are alike: a compiled graph is made for inputs that are one tensor or several.
+    return History(tuple(one.clone() for _ in range(generator.sizes.observed - 1)), displacement)
 
 
 def recorded(generator: Generator, displacements: Tensor) -> History:

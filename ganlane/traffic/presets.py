@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
-from ganlane.generator import headway_quantiles, load_generator, shipped_generator
+from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.mobil import TABLE_IV, MobilParameters
 from ganlane.sim.random import Stream
@@ -33,6 +33,13 @@ from ganlane.traffic.lane_change_faults import (
 )
 from ganlane.traffic.sequential import TrafficSequential
 from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
+
+
+#: Latent vectors of the calibrated traffic: so many times as large as in fitting, and forgotten so fast, s. Both were
+#: chosen on the scenes that the generator is fitted to: as fitted (1 and 5 s) too few drivers accelerate.
+NOISE_SCALE, NOISE_PERIOD_S = 1.5, 3.0
+#: Its anchor: the fitted one, but a driver who changes lanes moves over as fast as recorded ones do.
+SIMULATED_ANCHOR: AnchorParameters = replace(ANCHOR, lane_stiffness=0.6, lane_damping=1.55)
 
 
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
@@ -94,8 +101,9 @@ def gan_calibrated_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    noise_scale: float = 1.0,
+    noise_scale: float = NOISE_SCALE,
     changes_per_km: float | None = None,
+    noise_period_s: float = NOISE_PERIOD_S,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, traits, lane changes behind a gap check at the recorded rate.
@@ -103,9 +111,10 @@ def gan_calibrated_traffic(
     Args:
         road, stream: as for every traffic module.
         path: weights of the calibrated preset; by default those that ship.
-        noise_scale: 1 samples as fitted, 0 drives everybody by the mean prediction.
+        noise_scale: of the latent vectors; 1 as fitted, 0 drives everybody by the mean prediction.
         changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the rate of the
             recordings, which gives that rate in the simulation.
+        noise_period_s: time in which a driver's latent vector is forgotten.
         idm: of the gap check; the anchor keeps the IDM that the network was fitted on (Table V).
 
     Raises:
@@ -116,9 +125,14 @@ def gan_calibrated_traffic(
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
-    options: dict[str, Any] = {"headway_quantiles_s": headway_quantiles(metadata["driving_statistics"])}
+    options: dict[str, Any] = {
+        "noise_period_s": noise_period_s,
+        "noise_scale": noise_scale,
+        "headway_quantiles_s": headway_quantiles(metadata["driving_statistics"]),
+        "parameters": SIMULATED_ANCHOR,
+    }
     parts: dict[str, TrafficModule] = {
-        "generator": AnchoredGanTraffic(generator, road, stream, noise_scale=noise_scale, **options),
+        "generator": AnchoredGanTraffic(generator, road, stream, **options),
         "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes), idm),
     }
     return TrafficSequential(parts)

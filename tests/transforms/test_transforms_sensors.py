@@ -132,6 +132,8 @@ def test_nobody_is_seen_at_a_dropout_of_one_and_a_vehicle_that_is_not_there_neve
     absent = true.with_(valid=torch.tensor([[True, False, True]]).expand(4, 3))
     seen = measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), NOISY)
     assert torch.equal(seen.valid, absent.valid)
+    lossy = SensorParameters(dropout=0.5)
+    assert not measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), lossy).valid[:, 1].any()
 
 
 def test_perfect_sensors_show_the_present_observation_bit_for_bit():
@@ -355,6 +357,14 @@ def test_evaluate_takes_sensor_errors_from_the_command_line(tmp_path, monkeypatc
     assert results["config"]["observation"]["sensors"]["delay_s"] == 1.0
 
 
+def test_a_shipped_agent_drives_with_the_sensors_of_the_command_line(tmp_path, monkeypatch, capsys):
+    rewards = []
+    for errors in ([], ["observation.sensors.dropout=1"]):
+        _, results, _ = in_process(tmp_path, monkeypatch, capsys, "agents=[agent_idm]", "env.goal_m=1000", *errors)
+        rewards.append(results["rows"][0]["mean_reward"])
+    assert rewards[0] != rewards[1]
+
+
 def test_a_delay_between_two_decisions_is_a_users_mistake(tmp_path, monkeypatch, capsys):
     wrong = ["agents=[keep_lane]", "observation.sensors.delay_s=0.5"]
     status, _, err = in_process(tmp_path, monkeypatch, capsys, *wrong)
@@ -379,6 +389,15 @@ def test_training_with_sensor_errors_in_two_parts_ends_like_one_in_a_piece(tmp_p
     one, other = (read_agent(folder / "agent.safetensors")[0] for folder in folders)
     assert one.keys() == other.keys()
     assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_an_agent_trained_on_exact_sensors_is_a_start_for_training_with_errors(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    exact = [argument for argument in TINY if argument not in ERRORS]
+    assert train([*exact, "total_decisions=16"]) == 0
+    first = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: ")).parent / "agent.safetensors"
+    start = ["init=idm_ckpt", f"init.path={first}"]
+    assert train([*[part for part in TINY if part != "init=none"], *start, "total_decisions=16"]) == 0
 
 
 def test_every_leaf_of_the_state_is_in_the_spec():

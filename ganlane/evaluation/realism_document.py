@@ -1,0 +1,66 @@
+"""The card in a document: between two markers, rewritten by the command that measures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ganlane.errors import UserError
+from ganlane.evaluation.provenance import code_version, machine
+from ganlane.evaluation.realism_table import checks_text, long_table, quantities_table, starts_table
+from ganlane.files import write_bytes
+
+
+def markers(traffic: str) -> tuple[str, str]:
+    """The lines between which the card of a traffic stands."""
+    return f"<!-- begin realism {traffic} -->", f"<!-- end realism {traffic} -->"
+
+
+def require_markers(path: Path, traffic: str) -> tuple[str, str]:
+    """The document's text up to the first marker, and from the second on, markers included.
+
+    Raises:
+        UserError: there is no such file, or it does not hold the two markers once each and in order.
+    """
+    begin, end = markers(traffic)
+    if not path.is_file():
+        raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
+    text = path.read_text(encoding="utf-8")
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise UserError(f"report={path}: expected the lines {begin} and {end} in it, once each; add them.")
+    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
+
+
+def update_document(path: Path, traffic: str, content: str) -> None:
+    """Put ``content`` between the markers of a traffic, atomically; the rest stays as it is."""
+    before, after = require_markers(path, traffic)
+    write_bytes(path, f"{before}\n\n{content}\n\n{after}".encode())
+
+
+def card_text(numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """The card's tables, as they are printed.
+
+    Args:
+        numbers: what ``results.json`` holds.
+        long_runs: by traffic; those that drove none are left out.
+    """
+    traffic = numbers["traffic"]
+    tables = [quantities_table(numbers["quantities"], traffic), starts_table(numbers["driving"])]
+    tables += [f"I-80, {name}\n{quantities_table(rows, traffic)}" for name, rows in numbers["i80"].items()]
+    tables += [long_table(runs, name) for name, runs in long_runs.items() if runs]
+    return [*tables, checks_text(numbers["checks"])]
+
+
+def document_text(tables: Sequence[str], numbers: Mapping[str, Any], command: str, written: str) -> str:
+    """What :func:`update_document` puts between the markers: command, machine, starts, tables."""
+    here, code = machine(), code_version()
+    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    excess = ", ".join(f"{name} {value:g}" for name, value in numbers["desired_above_mps"].items())
+    said = [
+        f"Written by the command on {written}:\n\n    {command}",
+        f"Taken with Python {here['python']}, torch {here['torch']}, ganlane {code['version']}{revision}, from "
+        f"{numbers['starts']} starts: {', '.join(numbers['scenes']) or 'none recorded'}. Desired speeds above the "
+        f"speed at entry, mean, m/s: {excess or 'not fitted'}.",
+    ]
+    return "\n\n".join([*said, *(f"```text\n{table}\n```" for table in tables)])

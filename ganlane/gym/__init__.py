@@ -1,0 +1,33 @@
+"""The highway for gymnasium: one environment, and a batch of them behind gymnasium's vector interface.
+
+::
+
+    import gymnasium
+    import ganlane
+
+    env = gymnasium.make("ganlane/Highway-v0", traffic="gan", lanes=4)
+    envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, traffic="gan")
+
+Importing ganlane registers them (gymnasium 1 looks for no plugins); ``gymnasium.make("ganlane:ganlane/Highway-v0")``
+imports and makes in one call. :mod:`~ganlane.gym.single` and :mod:`~ganlane.gym.vector` are the two facades,
+:mod:`~ganlane.gym.rows` is what they share: a batch of TorchRL environments seen as NumPy arrays.
+:mod:`~ganlane.gym.pictures` and :mod:`~ganlane.gym.window` draw. This module itself stays light.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import gymnasium
+
+ENV_ID: Final = "ganlane/Highway-v0"
+
+
+def register_envs() -> None:
+    """Tell gymnasium of the environments; again does no harm."""
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(
+            ENV_ID,
+            entry_point="ganlane.gym.single:HighwayGym",
+            vector_entry_point="ganlane.gym.vector:HighwayVectorGym",
+        )

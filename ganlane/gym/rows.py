@@ -1,0 +1,166 @@
+"""A batch of TorchRL environments as NumPy arrays: what both facades share."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium.spaces import Box
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from ganlane import keys
+from ganlane.agents.drivers import legal_actions
+from ganlane.errors import UserError
+from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
+from ganlane.sim.road import road_in
+
+Floats = npt.NDArray[np.float32]
+#: Speed over desired speed beyond which the observation is cut off; a driver stays below its desired speed.
+SPEED_RATIO_LIMIT: Final = 4.0
+#: Unseeded environments draw their seed below this.
+SEEDS: Final = 2**31
+ACTIONS: Final = 3
+
+
+def observation_space(size: int) -> Box:
+    """Bounds of an observation of ``size`` numbers: speed over desired speed, then numbers from -1 to 1."""
+    low, high = np.full(size, -1.0, np.float32), np.full(size, 1.0, np.float32)
+    low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
+    return Box(low, high, dtype=np.float32)
+
+
+class Rows:
+    """N rows of an environment from :func:`ganlane.api.make_env`, their state kept here.
+
+    Args:
+        env: the environment.
+    """
+
+    def __init__(self, env: TransformedEnv) -> None:
+        self.env, self.count = env, env.batch_size[0]
+        self.space = observation_space(env.observation_spec[keys.OBSERVATION].shape[-1])
+        self.state: TensorDictBase | None = None
+
+    @torch.no_grad()
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
+        """Begin the episodes [N] of the seeds [N]; each may be one number for all rows."""
+        numbers = {keys.SEED: seed, keys.EPISODE: episode}
+        counters = {
+            name: torch.as_tensor(np.broadcast_to(value, self.count).astype(np.int64), device=self.env.device)
+            for name, value in numbers.items()
+        }
+        self.state = self.env.reset(TensorDict(counters, [self.count], device=self.env.device))
+
+    @torch.no_grad()
+    def step(self, actions: Tensor) -> TensorDictBase:
+        """One decision; the state after it, which also stays here. No row is reset."""
+        stepped = self.env.step(self._with(actions))
+        self.state = self.env.step_mdp(stepped)
+        return stepped.get("next")
+
+    @torch.no_grad()
+    def step_and_reset(self, actions: Tensor) -> TensorDictBase:
+        """One decision; the state after it. What stays here has the rows that ended at their next episodes."""
+        stepped, self.state = self.env.step_and_maybe_reset(self._with(actions))
+        return stepped.get("next")
+
+    @torch.no_grad()
+    def restart(self, rows: npt.NDArray[np.bool_]) -> None:
+        """Go on to the next episode in some rows [N]."""
+        mask = torch.as_tensor(rows, device=self.env.device)[:, None]
+        self.state = self.env.reset(self.now().set("_reset", mask))
+
+    def now(self) -> TensorDictBase:
+        """The state of all rows."""
+        if self.state is None:
+            raise UserError("step() before reset(); call reset() first.")
+        return self.state
+
+    def _with(self, actions: Tensor) -> TensorDictBase:
+        return self.now().set(keys.ACTION, actions.to(self.env.device))
+
+    def actions(self, given: Any) -> Tensor:
+        """Actions [N] int64 from what a user handed over.
+
+        Raises:
+            UserError: another shape, or none of the three.
+        """
+        array = np.asarray(given)
+        if array.shape != (self.count,) or array.dtype.kind not in "iu" or not np.isin(array, range(ACTIONS)).all():
+            shown = array.tolist() if self.count > 1 else array.ravel().tolist()
+            raise UserError(
+                f"action {shown}: expected {self.count} whole number(s), 0 (keep), 1 (left) or 2 (right); "
+                "give one for every environment."
+            )
+        return torch.as_tensor(array.astype(np.int64))
+
+    def observation(self, state: TensorDictBase | None = None) -> Floats:
+        """Observations [N, D], a copy, within the space."""
+        found = (self.now() if state is None else state).get(keys.OBSERVATION)
+        return np.clip(found.cpu().numpy(), self.space.low, self.space.high)
+
+    def info(self, state: TensorDictBase | None = None) -> dict[str, Any]:
+        """What is known beside the observation, by name, arrays [N] (the mask [N, 3]); copies.
+
+        docs/gymnasium.md lists the names.
+        """
+        at = self.now() if state is None else state
+        vehicles, ego, events = at.get(keys.VEHICLES), at.get(keys.EGO), at.get(keys.EVENTS)
+        road = road_in(at, self.env.base_env.road)
+        found = {
+            "seed": at.get(keys.SEED),
+            "episode_number": at.get(keys.EPISODE),
+            "time_s": at.get(keys.STEP).double() * PHYSICS_STEP_S,
+            "distance_m": ego.get("distance"),
+            "speed_mps": vehicles.get("speed")[:, EGO_INDEX],
+            "lane": road.lane_of(vehicles.get("y"))[:, EGO_INDEX].long(),
+            "decisions": ego.get("decisions"),
+            "lane_changes": ego.get("lane_changes"),
+            "action_mask": legal_actions(at, road).to(torch.int8),
+            **{name: events.get(name)[:, 0] for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)},
+        }
+        terms = at.get(keys.REWARD_TERMS)
+        paid = {name: _array(terms.get(name)[:, 0]) for name in keys.REWARD_TERM_NAMES}
+        return {**{name: _array(value) for name, value in found.items()}, keys.REWARD_TERMS: paid}
+
+
+def _array(tensor: Tensor) -> npt.NDArray[Any]:
+    return tensor.cpu().numpy().copy()
+
+
+def row_of(info: dict[str, Any], row: int) -> dict[str, Any]:
+    """One row of :meth:`Rows.info`, numbers as plain Python."""
+    return {name: _item(value, row) for name, value in info.items()}
+
+
+def _item(value: Any, row: int) -> Any:
+    if isinstance(value, dict):
+        return row_of(value, row)
+    return value[row].copy() if value.ndim > 1 else value[row].item()
+
+
+def seed_number(seed: Any) -> int:
+    """A seed, checked: the counters of the environment hold 63 bits."""
+    if not 0 <= int(seed) < 2**63:
+        raise UserError(f"seed={seed}: expected a whole number from 0 to 2**63 - 1; give for instance seed=0.")
+    return int(seed)
+
+
+def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
+    """The options of a reset, checked for names that nobody reads."""
+    unknown = sorted(set(options or {}) - set(names))
+    if unknown:
+        raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")
+    return dict(options or {})
+
+
+def episode_number(episode: Any) -> npt.NDArray[np.int64]:
+    """The option ``episode``, checked: whole numbers from 0."""
+    numbers = np.asarray(episode)
+    if numbers.dtype.kind not in "iu" or (numbers < 0).any():
+        raise UserError(f"options: episode={episode!r}: expected whole numbers from 0; give for instance 3.")
+    return numbers.astype(np.int64)

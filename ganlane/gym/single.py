@@ -1,0 +1,131 @@
+"""One highway as a ``gymnasium.Env``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from torchrl.envs import Transform, TransformedEnv
+
+from ganlane.api.options import Option, option
+from ganlane.api.parts import make_env
+from ganlane.errors import UserError
+from ganlane.gym.pictures import LiveView, real_time_fps
+from ganlane.gym.rows import ACTIONS, SEEDS, Floats, Rows, episode_number, known_options, row_of, seed_number
+from ganlane.gym.window import FilmWindow, has_display
+
+RENDER_MODES = ("human", "rgb_array")
+
+
+class HighwayGym(gymnasium.Env[Floats, Any]):
+    """``gymnasium.make("ganlane/Highway-v0", ...)``.
+
+    Args:
+        traffic, observation, reward, env, transforms, stream, device, overrides: as in
+            :func:`ganlane.api.make_env`.
+        seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random, as gymnasium
+            has it.
+        render_mode: None, ``rgb_array`` (a frame per decision) or ``human`` (a window, ten frames per second of
+            simulated time).
+
+    ``reset(seed=s)`` begins episode 0 of seed s, every further ``reset()`` the next one;
+    ``reset(options={"episode": k})`` runs episode k. ``action`` is 0 (keep), 1 (left) or 2 (right);
+    docs/gymnasium.md lists observations and infos.
+
+    Raises:
+        UserError: a wrong value, or ``human`` without a display.
+    """
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 1}  # noqa: RUF012 - gymnasium's own form
+
+    def __init__(
+        self,
+        traffic: Option = "idm_mobil",
+        observation: Option = "lane_view",
+        reward: Option = "paper",
+        seed: int | None = None,
+        env: Option = "highway",
+        transforms: Sequence[Transform] = (),
+        stream: str = "train",
+        device: str = "cpu",
+        render_mode: str | None = None,
+        **overrides: Any,
+    ) -> None:
+        made = make_env(
+            traffic,
+            env=env,
+            observation=observation,
+            reward=reward,
+            transforms=transforms,
+            stream=stream,
+            device=device,
+            **overrides,
+        )
+        self._rows = Rows(made)
+        self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
+        self.action_space = gymnasium.spaces.Discrete(ACTIONS)
+        # What can be drawn here and now: without a display, no window.
+        modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
+        self.metadata = {"render_modes": modes, "render_fps": real_time_fps(made)}
+        self.render_mode = render_mode
+        self._view = None if render_mode is None else _view(made, render_mode, label(traffic))
+        self._seed = None if seed is None else seed_number(seed)
+        self._episode = -1
+        self._running = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin an episode; see the class for which."""
+        given = known_options(options, ("episode",))
+        super().reset(seed=seed)
+        if seed is not None:
+            self._seed, self._episode = seed_number(seed), -1
+        elif self._seed is None:
+            self._seed = int(self.np_random.integers(SEEDS))
+        self._episode = int(episode_number(given.get("episode", self._episode + 1)))
+        self._rows.start(self._seed, self._episode)
+        self._running = True
+        if self._view is not None:
+            self._view.start(self._rows.now())
+        return self._rows.observation()[0], row_of(self._rows.info(), 0)
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """One decision: observation, reward, terminated, truncated, info."""
+        if not self._running:
+            raise UserError("step(): no episode is under way; call reset() first.")
+        actions = self._rows.actions(np.reshape(action, -1))
+        if self._view is not None:
+            self._view.decide(int(actions[0]))
+        after = self._rows.step(actions)
+        reward = float(after.get("reward")[0])
+        terminated, truncated = (bool(after.get(name)[0]) for name in ("terminated", "truncated"))
+        self._running = not (terminated or truncated)
+        if self._view is not None:
+            self._view.decided(after, reward)
+        return self._rows.observation(after)[0], reward, terminated, truncated, row_of(self._rows.info(after), 0)
+
+    def render(self) -> Any:
+        """The picture [height, width, 3] uint8 of the last moment with ``rgb_array``; ``human`` draws by itself."""
+        if self._view is None:
+            raise UserError(f"render(): made without render_mode; give one of {', '.join(RENDER_MODES)} to make().")
+        return self._view.picture() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+
+
+def _view(env: TransformedEnv, render_mode: str, traffic: str) -> LiveView:
+    """What draws in ``render_mode``."""
+    if render_mode not in RENDER_MODES:
+        raise UserError(f"render_mode={render_mode}: expected {' or '.join(RENDER_MODES)}; choose one of them.")
+    return LiveView(env, traffic, FilmWindow("ganlane") if render_mode == "human" else None)
+
+
+def label(traffic: Option) -> str:
+    """Name of the traffic in a picture."""
+    return option("traffic", traffic).label()

@@ -1,0 +1,190 @@
+"""The calls of a notebook do what the commands do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+import torch
+
+import ganlane
+from ganlane.agents.drivers import DRIVERS
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import GanTrafficConfig
+from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.errors import UserError
+from ganlane.traffic import IdmTraffic
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_every_name_at_the_top_is_there():
+    for name in ganlane.__all__:
+        assert getattr(ganlane, name) is not None
+    assert set(ganlane.__all__) <= set(dir(ganlane))
+    with pytest.raises(AttributeError, match="nothing_of_the_kind"):
+        ganlane.nothing_of_the_kind  # noqa: B018
+
+
+def test_a_commands_module_does_not_hide_the_call():
+    from ganlane.evaluate import main
+
+    assert callable(main)
+    assert ganlane.evaluate is ganlane.api.evaluate
+    from ganlane import evaluate
+
+    assert evaluate is ganlane.api.evaluate
+
+
+def test_an_environment_takes_what_the_command_line_takes():
+    env = ganlane.make_env(
+        "idm", 3, lanes=4, vehicles=15, recycle=True, idm={"headway_s": 1.2}, observation="table3", seed=4
+    )
+    base = env.base_env
+    assert (base.road.lanes, base.vehicles, base.recycle, base.batch_size[0]) == (4, 15, True, 3)
+    assert base.rules.idm.headway_s == 1.2
+    state = env.reset()
+    assert state["observation"].shape == (3, 3 + 3 * 14)
+    assert state["seed"].tolist() == [4, 4, 4]
+
+
+def test_options_come_as_names_mappings_configs_and_classes():
+    by_mapping = ganlane.make_env({"name": "gan", "noise_scale": 0.0}, reward={"hard_crash": -200.0})
+    by_config = ganlane.make_env(GanTrafficConfig(noise_scale=0.0), env=EnvConfig(lanes=2), lane_width_m=3.5)
+    assert by_config.base_env.road.lanes == 2
+    assert by_config.base_env.road.lane_width_m == 3.5
+    assert type(by_mapping.base_env.traffic) is type(by_config.base_env.traffic)
+    assert by_mapping.transform[-1].parameters.hard_crash == -200.0
+    assert isinstance(ganlane.make_env(IdmTraffic).base_env.traffic, IdmTraffic)
+    assert ganlane.make_env("idm", env="cut_in", scene={"gap_m": 15.0}).base_env.vehicles > 1
+    assert ganlane.make_env("idm", env="dense", vehicles=40).base_env.vehicles == 40
+
+
+def test_a_loaded_agent_drives_an_environment():
+    agent = ganlane.load_agent("agent_idm")
+    env = ganlane.make_env("idm", 2, observation=agent.observation, goal_m=50.0)
+    rollout = env.rollout(3, agent.policy)
+    assert rollout["action"].shape == (2, 3)
+    assert ganlane.load_agent("mobil", lanes=5).policy.road.lanes == 5
+
+
+def test_the_table_has_the_numbers_of_the_command(capsys):
+    from ganlane.evaluate import main
+
+    arguments = ["agents=[mobil,random_legal]", "traffics=[idm,idm_mobil]", "episodes=3", "env.goal_m=40"]
+    assert main([*arguments, "seed=2"]) == 0
+    written = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: "))
+    rows = json.loads(written.read_text())["rows"]
+    threads = torch.get_num_threads()
+    table = ganlane.evaluate(["mobil", "random_legal"], ["idm", "idm_mobil"], 3, seed=2, goal_m=40, folder="mine")
+    assert torch.get_num_threads() == threads
+    assert isinstance(table, pl.DataFrame)
+    assert json.loads(json.dumps(table.to_dicts())) == rows
+    assert json.loads(Path("mine/results.json").read_text())["rows"] == rows
+    assert pl.read_parquet("mine/episodes.parquet").equals(pl.read_parquet(written.parent / "episodes.parquet"))
+
+
+def test_own_drivers_and_own_names_stand_in_the_table():
+    from ganlane.sim import Road
+
+    own = DRIVERS["keep_lane"](Road(3), 2)
+    traffics = {"quiet": {"name": "idm"}, "mine": IdmTraffic}
+    episodes = ganlane.evaluate([own, ganlane.load_agent("keep_lane")], traffics, 2, goal_m=30, per_episode=True)
+    assert episodes.height == 8
+    assert episodes["traffic"].unique(maintain_order=True).to_list() == ["quiet", "mine"]
+    assert episodes["agent"].unique(maintain_order=True).to_list() == [type(own).__name__, "keep_lane"]
+    totals = episodes.group_by("agent", "traffic").agg(pl.col("reward").sum())["reward"]
+    assert totals.n_unique() == 1
+
+
+def test_a_run_is_trained_resumed_and_evaluated():
+    small = {"warmup": 64, "capacity": 1000, "hidden": [16], "batch_size": 16}
+    tiny = {"agent": small, "num_envs": 8, "goal_m": 40.0, "evaluation": {"agents": ["mobil"], "episodes": 2}}
+    run = ganlane.train("idm", "none", total_decisions=256, folder="run", logger={"progress": False}, **tiny)
+    assert run.agent == Path("run/agent.safetensors")
+    assert run.table["agent"].to_list() == ["trained", "mobil"]
+    assert run.results["decisions"] >= 256
+    assert {"config.yaml", "results.json", "episodes.parquet"} <= {path.name for path in run.folder.iterdir()}
+    table = ganlane.evaluate([str(run.agent)], ["idm"], 2, goal_m=40.0)
+    assert table["mean_reward"][0] == run.table["mean_reward"][0]
+    more = ganlane.train("idm", "none", total_decisions=512, folder="run", resume=True, **tiny)
+    assert more.results["decisions"] >= 512
+
+
+def test_a_film_is_written_where_it_was_asked_for():
+    path = ganlane.render("keep_lane", "idm", 2, out="strip.png", goal_m=30.0, film={"width": 640, "height": 200})
+    assert path == Path("strip.png")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert ganlane.render("keep_lane", "idm", format="png", goal_m=20.0).parent.parent == Path("outputs/render")
+
+
+def test_speed_is_measured():
+    found = ganlane.bench(
+        "sim", quick=True, batches=[2], modes=["eager"], threads=[1], vehicle_counts=[3], peers=False, memory=False
+    )
+    assert found.results["rows"][0]["physics_steps_per_s"] > 0
+
+
+@pytest.fixture
+def recordings(tmp_path, monkeypatch):
+    """A scene CSV; nothing else is found."""
+    monkeypatch.delenv("GANLANE_DATA", raising=False)
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=8, seconds=7.0)), tmp_path / "mine.csv")
+    return tmp_path / "mine.csv"
+
+
+def test_recordings_become_a_generator_that_drives(recordings):
+    prepared = ganlane.prepare({"path": recordings}, out="mine")
+    assert prepared.results["files"]
+    loop = {"updates": 2, "evaluate_every": 1}
+    fitted = ganlane.train_generator({"path": "mine"}, {"batch": 4, "loop": loop}, seed=1)
+    assert fitted.weights.is_file()
+    assert fitted.results["ade_m"].keys() >= {"mean", "constant_velocity"}
+    env = ganlane.make_env({"name": "gan", "path": fitted.weights}, 2)
+    assert env.rollout(2)["next", "reward"].shape == (2, 2, 1)
+
+
+def test_a_card_is_made(recordings):
+    held_out = {"path": recordings, "held_out": ["synthetic-1", "synthetic-2"]}
+    run = ganlane.realism("idm", ["idm_mobil"], data=held_out, quick=True, vehicle_km=0.0, resamples=100)
+    assert 0.0 <= run.results["quantities"]["speed"]["distance"] <= 1.0
+    assert (run.folder / "distributions.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: ganlane.make_env(num_envs=0), "num_envs=0: expected a number from 1"),
+        (lambda: ganlane.make_env(num_envs="2"), "num_envs='2': expected a whole number"),
+        (lambda: ganlane.make_env(device="tpu"), "device=tpu: expected one of cpu, cuda"),
+        (lambda: ganlane.make_env(reward={"base_speed_mps": 30.0}), "expected more than reward.base_speed_mps"),
+        (lambda: ganlane.make_env("no.such.Traffic"), "traffic._target_=no.such.Traffic"),
+        (lambda: ganlane.load_agent("nobody"), "agent nobody: unknown; choose one of"),
+        (lambda: ganlane.load_agent("gone.safetensors"), "agent gone.safetensors: no such file"),
+        (lambda: ganlane.evaluate(["mobil"], ["idm"], 0), "episodes=0: expected at least 1"),
+        (lambda: ganlane.evaluate(["mobil", "mobil"], ["idm"]), "a list of different names"),
+        (lambda: ganlane.evaluate(["mobil"], ["idm", {"name": "idm"}]), "one name twice"),
+        (lambda: ganlane.evaluate([42], ["idm"]), "agents: 42 is no driver"),
+        (lambda: ganlane.evaluate(["mobil"], ["idm"], generator={"path": "x"}), "env.generator: no such key"),
+        (lambda: ganlane.train("idm", resume=True), "resume=True: which run"),
+        (lambda: ganlane.train("idm", total_decisions=0, folder="none"), "total_decisions=0: expected at least 1"),
+        (lambda: ganlane.render("nobody", "idm"), "agent nobody: unknown"),
+        (lambda: ganlane.render(out="film.avi"), "format=avi: expected one of gif, mp4, png"),
+        (lambda: ganlane.realism("replay"), "traffic=replay: it is the recordings themselves"),
+        (lambda: ganlane.bench(report="x.md"), "report: tables go into a document with the command only"),
+        (lambda: ganlane.prepare(lanes=3), "lanes: no such key"),
+        (lambda: ganlane.prepare("ngsim"), "data=ngsim: which file is missing"),
+        (lambda: ganlane.train_generator({"path": "gone.csv"}), "gone.csv"),
+        (lambda: ganlane.bench("speed"), "suite=speed: expected one of"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(call, told, tmp_path):
+    with pytest.raises(UserError, match=told.replace("(", r"\(")) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []

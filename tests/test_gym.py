@@ -1,0 +1,376 @@
+"""The highway through gymnasium: one environment, a batch, pictures, and what other libraries expect of them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import ganlane
+from ganlane.errors import UserError
+from ganlane.gym.window import FilmWindow
+
+ID = "ganlane/Highway-v0"
+KEEP, LEFT, RIGHT = 0, 1, 2
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def make(**options):
+    return gymnasium.make(ID, **{"traffic": "idm", "goal_m": 60.0, **options})
+
+
+def make_vec(rows, **options):
+    return gymnasium.make_vec(ID, num_envs=rows, **{"traffic": "idm", "goal_m": 60.0, **options})
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"traffic": "idm_mobil"},
+        {"traffic": "gan"},
+        {"traffic": "idm", "lanes": 4, "vehicles": 15, "recycle": True, "observation": "table3"},
+        {"traffic": "idm", "env": "cut_in", "observation": "table3_lane_view", "render_mode": "rgb_array"},
+    ],
+)
+def test_gymnasiums_own_check_finds_nothing_to_say(options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make(ID, **options).unwrapped)
+
+
+def test_neither_making_nor_running_a_batch_warns():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        envs = gymnasium.make_vec(ID, num_envs=3, traffic="gan", goal_m=60.0)
+        envs.reset(seed=0)
+        for _ in range(6):
+            observation, reward, terminated, truncated, _ = envs.step(envs.action_space.sample())
+            assert envs.observation_space.contains(observation)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert reward.shape == terminated.shape == truncated.shape == (3,)
+    assert terminated.dtype == truncated.dtype == np.bool_
+
+
+def test_the_id_imports_the_package_by_itself():
+    code = "import gymnasium; print(gymnasium.make('ganlane:ganlane/Highway-v0', traffic='idm').action_space)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "Discrete(3)"
+
+
+def test_importing_the_package_loads_neither_torch_nor_hydra():
+    code = "import sys, ganlane; print([m for m in ('torch', 'hydra', 'polars', 'PIL') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_episodes_follow_from_seed_and_number():
+    env = make()
+    first, _ = env.reset(seed=5)
+    second, info = env.reset()
+    assert (info["seed"], info["episode_number"]) == (5, 1)
+    assert not np.array_equal(first, second)
+    again, info = env.reset(options={"episode": 1})
+    assert info["episode_number"] == 1
+    np.testing.assert_array_equal(again, second)
+    np.testing.assert_array_equal(make().reset(seed=5, options={"episode": 1})[0], second)
+
+
+def test_without_a_seed_two_environments_differ():
+    seeds = {make().reset()[1]["seed"] for _ in range(3)}
+    assert len(seeds) == 3
+    assert make(seed=7).reset()[1]["seed"] == 7
+
+
+def drive_alone(seed, episode, actions):
+    env = make(traffic="idm_mobil")
+    seen = [env.reset(seed=seed, options={"episode": episode})[0]]
+    paid = []
+    for action in actions:
+        observation, reward, *_ = env.step(action)
+        seen.append(observation)
+        paid.append(reward)
+    return np.stack(seen), paid
+
+
+def test_a_row_of_a_batch_drives_as_one_alone_does():
+    actions = [[LEFT, KEEP, KEEP], [KEEP, KEEP, LEFT], [KEEP, RIGHT, KEEP]]
+    envs = make_vec(3, traffic="idm_mobil", goal_m=60.0)
+    seen, paid = [envs.reset(seed=2, options={"episode": 3})[0]], []
+    ends = []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = envs.step(np.array(action))
+        seen.append(observation)
+        paid.append(reward)
+        ends.append(terminated | truncated)
+    for row in range(3):
+        alone, own_pay = drive_alone(2, 3 + row, [action[row] for action in actions[: lasts(ends, row)]])
+        count = lasts(ends, row)
+        np.testing.assert_array_equal(np.stack(seen)[:count, row], alone[:count])
+        np.testing.assert_array_equal(np.array(paid)[:count, row], own_pay)
+
+
+def lasts(ends, row):
+    """Decisions until the row ended, the last one included."""
+    over = [bool(end[row]) for end in ends]
+    return over.index(True) + 1 if True in over else len(over)
+
+
+def test_the_facade_gives_what_the_torchrl_environment_gives():
+    envs = make_vec(2, goal_m=400.0)
+    observation, _ = envs.reset(seed=1)
+    env = ganlane.make_env("idm", 2, goal_m=400.0, seed=1)
+    state = env.reset()
+    np.testing.assert_array_equal(observation, state["observation"].numpy())
+    for _ in range(3):
+        observation, reward, terminated, _, _ = envs.step(np.array([LEFT, KEEP]))
+        stepped, state = env.step_and_maybe_reset(state.set("action", torch.tensor([LEFT, KEEP])))
+        np.testing.assert_array_equal(observation, state["observation"].numpy())
+        np.testing.assert_array_equal(reward, stepped["next", "reward"][:, 0].double().numpy())
+        np.testing.assert_array_equal(terminated, stepped["next", "terminated"][:, 0].numpy())
+
+
+def until_the_end(env):
+    for _ in range(100):
+        found = env.step(KEEP)
+        if found[2] or found[3]:
+            return found
+    raise AssertionError("it never ended")
+
+
+def test_the_goal_terminates_and_a_time_out_truncates():
+    env = make(goal_m=30.0)
+    env.reset(seed=0)
+    *_, terminated, truncated, info = until_the_end(env)
+    assert (terminated, truncated, info["goal"], info["timeout"]) == (True, False, True, False)
+    env = make(goal_m=5000.0, timeout_s=3.0)
+    env.reset(seed=0)
+    *_, terminated, truncated, info = until_the_end(env)
+    assert (terminated, truncated, info["goal"], info["timeout"]) == (False, True, False, True)
+    assert info["time_s"] == pytest.approx(3.0)
+
+
+def test_leaving_the_road_terminates_and_the_mask_says_so_beforehand():
+    env = make(lanes=1)
+    _, info = env.reset(seed=0)
+    np.testing.assert_array_equal(info["action_mask"], [1, 0, 0])
+    _, reward, terminated, _, info = env.step(LEFT)
+    assert terminated
+    assert info["out_of_road"]
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-6)
+
+
+def test_a_row_that_ends_is_reset_in_the_same_step_and_tells_how_it_ended():
+    envs = make_vec(3, lanes=1, goal_m=500.0)
+    first, _ = envs.reset(seed=0)
+    observation, _, terminated, truncated, info = envs.step(np.array([KEEP, LEFT, KEEP]))
+    np.testing.assert_array_equal(terminated | truncated, [False, True, False])
+    np.testing.assert_array_equal(info["_final_obs"], [False, True, False])
+    assert info["final_obs"][0] is None
+    np.testing.assert_array_equal(info["final_obs"][1], first[1])  # off the road at once: nothing moved
+    assert info["final_info"]["out_of_road"][1]
+    assert info["final_info"]["episode_number"][1] == 1
+    np.testing.assert_array_equal(info["episode_number"], [0, 4, 2])
+    np.testing.assert_array_equal(info["time_s"], [1.0, 0.0, 1.0])
+    assert not np.array_equal(observation[1], first[1])
+    assert not info["out_of_road"].any()
+
+
+def test_rows_can_be_sent_on_by_hand_and_the_others_stay():
+    envs = make_vec(3, goal_m=500.0)
+    envs.reset(seed=0)
+    before, *_, told = envs.step(np.zeros(3, int))
+    after, info = envs.reset(options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal((before == after).all(1), [True, False, True])
+    np.testing.assert_array_equal(info["episode_number"], told["episode_number"] + [0, 3, 0])
+    _, info = envs.reset()
+    np.testing.assert_array_equal(info["episode_number"], [3, 7, 5])
+    _, info = envs.reset(seed=[7, 8, 9], options={"episode": np.array([4, 4, 0])})
+    np.testing.assert_array_equal(info["seed"], [7, 8, 9])
+    np.testing.assert_array_equal(info["episode_number"], [4, 4, 0])
+
+
+def test_a_users_transform_pays_what_it_says():
+    from torchrl.envs import RewardScaling
+
+    alone, doubled = make(), make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
+    rewards = []
+    for env in (alone, doubled):
+        env.reset(seed=0)
+        rewards.append(env.step(KEEP)[1])
+    assert rewards[1] == pytest.approx(2.0 * rewards[0])
+
+
+def test_episode_statistics_are_recorded_for_one_and_for_many():
+    env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
+    env.reset(seed=0)
+    paid = 0.0
+    while True:
+        _, reward, terminated, truncated, info = env.step(KEEP)
+        paid += reward
+        if terminated or truncated:
+            break
+    assert info["episode"]["r"] == pytest.approx(paid)
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_vec(2, goal_m=30.0))
+    envs.reset(seed=0)
+    while "episode" not in info or "_episode" not in info:
+        *_, info = envs.step(np.zeros(2, int))
+    assert info["episode"]["l"][info["_episode"]].min() > 0
+
+
+def test_infos_of_a_batch_can_be_had_row_by_row():
+    envs = gymnasium.wrappers.vector.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))
+    envs.reset(seed=0)
+    *_, infos = envs.step(np.array([KEEP, LEFT]))
+    assert "final_info" not in infos[0]
+    assert infos[1]["final_info"]["out_of_road"]
+    assert infos[0]["reward_terms"].keys() == infos[1]["reward_terms"].keys()
+
+
+def test_frames_show_the_road_and_change_as_the_ego_drives():
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (320, 1280, 3)
+    assert first.dtype == np.uint8
+    np.testing.assert_array_equal(first, env.render())
+    env.step(KEEP)
+    assert not np.array_equal(first, env.render())
+    envs = make_vec(2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    pictures = envs.render()
+    assert [picture.shape for picture in pictures] == [(320, 1280, 3)] * 2
+    assert not np.array_equal(*pictures)
+
+
+def test_a_long_episode_keeps_no_more_frames_than_its_trails():
+    env = make(render_mode="rgb_array", goal_m=5000.0)
+    env.reset(seed=0)
+    for _ in range(8):
+        env.step(KEEP)
+    recorder = env.unwrapped._view._recorder
+    assert len(recorder.frames) == len(recorder.time_s) == 31 + 10
+    assert recorder.time_s[-1] == pytest.approx(8.0)
+    assert env.render().shape == (320, 1280, 3)
+
+
+def test_videos_are_recorded(tmp_path):
+    pytest.importorskip("moviepy", reason="moviepy, which gymnasium's RecordVideo needs, is not installed")
+    video = gymnasium.wrappers.RecordVideo(make(render_mode="rgb_array", goal_m=30.0), str(tmp_path / "films"))
+    video.reset(seed=0)
+    until_the_end(video)
+    video.close()
+    (film,) = (tmp_path / "films").glob("*.mp4")
+    assert film.stat().st_size > 1000
+
+
+class Screen:
+    """A window that remembers what it was shown."""
+
+    def __init__(self, title):
+        self.shown, self.waited, self.closed = [], 0.0, False
+
+    def show(self, picture):
+        self.shown.append(picture)
+
+    def wait(self, seconds):
+        self.waited += seconds
+
+    def close(self):
+        self.closed = True
+
+
+def test_a_window_shows_every_physics_step(monkeypatch):
+    monkeypatch.setattr("ganlane.gym.single.FilmWindow", Screen)
+    monkeypatch.setattr("ganlane.gym.single.has_display", lambda: True)
+    env = make(render_mode="human")
+    env.reset(seed=0)
+    window = env.unwrapped._view.window
+    assert len(window.shown) == 1
+    env.step(KEEP)
+    assert len(window.shown) == 11
+    assert 0.0 < window.waited <= 1.1
+    assert env.render() is None
+    env.close()
+    assert window.closed
+
+
+def test_a_real_window_opens_where_there_is_a_display():
+    try:
+        window = FilmWindow("test")
+    except UserError as error:
+        pytest.skip(f"no display: {error}")
+    window.show(np.zeros((40, 60, 3), np.uint8))
+    window.close()
+    window.close()
+
+
+def test_without_a_display_the_window_is_refused_in_a_sentence(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(UserError, match="render_mode=human: needs tkinter and a display"):
+        make(render_mode="human")
+    assert make().unwrapped.metadata["render_modes"] == ["rgb_array"]
+    monkeypatch.setattr("ganlane.gym.single.has_display", lambda: True)
+    assert make().unwrapped.metadata["render_modes"] == ["human", "rgb_array"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"traffic": "gann"}, "traffic=gann: no such option .did you mean 'gan'.."),
+        ({"observation": "pixels"}, "observation=pixels: no such option"),
+        ({"lanes": 0}, "env.lanes=0: expected a number from 1 to 20"),
+        ({"lanes": "many"}, "env.lanes=many: expected a whole number"),
+        ({"lane": 4}, "env.lane: no such key .did you mean 'lanes'.."),
+        ({"reward": {"crash": 1.0}}, "reward.crash: no such key"),
+        ({"traffic": 3}, "traffic=3: expected a name"),
+        ({"stream": "test"}, "stream=test: expected one of train, select, report"),
+        ({"seed": -1}, "seed=-1: expected a whole number from 0"),
+        ({"render_mode": "ansi"}, "render_mode=ansi: expected human or rgb_array"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*render_mode")
+def test_a_wrong_argument_is_told_in_a_sentence(options, told):
+    with pytest.raises(UserError, match=told):
+        make(**options)
+
+
+def test_wrong_calls_are_told_in_a_sentence():
+    env, envs = make().unwrapped, make_vec(2)
+    with pytest.raises(UserError, match="call reset"):
+        env.step(KEEP)
+    with pytest.raises(UserError, match="call reset"):
+        envs.step(np.zeros(2, int))
+    with pytest.raises(UserError, match="episodes unknown; a reset takes episode"):
+        env.reset(options={"episodes": 3})
+    with pytest.raises(UserError, match="expected whole numbers from 0"):
+        env.reset(options={"episode": -3})
+    env.reset()
+    envs.reset()
+    with pytest.raises(UserError, match=r"0 \(keep\), 1 \(left\) or 2 \(right\)"):
+        env.step(3)
+    with pytest.raises(UserError, match="expected 2 whole number"):
+        envs.step(np.zeros(3, int))
+    with pytest.raises(UserError, match="made without render_mode"):
+        envs.render()
+    with pytest.raises(UserError, match="expected one seed and one episode, or 2 of each"):
+        envs.reset(seed=[1, 2, 3])
+
+
+def test_stable_baselines3_trains_on_it_unchanged():
+    baselines = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
+    model = baselines.DQN("MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]})
+    before = [weight.clone() for weight in model.q_net.parameters()]
+    model.learn(200)
+    assert model.num_timesteps == 200
+    assert len(model.ep_info_buffer) > 0
+    assert any(not torch.equal(old, new) for old, new in zip(before, model.q_net.parameters()))

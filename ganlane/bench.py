@@ -4,12 +4,14 @@
     ganlane bench suite=sim quick=true
     ganlane bench suite=sim batches=[1,1024] threads=[1] modes=[eager] repetitions=9
     ganlane bench suite=sim report=docs/performance.md
+    ganlane bench suite=traffic report=docs/performance.md
 
 Writes results.json into its run folder, and with ``report`` the tables into that document.
 """
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -71,8 +73,24 @@ def sim_suite(config: BenchConfig) -> Suite:
     return SimSuite(options)
 
 
+def traffic_suite(config: BenchConfig) -> Suite:
+    """``suite=traffic``."""
+    from ganlane.benchmarks.traffic import TrafficOptions, TrafficSuite
+
+    options = TrafficOptions(
+        env=config.env,
+        traffics=config.chosen_traffics(),
+        batches=tuple(config.traffic_batches),
+        modes=tuple(config.modes),
+        threads=tuple(config.threads),
+        peers=config.peers,
+        seed=config.seed,
+    )
+    return TrafficSuite(options)
+
+
 #: What ``suite=`` can be, and how each is made.
-SUITES: dict[str, Callable[[BenchConfig], Suite]] = {"sim": sim_suite}
+SUITES: dict[str, Callable[[BenchConfig], Suite]] = {"sim": sim_suite, "traffic": traffic_suite}
 
 
 def command_line(folder: Path) -> str:
@@ -87,7 +105,11 @@ def command_line(folder: Path) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
+    """Entry point; the exit status.
+
+    A thread of OpenMP's that spins while it waits takes the time of whoever works beside it.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     return run_command("bench", bench, arguments)
 
 

@@ -181,7 +181,7 @@ def show(config: RealismConfig, folder: Path, numbers: Mapping[str, Any], tables
     print(*tables, sep="\n\n")
     if config.report is not None:
         text = document_text(tables, numbers, command_line(folder), date.today().isoformat())
-        update_document(Path(config.report), numbers["traffic"], text)
+        update_document(Path(config.report), config.card(), text)
     for path in drawn if config.figures is not None else []:
         write_bytes(Path(str(config.figures)) / f"realism_{path.name}", path.read_bytes())
 
@@ -217,7 +217,7 @@ def check_targets(config: RealismConfig, path: Path | None) -> None:
     if config.publish and path is None:
         raise UserError("publish=true: the file that ships is made from recordings; give data.path=FILE.")
     if config.report is not None:
-        require_markers(Path(config.report), config.traffic.label())
+        require_markers(Path(config.report), config.card())
     if config.figures is not None and not Path(config.figures).is_dir():
         raise UserError(f"figures={config.figures}: no such folder; make it, or name another.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import torch
 from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+# Nothing is left in the user's cache.
+os.environ["GANLANE_CACHE"] = ""
 
 # The batches of tests are small: one thread is fastest, and the suite runs in two processes.
 torch.set_num_threads(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -17,7 +18,13 @@ EXAMPLES = {
     "own_reward.py": r"random_legal courteous: mean return +-?\d+\.\d, \d+ onsets behind",
     "own_policy.py": r"largest_gap",
     "stock_dqn.py": r"loss \d+\.\d+, reward per decision -?\d+\.\d+",
+    "cleanrl_style.py": r"2048 decisions, \d+ episodes, loss \d+\.\d+\nmean return of the last \d+: -?\d+\.\d",
+    "sb3_dqn.py": r"(?s)300 decisions, mean return of the last \d+ episodes -?\d+\.\d.*sb3_dqn.*mobil.*random_legal",
 }
+#: Budgets that keep a run to seconds.
+SHORT = {"stock_dqn.py": ["2048"], "cleanrl_style.py": ["2048"], "sb3_dqn.py": ["300", "4", "200"]}
+#: What an example needs beside ganlane.
+NEEDS = {"sb3_dqn.py": "stable_baselines3"}
 
 
 def run(name: str, *arguments: str) -> str:
@@ -35,8 +42,9 @@ def test_every_example_is_run_here():
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_example_runs_and_says_what_it_found(name):
-    arguments = ["2048"] if name == "stock_dqn.py" else []
-    assert re.search(EXAMPLES[name], run(name, *arguments))
+    if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
+        pytest.skip(f"{NEEDS[name]} is not installed")
+    assert re.search(EXAMPLES[name], run(name, *SHORT.get(name, [])))
 
 
 def test_the_traffic_model_in_the_docs_is_the_one_that_runs():

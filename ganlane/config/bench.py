@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 
 from ganlane.config.checks import Rule, between, check, every, one_of
 from ganlane.config.env import EnvConfig
-from ganlane.config.evaluate import NAMES
+from ganlane.config.evaluate import NAMES, all_traffics
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 
-SUITES = ("sim",)
+SUITES = ("sim", "traffic")
 MODES = ("eager", "compiled")
 DEVICES = ("cpu", "cuda")
 _QUICK_BATCH = 64
@@ -40,6 +40,8 @@ class BenchConfig:
     scaling_batch: int = 1024
     linear_from: int = 1024
     memory_batches: list[int] = field(default_factory=lambda: [1024, 4096])
+    traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
+    traffic_batches: list[int] = field(default_factory=lambda: [512, 2048])
     repetitions: int = 5
     seconds: float = 0.5
     peers: bool = True
@@ -63,6 +65,8 @@ class BenchConfig:
             vehicle_counts=_different(between(2, 1000)),
             scaling_batch=sizes,
             linear_from=sizes,
+            traffics=NAMES,
+            traffic_batches=_different(sizes),
             repetitions=between(1, 1000),
             seconds=between(0.001, 600),
             seed=between(0, 2**53),
@@ -72,7 +76,16 @@ class BenchConfig:
             ),
         )
         self._check_devices()
+        self.chosen_traffics()
         check_pay(self.env, self.reward)
+
+    def chosen_traffics(self) -> dict[str, TrafficConfig]:
+        """Those of ``suite=traffic``, by name."""
+        known = all_traffics()
+        for name in self.traffics:
+            if name not in known:
+                raise UserError(f"traffics={name}: no such traffic; choose among {', '.join(known)}.")
+        return {name: known[name] for name in self.traffics}
 
     def _check_devices(self) -> None:
         if self.devices is None:
@@ -96,6 +109,7 @@ class BenchConfig:
             batches=[batch for batch in self.batches if batch <= _QUICK_BATCH] or [1],
             threads=self.threads[:1],
             vehicle_counts=self.vehicle_counts[:2],
+            traffic_batches=[min(*self.traffic_batches, _QUICK_BATCH)],
             scaling_batch=min(self.scaling_batch, _QUICK_BATCH),
             repetitions=min(self.repetitions, 2),
             seconds=min(self.seconds, 0.01),

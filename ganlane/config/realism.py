@@ -76,6 +76,10 @@ class RealismConfig(RunConfig):
             raise UserError("publish=true: the file that ships is made from all recorded scenes; give scenes=all.")
         self.rivals()
 
+    def card(self) -> str:
+        """The card's name in a document: whose it is, and from where everybody starts."""
+        return f"{self.traffic.label()} {'folds' if self.fold_weights else self.scenes}"
+
     def rivals(self) -> dict[str, TrafficConfig]:
         """The traffics to compare with, by name; the traffic itself is left out."""
         names = [name for name in self.against if name != self.traffic.label()]

@@ -12,18 +12,18 @@ from ganlane.evaluation.realism_table import checks_text, long_table, quantities
 from ganlane.files import write_bytes
 
 
-def markers(traffic: str) -> tuple[str, str]:
-    """The lines between which the card of a traffic stands."""
-    return f"<!-- begin realism {traffic} -->", f"<!-- end realism {traffic} -->"
+def markers(card: str) -> tuple[str, str]:
+    """The lines between which a card stands; it is named by its traffic and its starts."""
+    return f"<!-- begin realism {card} -->", f"<!-- end realism {card} -->"
 
 
-def require_markers(path: Path, traffic: str) -> tuple[str, str]:
+def require_markers(path: Path, card: str) -> tuple[str, str]:
     """The document's text up to the first marker, and from the second on, markers included.
 
     Raises:
         UserError: there is no such file, or it does not hold the two markers once each and in order.
     """
-    begin, end = markers(traffic)
+    begin, end = markers(card)
     if not path.is_file():
         raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
     text = path.read_text(encoding="utf-8")
@@ -32,9 +32,9 @@ def require_markers(path: Path, traffic: str) -> tuple[str, str]:
     return text[: text.index(begin) + len(begin)], text[text.index(end) :]
 
 
-def update_document(path: Path, traffic: str, content: str) -> None:
-    """Put ``content`` between the markers of a traffic, atomically; the rest stays as it is."""
-    before, after = require_markers(path, traffic)
+def update_document(path: Path, card: str, content: str) -> None:
+    """Put ``content`` between the markers of a card, atomically; the rest stays as it is."""
+    before, after = require_markers(path, card)
     write_bytes(path, f"{before}\n\n{content}\n\n{after}".encode())
 
 

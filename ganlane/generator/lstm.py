@@ -68,10 +68,10 @@ class MotionLSTM(nn.Module):
     def _update(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         width = cell.shape[-1]
         take, keep, show = torch.sigmoid(gates[..., : 3 * width]).chunk(3, dim=-1)
-        cell = keep * cell + take * _tanh(gates[..., 3 * width :])
-        return show * _tanh(cell), cell
+        cell = _times_tanh(take, gates[..., 3 * width :]) + keep * cell
+        return _times_tanh(show, cell), cell
 
 
-def _tanh(x: Tensor) -> Tensor:
-    """The hyperbolic tangent by way of the sigmoid, which on a CPU takes a quarter of the time of ``torch.tanh``."""
-    return 2.0 * torch.sigmoid(2.0 * x) - 1.0
+def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
+    """``factor * tanh(x)`` by way of the sigmoid, which on a CPU takes a quarter of the time of ``torch.tanh``."""
+    return torch.addcmul(-factor, factor, torch.sigmoid(x + x), value=2.0)

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.sim.idm import IdmParameters
-from ganlane.sim.lanes import spanned
-from ganlane.sim.mobil import prospect
+from ganlane.sim.idm import IdmParameters, idm_acceleration
 from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -30,10 +28,25 @@ def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Te
     return (distance.abs() > range_m) & vehicles.valid
 
 
-def _room(scene: Scene, idm: IdmParameters, safe: float) -> Tensor:
-    """Whether neither a vehicle nor a follower of it would have to brake harder than ``safe``, bool [N, M]."""
-    seen = prospect(scene, spanned(scene.attention), idm)
-    return (torch.minimum(seen.own, seen.with_it) >= -safe).all(-1)
+def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
+    """Whether each of the first M vehicles and all others, pair by pair, could drive on at ``safe``, bool [N, M].
+
+    ``there`` holds 2 M vehicles: all of them where they would go, then all of them where they are. So it does not
+    matter who else goes: each pair is judged in both places.
+    """
+    count = there.observers.x.shape[1]
+    low, high = (torch.cat((each, each), dim=1) for each in there.attention)
+    shares = (there.attention.low[..., None] <= high[:, None, :]) & (
+        low[:, None, :] <= there.attention.high[..., None]
+    )
+    own, other = there.observers, there.vehicles
+    itself = torch.eye(count, dtype=torch.bool, device=own.x.device).repeat(1, 2)
+    counts = shares & other.valid[:, None, :] & ~itself
+    speed, desired = own.speed[..., None], own.desired_speed[..., None]
+    behind = idm_acceleration(speed, desired, there.ahead, other.speed[:, None, :], idm)
+    before = idm_acceleration(other.speed[:, None, :], other.desired_speed[:, None, :], there.behind, speed, idm)
+    asked = torch.where(there.order > 0, behind, before)
+    return (~counts | (asked >= -safe)).all(-1)
 
 
 def recycle(
@@ -45,10 +58,11 @@ def recycle(
 ) -> Vehicles:
     """``vehicles`` with those out of range, for whom there is room, on the other side of the ego.
 
-    The room is judged with all of them moved: who then has to wait leaves the others only more of it.
+    Of several the room of each is judged against every other one where it is *and* where it would go.
     """
     away = out_of_range(vehicles, road, range_m)
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
     moved = vehicles.with_(x=torch.where(away, vehicles.x - 2.0 * range_m * torch.sign(distance), vehicles.x))
-    room = _room(perceive(moved, road), idm, safe_deceleration)
+    both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))
+    room = _room(perceive(both, road, slice(0, vehicles.x.shape[1])), idm, safe_deceleration)
     return vehicles.with_(x=torch.where(away & room, moved.x, vehicles.x))

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ganlane.sim.following import following_acceleration
+from ganlane.sim.following import acceleration_behind
 from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.neighbours import perceive
+from ganlane.sim.lanes import spanned
+from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -70,8 +71,9 @@ class Guard(Overlay):
         """Lowest and highest acceleration allowed, m/s2, [N, M]."""
         g = self.guard
         scene = perceive(vehicles.with_(target_lane=target_lane), self.road)
-        close = following_acceleration(scene, self.idm, g.headway_s)
-        normal = following_acceleration(scene, self.idm)
+        ahead = leader(scene, spanned(scene.attention))
+        close = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
+        normal = acceleration_behind(scene, ahead, self.idm).amin(-1)
         highest = close.clamp_min(g.hardest_braking)
         lowest = normal - g.slack * vehicles.speed / vehicles.desired_speed
         return torch.minimum(lowest.clamp_min(g.hardest_braking), highest), highest

@@ -140,7 +140,7 @@ def gan_calibrated_traffic(
 
 #: Wishes per change that is carried out, measured in the simulation with 9 vehicles: a wish comes only while the
 #: driver is near its lane's centre, and waiting for a gap costs distance. A slow test holds the rate that results.
-WISH_PER_CHANGE = 2.0
+WISH_PER_CHANGE = 1.8
 
 
 @dataclass(frozen=True)

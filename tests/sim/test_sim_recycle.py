@@ -146,13 +146,6 @@ def burdened(before: Vehicles, after: Vehicles, road: Road) -> torch.Tensor:
     return (now < was.clamp_max(-SAFE_DECELERATION) - 1e-9) & before.valid
 
 
-MORE_THAN_ONE = pytest.mark.xfail(
-    strict=True,
-    reason="recycle() judges each returning vehicle as if all of them returned; where one of them waits, another may "
-    "find a neighbour that it was not judged against",
-)
-
-
 @settings(max_examples=50)
 @given(**ANY)
 def test_one_vehicle_that_returns_burdens_nobody(seed, lanes, cars):
@@ -165,7 +158,6 @@ def test_one_vehicle_that_returns_burdens_nobody(seed, lanes, cars):
     assert not (pair_overlaps(after) & ~pair_overlaps(before)).any()
 
 
-@MORE_THAN_ONE
 def test_several_that_return_at_once_burden_nobody():
     road, before = Road(lanes=2), random_scenes(2000, 12, 2, seed=0)
     after = recycle(before, road, TABLE_V)
@@ -222,7 +214,6 @@ def test_over_5_km_the_ego_keeps_its_company_and_without_recycling_it_loses_it()
     assert (spy.burdened, spy.overlaps) == (0, 0)
 
 
-@MORE_THAN_ONE
 @pytest.mark.slow
 def test_among_30_vehicles_too_nobody_overlaps_or_is_burdened():
     company, spy = in_range_by_km(on=True, cars=30, rows=16)

@@ -44,7 +44,7 @@ class PaddedGenerator(nn.Module):
         self.head = nn.Linear(s.hidden, 2)
 
     def forward(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Tensor:
-        """Displacements [N * M, 8, 2] that follow those observed [N, M, 8, 2], at positions [N, M, 2], by a mask [N, M]."""
+        """Displacements [N * M, 8, 2] that follow [N, M, 8, 2], at positions [N, M, 2], by a mask [N, M]."""
         n, m = valid.shape
         seen = torch.relu(self.embed(displacements)).flatten(0, 1)
         hidden = self.encoder(seen)[1][0][0].view(n, m, -1)

@@ -6,8 +6,8 @@
     ganlane realism traffic=gan_calibrated scenes=all report=docs/realism.md figures=docs/figures
     ganlane realism traffic=idm quick=true
 
-Writes results.json, distributions.png, distances.png and drift.png into its run folder. Without recordings on the machine it uses
-the histograms that ship, and says so.
+Writes results.json, distributions.png, distances.png and drift.png into its run folder. Without recordings on the
+machine it uses the histograms that ship, and says so.
 """
 
 from __future__ import annotations
@@ -146,32 +146,28 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
     return runs
 
 
+def rows_of(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
+    """The rows of a traffic's card, by quantity."""
+    from ganlane.evaluation.realism_card import quantity_rows
+
+    others = {name: each for name, each in starts.driven.items() if name != traffic}
+    own, held_against = starts.driven[traffic], (starts.recorded, starts.reference, starts.paired)
+    return quantity_rows(own, others, *held_against, resamples=resamples)
+
+
 def draw(
-    starts: Starts, runs: Sequence[Mapping[str, Any]], quantities: Mapping[str, Any], traffic: str, folder: Path
+    starts: Starts, runs: Sequence[Mapping[str, Any]], own: Mapping[str, Any], name: str, to: Path
 ) -> list[Path]:
-    """The figures, into ``folder``."""
-    from ganlane.evaluation.realism_card import FLOORS
-    from ganlane.evaluation.realism_quantities import QUANTITIES, UNITS
-    from ganlane.view.realism import draw_distributions, draw_drift, write_figure
-    from ganlane.view.realism_distances import draw_distances
+    """The figures of the traffic ``name``, whose rows are ``own``, into the folder ``to``."""
+    from ganlane.view.realism import card_pictures, write_figure
 
-    edges = {name: bins.edges for name, bins in QUANTITIES.items()}
-    simulated = {
-        name: {quantity: counts.sum(0) for quantity, counts in driven.counts.items()}
-        for name, driven in starts.driven.items()
-        if name not in FLOORS
-    }
-    recorded = {name: counts.sum(0) for name, counts in starts.recorded.items()}
-    pictures = {
-        "distributions": draw_distributions(edges, recorded, simulated, UNITS),
-        "distances": draw_distances(quantities, traffic),
-    }
-    if runs:
-        pictures["drift"] = draw_drift(runs, starts.reference.spread_mps)
-    return [write_figure(picture, folder / f"{name}.png") for name, picture in pictures.items()]
+    pictures = card_pictures(starts, runs, own, name)
+    return [write_figure(picture, to / f"{title}.png") for title, picture in pictures.items()]
 
 
-def show(config: RealismConfig, folder: Path, numbers: Mapping[str, Any], tables: list[str], drawn: list[Path]) -> None:
+def show(
+    config: RealismConfig, folder: Path, numbers: Mapping[str, Any], tables: list[str], drawn: list[Path]
+) -> None:
     """The tables on stdout; tables and figures where a document wants them."""
     from datetime import date
 
@@ -226,7 +222,7 @@ def realism(config: RealismConfig, folder: Path) -> str:
     """Drive, measure, print, draw, keep."""
     from ganlane.build import set_threads
     from ganlane.evaluation import write_results
-    from ganlane.evaluation.realism_card import from_starts, quantity_rows
+    from ganlane.evaluation.realism_card import from_starts
     from ganlane.evaluation.realism_checks import card_checks
     from ganlane.evaluation.realism_document import card_text
     from ganlane.evaluation.realism_i80 import i80_cards
@@ -238,9 +234,8 @@ def realism(config: RealismConfig, folder: Path) -> str:
     check_targets(config, path)
     files = i80_beside(config, path)
     starts = drive_from_starts(config, makers, path)
-    own, reference = starts.driven[traffic], starts.reference
-    others = {name: each for name, each in starts.driven.items() if name != traffic}
-    quantities = quantity_rows(own, others, starts.recorded, reference, starts.paired, resamples=config.resamples)
+    unseen, reference = starts.unseen, starts.reference
+    quantities = rows_of(starts, traffic, config.resamples)
     driving = {"recorded": starts.seen, **from_starts(starts.driven)}
     site = i80_cards(makers, files, starts.options, config.resamples, _say)
     far = makers if config.long_against else {traffic: makers[traffic]}
@@ -255,6 +250,7 @@ def realism(config: RealismConfig, folder: Path) -> str:
         "traffic": traffic,
         **starts.said(),
         "quantities": quantities,
+        "quantities_held_out": rows_of(starts.only(unseen), traffic, config.resamples) if unseen else None,
         "driving": driving,
         "i80": site,
         **totals(runs),

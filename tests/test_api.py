@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import polars as pl
@@ -16,6 +17,9 @@ from ganlane.config.traffic import GanTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.traffic import IdmTraffic
+
+#: Blocks of the documentation that take longer, or need recordings.
+LONG = re.compile(r"ganlane\.(train|realism|prepare|bench)")
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +74,8 @@ def test_a_loaded_agent_drives_an_environment():
     env = ganlane.make_env("idm", 2, observation=agent.observation, goal_m=50.0)
     rollout = env.rollout(3, agent.policy)
     assert rollout["action"].shape == (2, 3)
+    assert ganlane.load_agent("mobil").observation is None
+    assert ganlane.make_env("idm", observation=None).reset()["observation"].shape == (1, 23)
     assert ganlane.load_agent("mobil", lanes=5).policy.road.lanes == 5
 
 
@@ -154,6 +160,20 @@ def test_a_card_is_made(recordings):
     run = ganlane.realism("idm", ["idm_mobil"], data=held_out, quick=True, vehicle_km=0.0, resamples=100)
     assert 0.0 <= run.results["quantities"]["speed"]["distance"] <= 1.0
     assert (run.folder / "distributions.png").is_file()
+
+
+def test_the_short_blocks_in_the_docs_run(capsys):
+    page = (Path(__file__).parents[1] / "docs" / "python_api.md").read_text()
+    code = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if not LONG.search(block)]
+    assert len(code) == 5
+    names = {}
+    exec(
+        "\n".join(code).replace("episodes=100", "episodes=2, goal_m=30").replace('"end_s": 5.0', '"end_s": 1.0'),
+        names,
+    )
+    assert names["table"].height == 6
+    assert names["rollout"].batch_size == (64, 10)
+    assert Path("film.gif").is_file()
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ def test_card_holds_every_quantity_with_its_scale_and_the_rival(recordings, caps
         assert results[key] is not None
     assert results["long_runs"][0]["vehicle_km"] >= 0.5
     assert "changes per vehicle-km" in out
-    for name in ("distributions.png", "drift.png"):
+    for name in ("distributions.png", "distances.png", "drift.png"):
         assert Image.open(results["folder"] / name).width > 400
 
 
@@ -75,6 +75,28 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
     assert results["desired_above_mps"].keys() == {"idm"}
     assert results["long_runs"] == []
     assert results["overlaps_per_1000_vehicle_km"] is None
+
+
+def test_tables_and_figures_go_where_a_document_wants_them(recordings, capsys, tmp_path):
+    document, figures = tmp_path / "page.md", tmp_path / "figures"
+    figures.mkdir()
+    document.write_text("before\n<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\nafter\n")
+    held_out = "data.held_out=[synthetic-1]"
+    asked = ["scenes=all", f"report={document}", f"figures={figures}", "long_against=true", held_out]
+    status, results, _, _ = run(capsys, "traffic=idm", f"data.path={recordings}", *asked)
+    assert status == 0
+    text = document.read_text()
+    assert text.startswith("before\n<!-- begin realism idm all -->\n")
+    assert text.endswith("<!-- end realism idm all -->\nafter\n")
+    assert "former" not in text
+    assert "python -m ganlane.realism quick=true" in text
+    assert "held-out scenes alone" in text
+    assert "idm_mobil, long runs" in text
+    assert text.count("```text") == 6
+    assert results["quantities_held_out"]["speed"]["samples"] < results["quantities"]["speed"]["samples"]
+    assert results["long_runs_against"].keys() == {"idm_mobil"}
+    names = {"realism_distributions.png", "realism_distances.png", "realism_drift.png"}
+    assert {path.name for path in figures.iterdir()} == names
 
 
 def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):
@@ -147,6 +169,8 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
         (["publish=true"], "scenes=all"),
         (["scenes=some"], "held_out, all"),
         (["device=cuda"], "device=cuda"),
+        (["report=gone.md"], "gone.md: no such file"),
+        (["figures=gone"], "figures=gone: no such folder"),
         (["traffic.path=gone.safetensors", "traffic=gan"], "gone.safetensors"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import warnings
@@ -225,6 +226,22 @@ def test_episode_statistics_are_recorded_for_one_and_for_many():
     assert info["episode"]["l"][info["_episode"]].min() > 0
 
 
+def test_the_mask_keeps_random_actions_on_the_road():
+    env = make(lanes=2)
+    _, info = env.reset(seed=0)
+    drawn = {int(env.action_space.sample(info["action_mask"])) for _ in range(40)}
+    assert drawn == set(np.flatnonzero(info["action_mask"]))
+    assert len(drawn) == 2
+
+
+def test_gymnasiums_own_vectorisation_works_too():
+    envs = make_vec(2, vectorization_mode="sync")
+    observation, info = envs.reset(seed=4)
+    assert info["seed"].tolist() == [4, 5]
+    np.testing.assert_array_equal(observation[1], make().reset(seed=5)[0])
+    assert envs.step(np.zeros(2, int))[0].shape == (2, 23)
+
+
 def test_infos_of_a_batch_can_be_had_row_by_row():
     envs = gymnasium.wrappers.vector.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))
     envs.reset(seed=0)
@@ -361,13 +378,43 @@ def test_wrong_calls_are_told_in_a_sentence():
         envs.step(np.zeros(3, int))
     with pytest.raises(UserError, match="made without render_mode"):
         envs.render()
+    with pytest.raises(UserError, match=r"expected a boolean array of shape \(2,\)"):
+        envs.reset(options={"reset_mask": np.array([1, 0])})
     with pytest.raises(UserError, match="expected one seed and one episode, or 2 of each"):
         envs.reset(seed=[1, 2, 3])
+
+
+def blocks(page):
+    """The Python in a page of the documentation."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.S)
+
+
+def test_the_code_in_the_docs_runs():
+    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    code = "\n".join(blocks("gymnasium.md"))
+    assert "100_000" in code
+    names = {"np": np}
+    exec(code.replace("100_000", "120"), names)
+    assert names["following"].shape == (64, 23)
+    assert names["model"].num_timesteps == 120
+
+
+def test_the_docs_list_every_info():
+    page = (ROOT / "docs" / "gymnasium.md").read_text()
+    table = re.search(r"\| key \| what \|\n(.*?)\n\n", page, re.S).group(1)
+    listed = {name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+    _, info = make().reset(seed=0)
+    assert listed == set(info)
+    assert set(re.search(r"`speed, (.*?)` \|", table).group(1).split(", ")) | {"speed"} == set(info["reward_terms"])
 
 
 def test_stable_baselines3_trains_on_it_unchanged():
     baselines = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
     env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
+    check = pytest.importorskip("stable_baselines3.common.env_checker").check_env
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check(env.unwrapped)
     model = baselines.DQN("MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]})
     before = [weight.clone() for weight in model.q_net.parameters()]
     model.learn(200)

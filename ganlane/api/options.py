@@ -41,7 +41,8 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
 
     Args:
         group: ``env``, ``traffic``, ``observation``, ``reward`` ...
-        chosen: see :data:`Option`; for ``traffic`` also an import path or a class of your own.
+        chosen: see :data:`Option`; None: the group's default; for ``traffic`` also an import path or a class of
+            your own.
         overrides: values by key, nested ones as mappings.
 
     Raises:
@@ -49,6 +50,7 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
     """
     if is_dataclass(chosen) and not isinstance(chosen, type):
         return typed(group, chosen, overrides or {})
+    chosen = DEFAULTS[group] if chosen is None else chosen
     given = {"name": chosen} if isinstance(chosen, str) or inspect.isclass(chosen) else dict(_mapping(group, chosen))
     kind, own = _named(group, given.pop("name", DEFAULTS[group]))
     return typed(group, kind, {**own, **given, **(overrides or {})})

@@ -22,6 +22,7 @@ from ganlane.config.overrides import parse_arguments, without_repetitions
 from ganlane.config.resume import with_resumed
 from ganlane.config.store import register
 from ganlane.errors import UserError
+from ganlane.memory import keep_freed_memory
 from ganlane.paths import conf_folder
 
 #: What a command does with its config in its run folder; it returns a line to print last, or None.
@@ -43,6 +44,7 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     # TorchRL tells of every replay buffer otherwise.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    keep_freed_memory()
     try:
         with _sigterm_as_exception():
             _run(command, task, arguments)

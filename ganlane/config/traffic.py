@@ -85,7 +85,7 @@ class GanCalibratedTrafficConfig(TrafficConfig):
 
     _target_: str = "ganlane.traffic.presets.gan_calibrated_traffic"
     path: str | None = None
-    noise_scale: float = 1.5
+    noise_scale: float = 1.4
     noise_period_s: float = 3.0
     changes_per_km: float | None = None
 

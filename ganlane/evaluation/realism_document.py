@@ -46,7 +46,10 @@ def card_text(numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mappi
         long_runs: by traffic; those that drove none are left out.
     """
     traffic = numbers["traffic"]
-    tables = [quantities_table(numbers["quantities"], traffic), starts_table(numbers["driving"])]
+    tables = [quantities_table(numbers["quantities"], traffic)]
+    if numbers["quantities_held_out"] is not None:
+        tables.append(f"held-out scenes alone\n{quantities_table(numbers['quantities_held_out'], traffic)}")
+    tables.append(starts_table(numbers["driving"]))
     tables += [f"I-80, {name}\n{quantities_table(rows, traffic)}" for name, rows in numbers["i80"].items()]
     tables += [long_table(runs, name) for name, runs in long_runs.items() if runs]
     return [*tables, checks_text(numbers["checks"])]

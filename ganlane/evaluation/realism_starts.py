@@ -63,6 +63,24 @@ class Starts:
         """Whether the recorded units are those that were driven."""
         return self.kind == "recorded"
 
+    @property
+    def unseen(self) -> list[str]:
+        """The held-out scenes, where everybody started from others too; empty where all scenes are alike."""
+        if len(self.held_out) != 1:
+            return []
+        unseen = [name for name in self.scenes if name in self.held_out[0]]
+        return unseen if len(unseen) < len(self.scenes) else []
+
+    def only(self, scenes: Sequence[str]) -> Starts:
+        """The same driving, from these of its scenes alone."""
+        rows = [self.scenes.index(name) for name in scenes]
+        recorded = {name: counts[rows] for name, counts in self.recorded.items()}
+        driven = {
+            name: replace(each, counts={quantity: counts[rows] for quantity, counts in each.counts.items()})
+            for name, each in self.driven.items()
+        }
+        return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
+
     def said(self) -> dict[str, Any]:
         """What ``results.json`` says of it."""
         excess = {name: each.desired_above_mps for name, each in self.options.items() if name not in FLOORS}

@@ -57,7 +57,9 @@ def starts_table(driving: Mapping[str, Any]) -> str:
     for name, row in driving.items():
         low, high = (row["quantiles"]["acceleration"][level] for level in ("0.05", "0.95"))
         rate = _with_interval(row, "per_vehicle_km", 2)
-        lines.append([short_name(name), rate, _number(row["vehicle_km"], 1), f"{_number(low, 2)}, {_number(high, 2)}"])
+        lines.append(
+            [short_name(name), rate, _number(row["vehicle_km"], 1), f"{_number(low, 2)}, {_number(high, 2)}"]
+        )
     return _aligned(lines)
 
 
@@ -89,7 +91,9 @@ def checks_text(checks: Mapping[str, Any]) -> str:
     near = "acceleration_quantiles_within_30_percent"
     lines = [f"{near.replace('_', ' ')}: {words[checks[near]]}"]
     for other, verdicts in checks["compared_with"].items():
-        lines.append(f"than {short_name(other)}: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
+        lines.append(
+            f"than {short_name(other)}: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
+        )
     for run in checks["long_runs"]:
         told = ", ".join(
             f"{name.replace('_', ' ')}: {words[value]}" for name, value in run.items() if name != "vehicles"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
@@ -100,7 +100,7 @@ class Generator(nn.Module):
         """Context [B, G, H - Z] of every vehicle: its own motion, its neighbours, its further inputs."""
         hidden = self.encoder.encode(seen.projections)
         pooled = self.pooling(hidden, seen.position, seen.displacement, seen.valid)
-        first, _, second = self.context
+        first, second = (cast(nn.Linear, self.context[index]) for index in (0, 2))
         return apply(second, apply(first, torch.cat([hidden, pooled, seen.extra], dim=-1), relu=True))
 
     def decode(self, context: Tensor, noise: Tensor, seen: Observation, steps: int) -> Tensor:

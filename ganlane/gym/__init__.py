@@ -10,8 +10,9 @@
 
 Importing ganlane registers them (gymnasium 1 looks for no plugins); ``gymnasium.make("ganlane:ganlane/Highway-v0")``
 imports and makes in one call. :mod:`~ganlane.gym.single` and :mod:`~ganlane.gym.vector` are the two facades,
-:mod:`~ganlane.gym.rows` is what they share: a batch of TorchRL environments seen as NumPy arrays.
-:mod:`~ganlane.gym.pictures` and :mod:`~ganlane.gym.window` draw. This module itself stays light.
+:mod:`~ganlane.gym.rows` is what they share: a batch of TorchRL environments seen as NumPy arrays;
+:mod:`~ganlane.gym.arguments` checks what is handed to them. :mod:`~ganlane.gym.pictures` and
+:mod:`~ganlane.gym.window` draw. This module itself stays light.
 """
 
 from __future__ import annotations

@@ -19,11 +19,8 @@ from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.sim.road import road_in
 
 Floats = npt.NDArray[np.float32]
-#: Speed over desired speed beyond which the observation is cut off; a driver stays below its desired speed.
+#: Speed over desired speed beyond which the observation is cut off, so that the space has bounds. IDM stays far below.
 SPEED_RATIO_LIMIT: Final = 4.0
-#: Unseeded environments draw their seed below this.
-SEEDS: Final = 2**31
-ACTIONS: Final = 3
 
 
 def observation_space(size: int) -> Box:
@@ -77,26 +74,11 @@ class Rows:
     def now(self) -> TensorDictBase:
         """The state of all rows."""
         if self.state is None:
-            raise UserError("step() before reset(); call reset() first.")
+            raise UserError("no episode is under way; call reset() first.")
         return self.state
 
     def _with(self, actions: Tensor) -> TensorDictBase:
         return self.now().set(keys.ACTION, actions.to(self.env.device))
-
-    def actions(self, given: Any) -> Tensor:
-        """Actions [N] int64 from what a user handed over.
-
-        Raises:
-            UserError: another shape, or none of the three.
-        """
-        array = np.asarray(given)
-        if array.shape != (self.count,) or array.dtype.kind not in "iu" or not np.isin(array, range(ACTIONS)).all():
-            shown = array.tolist() if self.count > 1 else array.ravel().tolist()
-            raise UserError(
-                f"action {shown}: expected {self.count} whole number(s), 0 (keep), 1 (left) or 2 (right); "
-                "give one for every environment."
-            )
-        return torch.as_tensor(array.astype(np.int64))
 
     def observation(self, state: TensorDictBase | None = None) -> Floats:
         """Observations [N, D], a copy, within the space."""
@@ -141,26 +123,3 @@ def _item(value: Any, row: int) -> Any:
     if isinstance(value, dict):
         return row_of(value, row)
     return value[row].copy() if value.ndim > 1 else value[row].item()
-
-
-def seed_number(seed: Any) -> int:
-    """A seed, checked: the counters of the environment hold 63 bits."""
-    if not 0 <= int(seed) < 2**63:
-        raise UserError(f"seed={seed}: expected a whole number from 0 to 2**63 - 1; give for instance seed=0.")
-    return int(seed)
-
-
-def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
-    """The options of a reset, checked for names that nobody reads."""
-    unknown = sorted(set(options or {}) - set(names))
-    if unknown:
-        raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")
-    return dict(options or {})
-
-
-def episode_number(episode: Any) -> npt.NDArray[np.int64]:
-    """The option ``episode``, checked: whole numbers from 0."""
-    numbers = np.asarray(episode)
-    if numbers.dtype.kind not in "iu" or (numbers < 0).any():
-        raise UserError(f"options: episode={episode!r}: expected whole numbers from 0; give for instance 3.")
-    return numbers.astype(np.int64)

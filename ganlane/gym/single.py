@@ -12,8 +12,9 @@ from torchrl.envs import Transform, TransformedEnv
 from ganlane.api.options import Option, option
 from ganlane.api.parts import make_env
 from ganlane.errors import UserError
+from ganlane.gym.arguments import ACTIONS, SEEDS, actions_of, episode_numbers, known_options, seed_number
 from ganlane.gym.pictures import LiveView, real_time_fps
-from ganlane.gym.rows import ACTIONS, SEEDS, Floats, Rows, episode_number, known_options, row_of, seed_number
+from ganlane.gym.rows import Floats, Rows, row_of
 from ganlane.gym.window import FilmWindow, has_display
 
 RENDER_MODES = ("human", "rgb_array")
@@ -85,7 +86,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
             self._seed, self._episode = seed_number(seed), -1
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
-        self._episode = int(episode_number(given.get("episode", self._episode + 1)))
+        self._episode = int(episode_numbers(given.get("episode", self._episode + 1)))
         self._rows.start(self._seed, self._episode)
         self._running = True
         if self._view is not None:
@@ -96,7 +97,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         """One decision: observation, reward, terminated, truncated, info."""
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
-        actions = self._rows.actions(np.reshape(action, -1))
+        actions = actions_of(np.reshape(action, -1), 1)
         if self._view is not None:
             self._view.decide(int(actions[0]))
         after = self._rows.step(actions)

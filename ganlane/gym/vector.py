@@ -15,8 +15,17 @@ from torchrl.envs import Transform
 from ganlane.api.options import Option, option
 from ganlane.api.parts import make_env
 from ganlane.errors import UserError
+from ganlane.gym.arguments import (
+    ACTIONS,
+    SEEDS,
+    actions_of,
+    episode_numbers,
+    known_options,
+    row_mask,
+    seed_number,
+)
 from ganlane.gym.pictures import BatchView, real_time_fps
-from ganlane.gym.rows import ACTIONS, SEEDS, Floats, Rows, episode_number, known_options, seed_number
+from ganlane.gym.rows import Floats, Rows
 
 Flags = npt.NDArray[np.bool_]
 
@@ -87,7 +96,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         """Begin episodes in all rows, or with ``reset_mask`` in some; see the class for which."""
         given = known_options(options, ("episode", "reset_mask"))
         if "reset_mask" in given:
-            fresh = self._mask(given["reset_mask"])
+            fresh = row_mask(given["reset_mask"], self.num_envs)
             self._rows.restart(fresh)
         else:
             fresh = np.ones(self.num_envs, dtype=np.bool_)
@@ -105,7 +114,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         else:
             seeds, first = self._next(each)
         if episode is not None:
-            first = episode_number(episode)
+            first = episode_numbers(episode)
             first = first + each if first.ndim == 0 else first
         if first.shape != (self.num_envs,) or np.size(seeds) not in (1, self.num_envs):
             raise UserError(f"reset(): expected one seed and one episode, or {self.num_envs} of each.")
@@ -118,18 +127,9 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
             return now["seed"], now["episode_number"] + self.num_envs
         return int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed, each
 
-    def _mask(self, mask: Any) -> Flags:
-        rows = np.asarray(mask)
-        if rows.shape != (self.num_envs,) or rows.dtype != np.bool_ or self._rows.state is None:
-            raise UserError(
-                f"options: reset_mask: expected a boolean array of shape ({self.num_envs},), after a first reset of "
-                "all rows."
-            )
-        return rows
-
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
         """One decision in every row: observations [N, D], rewards, terminated, truncated [N], info."""
-        after = self._rows.step_and_reset(self._rows.actions(actions))
+        after = self._rows.step_and_reset(actions_of(actions, self.num_envs))
         reward, terminated, truncated = (
             after.get(name)[:, 0].cpu().numpy().copy() for name in ("reward", "terminated", "truncated")
         )

@@ -43,10 +43,10 @@ def boxes_overlap(
         dx, dy: from the centre of the first box to the centre of the other, m.
         heading, length, width: of the first box, rad and m; ``other_*``: of the other.
     """
-    turn = other_heading - heading
-    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
     c, s = torch.cos(heading), torch.sin(heading)
     oc, os = torch.cos(other_heading), torch.sin(other_heading)
+    # Of the angle between the two.
+    cos, sin = (c * oc + s * os).abs(), (c * os - s * oc).abs()
     own = (0.5 * length, 0.5 * width)
     other = (0.5 * other_length, 0.5 * other_width)
     by_own = _separated(dx * c + dy * s, dy * c - dx * s, *own, *other, cos, sin)

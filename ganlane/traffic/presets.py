@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,12 +35,13 @@ from ganlane.traffic.lane_change_faults import (
 from ganlane.traffic.sequential import TrafficSequential
 from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
-
 #: Latent vectors of the calibrated traffic: so many times as large as in fitting, and forgotten so fast, s. Both were
 #: chosen on the scenes that the generator is fitted to: as fitted (1 and 5 s) too few drivers accelerate.
-NOISE_SCALE, NOISE_PERIOD_S = 1.5, 3.0
-#: Its anchor: the fitted one, but a driver who changes lanes moves over as fast as recorded ones do.
-SIMULATED_ANCHOR: AnchorParameters = replace(ANCHOR, lane_stiffness=0.6, lane_damping=1.55)
+NOISE_SCALE, NOISE_PERIOD_S = 1.4, 3.0
+#: Its anchor: the fitted one, but drivers pull away more briskly and move over as fast as recorded ones do.
+SIMULATED_ANCHOR: AnchorParameters = replace(
+    ANCHOR, idm=replace(ANCHOR.idm, max_acceleration=1.0), lane_stiffness=0.6, lane_damping=1.55
+)
 
 
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
@@ -60,6 +62,35 @@ def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
     recorded = statistics.acceleration_smoothed
     default = SuddenAccelerations()
     return SuddenAccelerations(mean=recorded.mean or default.mean, sd=recorded.sd or default.sd)
+
+
+def simulated_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParameters:
+    """:data:`SIMULATED_ANCHOR` with the washout and the further inputs that the weights were fitted with.
+
+    Weights whose metadata names neither were fitted with those of :data:`ganlane.generator.ANCHOR`.
+
+    Args:
+        metadata: of the weights (:func:`ganlane.generator.load_generator`).
+        source: their file, for the message.
+
+    Raises:
+        UserError: fitted without traits, which this traffic always draws; or values that no fit can have.
+    """
+    config = metadata["config"] if isinstance(metadata.get("config"), Mapping) else {}
+    washout_s = config.get("washout_s", ANCHOR.washout_s)
+    further_inputs = config.get("further_inputs", ANCHOR.further_inputs)
+    if config.get("traits", True) is not True:
+        raise UserError(
+            f"{source}: fitted with traits={config['traits']}, but every driver of gan_calibrated has a headway "
+            "and a desired speed of its own; give weights fitted with generator.traits=true."
+        )
+    # Not in one comparison with 0: NaN has to fail, and True is no number of seconds.
+    if type(washout_s) not in (int, float) or not washout_s > 0 or type(further_inputs) is not bool:
+        raise UserError(
+            f"{source}: its config says washout_s={washout_s!r} and further_inputs={further_inputs!r}, expected "
+            "seconds above 0 and true or false; fit it again."
+        )
+    return replace(SIMULATED_ANCHOR, washout_s=float(washout_s), further_inputs=further_inputs)
 
 
 def gan_traffic(
@@ -108,6 +139,8 @@ def gan_calibrated_traffic(
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, traits, lane changes behind a gap check at the recorded rate.
 
+    The washout and the further inputs are those that the weights were fitted with (:func:`simulated_anchor`).
+
     Args:
         road, stream: as for every traffic module.
         path: weights of the calibrated preset; by default those that ship.
@@ -115,10 +148,10 @@ def gan_calibrated_traffic(
         changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the rate of the
             recordings, which gives that rate in the simulation.
         noise_period_s: time in which a driver's latent vector is forgotten.
-        idm: of the gap check; the anchor keeps the IDM that the network was fitted on (Table V).
+        idm: of the gap check; the anchor keeps its own (:data:`SIMULATED_ANCHOR`).
 
     Raises:
-        UserError: the weights are absent, foreign or of the other preset.
+        UserError: the weights are absent, foreign, of the other preset, or fitted without traits.
     """
     source = path or shipped_generator("calibrated")
     generator, metadata = load_generator(source, "calibrated")
@@ -129,7 +162,7 @@ def gan_calibrated_traffic(
         "noise_period_s": noise_period_s,
         "noise_scale": noise_scale,
         "headway_quantiles_s": headway_quantiles(metadata["driving_statistics"]),
-        "parameters": SIMULATED_ANCHOR,
+        "parameters": simulated_anchor(metadata, source),
     }
     parts: dict[str, TrafficModule] = {
         "generator": AnchoredGanTraffic(generator, road, stream, **options),

@@ -10,8 +10,12 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from ganlane.evaluation.realism_card import FLOORS
+from ganlane.evaluation.realism_quantities import QUANTITIES, UNITS
+from ganlane.evaluation.realism_starts import Starts
 from ganlane.files import atomic_path
 from ganlane.view.plot import INK, LINES, PAPER, Line, Panel
+from ganlane.view.realism_distances import draw_distances
 from ganlane.view.style import Colour, put_text
 
 RECORDED: Colour = INK
@@ -82,6 +86,31 @@ def draw_drift(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Image.Im
             lines.append(Line(lines[0].x, np.full_like(lines[0].x, spread_mps), RECORDED))
         panels.append(Panel(title, lines, _WIDTH, _HEIGHT, "s"))
     return _sheet(panels, {"recorded": RECORDED, **legend})
+
+
+def card_pictures(
+    starts: Starts, runs: Sequence[Mapping[str, Any]], quantities: Mapping[str, Any], traffic: str
+) -> dict[str, Image.Image]:
+    """The pictures of a card by name: ``distributions``, ``distances``, and ``drift`` if there are long runs.
+
+    Args:
+        starts: everybody from the same starts.
+        runs: the traffic's long runs.
+        quantities: its rows.
+        traffic: its name.
+    """
+    simulated = {
+        name.rpartition(".")[2]: {quantity: counts.sum(0) for quantity, counts in driven.counts.items()}
+        for name, driven in starts.driven.items()
+        if name not in FLOORS
+    }
+    edges = {name: bins.edges for name, bins in QUANTITIES.items()}
+    recorded = {name: counts.sum(0) for name, counts in starts.recorded.items()}
+    pictures = {
+        "distributions": draw_distributions(edges, recorded, simulated, UNITS),
+        "distances": draw_distances(quantities, traffic),
+    }
+    return pictures | ({"drift": draw_drift(runs, starts.reference.spread_mps)} if runs else {})
 
 
 def write_figure(picture: Image.Image, path: Path) -> Path:

@@ -1,15 +1,18 @@
 """The generated traffics that ship, with the weights that ship."""
 
+import math
+
 import pytest
 import torch
 
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.files import load_weights, save_weights
 from ganlane.generator import shipped_generator
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.traffic import Guard
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+from ganlane.traffic.presets import SIMULATED_ANCHOR, gan_calibrated_traffic, gan_traffic
 
 
 def drive(traffic, n, decisions, visit, first_episode=0):
@@ -125,3 +128,51 @@ def test_weights_of_the_other_preset_are_refused():
         gan_traffic(path=shipped_generator("calibrated"))
     with pytest.raises(UserError, match="no such file"):
         gan_calibrated_traffic(path="nowhere.safetensors")
+
+
+def fitted_with(folder, *without, **settings):
+    """The shipped calibrated weights as if they had been fitted with other ``settings``; ``without`` leaves out."""
+    tensors, metadata = load_weights(shipped_generator("calibrated"), "generator")
+    config = {name: value for name, value in metadata["config"].items() if name not in without}
+    path = folder / "generator.safetensors"
+    rest = {name: value for name, value in metadata.items() if name not in ("kind", "config")}
+    save_weights(path, "generator", tensors, {**rest, "config": {**config, **settings}})
+    return path
+
+
+def anchor_of(traffic):
+    return dict(traffic.named_parts())["generator"].parameters
+
+
+def test_calibrated_weights_drive_with_the_washout_and_the_further_inputs_they_were_fitted_with(tmp_path):
+    for settings in ({"washout_s": 6.0, "further_inputs": False}, {"washout_s": math.inf, "further_inputs": True}):
+        anchor = anchor_of(gan_calibrated_traffic(path=fitted_with(tmp_path, **settings)))
+        assert {name: getattr(anchor, name) for name in settings} == settings
+        # Everything else is the simulation's own.
+        assert (anchor.idm, anchor.lane_stiffness) == (SIMULATED_ANCHOR.idm, SIMULATED_ANCHOR.lane_stiffness)
+
+
+def test_the_shipped_weights_and_older_ones_that_name_no_washout_drive_with_the_default_anchor(tmp_path):
+    older = fitted_with(tmp_path, "washout_s", "further_inputs", "traits")
+    for path in (None, older):
+        assert anchor_of(gan_calibrated_traffic(path=path)) == SIMULATED_ANCHOR
+
+
+def test_weights_that_see_no_further_inputs_drive_otherwise_than_those_that_do(tmp_path):
+    blind = gan_calibrated_traffic(path=fitted_with(tmp_path, further_inputs=False), noise_scale=0.0)
+    seeing = gan_calibrated_traffic(noise_scale=0.0)
+    ends = [drive(traffic, 4, 3, None)["vehicles", "speed"][:, 1:] for traffic in (blind, seeing)]
+    assert float((ends[0] - ends[1]).abs().max()) > 1e-3
+
+
+def test_calibrated_weights_fitted_without_traits_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"generator\.safetensors: fitted with traits=False"):
+        gan_calibrated_traffic(path=fitted_with(tmp_path, traits=False))
+
+
+@pytest.mark.parametrize(
+    "settings", [{"washout_s": 0.0}, {"washout_s": math.nan}, {"washout_s": "3"}, {"further_inputs": 1}]
+)
+def test_a_washout_or_further_inputs_that_no_fit_can_have_are_refused(tmp_path, settings):
+    with pytest.raises(UserError, match="fit it again"):
+        gan_calibrated_traffic(path=fitted_with(tmp_path, **settings))

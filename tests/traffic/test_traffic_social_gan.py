@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -157,3 +159,31 @@ def test_the_other_presets_weights_and_a_wrong_execute_k_are_refused():
         SocialGanTraffic(generator(EXTRA_INPUTS), ROAD)
     with pytest.raises(UserError, match="execute_k=9"):
         paper(execute_k=9)
+
+
+@pytest.mark.parametrize("make", MODULES)
+def test_the_past_is_moved_on_by_name_and_not_copied(make):
+    module = make()
+    td = begin(module)
+    before = [td["traffic", name] for name in module.motions]
+    moved = module(td)
+    after = [moved["traffic", name] for name in module.motions]
+    assert [one.data_ptr() for one in after[:-1]] == [one.data_ptr() for one in before[1:]]
+    assert after[-1].data_ptr() not in {one.data_ptr() for one in before}
+
+
+def test_no_two_motions_of_a_fresh_past_are_one_tensor():
+    td = begin(paper())
+    assert len({td["traffic", name].data_ptr() for name in paper().motions}) == 7
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("c++") is None and shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("make", MODULES)
+def test_a_graph_drives_as_without_one(make):
+    eager, graph = make(), make()
+    graph.compile_graphs()
+    # So many rows that oneDNN multiplies.
+    one, other = drive(eager, begin(eager, rows=64), 12), drive(graph, begin(graph, rows=64), 12)
+    for name in ("x", "y", "speed"):
+        torch.testing.assert_close(one["vehicles", name], other["vehicles", name], atol=1e-3, rtol=1e-5)

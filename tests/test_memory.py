@@ -1,0 +1,28 @@
+import sys
+
+import pytest
+from ganlane import memory
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator is on Linux alone")
+def test_a_process_that_keeps_its_memory_is_not_given_new_pages_at_every_step():
+    torch = pytest.importorskip("torch")
+    import resource
+
+    def faults() -> int:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(20):
+            a = torch.zeros(2_000_000)
+            a = (a + 1.0) * 2.0
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    without = faults()
+    if not memory.keep_freed_memory():
+        pytest.skip("this libc has no mallopt")
+    faults()
+    assert faults() < max(without, 1) / 10
+
+
+def test_elsewhere_nothing_happens(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert not memory.keep_freed_memory()

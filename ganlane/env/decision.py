@@ -48,7 +48,7 @@ class Decision:
         """
         memory, start = memory_of(state), at.step
         counters = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.EPISODE_KEY: key}
-        for count in range(substeps or self.rules.episode.substeps()):
+        for count in range(self.rules.episode.substeps() if substeps is None else substeps):
             running = at.running
             if known_false(running.any()):
                 break

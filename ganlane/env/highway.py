@@ -95,7 +95,7 @@ class HighwayEnv(EnvBase):
         self.physics = Physics()
         self._seed = seed
         #: Seed and episode [N] of the rows as they were last seen; automatic resets go on from there.
-        self._last: tuple[Tensor, Tensor] | None = None
+        self.last_episodes: tuple[Tensor, Tensor] | None = None
         self.episode.check()
         if stream is not None and int(stream) != traffic.stream:
             raise UserError(
@@ -132,9 +132,9 @@ class HighwayEnv(EnvBase):
     def compile(self, **kwargs: Any) -> HighwayEnv:
         """Turn physics and traffic into compiled graphs, several small ones; returns the environment.
 
-        Several times as fast from some hundred environments on, after up to a minute of compiling. Results are
-        the same up to rounding, not bitwise. TorchRL's own version of this method, which ``compile=True`` to the
-        constructor calls as well, makes one graph of a whole step; here that one is slower and compiles longer.
+        How much faster that is at which batch, docs/performance.md tells; the first steps take a minute or so of
+        compiling. Results are the same up to rounding, not bitwise. ``HighwayEnv(compile=True)`` calls this method
+        too: TorchRL's own, which makes one graph of a whole step, is overridden.
 
         Raises:
             UserError: there is no C++ compiler, or an argument of TorchRL's version is given.
@@ -154,9 +154,9 @@ class HighwayEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
             seed, last = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
-        elif mask is not None and self._last is not None:
+        elif mask is not None and self.last_episodes is not None:
             # An automatic reset hands over the mask alone: TorchRL strips the counters.
-            seed, last = self._last
+            seed, last = self.last_episodes
         else:
             seed = torch.full((n,), self._seed, dtype=torch.int64, device=self.device)
             return seed, self.first_episode + torch.arange(n, device=self.device)
@@ -164,7 +164,7 @@ class HighwayEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDictBase:
         """All rows at the start of their episodes; EnvBase keeps those of the rows that were not asked for."""
-        seed, episode = self._last = self._episodes(tensordict)
+        seed, episode = self.last_episodes = self._episodes(tensordict)
         key = episode_key(self.stream, seed, episode)
         vehicles = self.scenes(key, self.dtype)
         memory = self.traffic.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
@@ -178,8 +178,8 @@ class HighwayEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One decision."""
-        self._last = (tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
-        key = episode_key(self.stream, *self._last)
+        self.last_episodes = (tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        key = episode_key(self.stream, *self.last_episodes)
         rules = self._rules_of(tensordict, key)
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(tensordict.get(keys.EGO).items())
         start, ordered = self.physics.begin(

@@ -1,6 +1,6 @@
 """What would have happened: branch a state, try each first action, go on with a base policy.
 
-The environment is stateless, so a state can be copied and driven on as often as one likes, exactly. That shows what
+The state travels in the TensorDict, so it can be copied and driven on as often as one likes, exactly. That shows what
 there is to win by a lane change, where an agent errs, and which crashes no driver could have avoided.
 """
 
@@ -44,11 +44,16 @@ def branch(
         env: writes ``reward`` [N, 1]; the traffic that follows is the one that would have followed.
         state: what ``env`` wrote, batch [N].
         policy: takes the decisions after the first one.
-        decisions: how many in all; a row that ends earlier earns nothing more.
+        decisions: how many in all; a row that ends earlier, or has ended in ``state``, earns nothing more.
         gamma: discount per decision.
         actions: A, the number of actions.
     """
+    base = getattr(env, "base_env", env)
+    last = getattr(base, "last_episodes", None)
     outcomes = [_follow(env, state, policy, action, decisions, gamma) for action in range(actions)]
+    if last is not None:
+        # Automatic resets go on from where the environment itself was, not from the branches.
+        base.last_episodes = last
     returns, crashed = zip(*outcomes)
     return Branches(torch.stack(returns), torch.stack(crashed))
 
@@ -58,7 +63,7 @@ def _follow(
 ) -> tuple[Tensor, Tensor]:
     """Discounted return [N] and hard crash [N] after the first action ``first`` and ``policy`` from then on."""
     at = state.clone(recurse=False)
-    running = torch.ones_like(at.get("done"))
+    running = ~at.get("done")
     total = torch.zeros_like(at.get(keys.VEHICLES).get("x")[:, :1])
     crashed = torch.zeros_like(running)
     with set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -19,7 +19,7 @@ from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.sim.road import road_in
 
 Floats = npt.NDArray[np.float32]
-#: Speed over desired speed beyond which the observation is cut off, so that the space has bounds. IDM stays far below.
+#: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
 SPEED_RATIO_LIMIT: Final = 4.0
 
 

@@ -77,7 +77,8 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 def _all_apart(dx: Tensor, vehicles: Vehicles) -> bool:
     """Whether in no row anybody is near enough to the ego along the road for boxes to matter.
 
-    On a CPU asking costs little, and a small batch is spared most of its tests; a graph, or a GPU's queue, would be
+    Two boxes can only touch within their half diagonals, of which each is at most half of length plus width. On a CPU
+    asking costs little, and a small batch is spared most of its tests; a graph, or a GPU's queue, would be
     broken by it.
     """
     if torch.compiler.is_compiling() or dx.device.type != "cpu":

@@ -62,6 +62,8 @@ class ObservationTransform(Transform):
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=[keys.OBSERVATION])
         if form not in OBSERVATIONS:
             raise UserError(f"observation.form={form!r} is unknown; choose one of {', '.join(OBSERVATIONS)}.")
+        if vehicles < 2:
+            raise UserError(f"vehicles={vehicles}: an observation is of at least one other vehicle; give 2 or more.")
         self.road, self.vehicles, self.form = road, vehicles, form
         self.scale = scale or ObservationScale()
 

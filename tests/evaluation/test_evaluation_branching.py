@@ -62,3 +62,21 @@ def test_branching_leaves_the_state_alone_and_agrees_with_driving_on():
         step, at = env.step_and_maybe_reset(driver(at))
         total += 0.9**number * step["next", "reward"]
     torch.testing.assert_close(outcome.returns[KEEP], total[:, 0])
+
+
+def test_an_episode_that_has_ended_earns_nothing_more():
+    env = highway(2)
+    state = env.reset()
+    state["done"][1] = True
+    outcome = branch(env, state, KeepLaneDriver(env.base_env.road), decisions=3)
+    assert (outcome.returns[:, 0] != 0).all()
+    assert (outcome.returns[:, 1] == 0).all()
+
+
+def test_automatic_resets_go_on_from_the_environment_not_from_the_branches():
+    env = highway(2)
+    env.base_env.last_episodes = (torch.zeros(2).long(), torch.tensor([4, 5]))
+    elsewhere = env.reset(env.base_env.reset().select("seed", "episode").set("episode", torch.tensor([100, 200])))
+    env.base_env.last_episodes = (torch.zeros(2).long(), torch.tensor([4, 5]))
+    branch(env, elsewhere, KeepLaneDriver(env.base_env.road), decisions=2)
+    assert env.base_env.last_episodes[1].tolist() == [4, 5]

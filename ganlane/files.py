@@ -1,4 +1,4 @@
-"""Files that are either whole or absent, and weights that cannot execute code."""
+"""Files that are either whole or absent, documents with a part to rewrite, and weights that cannot execute code."""
 
 from __future__ import annotations
 
@@ -42,6 +42,31 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     """Write ``content`` to ``path`` atomically."""
     with atomic_path(path) as part:
         part.write_bytes(content)
+
+
+def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
+    """The text of the document ``path`` up to the marker ``begin``, and from ``end`` on, markers included.
+
+    Raises:
+        UserError: there is no such file, or it does not hold the two markers once each and in order. Its sentence
+            names the key of the entry points that update a document, ``report``.
+    """
+    if not path.is_file():
+        raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
+    text = path.read_text(encoding="utf-8")
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise UserError(f"report={path}: expected the lines {begin} and {end} in it, once each; add them.")
+    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
+
+
+def write_between_markers(path: Path, begin: str, end: str, content: str) -> None:
+    """Put ``content`` on lines of its own between two markers of a document, atomically; the rest stays as it is.
+
+    Raises:
+        UserError: see :func:`split_at_markers`.
+    """
+    before, after = split_at_markers(path, begin, end)
+    write_bytes(path, f"{before}\n{content}\n{after}".encode())
 
 
 def write_json(path: str | Path, content: Any) -> None:

@@ -5,6 +5,8 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
 from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.sim.road import Road
+from ganlane.sim.scenes import RandomScenes
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import ObservationTransform, RewardTransform
 
@@ -47,3 +49,26 @@ def test_after_asked_episodes_the_next_ones_follow_from_those():
         state["action"] = torch.zeros(2, dtype=torch.int64)
         _, state = env.step_and_maybe_reset(state)
     assert ((state["episode"] - torch.tensor([10, 21])) % 2 == 0).all()
+
+
+def test_nonsense_in_the_padding_of_a_scene_reaches_nobody():
+    """Scenes of one's own may leave anything where nobody is, NaN for one."""
+
+    class Padded(RandomScenes):
+        def __call__(self, key, dtype):
+            scene = super().__call__(key, dtype)
+            there = torch.arange(self.vehicles) != 2
+            return scene.with_(
+                valid=scene.valid & there,
+                x=torch.where(there, scene.x, torch.nan),
+                speed=torch.where(there, scene.speed, torch.inf),
+            )
+
+    road = Road(3)
+    env = HighwayEnv(IdmMobilTraffic(road), 4, scenes=Padded(road, 9))
+    state = env.reset()
+    for _ in range(3):
+        state["action"] = torch.zeros(4, dtype=torch.int64)
+        _, state = env.step_and_maybe_reset(state)
+    assert torch.isfinite(state["vehicles", "x"]).all()
+    assert torch.isfinite(state["vehicles", "speed"]).all()

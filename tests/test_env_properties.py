@@ -28,6 +28,9 @@ def environments(draw, rows: int) -> HighwayEnv:
     lanes = draw(st.integers(1, 6))
     spacing = draw(st.sampled_from([5.0, 7.0, 12.0, 25.0]))
     vehicles = draw(st.integers(2, min(20, 4 * lanes)))
+    recycle = draw(st.booleans())
+    # Recycling needs somebody beyond 200 m within the few decisions of a plan.
+    spread_m = 600.0 if recycle else max(10.0, 3.0 * spacing)
     return environment(
         lanes,
         rows,
@@ -38,8 +41,9 @@ def environments(draw, rows: int) -> HighwayEnv:
         timeout_s=draw(st.sampled_from([2.5, 1000.0])),
         abort=draw(st.booleans()),
         visibility=draw(st.sampled_from(Visibility)),
-        spawn=packed(max(10.0, 3.0 * spacing), spacing),
+        spawn=packed(spread_m, spacing),
         seed=draw(st.integers(0, 2**40)),
+        recycle=recycle,
     )
 
 
@@ -65,10 +69,35 @@ def test_nobody_goes_faster_than_its_speed_or_backwards_and_sizes_never_change(e
 def check_motion(env: HighwayEnv, plan: list[list[int]], tolerance_m: float = 1e-9, slides: bool = False) -> None:
     """With ``slides`` the speed of the others is theirs along the road alone."""
     film, td = Film(env), env.reset()
-    before = start = Vehicles.of(td[keys.VEHICLES])
+    start = Vehicles.of(td[keys.VEHICLES])
     for action in plan:
+        before = Vehicles.of(td[keys.VEHICLES])
         td = step(env, td, action)
-    for after, _ in film.frames:
+        last = check_frames(env, film.frames, before, start, tolerance_m, slides)
+        check_between(env, last, Vehicles.of(td[keys.VEHICLES]))
+        film.frames.clear()
+
+
+def check_between(env: HighwayEnv, last: Vehicles, now: Vehicles) -> None:
+    """After a decision nothing changes but the positions of recycled vehicles: from beyond 200 m, by 400 m."""
+    for name in keys.VEHICLE_FIELDS:
+        assert name == "x" or torch.equal(getattr(now, name), getattr(last, name))
+    distance = last.x - last.x[:, :1]
+    recycled = last.x - 400.0 * torch.sign(distance)
+    may_go = (distance.abs() > 200.0) & env.recycle
+    assert ((now.x == last.x) | (may_go & (now.x == recycled))).all()
+
+
+def check_frames(
+    env: HighwayEnv,
+    frames: list[tuple[Vehicles, torch.Tensor]],
+    before: Vehicles,
+    start: Vehicles,
+    tolerance_m: float,
+    slides: bool,
+) -> Vehicles:
+    """The physics steps of a decision, from ``before``; gives the last one."""
+    for after, _ in frames:
         moved = torch.hypot(after.x - before.x, after.y - before.y)
         if slides:
             moved[:, 1:] = (after.x - before.x)[:, 1:].abs()
@@ -79,6 +108,7 @@ def check_motion(env: HighwayEnv, plan: list[list[int]], tolerance_m: float = 1e
         for name in FIXED:
             assert torch.equal(getattr(after, name), getattr(start, name))
         before = after
+    return before
 
 
 @settings(max_examples=40)

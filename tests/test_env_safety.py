@@ -1,4 +1,4 @@
-"""Rule-driven traffic has no crashes of its own making, with an ego that keeps its lane or shows its changes."""
+"""Rule-driven traffic has no crashes of its own making: alone, or with an ego that keeps its lane or signals."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ class Log:
         edges = env.road.right_edge_m(), env.road.left_edge_m()
 
         def record(vehicles: Vehicles, running: torch.Tensor) -> None:
-            self.vehicle_km += (vehicles.speed * running[:, None]).sum().item() * keys.PHYSICS_STEP_S / 1000.0
+            driven = vehicles.speed * (vehicles.valid & running[:, None])
+            self.vehicle_km += driven.sum().item() * keys.PHYSICS_STEP_S / 1000.0
             self.overlaps += pair_overlaps(vehicles)[running].sum().item() // 2
             self.off_road += ((vehicles.y < edges[0]) | (vehicles.y > edges[1])).sum().item()
             self.slowest_mps = min(self.slowest_mps, vehicles.speed.min().item())
@@ -65,7 +66,7 @@ def crawling(p: SpawnParameters, rng: random.Random) -> SpawnParameters:
 
 
 def drive(rng: random.Random, log: Log, most_vehicles: int, duration_s: float) -> None:
-    """One random road with random traffic, ``ROWS`` episodes of it."""
+    """One random road with random traffic, ``ROWS`` episodes of it; in a third of them it is alone, with no ego."""
     lanes, vehicles = rng.randint(1, 6), rng.randint(2, most_vehicles)
     spawn = dense(rng, vehicles, lanes) if rng.random() < 0.5 else sparse(vehicles, lanes)
     spawn = crawling(spawn, rng) if rng.random() < 0.4 else spawn
@@ -81,10 +82,12 @@ def drive(rng: random.Random, log: Log, most_vehicles: int, duration_s: float) -
         spawn=spawn,
         seed=rng.randrange(10**9),
         dtype=torch.float32,
+        recycle=rng.random() < 0.5,
     )
     driver = (MobilDriver if rng.random() < 0.5 else KeepLaneDriver)(env.road)
     log.watch(env)
     td = env.reset()
+    td[keys.VEHICLES, "valid"][:, 0] = rng.random() > 1 / 3
     for _ in range(round(duration_s / period_s)):
         td = env.step(driver(td))["next"]
         assert not td[keys.EVENTS, "hard_crash"].any()

@@ -25,6 +25,7 @@ from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
 from ganlane.sim.road import Road
+from ganlane.sim.scenes import RandomScenes
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic import IdmTraffic
 
@@ -128,6 +129,8 @@ def test_the_keep_lane_ego_stops_two_metres_behind_the_stalled_car(traffic):
 def test_the_stalled_car_stays_in_its_lane_and_all_but_stands():
     """A vehicle that desires next to nothing creeps 3.5 cm/s: IDM's first step from a stand is 0.07 m/s."""
     seen = drive(SCENARIOS["stalled_car"], "keep_lane", "idm_mobil", 90)
+    assert len(seen.frames) == 900
+    assert seen.overlaps == 0
     moved = seen.frames[-1].x[:, 1] - seen.frames[0].x[:, 1]
     assert (moved < 5.0).all()
     assert (seen.frames[-1].y[:, 1].abs() < 0.7).all()
@@ -237,6 +240,11 @@ def test_a_number_of_vehicles_other_than_the_scenes_is_refused():
     scene = FixedScene((SceneVehicle(0.0, 0), SceneVehicle(50.0, 1)), Road(2))
     with pytest.raises(UserError, match="vehicles=9: the scene has 2"):
         HighwayEnv(IdmTraffic(Road(2)), 1, 9, scenes=scene)
+
+
+def test_an_environment_refuses_scenes_of_another_road():
+    with pytest.raises(UserError, match="give both the same road"):
+        HighwayEnv(IdmTraffic(Road(2)), scenes=RandomScenes(Road(3)))
 
 
 def test_a_hopeless_scene_is_refused_when_the_environment_is_made():

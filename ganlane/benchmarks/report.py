@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.benchmarks.case import Suite
-from ganlane.errors import UserError
 from ganlane.evaluation import code_version, machine
-from ganlane.files import write_bytes
+from ganlane.files import split_at_markers, write_between_markers
 
 
 def markers(suite: str) -> tuple[str, str]:
@@ -18,24 +17,13 @@ def markers(suite: str) -> tuple[str, str]:
 
 
 def require_markers(path: Path, suite: str) -> tuple[str, str]:
-    """The document's text up to the first marker, and from the second on, markers included.
-
-    Raises:
-        UserError: there is no such file, or it does not hold the two markers once each and in order.
-    """
-    begin, end = markers(suite)
-    if not path.is_file():
-        raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
-    text = path.read_text(encoding="utf-8")
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise UserError(f"report={path}: expected the lines {begin} and {end} in it, once each; add them.")
-    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
+    """The document's text before and after a suite's tables (:func:`ganlane.files.split_at_markers`)."""
+    return split_at_markers(path, *markers(suite))
 
 
 def update_document(path: Path, suite: str, content: str) -> None:
     """Put ``content`` between the markers of a suite, atomically; the rest stays as it is."""
-    before, after = require_markers(path, suite)
-    write_bytes(path, f"{before}\n{content}\n{after}".encode())
+    write_between_markers(path, *markers(suite), content)
 
 
 def machine_sentence(threads: Sequence[int]) -> str:

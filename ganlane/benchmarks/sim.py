@@ -19,6 +19,7 @@ from ganlane.benchmarks.systems import (
     start_physics,
 )
 from ganlane.benchmarks.tables import Table
+from ganlane.build import make_traffic
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 
 _START: dict[str, Any] = {PHYSICS: start_physics, ENVIRONMENT: start_environment}
@@ -55,8 +56,11 @@ class SimSuite:
     def __init__(self, options: SimOptions) -> None:
         self.notes: list[str] = []
         self.memory = options.memory
-        env = replace(options.scenario.env, recycle=True)
+        recycle = not make_traffic(options.scenario.traffic, options.scenario.env).own_roads
+        env = replace(options.scenario.env, recycle=recycle)
         self.options = replace(options, scenario=replace(options.scenario, env=env))
+        if not recycle:
+            self.notes.append("Not recycled: recorded vehicles go where they went, so the road empties.")
         self.has_peer = options.peers and highway_env_version() is not None
         if options.peers and not self.has_peer:
             self.notes.append(MISSING)

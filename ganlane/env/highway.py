@@ -166,7 +166,7 @@ class HighwayEnv(EnvBase):
         """All rows at the start of their episodes; EnvBase keeps those of the rows that were not asked for."""
         seed, episode = self.last_episodes = self._episodes(tensordict)
         key = episode_key(self.stream, seed, episode)
-        vehicles = self.scenes(key, self.dtype)
+        vehicles = self.scenes(key, self.dtype).with_finite_padding()
         memory = self.traffic.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
         zero = torch.zeros(self.batch_size, dtype=self.dtype, device=self.device)
         rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}

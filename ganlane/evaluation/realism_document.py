@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ganlane.errors import UserError
 from ganlane.evaluation.provenance import code_version, machine
 from ganlane.evaluation.realism_table import checks_text, long_table, quantities_table, starts_table
-from ganlane.files import write_bytes
+from ganlane.files import split_at_markers, write_between_markers
 
 
 def markers(card: str) -> tuple[str, str]:
@@ -18,24 +17,13 @@ def markers(card: str) -> tuple[str, str]:
 
 
 def require_markers(path: Path, card: str) -> tuple[str, str]:
-    """The document's text up to the first marker, and from the second on, markers included.
-
-    Raises:
-        UserError: there is no such file, or it does not hold the two markers once each and in order.
-    """
-    begin, end = markers(card)
-    if not path.is_file():
-        raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
-    text = path.read_text(encoding="utf-8")
-    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise UserError(f"report={path}: expected the lines {begin} and {end} in it, once each; add them.")
-    return text[: text.index(begin) + len(begin)], text[text.index(end) :]
+    """The document's text before and after a card's tables (:func:`ganlane.files.split_at_markers`)."""
+    return split_at_markers(path, *markers(card))
 
 
 def update_document(path: Path, card: str, content: str) -> None:
     """Put ``content`` between the markers of a card, atomically; the rest stays as it is."""
-    before, after = require_markers(path, card)
-    write_bytes(path, f"{before}\n\n{content}\n\n{after}".encode())
+    write_between_markers(path, *markers(card), f"\n{content}\n")
 
 
 def card_text(numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:

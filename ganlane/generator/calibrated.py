@@ -39,7 +39,7 @@ class CalibratedConfig:
         noise_period_s: how fast each driver's latent vector wanders.
         mirror: swap left and right in half of the updates.
         washout_s: time over which the residual's mean is taken away; infinite is without washout. The simulation
-            takes that of :data:`ganlane.generator.ANCHOR`.
+            takes the one of the weights.
         further_inputs: whether the network sees gap, closing speed, IDM's acceleration and lane offset.
         traits: whether every driver has a headway and a desired speed of its own.
         seed: of weights, batches, traits and noise.

@@ -76,7 +76,7 @@ def _beyond(number: Tensor, where: Tensor) -> Tensor:
     """``number`` with so much added ``where`` it does not count that no minimum finds it.
 
     A sum in place of ``torch.where``: on a CPU that one branches at every element, which costs five times as much.
-    Adding 0 leaves a number as it is, to the last bit.
+    Adding 0 leaves a number as it is, to the last bit; NaN would stay NaN, so padding has to be finite.
     """
     return torch.add(number, where, alpha=_BEYOND)
 
@@ -86,15 +86,8 @@ def _only(gap: Tensor, counts: Tensor) -> Tensor:
     return _beyond(gap, ~counts).clamp_max(FREE_GAP_M)
 
 
-def _padded_with_zeros(vehicles: Vehicles) -> Vehicles:
-    """``vehicles`` whose padding is finite, whatever stands there: a sum with NaN would be seen by everybody."""
-    numbers = {name: torch.where(vehicles.valid, getattr(vehicles, name), 0.0) for name in ("x", "speed")}
-    return vehicles.with_(**numbers)
-
-
 def perceive(vehicles: Vehicles, road: Road, observers: slice = slice(None)) -> Scene:
     """The :class:`Scene` of ``vehicles`` on ``road``, as seen by all of them or by a slice of them."""
-    vehicles = _padded_with_zeros(vehicles)
     body = body_lanes(vehicles, road)
     attention = with_target(body, vehicles)
     half = 0.5 * vehicles.length

@@ -12,6 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from ganlane.errors import UserError
 from ganlane.sim.idm import IdmParameters
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.road import Road
@@ -49,9 +50,31 @@ class RandomScenes:
     others_visibility: int = Visibility.SIGNALLED
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """See :meth:`SpawnParameters.check`."""
-        if isinstance(road.lanes, int):
-            self.parameters.check(self.vehicles, road.lanes, idm)
+        """See :meth:`SpawnParameters.check`; the road must be the scene's, and wide and long enough for it."""
+        if isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
+            return  # a road for each row: its vehicles come from recordings
+        if road != self.road:
+            raise UserError(
+                f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both the "
+                "same road."
+            )
+        self.parameters.check(self.vehicles, road.lanes, idm)
+        self._check_room(road.lane_width_m, road.ring_m)
+
+    def _check_room(self, lane_width_m: float, ring_m: float | None) -> None:
+        """Side by side, and where a ring closes: the last vehicle is the first one's leader."""
+        p = self.parameters
+        if lane_width_m <= p.width_m:
+            raise UserError(
+                f"env.lane_width_m={lane_width_m:g}: expected more than env.width_m={p.width_m:g}, or vehicles in "
+                "neighbouring lanes touch; widen the lanes."
+            )
+        if ring_m is not None and p.spread_m + p.min_spacing_m > ring_m:
+            raise UserError(
+                f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and env.min_spacing_m="
+                f"{p.min_spacing_m:g} together, or the first vehicles stand upon the last; lengthen the ring or lower "
+                "env.spread_m."
+            )
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """One random scene per key."""
@@ -60,3 +83,8 @@ class RandomScenes:
         assert not isinstance(width, Tensor)
         seen = (self.ego_visibility, self.others_visibility)
         return spawn(key, self.vehicles, lanes, float(width), self.parameters, dtype, *seen)
+
+
+def _described(road: Road) -> str:
+    shape = "a straight road" if road.ring_m is None else f"a ring of {road.ring_m:g} m"
+    return f"{shape} of {road.lanes} lanes of {road.lane_width_m} m"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -34,7 +35,9 @@ class SpawnParameters:
         return int(self.spread_m / self.min_spacing_m) + 1
 
     def check(self, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V) -> None:
-        """Raise :class:`UserError` where ``vehicles`` do not fit on ``lanes`` lanes, overlap, or cannot brake."""
+        """Raise :class:`UserError`: impossible numbers, ``vehicles`` that do not fit, overlap, or cannot brake."""
+        self._check_sizes()
+        self._check_speeds()
         if self.min_spacing_m <= self.length_m:
             raise UserError(
                 f"env.min_spacing_m={self.min_spacing_m:g} is not above the vehicles' length of "
@@ -50,6 +53,27 @@ class SpawnParameters:
         if vehicles > 1:
             for follower in self.worst_followers():
                 self._check_braking(*follower, idm)
+
+    def _check_sizes(self) -> None:
+        for name in ("spread_m", "min_spacing_m", "length_m", "width_m", "ego_desired_speed_mps"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise UserError(f"env.{name}={value:g}: expected a finite number above 0; give one.")
+
+    def _check_speeds(self) -> None:
+        for name in ("front_speed_mps", "rear_speed_mps", "ego_speed_mps", "desired_speed_mps"):
+            low, high = getattr(self, name)
+            if not (math.isfinite(high) and 0 <= low <= high):
+                raise UserError(
+                    f"env.{name}=({low:g}, {high:g}): expected two finite speeds from 0 on, the lower one first; "
+                    "give such a range."
+                )
+        if self.desired_speed_mps[0] <= 0:
+            low, high = self.desired_speed_mps
+            raise UserError(
+                f"env.desired_speed_mps=({low:g}, {high:g}): expected speeds above 0, since a driver that wants to "
+                "stand still is no driver; raise the lower one."
+            )
 
     def worst_followers(self) -> tuple[tuple[str, float, float, float], ...]:
         """Who may start fastest behind whom: key, highest speed, the leader's lowest, highest desired speed, m/s."""

@@ -59,6 +59,10 @@ class Vehicles(NamedTuple):
         }
         return self.with_(**changing)
 
+    def with_finite_padding(self) -> Vehicles:
+        """The same vehicles with zeros in place of numbers of those that are not valid; a sum with NaN reaches all."""
+        return Vehicles(*(torch.where(self.valid, f, 0.0) if f.is_floating_point() else f for f in self))
+
     def where(self, rows: Tensor, other: Vehicles) -> Vehicles:
         """These vehicles in the rows [N] (or [N, 1], [N, M]) where ``rows`` holds, ``other`` elsewhere."""
         mask = rows[:, None] if rows.ndim == 1 else rows

@@ -139,19 +139,3 @@ def test_on_a_ring_distances_take_the_nearer_way_round():
     ring = Road(lanes=1, ring_m=100.0)
     start, end = torch.tensor([95.0, 5.0, 0.0, 0.0]), torch.tensor([5.0, 95.0, 210.0, 40.0])
     assert ring.distance_ahead(start, end).tolist() == [10.0, -10.0, 10.0, 40.0]
-
-
-def test_nobody_sees_what_stands_in_the_padding():
-    """An own scene or traffic model may leave anything there, NaN for one."""
-    scene = vehicles({"x": 0.0, "lane": 1}, {"x": 20.0, "lane": 1}, {"x": 50.0, "lane": 1})
-    empty = scene.valid.clone()
-    empty[:, 1] = False
-    for nonsense in (float("nan"), float("inf")):
-        padded = scene.with_(
-            valid=empty, x=torch.where(empty, scene.x, nonsense), speed=torch.where(empty, scene.speed, nonsense)
-        )
-        clean = scene.with_(valid=empty)
-        for seen, wanted in zip(
-            leader(perceive(padded, ROAD), lane(1.0, scene)), leader(perceive(clean, ROAD), lane(1.0, scene))
-        ):
-            assert torch.equal(seen[:, [0, 2]], wanted[:, [0, 2]])

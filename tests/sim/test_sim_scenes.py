@@ -19,6 +19,7 @@ from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.scene_files import read_scene
+from ganlane.sim.scenes import RandomScenes
 from ganlane.sim.spawn import SpawnParameters
 
 DOUBLE = torch.float64
@@ -111,6 +112,34 @@ def test_the_remedies_that_the_message_names_work():
 def test_weak_brakes_make_table_ii_hopeless():
     with pytest.raises(UserError, match=r"env\.idm\.min_acceleration=-5"):
         SpawnParameters().check(9, 3, replace(TABLE_V, min_acceleration=-5.0))
+
+
+def refusal(scenes: RandomScenes, road: Road) -> str:
+    with pytest.raises(UserError) as refused:
+        scenes.check(road, TABLE_V)
+    return str(refused.value)
+
+
+@pytest.mark.parametrize("other", [Road(2), Road(3, 3.5), Road(3, 4.0, ring_m=500.0)])
+def test_random_scenes_are_laid_out_on_the_environments_road(other):
+    RandomScenes(other).check(other, TABLE_V)
+    assert "a straight road of 3 lanes of 4.0 m" in refusal(RandomScenes(Road(3)), other)
+
+
+def test_lanes_no_wider_than_the_cars_are_refused():
+    for width in (2.4, 2.5):
+        said = refusal(RandomScenes(Road(3, width)), Road(3, width))
+        assert f"env.lane_width_m={width}: expected more than env.width_m=2.5" in said
+    RandomScenes(Road(3, 2.6)).check(Road(3, 2.6), TABLE_V)
+
+
+def test_a_ring_must_have_room_for_the_spread_and_one_more_spacing():
+    """Table II: 200 m and 25 m between the last vehicle and the first."""
+    short, enough = Road(3, ring_m=224.0), Road(3, ring_m=225.0)
+    assert "ring_m=224: expected at least env.spread_m=200 and env.min_spacing_m=25" in refusal(
+        RandomScenes(short), short
+    )
+    RandomScenes(enough).check(enough, TABLE_V)
 
 
 # Scenes set by hand

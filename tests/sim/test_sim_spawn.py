@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -92,6 +94,32 @@ def test_vehicles_that_do_not_fit_are_refused_in_a_sentence():
 def test_a_spacing_within_the_length_of_a_car_is_refused():
     with pytest.raises(UserError, match="min_spacing_m=4"):
         SpawnParameters(min_spacing_m=4.0).check(vehicles=2, lanes=1)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "what"),
+    [
+        (SpawnParameters(front_speed_mps=(-5.0, 12.0)), r"env.front_speed_mps=(-5, 12): expected two finite speeds"),
+        (SpawnParameters(rear_speed_mps=(25.0, 15.0)), r"env.rear_speed_mps=(25, 15): expected two finite speeds"),
+        (SpawnParameters(ego_speed_mps=(math.nan, 15.0)), r"env.ego_speed_mps=(nan, 15): expected two finite speeds"),
+        (SpawnParameters(ego_speed_mps=(10.0, math.nan)), r"env.ego_speed_mps=(10, nan): expected two finite speeds"),
+        (
+            SpawnParameters(desired_speed_mps=(18.0, math.inf)),
+            r"env.desired_speed_mps=(18, inf): expected two finite",
+        ),
+        (SpawnParameters(desired_speed_mps=(0.0, 26.0)), r"env.desired_speed_mps=(0, 26): expected speeds above 0"),
+        (SpawnParameters(ego_desired_speed_mps=0.0), "env.ego_desired_speed_mps=0: expected a finite number above 0"),
+        (SpawnParameters(length_m=0.0), "env.length_m=0: expected a finite number above 0"),
+        (SpawnParameters(width_m=-2.5), "env.width_m=-2.5: expected a finite number above 0"),
+        (SpawnParameters(spread_m=math.nan), "env.spread_m=nan: expected a finite number above 0"),
+        (SpawnParameters(min_spacing_m=math.inf), "env.min_spacing_m=inf: expected a finite number above 0"),
+    ],
+)
+def test_impossible_numbers_are_refused_by_name_whatever_the_number_of_vehicles(parameters, what):
+    for vehicles in (1, 9):
+        with pytest.raises(UserError) as refused:
+            parameters.check(vehicles, lanes=3)
+        assert what in str(refused.value)
 
 
 def test_every_lane_is_as_likely_as_the_others():

@@ -55,8 +55,8 @@ class RandomScenes:
             return  # a road for each row: its vehicles come from recordings
         if road != self.road:
             raise UserError(
-                f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both the "
-                "same road."
+                f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both "
+                "the same road."
             )
         self.parameters.check(self.vehicles, road.lanes, idm)
         self._check_room(road.lane_width_m, road.ring_m)
@@ -72,8 +72,8 @@ class RandomScenes:
         if ring_m is not None and p.spread_m + p.min_spacing_m > ring_m:
             raise UserError(
                 f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and env.min_spacing_m="
-                f"{p.min_spacing_m:g} together, or the first vehicles stand upon the last; lengthen the ring or lower "
-                "env.spread_m."
+                f"{p.min_spacing_m:g} together, or the first vehicles stand upon the last; lengthen the ring or "
+                "lower env.spread_m."
             )
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:

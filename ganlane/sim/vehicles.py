@@ -60,8 +60,12 @@ class Vehicles(NamedTuple):
         return self.with_(**changing)
 
     def with_finite_padding(self) -> Vehicles:
-        """The same vehicles with zeros in place of numbers of those that are not valid; a sum with NaN reaches all."""
-        return Vehicles(*(torch.where(self.valid, f, 0.0) if f.is_floating_point() else f for f in self))
+        """The same vehicles with finite numbers for those not valid: a sum with NaN would reach everybody."""
+
+        def finite(field: Tensor) -> Tensor:
+            return torch.where(self.valid, field, torch.nan_to_num(field, 1.0, 1.0, 1.0))
+
+        return Vehicles(*(finite(field) if field.is_floating_point() else field for field in self))
 
     def where(self, rows: Tensor, other: Vehicles) -> Vehicles:
         """These vehicles in the rows [N] (or [N, 1], [N, M]) where ``rows`` holds, ``other`` elsewhere."""

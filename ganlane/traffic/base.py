@@ -40,8 +40,8 @@ class TrafficModule(TensorDictModuleBase):
     In keys: ``vehicles`` (the state at t, never written), ``traffic`` (the module's memory), ``seed``,
     ``episode``, ``step`` ([N] int64); ``episode_key`` too, where the caller has worked it out. Out keys: ``moved``
     (the same fields as ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: what the module
-    writes there is overwritten by the environment. Numbers of vehicles that are not valid may be anything finite. Randomness comes from :mod:`ganlane.sim.random` and the counters
-    alone.
+    writes there is overwritten by the environment. Numbers of vehicles that are not valid may be anything finite.
+    Randomness comes from :mod:`ganlane.sim.random` and the counters alone.
 
     A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields` and
     fills them in :meth:`fresh_memory`::

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -13,7 +14,8 @@ from ganlane.benchmarks.systems import Scenario
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
-from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.config.traffic import IdmTrafficConfig, TrafficConfig
+from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
 
 SCENARIO = Scenario(EnvConfig(), IdmTrafficConfig(), ObservationConfig(), RewardConfig())
@@ -68,6 +70,21 @@ def test_growth_is_measured_side_by_side():
     vehicles = growth[f"{ENVIRONMENT}, growth with the vehicles"]
     assert [label.vehicles for label in vehicles] == [9, 15, 30, 60]
     assert {label.batch for label in vehicles} == {4}
+
+
+def test_the_road_is_kept_full_except_in_replayed_traffic_where_a_note_says_so(tmp_path):
+    path = tmp_path / "scenes.csv"
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=12, seconds=7.0)), path)
+    replay = replace(SCENARIO, traffic=TrafficConfig("ganlane.traffic.ReplayTraffic", {"path": str(path)}))
+    played = SimSuite(
+        SimOptions(replay, batches=(2,), vehicle_counts=(), modes=("eager",), peers=False, memory=False)
+    )
+    assert not played.options.scenario.env.recycle
+    assert any("Not recycled" in note for note in played.notes)
+    assert len(measure(played, SHORT)["rows"]) == 4
+    ruled = suite(peers=False)
+    assert ruled.options.scenario.env.recycle
+    assert not ruled.notes
 
 
 class ByHand(EnvConfig):

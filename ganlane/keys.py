@@ -47,8 +47,6 @@ VEHICLE_FLOATS: Final = ("x", "y", "heading", "speed", "acceleration", "length",
 VEHICLE_INTEGERS: Final = ("target_lane", "visibility")
 #: Boolean fields of ``vehicles``.
 VEHICLE_FLAGS: Final = ("valid",)
-#: What no step changes, for any vehicle.
-FIXED_FIELDS: Final = ("length", "width", "desired_speed")
 VEHICLE_FIELDS: Final = VEHICLE_FLOATS + VEHICLE_INTEGERS + VEHICLE_FLAGS
 
 #: Boolean events; a decision ends for at most one of them.

@@ -231,7 +231,7 @@ def test_a_vehicle_that_is_not_valid_is_in_no_observation(data, form, lanes, oth
     scene, ghosts = (any_vehicles(1 + others, lanes, data.draw(seeds)).with_(valid=valid) for _ in range(2))
     haunted = scene.where(valid, ghosts)
     road, own = Road(lanes), torch.zeros(1, dtype=torch.float64)
-    seen = [ObservationTransform(road, 1 + others, form).observe(s, own, own.long()) for s in (scene, haunted)]
+    seen = [ObservationTransform(road, 1 + others, form).observe(s, own, own.long(), road) for s in (scene, haunted)]
     assert torch.equal(*seen)
     # And those that are valid are seen: all of them, from the nearest on, in the list of Table III.
     if OBSERVATIONS[form][0]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ganlane.keys import FIXED_FIELDS, VEHICLE_FIELDS
+from ganlane.keys import VEHICLE_FIELDS
 
 
 class Vehicles(NamedTuple):
@@ -50,14 +50,9 @@ class Vehicles(NamedTuple):
         return Vehicles(*(field[:, which] for field in self))
 
     def with_first(self, first: Vehicles) -> Vehicles:
-        """The same rows with vehicle 0 replaced by ``first`` (fields [N]), but for what never changes."""
+        """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
         is_first = torch.arange(self.x.shape[1], device=self.x.device) == 0
-        changing = {
-            name: torch.where(is_first, getattr(first, name)[:, None], getattr(self, name))
-            for name in VEHICLE_FIELDS
-            if name not in FIXED_FIELDS
-        }
-        return self.with_(**changing)
+        return Vehicles(*(torch.where(is_first, one[:, None], all_) for one, all_ in zip(first, self)))
 
     def with_finite_padding(self) -> Vehicles:
         """The same vehicles with finite numbers for those not valid: a sum with NaN would reach everybody."""

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from ganlane.build import Driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
+from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
@@ -91,6 +92,21 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
         per_km = {"per_km": crashes.per_km.value, "per_km_ci": crashes.per_km.interval}
         found.append({"agent": agent, "traffic": traffic, **per_km, "scenes": crashes.rows})
     return found
+
+
+def compare_as_told(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.DataFrame:
+    """:func:`compare` with everything else as ``config`` says."""
+    return compare(
+        drivers,
+        config.chosen_traffics(),
+        config.env,
+        config.reward,
+        config.observation,
+        config.episodes,
+        config.seed,
+        config.num_envs,
+        config.device,
+    )
 
 
 def publish(

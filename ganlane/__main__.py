@@ -6,7 +6,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-#: Command to what it does; each is a module of the package with a ``main``.
+#: Command to what it does; each is a module of the package with a ``main``, and has a configuration.
 COMMANDS = {
     "train": "train an agent on a traffic, then evaluate it beside others",
     "evaluate": "agents x traffics on the same episodes, as one table",
@@ -16,13 +16,17 @@ COMMANDS = {
     "realism": "how close a traffic comes to recorded driving",
     "bench": "speed and memory, beside a peer measured in the same run",
 }
+#: Commands without a configuration: they take no keys.
+PLAIN_COMMANDS = {"doctor": "what is installed and found, and the command that mends what is missing"}
+COMPLETION_FLAGS = ("-sc", "--shell-completion")
 
 
 def usage() -> str:
     """The commands in a few lines."""
-    listed = "\n".join(f"  {name:<17}{text}" for name, text in COMMANDS.items())
+    listed = "\n".join(f"  {name:<17}{text}" for name, text in (COMMANDS | PLAIN_COMMANDS).items())
     return (
-        f"usage: ganlane COMMAND key=value ...\n\n{listed}\n\nganlane COMMAND --help explains its options and keys."
+        f"usage: ganlane COMMAND key=value ...\n\n{listed}\n\nganlane COMMAND --help explains its options and keys.\n"
+        'eval "$(ganlane -sc install=bash)" completes commands, options and keys in this shell.'
     )
 
 
@@ -37,8 +41,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         print(__version__)
         return 0
-    if command not in COMMANDS:
-        print(f"ganlane: {command}: no such command; choose one of {', '.join(COMMANDS)}.", file=sys.stderr)
+    if set(COMPLETION_FLAGS) & {command, *rest}:
+        from ganlane.config.completion import shell_completion
+
+        return shell_completion([command, *rest], {**COMMANDS, **PLAIN_COMMANDS})
+    if command not in COMMANDS | PLAIN_COMMANDS:
+        known = ", ".join(COMMANDS | PLAIN_COMMANDS)
+        print(f"ganlane: {command}: no such command; choose one of {known}.", file=sys.stderr)
         return 2
     # A console script, unlike python -m, does not look for a user's own modules where it is started.
     if "" not in sys.path:

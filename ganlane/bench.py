@@ -5,6 +5,7 @@
     ganlane bench suite=sim batches=[1,1024] threads=[1] modes=[eager] repetitions=9
     ganlane bench suite=sim report=docs/performance.md
     ganlane bench suite=traffic report=docs/performance.md
+    ganlane bench suite=train modes=[eager] train_batches=[512] seconds=2
 
 Writes results.json into its run folder, and with ``report`` the tables into that document.
 """
@@ -89,8 +90,33 @@ def traffic_suite(config: BenchConfig) -> Suite:
     return TrafficSuite(options)
 
 
+def train_suite(config: BenchConfig) -> Suite:
+    """``suite=train``."""
+    from ganlane.benchmarks import Budget
+    from ganlane.benchmarks.systems import Scenario
+    from ganlane.benchmarks.train import TrainOptions, TrainSuite
+
+    options = TrainOptions(
+        scenario=Scenario(config.env, config.traffic, config.observation, config.reward, config.seed),
+        traffics=config.chosen_train_traffics(),
+        agent=config.agent.rainbow(),
+        batches=tuple(config.train_batches),
+        modes=tuple(config.modes),
+        threads=tuple(config.threads),
+        devices=config.chosen_devices(),
+        stored=config.train_stored,
+        budget=Budget(config.repetitions, config.seconds),
+        peers=config.peers,
+    )
+    return TrainSuite(options)
+
+
 #: What ``suite=`` can be, and how each is made.
-SUITES: dict[str, Callable[[BenchConfig], Suite]] = {"sim": sim_suite, "traffic": traffic_suite}
+SUITES: dict[str, Callable[[BenchConfig], Suite]] = {
+    "sim": sim_suite,
+    "traffic": traffic_suite,
+    "train": train_suite,
+}
 
 
 def command_line(folder: Path) -> str:

@@ -85,6 +85,7 @@ def make_env(
     num_envs: int = 1,
     seed: int = 0,
     device: str = "cpu",
+    first_episode: int = 0,
 ) -> TransformedEnv:
     """A batched environment with observation and reward; its stream is the traffic's.
 
@@ -102,6 +103,7 @@ def make_env(
         env.idm.parameters(),
         stream=traffic.stream,
         seed=seed,
+        first_episode=first_episode,
         device=device,
         scenes=env.scenes(traffic.visibility),
         recycle=env.recycle,

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
+from torchrl.envs import EnvBase
 
 from ganlane.agents import GreedyPolicy, Rainbow, read_agent, save_agent, transfer
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
-from ganlane.build import make_env, make_road, make_traffic, observation_of
+from ganlane.build import make_env, make_road, make_traffic, observation_of, set_threads
+from ganlane.config.collector import MultiCollectorConfig, RayCollectorConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
+from ganlane.memory import keep_freed_memory
 from ganlane.sim.random import Stream
 from ganlane.training import TensorBoardLog, TrainingConfig, TrainingResult, find_checkpoint, train
+from ganlane.training.collectors import MultiSource, RaySource, SingleSource, Source, Team
 from ganlane.transforms import observation_size
 
 #: The trained agent, in the folder of its phase; its presence says that the phase is over.
@@ -62,23 +69,52 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
     if phase.init is not None and resume is None:
         check_observation(phase.init, config)
         transfer(agent, phase.init)
-    traffic = make_traffic(phase.traffic, config.env, Stream.TRAIN)
-    rows = config.collector.num_envs
-    env = make_env(traffic, config.env, config.observation, config.reward, rows, config.seed, config.device)
-    result = train(
-        env,
-        agent,
-        _rhythm(config, phase),
-        phase.folder,
-        evaluate=_selection(config, phase) if config.evaluate_every else None,
-        logs=[TensorBoardLog(phase.folder / "tensorboard")] if config.logger.kind == "tensorboard" else [],
-        metadata=describe(config, phase),
-        resume=resume,
-        identity=identity(config, phase),
-    )
+    with closing(make_source(config, phase)) as source:
+        result = train(
+            source,
+            agent,
+            _rhythm(config, phase),
+            phase.folder,
+            evaluate=_selection(config, phase) if config.evaluate_every else None,
+            logs=[TensorBoardLog(phase.folder / "tensorboard")] if config.logger.kind == "tensorboard" else [],
+            metadata=describe(config, phase),
+            resume=resume,
+            identity=identity(config, phase),
+        )
     if result.stopped_by is None:
         _keep(agent, config, phase, result)
     return result
+
+
+def make_source(config: TrainConfig, phase: Phase) -> Source:
+    """Where the steps of a phase come from: ``collector=single``, ``multi`` or ``ray``.
+
+    Raises:
+        UserError: the environments cannot be made, or Ray is not installed.
+    """
+    collector = config.collector
+    if not isinstance(collector, MultiCollectorConfig):
+        return SingleSource(training_env(config, phase, collector.num_envs, device=config.device))
+    training_env(config, phase, 1)  # a mistake shows here, before there are workers
+    team = Team(collector.workers, collector.num_envs, collector.weights_every)
+    if isinstance(collector, RayCollectorConfig):
+        return RaySource(partial(worker_env, config, phase), team, collector.address)
+    return MultiSource(partial(worker_env, config, phase), team)
+
+
+def training_env(
+    config: TrainConfig, phase: Phase, rows: int, first_episode: int = 0, device: str = "cpu"
+) -> EnvBase:
+    """``rows`` environments of the training stream; row i begins with episode ``first_episode + i``."""
+    traffic = make_traffic(phase.traffic, config.env, Stream.TRAIN)
+    return make_env(traffic, config.env, config.observation, config.reward, rows, config.seed, device, first_episode)
+
+
+def worker_env(config: TrainConfig, phase: Phase, rows: int, first_episode: int) -> EnvBase:
+    """The same in a process of its own, on its CPU."""
+    set_threads(config.threads)
+    keep_freed_memory()
+    return training_env(config, phase, rows, first_episode)
 
 
 def make_agent(config: TrainConfig, trained: bool = False) -> Rainbow:
@@ -125,8 +161,10 @@ def _selection(config: TrainConfig, phase: Phase) -> Callable[[GreedyPolicy], Ma
         table = run_episodes(env, policy, range(config.selection_episodes), config.seed)
         total = table.select("reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash").sum()
         reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
+        spread = float(np.std(table["reward"].to_numpy()))
         return {
             "mean_reward": reward / table.height,
+            "standard_error": spread / math.sqrt(table.height),
             "crash_rate": crashes / table.height,
             "lane_changes_per_km": 1000.0 * changes / max(distance_m, 1.0),
         }
@@ -141,7 +179,7 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "traffic": asdict(phase.traffic),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
-        "collector": asdict(config.collector),
+        "collector": {name: value for name, value in asdict(config.collector).items() if name != "address"},
         "seed": config.seed,
     }
 
@@ -163,7 +201,7 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "sensors": asdict(config.observation)["sensors"],
         "environment": environment,
         "env": asdict(config.env),
-        "num_envs": config.collector.num_envs,
+        "num_envs": config.collector.environments,
         "code": code_version(),
         "agent": asdict(config.agent),
         "reward": asdict(config.reward),

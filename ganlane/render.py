@@ -1,8 +1,10 @@
-"""``ganlane render``: an episode of an agent on a traffic, as a film seen from above.
+"""``ganlane render``: episodes as a film, an HTML player or a table of trajectories; learning curves of runs.
 
     ganlane render agent=mobil traffic=idm_mobil episode=3
     ganlane render agent=agent_idm traffic=gan format=mp4 out=film.mp4
-    ganlane render agent=mobil traffic=gan_calibrated film.end_s=20 film.max_bytes=2000000
+    ganlane render agents=[mobil,agent_idm] traffic=gan episode=3 out=player.html
+    ganlane render agent=mobil traffic=gan_calibrated episodes=[0,1,2] out=simulated.parquet
+    ganlane render run=outputs/train/FIRST,outputs/train/SECOND out=curves.png
 
 The episodes are those of ``ganlane evaluate`` with the same seed.
 """
@@ -12,41 +14,99 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
-from ganlane.config.render import RenderConfig
+from ganlane.config.render import FILMS, RenderConfig
+
+if TYPE_CHECKING:
+    from ganlane.view import Trajectory
 
 
 def render(config: RenderConfig, folder: Path) -> str:
-    """Drive the episode, draw it and write the film."""
-    from ganlane.build import make_driver, make_env, make_traffic, set_threads
-    from ganlane.sim.random import Stream
-    from ganlane.view import DrawingParameters, Film, FramePainter, WindowParameters, record_episode, write_film
-    from ganlane.view.films import film_format
+    """Draw what is asked for; the line that names the file."""
+    if config.run is not None:
+        return _curves(config, config.run, folder)
+    from ganlane.build import set_threads
+    from ganlane.view import write_player, write_tracks
 
     set_threads(config.threads)
-    film, label = config.film, config.traffic.label()
-    driver = make_driver(config.driver, config.env, device=config.device)
+    episodes = [_record(config, agent, episode) for agent, episode in config.pairs()]
+    kind, film = config.kind, config.film
+    out = Path(config.out) if config.out is not None else folder / _name(config)
+    if kind in FILMS:
+        return _film(config, episodes[0], out)
+    shown = [episode.since(film.start_s) for episode in episodes]
+    if kind == "html":
+        return f"player: {write_player(shown, out, film.max_bytes)}"
+    return f"tracks: {write_tracks(shown, out, 'csv' if kind == 'csv' else 'parquet')}"
+
+
+def _record(config: RenderConfig, agent: str, number: int) -> Trajectory:
+    """Drive an episode, and say how it ended."""
+    from ganlane.build import make_driver, make_env, make_traffic
+    from ganlane.sim.random import Stream
+    from ganlane.view import record_episode
+
+    label = config.traffic.label()
+    driver = make_driver(agent, config.env, device=config.device)
     traffic = make_traffic(config.traffic, config.env, Stream.REPORT)
     seen = config.observation.read_by(driver.observation)
     env = make_env(traffic, config.env, seen, config.reward, device=config.device)
-    end_s = film.end_s if film.end_s is not None else float("inf")
-    episode = record_episode(env, driver.policy, config.seed, config.episode, driver.name, label, end_s)
+    end_s = config.film.end_s if config.film.end_s is not None else float("inf")
+    episode = record_episode(env, driver.policy, config.seed, number, driver.name, label, end_s)
+    which = f"{driver.name} on {label}, seed {config.seed}, episode {number}"
+    print(f"{which}: {episode.outcome or 'cut off'} after {episode.time_s[-1]:.1f} s")
+    return episode
+
+
+def _film(config: RenderConfig, episode: Trajectory, out: Path) -> str:
+    """Draw an episode and write the film."""
+    from ganlane.view import DrawingParameters, Film, FramePainter, WindowParameters, write_film
+    from ganlane.view.films import film_format
+
+    film = config.film
     window = WindowParameters(width=film.width, height=film.height, length_m=film.road_m)
     painter = FramePainter(episode, window, DrawingParameters(film.trail_s, film.speeds, film.leader_line))
     frames = Film(painter, film.fps, film.speedup, film.start_s, film.end_s)
-    name = f"{Path(config.driver).stem}_{label}_{config.seed}_{config.episode}.{config.format}"
-    out = Path(config.out) if config.out else folder / name
-    path = write_film(frames, out, film.fps, film_format(out, config.format), film.max_bytes, film.scale)
-    ending = episode.outcome or "cut off"
-    which = f"{driver.name} on {label}, seed {config.seed}, episode {config.episode}"
-    print(f"{which}: {ending} after {episode.time_s[-1]:.1f} s")
-    return f"film: {path}"
+    return f"film: {write_film(frames, out, film.fps, film_format(out, config.kind), film.max_bytes, film.scale)}"
+
+
+def _curves(config: RenderConfig, runs: Sequence[str], folder: Path) -> str:
+    """Draw the learning curves of ``runs``."""
+    from ganlane.view import write_runs
+
+    out = Path(config.out) if config.out is not None else folder / "curves.png"
+    return f"curves: {write_runs(runs, out, config.curves.columns, config.curves.smooth)}"
+
+
+def _name(config: RenderConfig) -> str:
+    """The file's name where none is given: agents, traffic, seed, episodes."""
+    agents = dict.fromkeys(Path(agent).stem for agent, _ in config.pairs())
+    numbers = dict.fromkeys(str(number) for _, number in config.pairs())
+    parts = [*agents, config.traffic.label(), str(config.seed), *numbers]
+    return f"{'_'.join(parts)}.{config.kind}"
+
+
+def with_runs_listed(arguments: Sequence[str]) -> list[str]:
+    """``run=A,B`` as the list ``run=['A','B']``: to Hydra a comma means a sweep, and few folders need no quotes."""
+    if "-m" in arguments or "--multirun" in arguments:
+        return list(arguments)
+    return [_listed(argument) for argument in arguments]
+
+
+def _listed(argument: str) -> str:
+    key, _, value = argument.partition("=")
+    if key != "run" or not value or value[0] in "['\"" or value == "null":
+        return argument
+    quoted = ("'" + path.replace("'", "\\'") + "'" for path in value.split(","))
+    return f"run=[{','.join(quoted)}]"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit status."""
-    return run_command("render", render, arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    return run_command("render", render, with_runs_listed(given))
 
 
 if __name__ == "__main__":

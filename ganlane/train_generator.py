@@ -2,6 +2,8 @@
 
     ganlane train_generator data=scenes data.path=recordings.csv
     ganlane train_generator generator=calibrated data.path=recordings.csv seed=1
+    ganlane train_generator data=ngsim data.path=ngsim.csv
+    ganlane train_generator data=highd data.path=highD/data
     ganlane train_generator generator=paper data=scenes folds=5
     ganlane evaluate traffics=[gan] generator.path=outputs/train_generator/RUN/generator_paper.safetensors
 
@@ -17,16 +19,20 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ganlane.config.app import run_command
+from ganlane.config.data import DataConfig, NgsimDataConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
+from ganlane.errors import UserError
+
+if TYPE_CHECKING:
+    import polars as pl
 
 
 def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     """Read, fit, print the held-out errors beside constant velocity, save."""
     from ganlane.build import set_threads
-    from ganlane.data import default_scenes, read_scenes
     from ganlane.evaluation import write_results
     from ganlane.evaluation.provenance import code_version
     from ganlane.fit_report import FitProgress, metrics_table, results_of
@@ -43,8 +49,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     )
 
     set_threads(config.threads)
-    source = Path(config.data.path) if config.data.path else default_scenes()
-    frame = read_scenes(source)
+    source, frame = _recordings(config.data)
     held_out = config.data.held_out_scenes(frame["scene"].unique().to_list(), HELD_OUT)
     preset = config.generator.preset_name()
     fit_config = config.generator.fit_config(config.seed)
@@ -78,6 +83,20 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     numbers = results_of(result) | numbers
     path = write_results(folder, numbers, asdict(config), {"seed": config.seed, "held_out": held_out})
     return f"results: {path}"
+
+
+def _recordings(data: DataConfig) -> tuple[Path, pl.DataFrame]:
+    """Where the recordings lie, fetched first where asked to, and all of their scenes."""
+    from ganlane.data import ByteProgress, default_scenes, download, read_recordings
+
+    if data.format != "scenes" and data.path is None:
+        raise UserError(f"data={data.format}: which file is missing; give data.path=FILE.")
+    source = Path(data.path) if data.path else default_scenes()
+    if isinstance(data, NgsimDataConfig) and data.download:
+        with ByteProgress("download") as progress:
+            download(data.url, source, data.sha256, progress)
+    with ByteProgress("read") as progress:
+        return source, read_recordings(data.format, source, data.parameters(), progress)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -61,6 +61,20 @@ def test_report_rewrites_the_tables_of_a_document(tmp_path, capsys):
     assert str(tmp_path) not in text
 
 
+def test_training_is_measured_and_reported(tmp_path, capsys):
+    document = tmp_path / "speed.md"
+    document.write_text("<!-- begin bench train -->\n<!-- end bench train -->\n")
+    small = ["train_batches=[4]", "agent.hidden=[8]", "agent.batch_size=8", "train_stored=16"]
+    status, out, _ = run(capsys, "suite=train", "peers=false", "devices=[cpu]", *small, f"report={document}")
+    assert status == 0
+    results = json.loads(Path(out.splitlines()[-1].removeprefix("results: ")).read_text())
+    assert [speed["traffic"] for speed in results["speeds"]] == ["idm_mobil", "gan"]
+    assert {"rows", "shares", "losses", "config"} <= results.keys()
+    text = document.read_text()
+    assert "Share of the time" in text
+    assert "| ganlane training | idm_mobil | eager | cpu | 1 | 4 |" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
@@ -70,6 +84,8 @@ def test_report_rewrites_the_tables_of_a_document(tmp_path, capsys):
         (["batches=[0]"], "batches=[0]: expected a list"),
         (["modes=[slow]"], "one of eager, compiled"),
         (["devices=[tpu]"], "one of cpu, cuda"),
+        (["suite=train", "train_traffics=[nobody]"], "train_traffics=nobody"),
+        (["suite=train", "train_stored=9"], "train_stored=9: expected at least agent.batch_size=256"),
         (["memory_batches=[8,8]"], "two batch sizes, the smaller one first"),
         (["env.vehicles=100"], "env.vehicles=100 do not fit"),
     ],

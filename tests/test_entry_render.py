@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
+import polars as pl
 import pytest
 from PIL import Image
 
-from ganlane.render import main
+from ganlane.data import read_scenes
+from ganlane.render import main, with_runs_listed
 
 SHORT = ["env.goal_m=40", "film.fps=5", "film.width=640", "film.height=160"]
 
@@ -37,3 +41,95 @@ def test_an_unknown_driver_leaves_nothing(capsys, tmp_path):
     assert main([*SHORT, "agent=nobody"]) == 2
     assert "agent nobody: unknown" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_ending_of_the_file_chooses_the_format(tmp_path):
+    assert main([*SHORT, "agent=keep_lane", "out=strip.png"]) == 0
+    assert Image.open(tmp_path / "strip.png").format == "PNG"
+
+
+def test_agents_and_episodes_play_beside_each_other(capsys, tmp_path):
+    assert main([*SHORT, "agents=[keep_lane,agent_idm]", "episodes=[2,5]", "out=player.html"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "player: player.html"
+    page = (tmp_path / "player.html").read_text()
+    told = json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])["episodes"]
+    assert [(each["agent"], each["episode"]) for each in told] == [
+        ("keep_lane", 2),
+        ("agent_idm", 2),
+        ("keep_lane", 5),
+        ("agent_idm", 5),
+    ]
+    assert [len(each["action_values"]) for each in told] == [0, 3, 0, 3]
+    assert all(each["reward"] for each in told)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_simulated_traffic_is_replayed_like_recorded_traffic(ending, capsys):
+    assert main(["env.goal_m=300", "agent=keep_lane", "episodes=[0,1]", f"format={ending}"]) == 0
+    path = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("tracks: "))
+    assert path.name == f"keep_lane_idm_mobil_0_0_1.{ending}"
+    assert read_scenes(path)["scene"].n_unique() == 2
+    replay = ["traffic=replay", f"traffic.path={path}", "film.end_s=5", "format=parquet", "out=again.parquet"]
+    assert main([*replay, "agent=keep_lane"]) == 0
+    assert "on replay" in capsys.readouterr().out
+    assert read_scenes("again.parquet")["vehicle"].n_unique() > 1
+
+
+def test_only_a_part_of_the_episode_is_kept(tmp_path):
+    part = ["film.start_s=1", "film.end_s=3", "out=part.parquet"]
+    assert main(["traffic=idm", "agent=keep_lane", *part]) == 0
+    assert pl.read_parquet(tmp_path / "part.parquet")["frame"].n_unique() == 21
+
+
+def test_runs_are_drawn_beside_each_other(capsys, tmp_path):
+    for name in ("first", "it's"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.csv").write_text("decisions,mean_return,crash_rate\n1,2,0.5\n10,3,0.2\n")
+    assert main(["run=first,it's", "out=curves.png"]) == 0
+    assert capsys.readouterr().out == "curves: curves.png\n"
+    assert Image.open(tmp_path / "curves.png").size == (2 * 480, 260 + 34)
+    assert main(["run=first", "curves.columns=[crash_rate]", "curves.smooth=2"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "listed"),
+    [
+        ("run=a", "run=['a']"),
+        ("run=a/b=c,d e", "run=['a/b=c','d e']"),
+        ("run=[a,b]", "run=[a,b]"),
+        ("run=null", "run=null"),
+        ("out=a,b", "out=a,b"),
+    ],
+)
+def test_runs_need_no_quotes(given, listed):
+    assert with_runs_listed([given]) == [listed]
+    assert with_runs_listed(["-m", given]) == ["-m", given]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("episodes=[0,1]", "a film shows one episode, not 2; use format=html"),
+        ("format=html episodes=[0,0]", "a list of different entries"),
+        ("format=html agents=[]", "not empty"),
+        ("format=html episodes=[-1]", "from 0"),
+        ("format=html agents=[a,b,c,d] episodes=[0,1,2,3]", "16 episodes; choose at most 12"),
+        ("format=gif out=film.mp4", "the ending says mp4 and format gif"),
+        ("out=film.avi", "expected one of gif, mp4, png, html, csv, parquet"),
+        ("run=nowhere", "nowhere: no such file; expected the metrics.csv"),
+        ("run=nowhere format=gif", "learning curves are a png"),
+        ("run=[]", "a list, not empty"),
+        ("curves.smooth=0", "at least 1"),
+        (
+            "traffic=idm agent=keep_lane film.start_s=500 film.end_s=501 env.goal_m=40 format=csv",
+            "choose a part of it",
+        ),
+        ("traffic=idm agent=keep_lane env.goal_m=40 format=html film.max_bytes=10000", "film.max_bytes"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(line, message, capsys, tmp_path):
+    assert main(line.split()) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.count("\n") == 1
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

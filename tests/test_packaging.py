@@ -53,7 +53,9 @@ def test_the_wheel_holds_configuration_and_weights(tmp_path):
         if f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" not in names
     ]
     assert not missing
-    shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob("*.safetensors")}
-    assert shipped <= names
+    for kind in ("safetensors", "json"):
+        shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob(f"*.{kind}")}
+        assert shipped
+        assert shipped <= names
     assert "ganlane/py.typed" in names
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]

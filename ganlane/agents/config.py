@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+from ganlane.agents.encoder import ENCODERS
 from ganlane.agents.network import NetworkConfig
 from ganlane.errors import UserError
+
+#: What must be at least 1.
+COUNTS = (
+    *("n_step", "atoms", "batch_size", "capacity", "decisions_per_update", "target_period"),
+    *("encoder_width", "encoder_layers"),
+)
 
 
 @dataclass(frozen=True)
@@ -13,18 +20,24 @@ class RainbowConfig:
     """Hyperparameters; the values are for one update of 256 per 64 decisions.
 
     Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
+    ``encoder, encoder_width, encoder_layers``: see :class:`~ganlane.agents.encoder.VehicleEncoder`;
+    ``decide_when_free``: see :class:`~ganlane.agents.free_decisions.FreeDecisionWindow`.
     ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is the share of
     random legal actions, drawn beside the noise (docs/agent.md). ``adam_eps=None`` stands for
     0.005 / ``batch_size``. ``warmup`` is the number of transitions before the first update.
     """
 
     hidden: tuple[int, ...] = (256, 256)
+    encoder: str = "none"
+    encoder_width: int = 64
+    encoder_layers: int = 2
     noisy: bool = True
     dueling: bool = True
     distributional: bool = True
     double: bool = True
     prioritised: bool = True
     n_step: int = 3
+    decide_when_free: bool = False
     gamma: float = 0.98
     atoms: int = 101
     v_min: float = -120.0
@@ -47,9 +60,11 @@ class RainbowConfig:
     epsilon_decisions: int = 300_000
 
     def __post_init__(self) -> None:
-        for name in ("n_step", "atoms", "batch_size", "capacity", "decisions_per_update", "target_period"):
+        for name in COUNTS:
             if getattr(self, name) < 1:
                 raise UserError(f"agent.{name}={getattr(self, name)}: expected at least 1; give a positive number.")
+        if self.encoder not in ENCODERS:
+            raise UserError(f"agent.encoder={self.encoder}: no such encoder; choose one of {', '.join(ENCODERS)}.")
         if not 0.0 < self.gamma <= 1.0:
             raise UserError(f"agent.gamma={self.gamma}: expected a discount above 0 and at most 1.")
         if self.v_min >= self.v_max or (self.distributional and self.atoms < 2):

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import NoisyLinear
 
+from ganlane.agents.encoder import make_encoder
 from ganlane.agents.linear import linear
 from ganlane.errors import UserError
 
@@ -29,12 +30,16 @@ class NetworkConfig:
 
     ``observation_size`` D and ``actions`` A come from the environment. ``v_min`` and ``v_max`` bound the discounted
     return, with ``atoms`` points between; without ``distributional`` they are ignored. ``noisy_sigma`` is the
-    initial noise of Fortunato et al. 2017 (0.5), divided there by the root of the layer's width.
+    initial noise of Fortunato et al. 2017 (0.5), divided there by the root of the layer's width. ``encoder`` stands
+    before the noisy layers and has no noise (:func:`ganlane.agents.encoder.make_encoder`).
     """
 
     observation_size: int
     actions: int = 3
     hidden: tuple[int, ...] = (256, 256)
+    encoder: str = "none"
+    encoder_width: int = 64
+    encoder_layers: int = 2
     noisy: bool = True
     dueling: bool = True
     distributional: bool = True
@@ -54,6 +59,9 @@ class QNetwork(nn.Module):
 
     Noise is added under ``ExplorationType.RANDOM`` alone and stays the same until it is drawn anew
     (:func:`ganlane.agents.noise.redraw_noise`).
+
+    Raises:
+        UserError: the encoder does not exist or cannot read observations of this size.
     """
 
     support: Tensor
@@ -61,7 +69,11 @@ class QNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        widths = (config.observation_size, *config.hidden)
+        self.encoder = make_encoder(
+            config.encoder, config.observation_size, config.encoder_width, config.encoder_layers
+        )
+        inputs = config.observation_size if self.encoder is None else self.encoder.outputs
+        widths = (inputs, *config.hidden)
         self.trunk = nn.ModuleList(self._linear(*pair) for pair in pairwise(widths))
         rows = config.actions + int(config.dueling)
         self.head = self._linear(widths[-1], rows * config.outputs)
@@ -73,7 +85,7 @@ class QNetwork(nn.Module):
         return nn.Linear(inputs, outputs)
 
     def weights(self) -> Weights:
-        """Weight and bias of every layer, the head last, with the present noise (see the class) added."""
+        """Weight and bias of every layer after the encoder, the head last, with the present noise added."""
         return [(layer.weight, layer.bias) for layer in (*self.trunk, self.head)]
 
     def logits(self, observation: Tensor, weights: Weights | None = None) -> Tensor:
@@ -83,6 +95,8 @@ class QNetwork(nn.Module):
         """
         *hidden_layers, head = self.weights() if weights is None else weights
         hidden = observation.to(self.support.dtype)
+        if self.encoder is not None:
+            hidden = self.encoder(hidden)
         for weight, bias in hidden_layers:
             hidden = linear(hidden, weight, bias, relu=True)
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))

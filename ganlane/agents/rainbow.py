@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from ganlane.agents.config import RainbowConfig
+from ganlane.agents.free_decisions import FreeDecisionWindow
 from ganlane.agents.loss import make_loss
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import QNetwork, load_parameters, parameters_of
@@ -76,9 +77,10 @@ class Rainbow:
         """Whether the buffer holds enough to learn from."""
         return len(self.replay) >= self.config.warmup
 
-    def window(self) -> NStepWindow:
+    def window(self) -> NStepWindow | FreeDecisionWindow:
         """A fresh n-step window for a batch of environments."""
-        return NStepWindow(self.config.n_step, self.config.gamma)
+        kind = FreeDecisionWindow if self.config.decide_when_free else NStepWindow
+        return kind(self.config.n_step, self.config.gamma)
 
     def anneal(self, decisions: int) -> None:
         """Set the share of random actions after ``decisions``."""
@@ -164,11 +166,12 @@ class Rainbow:
         Raises:
             UserError: it is the state of an agent with other hyperparameters or another observation.
         """
+        # An agent saved before there was an option has its default.
+        saved = {**asdict(RainbowConfig()), **state["config"]}
         for name, value in asdict(self.config).items():
-            if state["config"].get(name) != value:
+            if saved[name] != value:
                 raise UserError(
-                    f"agent.{name}={value}: the saved agent has {state['config'].get(name)}; give the same to go on "
-                    "from it."
+                    f"agent.{name}={value}: the saved agent has {saved[name]}; give the same to go on from it."
                 )
         load_parameters(self.network, state["network"])
         load_parameters(self.loss.target_network, state["target"])

@@ -8,8 +8,10 @@ suite its findings; :mod:`~ganlane.benchmarks.report` prints them and writes the
 
 :mod:`~ganlane.benchmarks.sim` is the suite of the simulator: its own systems are in
 :mod:`~ganlane.benchmarks.systems`, the simulators of others in :mod:`~ganlane.benchmarks.peers`, what follows from
-its rows in ``sim_findings`` and ``sim_tables``. A further suite is
-one more module with such a class, and one more entry in ``ganlane.bench.SUITES``.
+its rows in ``sim_findings`` and ``sim_tables``. :mod:`~ganlane.benchmarks.traffic` is that of the traffic models, and
+:mod:`~ganlane.benchmarks.train` that of the training loop: ``train_loop`` runs it, ``train_shares`` puts timers round
+its calls, ``train_losses`` and ``train_peer`` are what it is held against. A further suite is one more module with
+such a class, and one more entry in ``ganlane.bench.SUITES``.
 """
 
 from ganlane.benchmarks.case import Case, Group, Labels, Suite

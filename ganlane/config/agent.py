@@ -5,11 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import above, at_least, between, check, every, number, optional
+from ganlane.config.checks import above, at_least, between, check, every, number, one_of, optional
+from ganlane.config.observation import LISTS, ObservationConfig
 from ganlane.config.plain import plain_copy
+from ganlane.errors import UserError
 
 if TYPE_CHECKING:
     from ganlane.agents import RainbowConfig
+    from ganlane.config.env import EnvConfig
+
+#: As in :data:`ganlane.agents.encoder.ENCODERS`; repeated here so that a wrong name is found without loading torch.
+ENCODERS = ("none", "shared")
 
 
 @dataclass
@@ -17,12 +23,16 @@ class AgentConfig:
     """``agent=rainbow``: all of :class:`ganlane.agents.RainbowConfig`."""
 
     hidden: list[int] = field(default_factory=lambda: [256, 256])
+    encoder: str = "none"
+    encoder_width: int = 64
+    encoder_layers: int = 2
     noisy: bool = True
     dueling: bool = True
     distributional: bool = True
     double: bool = True
     prioritised: bool = True
     n_step: int = 3
+    decide_when_free: bool = False
     gamma: float = 0.98
     atoms: int = 101
     v_min: float = -120.0
@@ -45,12 +55,14 @@ class AgentConfig:
     epsilon_decisions: int = 300_000
 
     def __post_init__(self) -> None:
-        counts = ("n_step", "batch_size", "capacity", "warmup", "decisions_per_update", "target_period", "atoms")
+        counts = ["n_step", "batch_size", "capacity", "warmup", "decisions_per_update", "target_period", "atoms"]
+        counts += ["encoder_width", "encoder_layers"]
         shares = ("alpha", "beta_start", "epsilon_start", "epsilon")
         check(
             self,
             "agent",
             hidden=every(at_least(1)),
+            encoder=one_of(ENCODERS),
             gamma=between(0, 1),
             v_min=number(),
             v_max=number(),
@@ -82,3 +94,21 @@ class DqnConfig(AgentConfig):
     double: bool = False
     prioritised: bool = False
     n_step: int = 1
+
+
+def check_agent(agent: AgentConfig, observation: ObservationConfig, env: EnvConfig) -> None:
+    """Refuse an agent that could not read the observation, or would not learn what it is asked in ``env``.
+
+    Raises:
+        UserError: an encoder over vehicles without a list of them, or turning back while nothing is learnt.
+    """
+    if agent.encoder != "none" and observation.form not in LISTS:
+        raise UserError(
+            f"agent.encoder={agent.encoder} with observation={observation.form}: the encoder reads vehicles in Table "
+            f"III's layout; give one of {', '.join(LISTS)}, or agent.encoder=none."
+        )
+    if agent.decide_when_free and env.ego.abort_lane_change:
+        raise UserError(
+            "agent.decide_when_free=true with env.ego.abort_lane_change=true: commands are then obeyed during a lane "
+            "change, but nothing would be learnt from them; switch one of the two off."
+        )

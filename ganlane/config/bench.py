@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from ganlane.config.agent import AgentConfig
 from ganlane.config.checks import Rule, between, check, every, one_of
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import NAMES, all_traffics
@@ -12,10 +13,11 @@ from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 
-SUITES = ("sim", "traffic")
+SUITES = ("sim", "traffic", "train")
 MODES = ("eager", "compiled")
 DEVICES = ("cpu", "cuda")
 _QUICK_BATCH = 64
+_QUICK_STORED = 1000
 
 
 def _different(rule: Rule) -> Rule:
@@ -42,6 +44,9 @@ class BenchConfig:
     memory_batches: list[int] = field(default_factory=lambda: [1024, 4096])
     traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
     traffic_batches: list[int] = field(default_factory=lambda: [512, 2048])
+    train_traffics: list[str] = field(default_factory=lambda: ["idm_mobil", "gan"])
+    train_batches: list[int] = field(default_factory=lambda: [256, 512, 1024])
+    train_stored: int = 1_000_000
     repetitions: int = 5
     seconds: float = 0.5
     peers: bool = True
@@ -52,6 +57,7 @@ class BenchConfig:
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
 
     def __post_init__(self) -> None:
         sizes = between(1, 2**20)
@@ -67,6 +73,8 @@ class BenchConfig:
             linear_from=sizes,
             traffics=NAMES,
             traffic_batches=_different(sizes),
+            train_traffics=NAMES,
+            train_batches=_different(sizes),
             repetitions=between(1, 1000),
             seconds=between(0.001, 600),
             seed=between(0, 2**53),
@@ -76,16 +84,26 @@ class BenchConfig:
             ),
         )
         self._check_devices()
+        self._check_stored()
         self.chosen_traffics()
+        self.chosen_train_traffics()
         check_pay(self.env, self.reward)
 
     def chosen_traffics(self) -> dict[str, TrafficConfig]:
         """Those of ``suite=traffic``, by name."""
-        known = all_traffics()
-        for name in self.traffics:
-            if name not in known:
-                raise UserError(f"traffics={name}: no such traffic; choose among {', '.join(known)}.")
-        return {name: known[name] for name in self.traffics}
+        return _known("traffics", self.traffics)
+
+    def chosen_train_traffics(self) -> dict[str, TrafficConfig]:
+        """Those of ``suite=train``, by name."""
+        return _known("train_traffics", self.train_traffics)
+
+    def _check_stored(self) -> None:
+        least, most = self.agent.batch_size, self.agent.capacity
+        if not least <= self.train_stored <= most:
+            raise UserError(
+                f"train_stored={self.train_stored}: expected at least agent.batch_size={least} and at most "
+                f"agent.capacity={most} transitions."
+            )
 
     def _check_devices(self) -> None:
         if self.devices is None:
@@ -101,7 +119,10 @@ class BenchConfig:
         return DEVICES if _has_cuda() else DEVICES[:1]
 
     def shortened(self) -> BenchConfig:
-        """With ``quick``, at most seconds of measuring: small batches, two short repetitions, no memory."""
+        """With ``quick``, at most seconds of measuring: small batches, two short repetitions, no memory.
+
+        Training is not compiled then: that alone takes longer.
+        """
         if not self.quick:
             return self
         return replace(
@@ -110,11 +131,23 @@ class BenchConfig:
             threads=self.threads[:1],
             vehicle_counts=self.vehicle_counts[:2],
             traffic_batches=[min(*self.traffic_batches, _QUICK_BATCH)],
+            train_batches=[min(*self.train_batches, _QUICK_BATCH)],
+            train_stored=min(self.train_stored, max(_QUICK_STORED, self.agent.batch_size)),
+            modes=self.modes[:1] if self.suite == "train" else self.modes,
             scaling_batch=min(self.scaling_batch, _QUICK_BATCH),
             repetitions=min(self.repetitions, 2),
             seconds=min(self.seconds, 0.01),
             memory=False,
         )
+
+
+def _known(key: str, names: list[str]) -> dict[str, TrafficConfig]:
+    """The traffics of these names."""
+    known = all_traffics()
+    for name in names:
+        if name not in known:
+            raise UserError(f"{key}={name}: no such traffic; choose among {', '.join(known)}.")
+    return {name: known[name] for name in names}
 
 
 def _has_cuda() -> bool:

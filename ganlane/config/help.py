@@ -11,7 +11,7 @@ from ganlane.paths import conf_folder
 
 _FLAGS = """flags
   -m, --multirun       a sweep over values with commas, each run in its own folder: ganlane {command} -m seed=0,1
-  --cfg job            print the whole configuration and stop
+  --cfg job            print the whole configuration and stop; with --resolve its references filled in
   --hydra-help         Hydra's own flags; --shell-completion for bash, zsh and fish
 
 exit status: 0 done, 2 a mistake in configuration, file or checkpoint, 130 stopped by Ctrl-C, 143 by SIGTERM"""

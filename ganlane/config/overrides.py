@@ -22,7 +22,7 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
     """Hydra's flags and the overrides of a command.
 
     Raises:
-        UserError: an unknown flag.
+        UserError: an unknown flag, or one that would have no effect.
     """
     parser = get_args_parser()
 
@@ -31,8 +31,19 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
 
     parser.error = refuse  # type: ignore[method-assign]
     flags = parser.parse_args(list(arguments))
+    _refuse_idle_flags(flags)
     flags.overrides = [_renamed(override, ALIASES.get(command, {})) for override in flags.overrides]
     return flags
+
+
+def _refuse_idle_flags(flags: Namespace) -> None:
+    """Hydra's flags that a run would pass over in silence; one of them would execute what a pickle holds."""
+    for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
+        if getattr(flags, name) is not None:
+            raise UserError(f"--{name.replace('_', '-')}: ganlane has its own configuration; give key=value instead.")
+    for name in ("resolve", "package"):
+        if getattr(flags, name) and flags.cfg is None and not flags.help:
+            raise UserError(f"--{name}: it goes with --cfg alone, which shows the configuration; add --cfg job.")
 
 
 def _renamed(override: str, aliases: Mapping[str, str]) -> str:

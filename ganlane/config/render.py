@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ganlane.config.checks import above, at_least, between, check, one_of, optional
+from ganlane.config.checks import Rule, above, at_least, between, check, every, optional, text
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
@@ -14,7 +14,10 @@ from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 
-FORMATS = ("gif", "mp4", "png")
+#: Films of one episode; pages and tables of any number of episodes.
+FILMS = ("gif", "mp4", "png")
+FORMATS = (*FILMS, "html", "csv", "parquet")
+MOST_EPISODES = 12
 
 
 @dataclass
@@ -54,12 +57,29 @@ class FilmConfig:
 
 
 @dataclass
+class CurvesConfig:
+    """``curves``: how the figures of training runs are drawn."""
+
+    columns: list[str] | None = None
+    smooth: int = 1
+
+    def __post_init__(self) -> None:
+        check(self, "curves", columns=optional(every(text())), smooth=at_least(1))
+
+
+@dataclass
 class RenderConfig(RunConfig):
-    """One episode of one agent on one traffic, as a film."""
+    """Episodes of agents on one traffic, as a film, page or table; or the learning curves of runs.
+
+    ``agents`` and ``episodes`` take the place of ``driver`` and ``episode`` where there are several.
+    """
 
     driver: str = "mobil"
     episode: int = 0
-    format: str = "gif"
+    agents: list[str] | None = None
+    episodes: list[int] | None = None
+    run: list[str] | None = None
+    format: str | None = None
     out: str | None = None
     env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
@@ -67,22 +87,60 @@ class RenderConfig(RunConfig):
     reward: RewardConfig = field(default_factory=RewardConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     film: FilmConfig = field(default_factory=FilmConfig)
+    curves: CurvesConfig = field(default_factory=CurvesConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "", episode=between(0, 2**53), format=one_of(FORMATS))
+        number = between(0, 2**53)
+        check(self, "", episode=number, format=_FORMAT, run=optional(every(text())))
+        check(self, "", agents=optional(_DIFFERENT), episodes=optional(_DIFFERENT))
+        check(self, "", episodes=optional(every(number)))
         check_pay(self.env, self.reward)
-        if self.format == "mp4":
-            require_video()
         if self.out is not None:
             _check_out(Path(self.out))
-            _check_suffix(Path(self.out))
+        self._check_kind()
+
+    @property
+    def kind(self) -> str:
+        """The format that is asked for: ``format``, or the ending of ``out``, or png for ``run``, else gif."""
+        ending = Path(self.out).suffix.removeprefix(".").lower() if self.out is not None else ""
+        return self.format or ending or ("gif" if self.run is None else "png")
+
+    def pairs(self) -> list[tuple[str, int]]:
+        """The episodes to record: agent and number of each."""
+        return [
+            (agent, episode)
+            for episode in (self.episodes if self.episodes is not None else [self.episode])
+            for agent in (self.agents if self.agents is not None else [self.driver])
+        ]
+
+    def _check_kind(self) -> None:
+        """What is asked for, what the file is called and how many episodes there are must fit together."""
+        _check_suffix(self.out, self.kind)
+        if self.run is not None and self.kind != "png":
+            raise UserError(f"format={self.kind}: learning curves are a png; leave format out with run=PATH.")
+        if self.kind == "mp4":
+            require_video()
+        count = len(self.pairs())
+        if self.kind in FILMS and count > 1:
+            raise UserError(
+                f"format={self.kind}: a film shows one episode, not {count}; use format=html for several."
+            )
+        if count > MOST_EPISODES:
+            raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
 
 
-def _check_suffix(path: Path) -> None:
+_FORMAT = Rule(lambda value: value is None or value in FORMATS, f"one of {', '.join(FORMATS)}")
+_DIFFERENT = Rule(lambda all: len(all) > 0 and len(set(all)) == len(all), "a list of different entries, not empty")
+
+
+def _check_suffix(out: str | None, kind: str) -> None:
     """The file's name must not promise what it does not hold."""
-    if path.suffix and path.suffix.removeprefix(".").lower() not in FORMATS:
-        raise UserError(f"out={path}: films are {', '.join(FORMATS)}; give the file one of these endings.")
+    ending = Path(out).suffix.removeprefix(".").lower() if out is not None else ""
+    if ending and ending not in FORMATS:
+        raise UserError(f"out={out}: expected one of {', '.join(FORMATS)}; give the file one of these endings.")
+    if ending and ending != kind:
+        raise UserError(f"out={out}: the ending says {ending} and format {kind}; give one of them.")
 
 
 def _check_out(path: Path) -> None:

@@ -84,6 +84,9 @@ def register() -> None:
     """Fill the ConfigStore; again does no harm."""
     store = ConfigStore.instance()
     for group, options in SCHEMAS.items():
+        kept = store.repo.get(group, {}) if group else store.repo
         for name, schema in options.items():
-            store.store(group=group or None, name=name + SUFFIX, node=schema, provider="ganlane")
+            # Storing one takes OmegaConf milliseconds, and a command comes here twice.
+            if f"{name}{SUFFIX}.yaml" not in kept:
+                store.store(group=group or None, name=name + SUFFIX, node=schema, provider="ganlane")
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)

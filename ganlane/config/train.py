@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.config.agent import AgentConfig
+from ganlane.config.agent import AgentConfig, check_agent
 from ganlane.config.checks import at_least, between, check
 from ganlane.config.collector import CollectorConfig
 from ganlane.config.env import EnvConfig
@@ -82,6 +82,7 @@ class TrainConfig(RunConfig):
             checkpoint_every_s=at_least(0),
         )
         check_pay(self.env, self.reward)
+        check_agent(self.agent, self.observation, self.env)
 
     def all_traffic(self) -> list[TrafficConfig]:
         """Every traffic that this run drives in."""

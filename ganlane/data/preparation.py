@@ -15,7 +15,7 @@ from ganlane.data.ngsim_rows import NgsimParameters
 from ganlane.data.pooling import PooledStatistics
 from ganlane.data.prepared import cut_into_scenes, file_name, whole_folder, write_prepared
 from ganlane.data.scene_summary import SceneSummary
-from ganlane.data.scenes import scene_csv_scenes
+from ganlane.data.scenes import read_scenes, scene_csv_scenes
 from ganlane.data.schema import sort
 from ganlane.data.source import OnProgress, RowCount, Scene
 from ganlane.errors import UserError
@@ -67,9 +67,22 @@ def open_scenes(
     raise UserError(f"{kind}: no such kind of recordings; expected scenes, ngsim or highd.")
 
 
-def read_recordings(kind: str, path: str | Path, parameters: NgsimParameters | None = None) -> pl.DataFrame:
-    """All scenes of recordings in one frame, sorted; for what fits into memory (see :func:`open_scenes`)."""
-    return sort(pl.concat([scene.frame for scene in open_scenes(kind, path, RowCount(), parameters)]))
+def read_recordings(
+    kind: str, path: str | Path, parameters: NgsimParameters | None = None, on_progress: OnProgress | None = None
+) -> pl.DataFrame:
+    """All scenes of recordings in one frame, sorted; for what fits into memory.
+
+    Arguments and errors are those of :func:`open_scenes`; a file without any row to use is an error too.
+    """
+    if kind == "scenes":
+        return read_scenes(path)
+    scenes = open_scenes(kind, path, RowCount(), parameters, on_progress=on_progress)
+    frames = [scene.frame for scene in scenes]
+    if not frames:
+        raise UserError(
+            f"{path}: no vehicle on any of the lanes kept; give a recording of a road with traffic on it."
+        )
+    return sort(pl.concat(frames))
 
 
 def prepare_recordings(
@@ -102,6 +115,8 @@ def prepare_recordings(
                 count.drop("scene in which nobody drives", scene.frame.height)
                 continue
             summary = statistics.add(scene)
+            if file_name(scene.name) in files:
+                raise UserError(f"{path}: a second scene that {file_name(scene.name)} is the file of; rename one.")
             files.append(file_name(scene.name))
             write_prepared(cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame, folder / files[-1])
             written += scene.frame.height

@@ -42,9 +42,18 @@ def read_prepared(path: str | Path) -> pl.DataFrame:
     seen: dict[str, Path] = {}
     for file, frame in zip(files, frames):
         for scene in frame["scene"].unique():
-            if seen.setdefault(scene, file) != file:
-                raise UserError(f"{file}: scene {scene} is in {seen[scene]} too; remove one of them.")
+            note_scene(scene, file, seen)
     return sort(pl.concat(frames))
+
+
+def note_scene(scene: str, file: Path, seen: dict[str, Path]) -> None:
+    """Note in ``seen`` in which file a scene is.
+
+    Raises:
+        UserError: it was in another one too.
+    """
+    if seen.setdefault(scene, file) != file:
+        raise UserError(f"{file}: scene {scene} is in {seen[scene]} too; remove one of them.")
 
 
 def prepared_files(path: str | Path) -> list[Path]:

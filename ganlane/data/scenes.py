@@ -9,7 +9,7 @@ from typing import Final
 import polars as pl
 
 from ganlane.data.lane_widths import lane_width, scene_lane_widths
-from ganlane.data.prepared import is_prepared, prepared_files, read_prepared
+from ganlane.data.prepared import is_prepared, note_scene, prepared_files, read_prepared
 from ganlane.data.schema import SCHEMA, sort, validate
 from ganlane.data.source import RowCount, Scene
 from ganlane.data.tables import FIRST_LINE, read_table
@@ -59,12 +59,14 @@ def read_scenes(path: str | Path) -> pl.DataFrame:
 
 def scene_csv_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
     """The scenes of :func:`read_scenes` one by one; ``count`` gets the rows read. Each file is read at once."""
-    for file in prepared_files(path) if is_prepared(path) else [path]:
+    seen: dict[str, Path] = {}
+    for file in prepared_files(path) if is_prepared(path) else [Path(path)]:
         frame = read_scenes(file)
         if count is not None:
             count.read += frame.height
         widths = scene_lane_widths(frame)
         for (name,), rows in frame.group_by("scene", maintain_order=True):
+            note_scene(str(name), file, seen)
             yield Scene(str(name), rows, widths[str(name)])
 
 

@@ -91,8 +91,7 @@ def advance(rules: Rules, at: Substep, moved: Vehicles, everybody: bool) -> Subs
     crash = ego_overlaps(vehicles, rules.road).any(-1) & at.running
     goal = (vehicles.x[:, EGO_INDEX] >= rules.episode.goal_m) & at.running & ~crash
     step = at.step + at.running
-    late = step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)
-    late = late if rules.scene_steps is None else late | scene_over(rules, step)
+    late = (step >= round(rules.episode.timeout_s / PHYSICS_STEP_S)) | scene_over(rules, step)
     return Substep(
         vehicles=vehicles,
         acceleration=acceleration,

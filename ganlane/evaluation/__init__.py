@@ -6,15 +6,20 @@ bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for
 (:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
 on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resamples whole scenes;
 :func:`text_table` and :func:`markdown_table` print it; :func:`write_results` and :func:`write_episodes` keep it.
+Which crashes nobody could have avoided, :func:`beam_search` tells, which looks for a way through an episode on the
+simulator itself (:mod:`~ganlane.evaluation.crash_floor`).
 """
 
+from ganlane.evaluation.beam_search import Plan, beam_search
 from ganlane.evaluation.branching import Branches, branch
 from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
+from ganlane.evaluation.crash_floor import Way, floor_rows, search_left, ways_of_drivers
 from ganlane.evaluation.episodes import run_episodes
 from ganlane.evaluation.layout import markdown_table, text_table
 from ganlane.evaluation.provenance import code_version, machine
 from ganlane.evaluation.results import results_record, write_episodes, write_results
+from ganlane.evaluation.rides import Ride, drive, replay
 from ganlane.evaluation.score import NormalizedScore, normalized_percent
 from ganlane.evaluation.statistics import (
     Estimate,
@@ -30,11 +35,17 @@ __all__ = [
     "CrashesByScene",
     "Estimate",
     "NormalizedScore",
+    "Plan",
+    "Ride",
+    "Way",
+    "beam_search",
     "branch",
     "clopper_pearson",
     "code_version",
     "crashes_by_scene",
+    "drive",
     "evaluation_rows",
+    "floor_rows",
     "interquartile_mean",
     "machine",
     "markdown_table",
@@ -44,9 +55,12 @@ __all__ = [
     "poisson_interval",
     "probability_of_improvement",
     "rate_per_1000_km",
+    "replay",
     "results_record",
     "run_episodes",
+    "search_left",
     "text_table",
+    "ways_of_drivers",
     "write_episodes",
     "write_results",
 ]

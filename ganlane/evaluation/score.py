@@ -42,8 +42,9 @@ def normalized_percent(
 ) -> NormalizedScore:
     """Score of ``agent`` from returns [E] of the three drivers on the same episodes, in the same order.
 
-    The interval resamples episodes, all three drivers together. There is no score where the paired interval
-    of MOBIL's lead over the random driver includes 0: the scale would have no length.
+    The interval resamples episodes, all three drivers together; resamples in which MOBIL's lead over the random
+    driver is exactly 0 (a few identical episodes) have no score and are left out. There is no score at all where the
+    paired interval of that lead includes 0: the scale would have no length.
     """
     returns = np.stack([np.asarray(values, dtype=np.float64) for values in (agent, mobil, random_legal)], axis=1)
     lead = paired_difference(returns[:, 1], returns[:, 2], resamples=resamples, seed=seed)
@@ -53,8 +54,8 @@ def normalized_percent(
         return no_score(
             f"the interval of mobil's lead over random_legal includes 0 ({lead.low:.1f} to {lead.high:.1f})"
         )
-    percents = _percent_of_way(bootstrap_means(returns, resamples, seed))
-    low, high = np.quantile(percents, percentile_levels())
+    means = bootstrap_means(returns, resamples, seed)
+    low, high = np.quantile(_percent_of_way(means[means[:, 1] != means[:, 2]]), percentile_levels())
     return NormalizedScore(float(_percent_of_way(returns.mean(axis=0))), [float(low), float(high)], None)
 
 

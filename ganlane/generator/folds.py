@@ -53,7 +53,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
     there is but one other scene it does both.
 
     Raises:
-        UserError: a held-out name is not among the scenes, or nothing is left to fit to or to report.
+        UserError: as :func:`split_scenes`.
     """
     others, kept = split_scenes(scenes, held_out)
     validation: list[SceneTracks] = []
@@ -72,9 +72,14 @@ def split_scenes(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> tuple[
     """(others, held out), split by the scenes' names.
 
     Raises:
-        UserError: a held-out name is not among the scenes, or one of the two parts is empty.
+        UserError: there is but one scene, a held-out name is not among them, or one of the two parts is empty.
     """
     names = [scene.name for scene in scenes]
+    if len(names) < 2:
+        raise UserError(
+            f"recordings of one scene, {', '.join(names)}: one has to be fitted to and another held out; cut it into "
+            "several with ganlane prepare ... scene_s=30."
+        )
     unknown = sorted(set(held_out) - set(names))
     if unknown:
         raise UserError(f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these.")

@@ -71,14 +71,18 @@ class LiteralLaneChange(Overlay):
     def rewrite(
         self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
     ) -> tuple[Vehicles, dict[str, Tensor]]:
-        """Start changes, and move those under way sideways at their own speed until they arrive."""
+        """Start changes, and move those under way sideways at their own speed until they arrive.
+
+        Whoever's target lane was set back on the way (:class:`ganlane.traffic.AbortedLaneChange`) returns as fast.
+        """
         side, pace = self._start(vehicles, memory, key, step)
         target = vehicles.target_lane + side
-        lateral = torch.where(side != 0, side * pace, memory["lateral_speed"])
-        changing = lateral != 0
+        pace = torch.where(side != 0, pace, memory["lateral_speed"].abs())
+        changing = pace != 0
         remaining = self.road.centre_of(target, vehicles.y.dtype) - vehicles.y
+        lateral = torch.copysign(pace, remaining)
         stride = lateral * self.dt
-        arrives = changing & (remaining * torch.sign(lateral) <= stride.abs())
+        arrives = changing & (remaining.abs() <= stride.abs())
         y = vehicles.y + torch.where(arrives, remaining, stride)
         heading = torch.atan(lateral / vehicles.speed.clamp_min(1.0))
         clock = torch.where(changing, 0, memory["clock"] + 1)

@@ -1,8 +1,7 @@
 """Faults of drivers across the road, as overlays: lane changes that are hesitant, and some that are broken off.
 
-Both look at the target lane that the model below sets, and need one that steers towards
-``vehicles.target_lane``: ``idm_mobil`` and ``gan_calibrated`` do. The paper's literal lane changes carry
-themselves out and cannot be turned back.
+Both look at the target lane that the model below sets, and need one that moves towards
+``vehicles.target_lane``, as every model that ships does.
 """
 
 from __future__ import annotations

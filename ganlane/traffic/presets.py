@@ -162,7 +162,7 @@ def gan_calibrated_traffic(
         "noise_period_s": noise_period_s,
         "noise_scale": noise_scale,
         "headway_quantiles_s": headway_quantiles(metadata["driving_statistics"]),
-        "parameters": simulated_anchor(metadata, source),
+        "anchor": simulated_anchor(metadata, source),
     }
     parts: dict[str, TrafficModule] = {
         "generator": AnchoredGanTraffic(generator, road, stream, **options),

@@ -164,7 +164,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
 
     Args:
         headway_quantiles_s: 5, 25, 50, 75 and 95 % quantiles that the drivers' headways are drawn from.
-        parameters: of the anchor.
+        anchor: its parameters.
     """
 
     extra_inputs = EXTRA_INPUTS
@@ -177,10 +177,10 @@ class AnchoredGanTraffic(GeneratedTraffic):
         noise_period_s: float = 5.0,
         noise_scale: float = 1.0,
         headway_quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S,
-        parameters: AnchorParameters = ANCHOR,
+        anchor: AnchorParameters = ANCHOR,
     ) -> None:
         super().__init__(generator, road, stream, noise_period_s, noise_scale)
-        self.headway_quantiles_s, self.parameters = headway_quantiles_s, parameters
+        self.headway_quantiles_s, self.anchor = headway_quantiles_s, anchor
 
     @property
     def memory_fields(self) -> MemoryFields:  # type: ignore[override]
@@ -201,7 +201,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
         noise = self.next_noise(memory, key, step)
         driver = DriverMemory(self.history(memory), memory["residual_mean"], memory["headway"])
         moved, driver = anchored_step(
-            self.generator, vehicles, self.road, driver, self.noise_scale * noise, self.parameters
+            self.generator, vehicles, self.road, driver, self.noise_scale * noise, self.anchor
         )
         return moved, {
             **self.kept(driver.history),

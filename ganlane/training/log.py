@@ -24,6 +24,8 @@ COLUMNS = (
     "episodes",
     "mean_return",
     "mean_discounted_return",
+    "mean_return_to_go",
+    "mean_value",
     "goal_rate",
     "crash_rate",
     "out_of_road_rate",

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from ganlane.agents import GreedyPolicy, Rainbow
 from ganlane.errors import UserError
+from ganlane.training.collectors import Source
 from ganlane.training.config import TrainingConfig, TrainingResult
 from ganlane.training.log import Log, Logs
 from ganlane.training.run import Run
@@ -24,7 +25,7 @@ Evaluate = Callable[[GreedyPolicy], Mapping[str, float]]
 
 
 def train(
-    env: EnvBase,
+    env: EnvBase | Source,
     agent: Rainbow,
     config: TrainingConfig,
     run_folder: str | Path,
@@ -38,7 +39,7 @@ def train(
 
     Args:
         env: batch [N], writes ``observation`` and ``reward``; its state must travel in the TensorDict for a resumed
-            run to be exact.
+            run to be exact. Or a source of steps (:mod:`ganlane.training.collectors`), which the caller closes.
         agent: trained in place.
         config: length and rhythm.
         run_folder: gets ``metrics.csv``, ``evaluation.csv`` and ``checkpoints/{last.pt, last, best.safetensors}``.
@@ -53,11 +54,11 @@ def train(
         UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not evaluated.
     """
     run = Run(env, agent, identity)
-    exact = resume is None or run.restore(resume)
+    missing = None if resume is None else run.restore(resume)
     saver = Saver(run, run_folder, config, metadata or {})
     with closing(Logs(Path(run_folder), config, agent.network.config.actions, run.decisions, logs)) as log:
-        if not exact:
-            log.say("resumed without the replay buffer: it is filled again before the next update; not bit-exact")
+        if missing is not None:
+            log.say(f"resumed without {missing}; not bit-exact")
         stopped_by = _loop(run, config, evaluate, log, saver)
     return TrainingResult(run.decisions, agent.updates, run.wall_s, run.best, stopped_by, saver.path)
 
@@ -84,9 +85,9 @@ def _loop(run: Run, config: TrainingConfig, evaluate: Evaluate | None, log: Logs
 
 @torch.no_grad()
 def collect(run: Run) -> TensorDictBase:
-    """One decision of every environment; those that ended start afresh in the carrier, not in the step."""
+    """One decision of every environment."""
     run.agent.anneal(run.decisions)
-    step, run.carrier = run.env.step_and_maybe_reset(run.agent.policy(run.carrier))
+    step = run.source.step(run.agent)
     run.decisions += run.environments
     run.meter.step(step)
     return step

@@ -18,24 +18,38 @@ RATES = {
     "out_of_road": "out_of_road_rate",
     "timeout": "timeout_rate",
 }
+#: Where TorchRL's policies, and others that tell, write the value of the action they chose, [N] or [N, 1].
+CHOSEN_VALUE = "chosen_action_value"
+#: Sums over the running episode of every environment.
+RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
 
 
 class Meter:
     """Episode and update statistics since the last :meth:`read`.
 
-    Keys that an environment does not write (``events``, ``ego``) are left out, so the meter serves any environment.
+    Keys that an environment or a policy does not write (``events``, ``ego``, ``chosen_action_value``) are left out,
+    so the meter serves any of them.
+
+    **Q-values against realised returns.** ``mean_return_to_go`` is the discounted return from a decision to the end
+    of its episode, averaged over all decisions of the finished episodes; ``mean_value`` is the mean of the values
+    that the policy gave its actions at the same decisions. The two agree where the values are right (an episode that
+    is cut off by time has no return beyond).
 
     Args:
         environments: N.
         actions: A, for the shares of the actions.
-        gamma: discount per decision; the discounted return is what the Q-values should agree with.
+        gamma: discount per decision.
         device: of the sums.
     """
 
     def __init__(self, environments: int, actions: int, gamma: float, device: torch.device | str = "cpu") -> None:
         self.gamma = gamma
-        self.returns, self.discounted = (torch.zeros(environments, device=device) for _ in range(2))
+        self.returns, self.discounted, self.to_go, self.lengths, self.values = (
+            torch.zeros(environments, device=device) for _ in RUNNING
+        )
         self.discount = torch.ones(environments, device=device)
+        #: How often, discounted, the next reward counts in the returns from all decisions of the episode so far.
+        self.weight = torch.ones(environments, device=device)
         self.actions = torch.arange(actions, device=device)
         self.sums: dict[str, Tensor] = {}
         self.updates: dict[str, Tensor] = {}
@@ -49,14 +63,20 @@ class Meter:
         self.returns += reward
         self.discounted += self.discount * reward
         self.discount *= self.gamma
-        self._finish(after, done)
+        self.to_go += self.weight * reward
+        self.weight = 1.0 + self.gamma * self.weight
+        self.lengths += 1.0
+        chosen = step.get(CHOSEN_VALUE, None)
+        if chosen is not None:
+            self.values += chosen.reshape(-1)
+        self._finish(after, done, chosen is not None)
         self._add("actions", (step.get(keys.ACTION)[:, None] == self.actions).sum(0))
 
-    def _finish(self, after: TensorDictBase, done: Tensor) -> None:
+    def _finish(self, after: TensorDictBase, done: Tensor, has_values: bool) -> None:
         """Count the episodes that ended and start their sums afresh."""
         self._add("episodes", done.sum())
-        self._add("return", (self.returns * done).sum())
-        self._add("discounted", (self.discounted * done).sum())
+        for name in RUNNING if has_values else RUNNING[:-1]:
+            self._add(name, (getattr(self, name) * done).sum())
         events = after.get(keys.EVENTS, None)
         if events is not None:
             for name in RATES.keys() & events.keys():
@@ -66,9 +86,9 @@ class Meter:
             for name in ("distance", "lane_changes"):
                 self._add(name, (ego.get(name) * done).sum())
         going = ~done
-        self.returns *= going
-        self.discounted *= going
-        self.discount = torch.where(done, 1.0, self.discount)
+        for name in RUNNING:
+            setattr(self, name, getattr(self, name) * going)
+        self.discount, self.weight = (torch.where(done, 1.0, value) for value in (self.discount, self.weight))
 
     def update(self, metrics: Mapping[str, Tensor]) -> None:
         """Add the 0-dim ``metrics`` of one update."""
@@ -91,7 +111,7 @@ class Meter:
 
     def state_dict(self) -> dict[str, Any]:
         """Sums of the running episodes and of the present interval."""
-        names = ("returns", "discounted", "discount", "sums", "updates", "update_count")
+        names = (*RUNNING, "discount", "weight", "sums", "updates", "update_count")
         return {name: _copy(getattr(self, name)) for name in names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -106,7 +126,10 @@ def _per_episode(sums: dict[str, float]) -> dict[str, float]:
     row = {"episodes": episodes}
     if episodes == 0.0:
         return row
-    row |= {"mean_return": sums["return"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
+    row |= {"mean_return": sums["returns"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
+    row["mean_return_to_go"] = sums["to_go"] / sums["lengths"]
+    if "values" in sums:
+        row["mean_value"] = sums["values"] / sums["lengths"]
     row |= {column: sums[name] / episodes for name, column in RATES.items() if name in sums}
     if sums.get("distance", 0.0) > 0.0:
         row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]

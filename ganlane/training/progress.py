@@ -15,10 +15,14 @@ SHOWN = {
     "out_of_road_rate": "off the road {:.1%}",
     "goal_rate": "goals {:.1%}",
 }
+#: The bar: the rate is that of the last seconds, the time left follows from it.
+BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} decisions, {rate_noinv_fmt}, {remaining} left{postfix}"
 
 
 class Progress:
-    """A Log that shows rather than keeps.
+    """A Log that shows rather than keeps: decisions per second, time left, mean return, ends of the episodes.
+
+    Figures that a row lacks, since no episode ended in its interval, are shown as they were last.
 
     Args:
         total: decisions of the whole run.
@@ -28,9 +32,10 @@ class Progress:
 
     def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
         self.total, self.stream = total, sys.stderr if stream is None else stream
+        self.known: dict[str, float] = {}
         self._bar = None
         if self.stream.isatty():
-            options = {"unit": "dec", "unit_scale": True, "dynamic_ncols": True, "file": self.stream}
+            options = {"unit": "", "unit_scale": True, "dynamic_ncols": True, "bar_format": BAR, "file": self.stream}
             self._bar = tqdm(total=total, initial=done, desc="train", **options)
 
     def advance(self, decisions: int) -> None:
@@ -40,7 +45,8 @@ class Progress:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Show the figures of one row."""
-        text = ", ".join(form.format(row[name]) for name, form in SHOWN.items() if name in row)
+        self.known |= {name: row[name] for name in SHOWN if name in row}
+        text = ", ".join(form.format(self.known[name]) for name, form in SHOWN.items() if name in self.known)
         if self._bar is not None:
             self._bar.set_postfix_str(text)
             return

@@ -1,4 +1,4 @@
-"""Everything the rest of a run follows from: agent, window, carrier, counters. It can be saved and restored."""
+"""Everything the rest of a run follows from: agent, window, source of steps, counters. Can be saved and restored."""
 
 from __future__ import annotations
 
@@ -7,30 +7,28 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from ganlane import keys
 from ganlane.agents import Rainbow
 from ganlane.errors import UserError
-from ganlane.training.checkpoints import load_checkpoint, pack, unpack
+from ganlane.training.checkpoints import load_checkpoint
+from ganlane.training.collectors import Source, source_of
 from ganlane.training.meter import Meter
 
 
 class Run:
     """State of a run of ``agent`` in ``env``, batch [N].
 
-    ``carrier`` is the TensorDict that takes the environments' state from step to step; ``owed`` counts the decisions
-    not yet paid for by an update; ``best`` is the best evaluation so far. ``identity`` is plain data that a resumed
-    run must share: environment, traffic, reward, seed.
+    ``source`` gives the steps of the environments; ``owed`` counts the decisions not yet paid for by an update;
+    ``best`` is the best evaluation so far. ``identity`` is plain data that a resumed run must share: environment,
+    traffic, reward, seed.
     """
 
-    def __init__(self, env: EnvBase, agent: Rainbow, identity: Mapping[str, Any] | None = None) -> None:
-        self.env, self.agent, self.identity = env, agent, dict(identity or {})
-        self.environments = env.batch_size.numel()
+    def __init__(self, env: EnvBase | Source, agent: Rainbow, identity: Mapping[str, Any] | None = None) -> None:
+        self.source, self.agent, self.identity = source_of(env), agent, dict(identity or {})
+        self.environments = self.source.environments
         self.window = agent.window()
         self.meter = Meter(self.environments, agent.network.config.actions, agent.config.gamma, agent.device)
-        self.carrier: TensorDictBase = env.reset()
         self.decisions, self.owed = 0, 0
         self.best: float | None = None
         self._before_s, self._started_s = 0.0, time.monotonic()
@@ -48,56 +46,48 @@ class Run:
         """Tensors and plain data.
 
         Without the replay buffer it is small, and of the environments only the episodes are kept: a resumed run
-        starts the next ones, and is not bit-exact.
+        starts the next ones, and is not bit-exact. So it is with a source that cannot be resumed exactly.
         """
+        exact = with_replay and self.source.exact
         counters = {"decisions": self.decisions, "owed": self.owed, "wall_s": self.wall_s, "best": self.best}
-        whole = {
+        return {
             "agent": self.agent.state_dict(with_replay),
-            "window": self.window.state_dict(),
-            "carrier": pack(self.carrier),
-            "meter": self.meter.state_dict(),
+            "window": self.window.state_dict() if exact else None,
+            "carrier": self.source.state_dict(exact),
+            "meter": self.meter.state_dict() if exact else None,
             "counters": counters,
             "identity": self.identity,
         }
-        if with_replay:
-            return whole
-        episodes = self.carrier.select(keys.SEED, keys.EPISODE, strict=False)
-        return {**whole, "carrier": pack(episodes), "window": None, "meter": None}
 
-    def restore(self, path: str | Path) -> bool:
+    def restore(self, path: str | Path) -> str | None:
         """Go on from the checkpoint of a run with as many environments and the same agent.
 
         Returns:
-            Whether the replay buffer was in it, so that the rest of the run is the one it would have been.
+            None where the rest of the run is the one it would have been, else what it has to do without.
 
         Raises:
             UserError: unreadable, or of another run.
         """
         state = load_checkpoint(path, self.agent.device)
         refuse_another_run(path, state["identity"], self.identity)
-        carrier, expected = unpack(state["carrier"]), self.carrier.batch_size
-        if carrier.batch_size != expected:
+        exact = state["window"] is not None
+        try:
+            self.source.load_state_dict(state["carrier"], exact)
+        except ValueError as error:
             raise UserError(
-                f"resume={path}: saved with environments of shape {list(carrier.batch_size)}, this run has "
-                f"{list(expected)}; use the same number."
-            )
+                f"resume={path}: saved with environments of shape {error}, this run has [{self.environments}]; use "
+                "the same number."
+            ) from error
         self.agent.load_state_dict(state["agent"])
-        if state["window"] is None:
-            self.carrier = self._next_episodes(carrier)
-        else:
+        if exact:
             self.window.load_state_dict(state["window"])
             self.meter.load_state_dict(state["meter"])
-            self.carrier = carrier
         counters = state["counters"]
         self.decisions, self.owed, self.best = (counters[name] for name in ("decisions", "owed", "best"))
         self._before_s = counters["wall_s"]
-        return state["agent"]["replay"] is not None
-
-    def _next_episodes(self, last: TensorDictBase) -> TensorDictBase:
-        """All environments at the start of the episodes after ``last``, or of their first ones if it has none."""
-        if keys.EPISODE not in last:
-            return self.env.reset()
-        return self.env.reset(last.set(keys.EPISODE, last.get(keys.EPISODE) + self.environments))
+        if state["agent"]["replay"] is None:
+            return "the replay buffer: it is filled again before the next update"
+        return None if exact else "the episodes that were under way: the workers begin the next ones"
 
 
 def refuse_another_run(path: str | Path, saved: Mapping[str, Any], asked: Mapping[str, Any]) -> None:

@@ -25,7 +25,7 @@ _WAYS = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
 _NOBODY = 1e9
 
 
-def _lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
+def lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
     """Lanes between the ego and each of the others, [N, M - 1]."""
     widest = (lanes - 1).clamp_min(1) if isinstance(lanes, Tensor) else max(lanes - 1, 1)
     return torch.round(others.lane * widest)
@@ -40,7 +40,7 @@ def lane_view(others: Others, lanes: int | Tensor, scale: ObservationScale) -> T
     distance = others.position[:, None, :] * way
     in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
     there = (distance > 0) | ((distance == 0) & (way < 0))
-    counts = in_sight & there & (_lane_offset(others, lanes)[:, None, :] == side)
+    counts = in_sight & there & (lane_offset(others, lanes)[:, None, :] == side)
     distance = torch.add(distance, ~counts, alpha=_NOBODY)
     nearest = distance.amin(-1, keepdim=True)
     speed = torch.add(others.speed[:, None, :], distance > nearest, alpha=_NOBODY).amin(-1, keepdim=True)

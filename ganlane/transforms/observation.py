@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +15,7 @@ from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
+from ganlane.transforms.fixed_order import fixed_order, places
 from ganlane.transforms.lane_view import LANE_VIEW_SIZE, lane_view
 from ganlane.transforms.sensors import perceived
 from ganlane.transforms.table3 import (
@@ -26,19 +27,30 @@ from ganlane.transforms.table3 import (
     own_state,
 )
 
-#: Name to (the list of vehicles, nearest first; the lane view; the ego's own lane change).
-OBSERVATIONS: Final[dict[str, tuple[bool, bool, bool]]] = {
-    "table3": (True, False, False),
-    "table3_progress": (True, False, True),
-    "lane_view": (False, True, True),
-    "table3_lane_view": (True, True, True),
+
+class Form(NamedTuple):
+    """What follows the own state: the list, nearest first; the lane view; own lane change; a place for every role."""
+
+    listed: bool = False
+    viewed: bool = False
+    progress: bool = False
+    placed: bool = False
+
+
+OBSERVATIONS: Final = {
+    "table3": Form(listed=True),
+    "table3_progress": Form(listed=True, progress=True),
+    "lane_view": Form(viewed=True, progress=True),
+    "table3_lane_view": Form(listed=True, viewed=True, progress=True),
+    "fixed_order": Form(placed=True, progress=True),
 }
 
 
 def observation_size(name: str, vehicles: int) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
-    listed, viewed, progress = OBSERVATIONS[name]
-    return 3 + listed * 3 * (vehicles - 1) + viewed * LANE_VIEW_SIZE + progress * 2
+    form, others = OBSERVATIONS[name], vehicles - 1
+    listed = 3 * (form.listed * others + form.placed * places(others))
+    return 3 + listed + form.viewed * LANE_VIEW_SIZE + form.progress * 2
 
 
 class ObservationTransform(Transform):
@@ -49,7 +61,8 @@ class ObservationTransform(Transform):
         vehicles: M, the ego included.
         form: ``table3`` (the paper's literal 3 + 3 (M - 1) numbers), ``table3_progress`` (and the ego's own
             lane change: progress 0 to 1, direction -1, 0 or 1), ``lane_view`` (own state, lane view, lane
-            change), ``table3_lane_view`` (all of it).
+            change), ``table3_lane_view`` (all of it), ``fixed_order`` (as ``table3_progress``, with a place for
+            every lane and role in the list's stead).
         scale: normalisers.
 
     Raises:
@@ -79,14 +92,16 @@ class ObservationTransform(Transform):
             seen: the others as the ego perceives them, and where it was itself when it did (column 0).
         """
         seen = vehicles if seen is None else seen
-        listed, viewed, with_progress = OBSERVATIONS[self.form]
+        form = OBSERVATIONS[self.form]
         others = other_vehicles(seen, road, self.scale)
         parts = [own_state(vehicles, road)]
-        if listed:
+        if form.listed:
             parts.append(as_list(nearest_first(others, distance_to_ego(seen, road))))
-        if viewed:
+        if form.placed:
+            parts.append(as_list(fixed_order(others, distance_to_ego(seen, road), road.lanes)))
+        if form.viewed:
             parts.append(lane_view(others, road.lanes, self.scale))
-        if with_progress:
+        if form.progress:
             parts.append(torch.stack((progress, direction.to(progress.dtype)), dim=1))
         return torch.cat(parts, dim=1)
 

@@ -86,21 +86,35 @@ def draw_curves(
     names = _chosen_columns(runs, columns)
     if not names:
         raise UserError("learning curves: the runs have no numbers to draw; give the metrics.csv of a training run.")
-    panels = [
-        Panel(name.replace("_", " "), _lines(runs, name, smooth), _PANEL_WIDTH, _PANEL_HEIGHT, X_COLUMN).draw()
-        for name in names
-    ]
+    panels = [curve_panel(name.replace("_", " "), lines_of(runs, name, smooth)) for name in names]
+    return curve_sheet(panels, list(runs))
+
+
+def curve_panel(title: str, lines: Sequence[Line]) -> Image.Image:
+    """One panel over the number of decisions."""
+    return Panel(title, lines, _PANEL_WIDTH, _PANEL_HEIGHT, X_COLUMN).draw()
+
+
+def curve_sheet(panels: Sequence[Image.Image], names: Sequence[str]) -> Image.Image:
+    """Panels side by side, below the runs' ``names`` in their colours."""
     across = min(_MAX_COLUMNS, len(panels))
     down = -(-len(panels) // across)
     sheet = Image.new("RGB", (across * _PANEL_WIDTH, down * _PANEL_HEIGHT + _LEGEND_HEIGHT), PAPER)
     for index, panel in enumerate(panels):
         sheet.paste(panel, (index % across * _PANEL_WIDTH, index // across * _PANEL_HEIGHT + _LEGEND_HEIGHT))
-    _draw_legend(sheet, list(runs))
+    _draw_legend(sheet, names)
     return sheet
 
 
-def _lines(runs: Mapping[str, pl.DataFrame], name: str, smooth: int) -> list[Line]:
-    """The runs' lines for one column; a run keeps its colour in every panel."""
+def lines_of(runs: Mapping[str, pl.DataFrame], name: str, smooth: int = 1, dashed: bool = False) -> list[Line]:
+    """The runs' lines for one column; a run keeps its colour in every panel.
+
+    Args:
+        runs: see :func:`draw_curves`.
+        name: of the column; a run that has none is left out.
+        smooth: rows that the running mean takes in; above 1 the rows themselves are drawn faintly.
+        dashed: draw broken lines.
+    """
     lines = []
     for index, frame in enumerate(runs.values()):
         if name not in frame.columns:
@@ -108,7 +122,8 @@ def _lines(runs: Mapping[str, pl.DataFrame], name: str, smooth: int) -> list[Lin
         table = frame.select(pl.col(X_COLUMN, name).cast(pl.Float64)).drop_nulls()
         x, y = table[X_COLUMN].to_numpy(), table[name].to_numpy()
         colour = LINES[index % len(LINES)]
-        lines.append(Line(x, running_mean(y, smooth), colour, y) if smooth > 1 else Line(x, y, colour))
+        smoothed = running_mean(y, smooth) if smooth > 1 else y
+        lines.append(Line(x, smoothed, colour, y if smooth > 1 and not dashed else None, dashed))
     return lines
 
 

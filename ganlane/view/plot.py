@@ -31,6 +31,8 @@ LINES: tuple[Colour, ...] = (
 #: Lines are drawn so many times larger and reduced, which smooths them.
 _OVERSAMPLING = 3
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 16, 30, 36
+#: Length of a dash and of the gap after it, pixels.
+_DASH = 5
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Line:
     colour: Colour = LINES[0]
     #: Drawn faintly below, for instance what ``y`` is a running mean of.
     raw: FloatArray | None = None
+    dashed: bool = False
 
 
 def ticks(low: float, high: float, wanted: int = 5) -> FloatArray:
@@ -106,7 +109,7 @@ class Panel:
             if line.raw is not None:
                 self._draw_line(picture, line.x, line.raw, line.colour, strength=70, thickness=1)
         for line in self.lines:
-            self._draw_line(picture, line.x, line.y, line.colour, strength=255, thickness=2)
+            self._draw_line(picture, line.x, line.y, line.colour, 255, 2, line.dashed)
         return picture
 
     def _draw_axes(self, picture: Image.Image) -> None:
@@ -127,7 +130,14 @@ class Panel:
         put_text(picture, (self.width - _RIGHT, bottom + 20), self.x_title, 11, FAINT, 1.0)
 
     def _draw_line(
-        self, picture: Image.Image, x: FloatArray, y: FloatArray, colour: Colour, strength: int, thickness: int
+        self,
+        picture: Image.Image,
+        x: FloatArray,
+        y: FloatArray,
+        colour: Colour,
+        strength: int,
+        thickness: int,
+        dashed: bool = False,
     ) -> None:
         """A smooth line, interrupted where ``y`` is not a number."""
         mask = Image.new("L", (self.width * _OVERSAMPLING, self.height * _OVERSAMPLING))
@@ -137,9 +147,24 @@ class Panel:
             known = run[np.isfinite(run).all(axis=1)].tolist()
             if len(known) > 1:
                 path = [(a, b) for a, b in known]
-                draw.line(path, fill=strength, width=thickness * _OVERSAMPLING, joint="curve")
+                for part in _dashes(path) if dashed else [path]:
+                    draw.line(part, fill=strength, width=thickness * _OVERSAMPLING, joint="curve")
             elif known:
                 a, b = known[0]
                 reach = 2 * _OVERSAMPLING
                 draw.ellipse((a - reach, b - reach, a + reach, b + reach), fill=strength)
         picture.paste(colour, (0, 0), mask.reduce(_OVERSAMPLING))
+
+
+def _dashes(path: Sequence[tuple[float, float]]) -> list[list[tuple[float, float]]]:
+    """A path as dashes with gaps of the same length, measured along it."""
+    points = np.array(path)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    dash = float(_DASH * _OVERSAMPLING)
+    found = []
+    for start in np.arange(0.0, along[-1], 2 * dash):
+        end = min(start + dash, along[-1])
+        places = np.concatenate([[start], along[(along > start) & (along < end)], [end]])
+        columns, rows = (np.interp(places, along, values).tolist() for values in points.T)
+        found.append(list(zip(columns, rows)))
+    return found

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
+from ganlane.agents.policy import GreedyPolicy
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
 from ganlane.sim.road import road_in
@@ -40,6 +41,8 @@ class Recorder:
     action: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
     action_values: list[np.ndarray] = field(default_factory=list)
+    #: Frames recorded by the end of each decision, and its reward; empty where nobody tells them.
+    decided: list[tuple[int, float]] = field(default_factory=list)
     current_action: int = -1
     current_return: float = 0.0
     current_values: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -71,7 +74,16 @@ class Recorder:
             returns=np.array([*self.returns[:-1], self.current_return]),
             outcome=outcome,
             action_values=self._values(),
+            reward=self._rewards(),
         )
+
+    def _rewards(self) -> np.ndarray:
+        """Reward of each frame's decision, [T]; not a number before the first; empty where rewards were not told."""
+        rewards = np.full(len(self.frames) if self.decided else 0, np.nan)
+        begin = 1
+        for end, reward in self.decided:
+            rewards[begin:end], begin = reward, end
+        return rewards
 
     def _values(self) -> np.ndarray:
         """Action values [T, A]; not a number before the first decision; empty where the policy tells none."""
@@ -136,21 +148,30 @@ def record_episode(
         recorder.add(state[keys.VEHICLES], 0.0)
         outcome, done = "", False
         while not done and recorder.time_s[-1] < max_time_s - 1e-6:
-            state = _decide(env, policy(state), recorder)
+            state = _decide(env, policy, policy(state), recorder)
             done = bool(state["done"][0])
             outcome = _outcome(state) if done else ""
     return recorder.trajectory(label, outcome)
 
 
-def _decide(env: EnvBase, state: TensorDictBase, recorder: Recorder) -> TensorDictBase:
+def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder) -> TensorDictBase:
     """One decision; the state after it."""
     recorder.current_action = int(state[keys.ACTION][0])
-    values = state.get("action_value", None)
+    values = _action_values(policy, state)
     if values is not None and values.ndim == 2:
         recorder.current_values = values[0].double().cpu().numpy()
     stepped = env.step(state)
-    recorder.current_return += float(stepped["next", keys.REWARD][0])
+    reward = float(stepped["next", keys.REWARD][0])
+    recorder.current_return += reward
+    recorder.decided.append((len(recorder.frames), reward))
     return env.step_mdp(stepped)
+
+
+def _action_values(policy: TensorDictModuleBase, state: TensorDictBase) -> Tensor | None:
+    """What the policy expects of each action, [N, A]: from its output, or from its network; None if it tells none."""
+    if isinstance(policy, GreedyPolicy):
+        return policy.network.values(state[keys.OBSERVATION])
+    return state.get("action_value", None)
 
 
 def _outcome(after: TensorDictBase) -> str:

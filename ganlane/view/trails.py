@@ -9,6 +9,8 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 _OVERSAMPLING = 2
+#: Pixels around a trail that its width may reach into.
+_MARGIN = 3
 #: Coverage (0 to 255) of the oldest and the newest third of a trail, the ego's and the others'.
 _EGO_COVERAGE = (110, 175, 240)
 _OTHER_COVERAGE = (45, 80, 120)
@@ -30,15 +32,30 @@ def draw_trails(
         edges: rows of the road's edges; trails are drawn between them and a margin.
     """
     top, bottom = int(edges[0]) - 20, int(edges[1]) + 20
-    mask = Image.new("L", (picture.width * _OVERSAMPLING, (bottom - top) * _OVERSAMPLING))
-    draw = ImageDraw.Draw(mask)
-    points = np.stack((columns, rows - top), axis=-1) * _OVERSAMPLING
     for vehicle in range(columns.shape[1] - 1, -1, -1):
-        trail = points[known[:, vehicle], vehicle]
-        coverage = _EGO_COVERAGE if vehicle == 0 else _OTHER_COVERAGE
-        for part, strength in zip(_thirds(trail), coverage):
-            draw.line([(x, y) for x, y in part.tolist()], fill=strength, width=2 * _OVERSAMPLING)
-    picture.paste((255, 255, 255), (0, top), mask.reduce(_OVERSAMPLING))
+        trail = np.stack((columns[:, vehicle], rows[:, vehicle]), axis=-1)[known[:, vehicle]]
+        if len(trail) > 1:
+            coverage = _EGO_COVERAGE if vehicle == 0 else _OTHER_COVERAGE
+            _draw_trail(picture, trail, coverage, (top, bottom))
+
+
+def _draw_trail(
+    picture: Image.Image,
+    trail: npt.NDArray[np.float64],
+    coverage: tuple[int, int, int],
+    bounds: tuple[int, int],
+) -> None:
+    """One trail, on a mask no larger than it is: a trail is long but hardly wide."""
+    low, high = trail.min(axis=0), trail.max(axis=0)
+    left, right = max(0, int(low[0]) - _MARGIN), min(picture.width, int(high[0]) + _MARGIN)
+    top, bottom = max(bounds[0], int(low[1]) - _MARGIN), min(bounds[1], int(high[1]) + _MARGIN)
+    if left >= right or top >= bottom:
+        return
+    mask = Image.new("L", ((right - left) * _OVERSAMPLING, (bottom - top) * _OVERSAMPLING))
+    draw, points = ImageDraw.Draw(mask), (trail - (left, top)) * _OVERSAMPLING
+    for part, strength in zip(_thirds(points), coverage):
+        draw.line([(x, y) for x, y in part.tolist()], fill=strength, width=2 * _OVERSAMPLING)
+    picture.paste((255, 255, 255), (left, top), mask.reduce(_OVERSAMPLING))
 
 
 def _thirds(trail: npt.NDArray[np.float64]) -> list[npt.NDArray[np.float64]]:

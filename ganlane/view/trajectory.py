@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -66,6 +66,8 @@ class Trajectory:
     outcome: str = ""
     #: Values of the actions where the policy tells them, [T, A]; empty otherwise.
     action_values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    #: Reward of the decision that a frame belongs to, [T]; not a number before the first; empty where nobody told it.
+    reward: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -90,6 +92,41 @@ class Trajectory:
         """Whether a vehicle was put elsewhere since the frame before, [T, M]."""
         moved = np.abs(np.diff(self.x, axis=0, prepend=self.x[:1]))
         return moved > JUMP_M * max(1.0, self.frame_s)
+
+    def jerk(self) -> FloatArray:
+        """Change of the acceleration since the frame before, m/s3, [T, M].
+
+        0 in the first two frames and after a jump: nobody has driven before the first.
+        """
+        change = np.diff(self.acceleration, axis=0, prepend=self.acceleration[:1]) / self.frame_s
+        begins = np.arange(len(self))[:, None] < 2
+        return np.where(begins | self.jumped(), 0.0, change)
+
+    def comfort(self) -> dict[str, float]:
+        """How the ego's passengers fare.
+
+        Returns:
+            ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and ``rms_jerk``, m/s3.
+        """
+        acceleration, jerk = self.acceleration[:, 0], self.jerk()[:, 0]
+        return {
+            "rms_acceleration": round(float(np.sqrt(np.mean(acceleration**2))), 3),
+            "rms_jerk": round(float(np.sqrt(np.mean(jerk**2))), 3),
+            "hardest_braking": round(min(0.0, float(acceleration.min())), 3),
+        }
+
+    def since(self, start_s: float) -> Trajectory:
+        """The frames from ``start_s`` on.
+
+        Raises:
+            UserError: the episode is over by then.
+        """
+        first = int(np.searchsorted(self.time_s, start_s - 1e-9))
+        if first == len(self):
+            raise UserError(f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it.")
+        told = {each.name: getattr(self, each.name) for each in fields(self)}
+        per_frame = {name: value for name, value in told.items() if isinstance(value, np.ndarray) and value.size}
+        return replace(self, **{name: value[first:] for name, value in per_frame.items()})
 
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""

@@ -120,6 +120,16 @@ def test_the_clamped_fraction_is_the_mass_outside_the_support():
     assert torch.isclose(outside_support(values, probabilities, support), torch.tensor(0.25))
 
 
+def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():
+    loss, data = LeanDistributionalLoss(network(), gamma=1.0), batch()
+    data["next", "terminated"][:] = True
+    data["next", "reward"] = torch.linspace(-9.0, 9.0, 64)[:, None]
+    beyond = (data["next", "reward"].abs() > 5.0).float().mean()
+    torch.testing.assert_close(loss(data)["clamped_fraction"], beyond)
+    data["next", "reward"] *= 0.5
+    assert loss(data)["clamped_fraction"] == 0.0
+
+
 def test_the_kl_priority_is_the_cross_entropy_less_the_targets_entropy():
     loss = unlike_target(LeanDistributionalLoss(network(noisy=False), gamma=0.97))
     data = batch()

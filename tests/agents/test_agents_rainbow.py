@@ -299,6 +299,14 @@ def test_impossible_hyperparameters_are_refused(options, name):
         RainbowConfig(**{**SMALL, **options})
 
 
+def test_a_state_saved_before_there_was_an_option_is_that_of_its_default():
+    state = agent().state_dict()
+    del state["config"]["encoder"]
+    agent().load_state_dict(state)
+    with pytest.raises(UserError, match=r"agent.encoder=shared: the saved agent has none"):
+        Rainbow(RainbowConfig(**SMALL, encoder="shared"), 6).load_state_dict(state)
+
+
 def test_the_state_of_an_agent_with_other_hyperparameters_is_refused():
     with pytest.raises(UserError, match=r"agent.gamma=0.9: the saved agent has 0.98"):
         agent(gamma=0.9).load_state_dict(agent().state_dict())

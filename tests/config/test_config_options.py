@@ -12,7 +12,9 @@ from omegaconf import OmegaConf
 
 from ganlane.__main__ import COMMANDS
 from ganlane.agents import RainbowConfig
-from ganlane.config.agent import AgentConfig, DqnConfig
+from ganlane.agents.encoder import ENCODERS
+from ganlane.config import agent as agent_config
+from ganlane.config.agent import AgentConfig, DqnConfig, check_agent
 from ganlane.config.compose import check
 from ganlane.config.data import NgsimDataConfig
 from ganlane.config.env import EgoConfig, EnvConfig, IdmConfig, MobilConfig
@@ -23,7 +25,7 @@ from ganlane.config.generator import (
     PaperGeneratorConfig,
     WeightOptions,
 )
-from ganlane.config.observation import FORMS, ObservationConfig, SensorsConfig
+from ganlane.config.observation import FORMS, LISTS, ObservationConfig, SensorsConfig
 from ganlane.config.plain import plain_copy
 from ganlane.config.reward import RewardConfig
 from ganlane.config.store import SCHEMAS, SUFFIX, register
@@ -36,6 +38,7 @@ from ganlane.config.traffic_faults import (
 )
 from ganlane.data import NgsimParameters
 from ganlane.env import EpisodeParameters
+from ganlane.errors import UserError
 from ganlane.generator import (
     CalibratedConfig,
     LoopConfig,
@@ -153,6 +156,29 @@ def test_faults_of_the_command_line_reach_the_traffic():
 
 def test_observation_forms_are_those_of_the_transform():
     assert set(FORMS) == set(OBSERVATIONS)
+
+
+def test_encoders_are_those_of_the_agent():
+    assert agent_config.ENCODERS == ENCODERS
+    assert check("train", ["agent.encoder=shared", "observation=table3"]).config.agent.rainbow().encoder == "shared"
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_encoder_is_for_lists_of_vehicles_alone(form):
+    given = AgentConfig(encoder="shared"), ObservationConfig(form), EnvConfig()
+    check_agent(AgentConfig(), *given[1:])
+    if form in LISTS:
+        check_agent(*given)
+    else:
+        with pytest.raises(UserError, match=f"agent.encoder=shared with observation={form}"):
+            check_agent(*given)
+
+
+def test_who_learns_only_when_free_cannot_turn_back():
+    agent, observation = AgentConfig(decide_when_free=True), ObservationConfig()
+    check_agent(agent, observation, EnvConfig())
+    with pytest.raises(UserError, match=r"env\.ego\.abort_lane_change=true"):
+        check_agent(agent, observation, EnvConfig(ego=EgoConfig(abort_lane_change=True)))
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -26,6 +26,8 @@ from ganlane.traffic import (
     IdmMobilTraffic,
     IdmTraffic,
     LateReaction,
+    LiteralChanges,
+    LiteralLaneChange,
     Overlay,
     PhantomBraking,
     ReactionFaults,
@@ -33,7 +35,13 @@ from ganlane.traffic import (
     TrafficSequential,
 )
 from ganlane.traffic.faults import driven_at
-from ganlane.traffic.presets import DriverFaults, gan_calibrated_traffic, idm_faults_traffic, with_faults
+from ganlane.traffic.presets import (
+    DriverFaults,
+    gan_calibrated_traffic,
+    gan_traffic,
+    idm_faults_traffic,
+    with_faults,
+)
 
 NONE = DriverFaults(BrakingFaults(0.0), ReactionFaults(0.0), HesitationFaults(0.0), AbortFaults(0.0))
 EGO = {"x": -1000.0, "lane": 0}
@@ -198,6 +206,32 @@ def test_an_aborted_change_returns_to_the_centre_of_the_lane_it_left():
         TrafficSequential({"base": OneChange(), "fault": AbortedLaneChange(faults=AbortFaults(0.0))}), scene, 160
     )
     assert other[-1].target_lane[0, 1:].tolist() == [2, 1]
+
+
+def test_a_literal_change_that_is_broken_off_goes_back_as_fast_as_it_came():
+    scene = vehicles(*({"x": 150.0 * i, "lane": lane} for i, lane in enumerate((0, 0, 1, 2, 1, 0))))
+    # Everybody begins a change within ten steps, and another one within ten steps after it.
+    changes = LiteralChanges(mean_steps=10.0, lateral_speed_mps=0.8, lateral_speed_sd_mps=0.0)
+    parts = {"base": IdmTraffic(), "change": LiteralLaneChange(changes=changes)}
+    track = play(TrafficSequential({**parts, "fault": AbortedLaneChange(faults=AbortFaults(1.0))}), scene, 90)
+    y = torch.stack([scene.y[0], *(now.y[0] for now in track)])[:, 1:]
+    assert y.diff(dim=0).abs().max() < 0.09
+    reached = (y - y[0]).abs().amax(0)
+    assert (reached >= 2.0).all()
+    assert (reached < 2.2).all()
+
+
+def test_a_broken_off_change_of_the_papers_traffic_does_not_jump_either():
+    traffic = TrafficSequential({"base": gan_traffic(), "fault": AbortedLaneChange(faults=AbortFaults(1.0))})
+    widest = turned = 0.0
+    for before, after, was, now in in_simulation(traffic, 8, 20, "fault", "origin"):
+        turned += ((before >= 0) & (after < 0) & (now.target_lane == before)).sum().item()
+        # Rows of new episodes start elsewhere.
+        same = (now.x >= was.x).all(1) & (now.x - was.x < 10.0).all(1)
+        widest = max(widest, (now.y - was.y)[same].abs().amax().item())
+    assert turned > 30
+    # The guard's pull is added to the driver's own pace, which is seldom above 2 m/s.
+    assert widest < 0.4
 
 
 def test_a_hesitant_change_takes_about_twice_as_long_and_does_not_swing():

@@ -75,6 +75,7 @@ def test_environments_without_events_are_metered_too():
         "episodes",
         "mean_return",
         "mean_discounted_return",
+        "mean_return_to_go",
         "action_0_share",
         "action_1_share",
     }

@@ -12,6 +12,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 from view_scenes import straight
 
+from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
@@ -134,3 +137,32 @@ def test_tracks_need_frames_a_tenth_of_a_second_apart():
 def test_an_environment_without_the_hook_cannot_be_recorded():
     with pytest.raises(UserError, match="HighwayEnv"):
         record_episode(GymEnv("CartPole-v1"), always(0), seed=0, episode=0)
+
+
+def test_a_network_tells_its_values_and_the_rewards_add_up():
+    """A policy of a Q-network leaves what it expected at each decision; others leave nothing."""
+    config = EnvConfig(goal_m=60.0)
+    driver = make_driver("agent_idm", config)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, driver.observation)
+    trajectory = record_episode(env, driver.policy, seed=0, episode=0)
+    values, reward = trajectory.action_values, trajectory.reward
+    assert values.shape == (len(trajectory), 3)
+    assert np.isnan(values[0]).all()
+    assert np.array_equal(values[1:].argmax(axis=1), trajectory.action[1:])
+    # A decision lasts ten frames; all of its frames tell its values and its reward.
+    assert np.isnan(reward[0])
+    assert np.array_equal(reward[1:], np.repeat(reward[1::10], 10)[: len(reward) - 1])
+    assert trajectory.returns[-1] == pytest.approx(reward[1::10].sum())
+    assert len(np.unique(reward[1:])) > 1
+    assert record_episode(highway(goal_m=60.0), always(0), seed=0, episode=0).action_values.size == 0
+
+
+def test_a_part_of_a_recording_keeps_its_numbers():
+    trajectory = record_episode(highway(goal_m=60.0), always(0), seed=0, episode=0)
+    later = trajectory.since(1.0)
+    assert later.time_s[0] == pytest.approx(1.0)
+    assert np.array_equal(later.x, trajectory.x[10:])
+    assert np.array_equal(later.reward, trajectory.reward[10:])
+    assert later.outcome == trajectory.outcome
+    with pytest.raises(UserError, match="choose a part"):
+        trajectory.since(1000.0)

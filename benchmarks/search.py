@@ -1,0 +1,166 @@
+"""The runs of a search in one table: what differed, what each scored on the stream kept for selection.
+
+    python benchmarks/search.py outputs/train_sweeps/SWEEP
+    python benchmarks/search.py outputs/train_sweeps/* --report docs/search.md --csv docs/search.csv
+
+Reads config.yaml, evaluation.csv and metrics.csv of every run below the folders; runs that are not finished are
+listed with what they have. ``--report`` puts the table between the two marker lines of a document.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from ganlane.errors import UserError
+from ganlane.files import write_between_markers, write_bytes
+from ganlane.training.log import read_rows
+from ganlane.training.run import flat
+
+BEGIN, END = "<!-- search: begin -->", "<!-- search: end -->"
+#: Options that change nothing in what is learned.
+ASIDE = ("resume", "threads", "logger.", "checkpoint_")
+SCORE = "mean_reward"
+
+
+@dataclass(frozen=True)
+class SearchRun:
+    """One run folder: its options by dotted name, rows of its evaluations and of its metrics as they stand there."""
+
+    name: str
+    options: dict[str, Any]
+    evaluations: list[dict[str, str]]
+    metrics: list[dict[str, str]]
+
+    @property
+    def best(self) -> dict[str, str]:
+        """The evaluation with the highest score, the first of several; empty without any."""
+        return max(self.evaluations, key=lambda row: float(row[SCORE]), default={})
+
+
+def read_runs(folders: Iterable[Path]) -> list[SearchRun]:
+    """Every run that has begun to train, anywhere below ``folders``.
+
+    Raises:
+        UserError: a folder without any.
+    """
+    runs = []
+    for folder in folders:
+        found = sorted(
+            (path.parent for path in folder.rglob("config.yaml") if (path.parent / "metrics.csv").is_file()),
+            key=_in_order,
+        )
+        if not found:
+            raise UserError(f"{folder}: no run there with config.yaml and metrics.csv; give the folder of a sweep.")
+        runs += [read_run(path, folder) for path in found]
+    return runs
+
+
+def read_run(path: Path, sweep: Path) -> SearchRun:
+    """The run in ``path``, below ``sweep``."""
+    config = OmegaConf.to_container(OmegaConf.load(path / "config.yaml"))
+    options = {name: value for name, value in flat(config).items() if not name.startswith(ASIDE)}  # type: ignore[arg-type]
+    evaluations = [row for row in read_rows(path / "evaluation.csv") if row.get(SCORE)]
+    name = f"{sweep.name}/{path.relative_to(sweep)}" if path != sweep else sweep.name
+    return SearchRun(name, options, evaluations, read_rows(path / "metrics.csv"))
+
+
+def _in_order(path: Path) -> tuple[int, str]:
+    """Hydra numbers the runs of a sweep: 2 before 10."""
+    return (int(path.name), "") if path.name.isdigit() else (sys.maxsize, str(path))
+
+
+def differing(runs: Sequence[SearchRun]) -> list[str]:
+    """Names of the options that are not the same in all runs, as the configs list them."""
+    names = dict.fromkeys(name for run in runs for name in run.options)
+    return [name for name in names if any(run.options.get(name) != runs[0].options.get(name) for run in runs)]
+
+
+def table(runs: Sequence[SearchRun]) -> list[dict[str, str]]:
+    """One row per run, the best score first; cells as they are shown, empty where there is nothing to show."""
+    options = differing(runs)
+    ordered = sorted(runs, key=lambda run: float(run.best.get(SCORE, "-inf")), reverse=True)
+    return [_row(run, options) for run in ordered]
+
+
+def _row(run: SearchRun, options: Sequence[str]) -> dict[str, str]:
+    best, last = run.best, run.evaluations[-1] if run.evaluations else {}
+    end = run.metrics[-1] if run.metrics else {}
+    seconds = float(end.get("wall_s") or 0.0)
+    return {
+        "run": run.name,
+        **{name: _shown(run.options.get(name)) for name in options},
+        "decisions": _count(end),
+        "best": _number(best, SCORE),
+        "best s.e.": _number(best, f"{SCORE}_se"),
+        "best at": _count(best),
+        "last": _number(last, SCORE),
+        "last s.e.": _number(last, f"{SCORE}_se"),
+        "crash rate": _number(best, "crash_rate", "{:.3f}"),
+        "changes/km": _number(best, "lane_changes_per_km", "{:.2f}"),
+        "decisions/s": f"{float(end['decisions']) / seconds:.0f}" if seconds > 0.0 else "",
+    }
+
+
+def _count(row: Mapping[str, str]) -> str:
+    return row.get("decisions", "")
+
+
+def _number(row: Mapping[str, str], name: str, form: str = "{:.1f}") -> str:
+    return form.format(float(row[name])) if row.get(name) else ""
+
+
+def _shown(value: Any) -> str:
+    """As one would type it on the command line."""
+    if isinstance(value, list):
+        return f"[{','.join(map(_shown, value))}]"
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def markdown(rows: Sequence[Mapping[str, str]]) -> str:
+    """The rows as a table."""
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def as_csv(rows: Sequence[Mapping[str, str]]) -> str:
+    """The rows as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table, and write it where asked; the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+    parser.add_argument("folders", type=Path, nargs="+", help="of sweeps, or of single runs")
+    parser.add_argument("--report", type=Path, help=f"a document with the lines {BEGIN} and {END}")
+    parser.add_argument("--csv", type=Path, help="where to write the table as CSV")
+    given = parser.parse_args(arguments)
+    try:
+        rows = table(read_runs(given.folders))
+        if given.report:
+            write_between_markers(given.report, BEGIN, END, markdown(rows))
+    except UserError as error:
+        print(f"search: {error}", file=sys.stderr)
+        return 2
+    if given.csv:
+        write_bytes(given.csv, as_csv(rows).encode())
+    print(markdown(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,191 @@
+"""``ganlane doctor`` tells what is there, what is not, and what to type."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
+from ganlane.config.completion import candidates
+from ganlane.diagnosis import Finding, State, missing, report
+from ganlane.diagnosis.contents import cache, checkpoints, outputs, recordings
+from ganlane.diagnosis.machine import machine
+from ganlane.diagnosis.software import EXTRAS, REQUIRED, extra, parsed, required
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:  # pragma: no cover
+    tomllib = pytest.importorskip("tomli")
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+#: Extras that are for people who work on the package, and hold the others.
+FOR_DEVELOPERS = {"test", "dev"}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_whole_installation_is_found_whole(here, capsys):
+    assert main(["doctor"]) == 0
+    shown = capsys.readouterr().out
+    for part in ("python", "torch", "devices", "C++ compiler", "agent_idm", "recordings", "cache", "extra video"):
+        assert f" {part} " in shown
+    assert shown.endswith("All that is needed is there; what is absent serves further purposes only.\n")
+    assert list(here.iterdir()) == []
+
+
+def test_what_is_needed_and_missing_makes_the_status_1(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("ganlane.paths.CHECKPOINTS", tmp_path)
+    assert main(["doctor"]) == 1
+    shown = capsys.readouterr().out
+    assert "MISSING agent_idm" in shown
+    assert "mend: python -m pip install" in shown
+    assert shown.splitlines()[-1].startswith("Missing: agent_idm, generator_calibrated, generator_paper;")
+
+
+def test_help_is_printed_and_keys_are_refused(capsys):
+    assert main(["doctor", "--help"]) == 0
+    assert "exit status" in capsys.readouterr().out
+    assert main(["doctor", "seed=1"]) == 2
+    assert capsys.readouterr().err == "ganlane doctor: seed=1: it takes no keys; run ganlane doctor alone.\n"
+
+
+def test_it_asks_for_what_the_package_asks_for():
+    assert list(REQUIRED) == PROJECT["dependencies"]
+    extras = PROJECT["optional-dependencies"]
+    assert extras.keys() - FOR_DEVELOPERS <= EXTRAS.keys()
+    for name in extras.keys() & EXTRAS.keys():
+        assert list(EXTRAS[name][1]) == extras[name], name
+
+
+@pytest.mark.parametrize(
+    ("version", "allowed"),
+    [("2.11", True), ("2.11.0", True), ("2.13.0+cpu", True), ("2.10.9", False), ("2.14.0", False), ("10.0", False)],
+)
+def test_versions_are_compared_as_numbers(version, allowed):
+    assert parsed("torch>=2.11,<2.14").allows(version) is allowed
+
+
+def test_a_package_that_is_not_there_comes_with_its_command():
+    found = required("no-such-package>=1.0")
+    assert found == Finding(
+        "no-such-package", State.MISSING, "not installed", 'python -m pip install "no-such-package>=1.0"'
+    )
+    assert required("numpy>=999").state is State.MISSING
+
+
+def test_a_package_that_cannot_be_imported_is_missing(monkeypatch):
+    def broken(name):
+        raise OSError("lib.so:\n undefined symbol")
+
+    monkeypatch.setattr("ganlane.diagnosis.software.importlib.import_module", broken)
+    found = required("numpy>=1.26")
+    assert (found.state, found.found) == (State.MISSING, "lib.so: undefined symbol")
+    assert "--force-reinstall" in found.mend
+
+
+def test_an_extra_names_only_what_it_lacks(monkeypatch):
+    monkeypatch.setitem(EXTRAS, "mixed", ("counting", ("numpy>=1.26", "no-such-package>=1")))
+    found = extra("mixed")
+    assert (found.state, found.found) == (State.ABSENT, "counting: no-such-package not installed")
+    assert found.mend == 'python -m pip install "no-such-package>=1"'
+
+
+def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
+    from ganlane.paths import CHECKPOINTS
+
+    for file in CHECKPOINTS.glob("*.safetensors"):
+        (tmp_path / file.name).write_bytes(file.read_bytes()[: -100 if "paper" in file.name else None])
+    monkeypatch.setattr("ganlane.paths.CHECKPOINTS", tmp_path)
+    assert {found.subject for found in checkpoints() if found.state is State.MISSING} == {"generator_paper"}
+
+
+def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
+    assert recordings().state is State.ABSENT
+    assert "export GANLANE_DATA=FOLDER" in recordings().mend
+    (tmp_path / "us101_scenes.csv").write_bytes(b"x" * 2**20)
+    assert recordings().found == f"{tmp_path / 'us101_scenes.csv'} (1.0 MB)"
+
+
+def test_cache_and_run_folders(tmp_path, monkeypatch):
+    monkeypatch.setenv("GANLANE_CACHE", "")
+    assert cache().found == "off (GANLANE_CACHE is empty)"
+    monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / "cache"))
+    assert cache().found == f"{tmp_path / 'cache'} (0 files, 0.0 MB)"
+    (tmp_path / "cache").write_text("in the way")
+    assert cache().state is State.ABSENT
+    assert outputs().state is State.OK
+    (tmp_path / "outputs").write_text("in the way")
+    assert outputs().state is State.MISSING
+
+
+def test_a_machine_without_compiler_is_told_what_to_install(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    found = machine()[-1]
+    assert found.state is State.ABSENT
+    assert "no-such-compiler" in found.found
+    assert found.mend
+
+
+def test_the_report_shows_every_finding_and_its_command():
+    found = {"software": [Finding("torch", State.OK, "2.13"), Finding("numpy", State.MISSING, "gone", "do this")]}
+    assert missing(found) == ["numpy"]
+    assert report(found).splitlines() == [
+        "software",
+        "  ok      torch                 2.13",
+        "  MISSING numpy                 gone",
+        "          mend: do this",
+        "",
+        "Missing: numpy; run what stands beside 'mend'.",
+    ]
+
+
+def test_the_page_names_every_command():
+    page = (ROOT / "docs" / "command_line.md").read_text()
+    for name in (*COMMANDS, *PLAIN_COMMANDS):
+        assert re.search(rf"^\| `{name}` \|", page, flags=re.MULTILINE), name
+
+
+@pytest.mark.parametrize(
+    ("line", "some"),
+    [
+        ("ganlane ", {"train", "evaluate", "doctor"}),
+        ("ganlane tr", {"train", "train_generator"}),
+        ("ganlane train traffic=", {"traffic=gan", "traffic=idm"}),
+        ("ganlane train traffic=gan_", {"traffic=gan_calibrated"}),
+        ("ganlane train traffic=gan env.lan", {"env.lanes=", "env.lane_width_m="}),
+        ("ganlane train ", {"traffic=", "total_decisions="}),
+    ],
+)
+def test_the_shell_completes_commands_options_and_keys(line, some):
+    found = candidates(line, [*COMMANDS, *PLAIN_COMMANDS])
+    assert some <= set(found)
+    last = line.rpartition(" ")[2]
+    assert all(word.startswith(last) for word in found)
+    assert not [word for word in found if "schema" in word or word.startswith("hydra")]
+
+
+@pytest.mark.parametrize("line", ["ganlane fly traffic=", "ganlane doctor ", ""])
+def test_there_is_nothing_to_complete_behind_other_words(line):
+    assert candidates(line, list(COMMANDS) if line else []) == []
+
+
+@pytest.mark.parametrize("arguments", [["-sc", "install=bash"], ["train", "-sc", "install=bash"]])
+def test_the_script_for_the_shell_registers_the_console_script(arguments, capsys):
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.rstrip().endswith("-F hydra_bash_completion ganlane")
+
+
+def test_another_shell_is_refused(capsys):
+    assert main(["-sc", "install=tcsh"]) == 2
+    err = capsys.readouterr().err
+    assert "bash, zsh, fish" in err
+    assert err.count("\n") == 1

@@ -1,0 +1,85 @@
+"""``ganlane train -m``: every run of a sweep has a folder of its own, whichever launcher starts it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+TINY = [
+    "env.goal_m=40",
+    "traffic=idm",
+    "init=none",
+    "observation=table3_progress",
+    "total_decisions=320",
+    "log_every=160",
+    "collector.num_envs=16",
+    "agent.hidden=[16,16]",
+    "agent.batch_size=32",
+    "agent.warmup=64",
+    "agent.capacity=1000",
+    "evaluation.agents=[random_legal]",
+    "evaluation.episodes=2",
+]
+#: Option of hydra/launcher to the package that brings it and what it is told beside.
+LAUNCHERS = {
+    "basic": ("hydra", []),
+    "joblib": ("hydra_plugins.hydra_joblib_launcher", ["hydra.launcher.n_jobs=2"]),
+    "submitit_local": ("hydra_plugins.hydra_submitit_launcher", ["hydra.launcher.timeout_min=5"]),
+    "ray": ("hydra_plugins.hydra_ray_launcher", []),
+}
+
+
+def sweep(folder, *arguments):
+    """Run a sweep over two seeds in a process of its own, in ``folder``."""
+    command = [sys.executable, "-m", "ganlane.train", "-m", "seed=0,1", *TINY, *arguments]
+    root = str(Path(__file__).parent.parent)
+    environment = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=500)
+
+
+def skip_without(launcher):
+    package, _ = LAUNCHERS[launcher]
+    try:
+        found = find_spec(package)
+    except ModuleNotFoundError:
+        found = None
+    if found is None:
+        pytest.skip(f"hydra/launcher={launcher} needs {package}, which is not installed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_the_runs_of_a_sweep_share_no_file(launcher, tmp_path):
+    skip_without(launcher)
+    done = sweep(tmp_path, f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1])
+    assert done.returncode == 0, done.stderr[-3000:]
+    (folder,) = (tmp_path / "outputs" / "train_sweeps").iterdir()
+    runs = [folder / "0", folder / "1"]
+    assert sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".") == runs
+    files = [sorted(str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()) for run in runs]
+    assert files[0] == files[1]
+    expected = {"agent.safetensors", "checkpoints/last.pt", "config.yaml", "metrics.csv", "results.json"}
+    assert expected <= set(files[0])
+    results = [json.loads((run / "results.json").read_text()) for run in runs]
+    assert [result["config"]["seed"] for result in results] == [0, 1]
+    assert [result["decisions"] for result in results] == [320, 320]
+    weights = [(run / "agent.safetensors").read_bytes() for run in runs]
+    assert weights[0] != weights[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_a_mistake_in_a_sweep_is_one_sentence(launcher, tmp_path):
+    skip_without(launcher)
+    given = [f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1], "init=idm_ckpt", "init.path=nowhere.safetensors"]
+    done = sweep(tmp_path, *given)
+    assert done.returncode == 2
+    assert "nowhere.safetensors" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "outputs").exists()

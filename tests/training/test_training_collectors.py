@@ -1,0 +1,357 @@
+"""Steps from workers: in the order of time, from episodes of their own, with weights that follow the learner's."""
+
+import functools
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from training.toy import ToyRoad
+
+from ganlane import keys
+from ganlane.agents import Rainbow, RainbowConfig
+from ganlane.build import make_env, make_traffic
+from ganlane.config.collector import MultiCollectorConfig
+from ganlane.config.env import EnvConfig
+from ganlane.config.observation import ObservationConfig
+from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.config.train import TrainConfig
+from ganlane.errors import UserError
+from ganlane.phases import identity, make_source, phases_of
+from ganlane.training import TrainingConfig, train
+from ganlane.training.collectors import MultiSource, RaySource, SingleSource, Team, source_of
+from ganlane.training.collectors.remote import EPISODES_PER_WORKER, noise_seed
+from ganlane.training.collectors.signals import shielded_children
+from ganlane.training.collectors.workers import WorkerSource
+from ganlane.training.loop import collect
+from ganlane.training.run import Run
+
+ROOT = Path(__file__).resolve().parents[2]
+NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)")
+NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+ROAD = EnvConfig(vehicles=4, goal_m=60.0)
+QUIET = {"auto_register_policy_transforms": False}
+SMALL = {"hidden": (16, 16), "batch_size": 16, "warmup": 32, "capacity": 1000, "decisions_per_update": 8, "atoms": 11}
+
+
+def road(rows, first_episode):
+    return make_env(
+        make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(), num_envs=rows, first_episode=first_episode
+    )
+
+
+def toy(rows, first_episode):
+    return ToyRoad(rows)
+
+
+def agent(size=23, seed=0, **options):
+    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
+
+
+class Here:
+    """TorchRL's collectors of all workers, one after the other in this process, with the interface of the others."""
+
+    def __init__(self, environments, policies, frames):
+        self.workers = [
+            Collector(env, policy_factory=policy, frames_per_batch=frames, trust_policy=True, **QUIET)
+            for env, policy in zip(environments, policies)
+        ]
+        self.handed_over = []
+
+    def map_fn(self, name, arguments):
+        self.handed_over.append(arguments)
+        for worker, given in zip(self.workers, arguments):
+            worker.cascade_execute(name, *given)
+
+    def __iter__(self):
+        for batches in zip(*self.workers):
+            yield torch.cat(list(batches), 0)
+
+    def shutdown(self):
+        for worker in self.workers:
+            worker.shutdown()
+
+
+class HereSource(WorkerSource):
+    name = "here"
+
+    def start(self, environments, policies, frames):
+        return Here(environments, policies, frames)
+
+    def arranged(self, batch):
+        return batch
+
+    def failure(self, error):
+        return None
+
+
+def steps(source, learner, count):
+    return torch.stack([source.step(learner).clone() for _ in range(count)])
+
+
+# --- steps, episodes, weights
+
+
+def test_steps_come_in_the_order_of_time_across_batches():
+    source = HereSource(road, Team(2, 3, weights_every=18))
+    seen = steps(source, agent(), 10)
+    assert seen.batch_size == (10, 6)
+    going = ~seen["next", "done"][:-1, :, 0]
+    assert going.any()
+    assert torch.equal(seen["next", keys.OBSERVATION][:-1][going], seen[keys.OBSERVATION][1:][going])
+    assert keys.VEHICLES not in seen
+    assert keys.VEHICLES not in seen["next"]
+
+
+def test_no_two_workers_drive_the_same_episode():
+    source = HereSource(road, Team(3, 2, weights_every=60))
+    episodes = steps(source, agent(), 40)[keys.EPISODE]
+    assert torch.equal(episodes[0], torch.tensor([w * EPISODES_PER_WORKER + i for w in range(3) for i in range(2)]))
+    driven = [set(episodes[:, row].tolist()) for row in range(6)]
+    assert all(len(own) > 1 for own in driven)
+    assert len(set.union(*driven)) == sum(map(len, driven))
+
+
+def test_workers_explore_each_in_its_own_way():
+    source = HereSource(toy, Team(2, 64, weights_every=1))
+    learner = agent(4, epsilon_start=1.0)
+    first, second = source.step(learner)[keys.ACTION].split(64)
+    assert not torch.equal(first, second)
+    seeds = {noise_seed(0, first) for first in (0, EPISODES_PER_WORKER, 7, EPISODES_PER_WORKER + 7)}
+    assert len(seeds | {noise_seed(1, 0)}) == 5
+
+
+def test_workers_drive_with_the_weights_of_the_last_handover():
+    source = HereSource(toy, Team(2, 4, weights_every=32))
+    learner = agent(4, noisy=False, epsilon_start=0.0, epsilon=0.0)
+    source.step(learner)
+    with torch.no_grad():
+        learner.network.head.bias[11:22] += torch.linspace(-50.0, 50.0, 11)
+    old = steps(source, learner, 3)[keys.ACTION]
+    new = steps(source, learner, 4)[keys.ACTION]
+    assert not (old == 0).all()
+    assert (new == 0).all()
+    assert len(source.collector.handed_over) == 2
+
+
+@pytest.mark.parametrize(("every", "expected"), [(1, 1), (8, 1), (23, 2), (800, 100)])
+def test_weights_are_handed_over_every_so_many_decisions_in_whole_steps(every, expected):
+    assert Team(2, 4, every).steps == expected
+
+
+def test_the_share_of_random_actions_travels_with_the_weights():
+    source = HereSource(toy, Team(1, 4, weights_every=4))
+    run = Run(source, agent(4, epsilon_start=1.0, epsilon=0.0, epsilon_decisions=8))
+    for _ in range(3):
+        collect(run)
+    assert [given[0][1] for given in source.collector.handed_over] == [1.0, 0.5, 0.0]
+
+
+# --- the loop on top of them
+
+
+def test_a_run_with_workers_learns_what_a_run_without_does(tmp_path):
+    learner = agent(4, **{"gamma": 0.8, "v_min": -10.0, "v_max": 10.0, "learning_rate": 3e-3})
+    config = TrainingConfig(6000, log_every=1000, progress=False)
+    source = HereSource(toy, Team(2, 8, weights_every=64))
+    result = train(source, learner, config, tmp_path)
+    assert result.decisions == 6000
+    assert result.updates == pytest.approx((6000 - 32) / 8, abs=8)
+    observation = torch.rand(500, 4)
+    action = learner.greedy(TensorDict({"observation": observation}, [500]))["action"]
+    assert (action == observation[:, :3].argmax(-1)).float().mean() > 0.7
+
+
+def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(tmp_path, capsys):
+    config = TrainingConfig(400, log_every=200, progress=False)
+    source = HereSource(road, Team(2, 4, weights_every=80))
+    first = train(source, agent(), config, tmp_path)
+    begun = source._last[keys.EPISODE].reshape(2, 4)
+    resumed, again = agent(), HereSource(road, Team(2, 4, weights_every=80))
+    result = train(again, resumed, TrainingConfig(480, progress=False), tmp_path, resume=first.checkpoint)
+    assert "the workers begin the next ones; not bit-exact" in capsys.readouterr().err
+    assert again.first_episodes == [int(last) + 1 for last in begun.amax(1)]
+    assert len(resumed.replay) > 400  # the buffer of the first stretch is still there
+    assert (result.decisions, result.updates > first.updates) == (480, True)
+
+
+def test_another_number_of_workers_is_refused_on_resume(tmp_path):
+    first = train(HereSource(toy, Team(2, 4, 8)), agent(4), TrainingConfig(80, progress=False), tmp_path)
+    for other in (HereSource(toy, Team(3, 4, 8)), ToyRoad(4)):
+        with pytest.raises(UserError, match=r"shape \[8\], this run has"):
+            train(other, agent(4), TrainingConfig(160, progress=False), tmp_path, resume=first.checkpoint)
+
+
+def test_an_environment_is_a_source_of_its_own():
+    env = ToyRoad(4)
+    source = source_of(env)
+    assert isinstance(source, SingleSource)
+    assert source.env is env
+    assert source_of(source) is source
+
+
+# --- options
+
+
+def test_a_phase_collects_as_the_option_says(monkeypatch):
+    collector = MultiCollectorConfig(num_envs=3, workers=5, weights_every=60)
+    config = TrainConfig(collector=collector, traffic=IdmTrafficConfig(), env=ROAD)
+    (phase,) = phases_of(config, Path("nowhere"))
+    source = make_source(config, phase)
+    assert isinstance(source, MultiSource)
+    assert source.team == Team(5, 3, 60)
+    assert collector.environments == source.environments == 15
+    assert source.make_env(2, 70).reset()[keys.EPISODE].tolist() == [70, 71]
+    assert identity(config, phase)["collector"] == {"num_envs": 3, "workers": 5, "weights_every": 60}
+
+
+def test_a_missing_ray_is_named_with_the_command_that_mends_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UserError, match=r"pip install 'ganlane\[ray\]'"):
+        RaySource(toy, Team(1, 1, 1))
+
+
+# --- signals
+
+
+def test_children_of_a_run_are_spared_its_signals():
+    with shielded_children():
+        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            child.send_signal(number)
+        time.sleep(0.5)
+        assert child.poll() is None
+    finally:
+        child.kill()
+        child.wait()
+
+
+def test_a_signal_that_comes_while_children_start_is_not_lost_nor_its_handler():
+    seen = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: seen.append(number))
+    try:
+        with shielded_children():
+            os.kill(os.getpid(), signal.SIGTERM)
+        with shielded_children():
+            signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))  # as ray.init does
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert seen == [signal.SIGTERM, signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+# --- processes
+
+
+def alive(number):
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_dead_worker_ends_the_run_in_one_sentence_and_takes_the_others_along():
+    source, learner = MultiSource(road, Team(2, 2, weights_every=8)), agent()
+    threads = torch.get_num_threads()
+    try:
+        seen = steps(source, learner, 4)
+        assert torch.equal(seen[keys.EPISODE][0], torch.tensor([0, 1, 2**40, 2**40 + 1]))
+        going = ~seen["next", "done"][:-1, :, 0]
+        assert torch.equal(seen["next", keys.OBSERVATION][:-1][going], seen[keys.OBSERVATION][1:][going])
+        numbers = [process.pid for process in source.collector.procs]
+        os.kill(numbers[1], signal.SIGKILL)
+        with pytest.raises(UserError, match=r"^collector=multi: .*died.* go on from the last checkpoint") as error:
+            steps(source, learner, 3)
+        assert "\n" not in str(error.value)
+    finally:
+        source.close()
+    assert not any(map(alive, numbers))
+    assert torch.get_num_threads() == threads
+
+
+@NO_RAY
+@pytest.mark.slow
+def test_two_ray_workers_collect_and_a_dead_one_is_told_in_one_sentence():
+    source, learner = RaySource(road, Team(2, 2, weights_every=8)), agent()
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        seen = steps(source, learner, 6)
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+        assert torch.equal(seen[keys.EPISODE][0], torch.tensor([0, 1, 2**40, 2**40 + 1]))
+        going = ~seen["next", "done"][:-1, :, 0]
+        assert torch.equal(seen["next", keys.OBSERVATION][:-1][going], seen[keys.OBSERVATION][1:][going])
+        assert len({policy.initial_seed() for policy in source.collector.get_distant_attr("policy.generator")}) == 2
+        import ray
+
+        ray.kill(source.collector.remote_collectors[0])
+        with pytest.raises(UserError, match=r"^collector=ray: a worker died"):
+            steps(source, learner, 4)
+    finally:
+        source.close()
+    assert not ray.is_initialized()
+
+
+@NO_RAY
+@pytest.mark.slow
+def test_an_address_without_a_cluster_is_named():
+    source = RaySource(road, Team(1, 1, 1), address="127.0.0.1:1")
+    with pytest.raises(UserError, match=r"no Ray cluster answers at collector.address=127.0.0.1:1"):
+        source.step(agent())
+    source.close()
+
+
+COMMAND = [
+    *("traffic=idm", "init=none", "env.goal_m=40", "collector=multi", "collector.num_envs=8"),
+    *("collector.weights_every=32", "log_every=64", "agent.hidden=[16,16]", "agent.batch_size=32"),
+    *("agent.warmup=64", "agent.capacity=1000", "evaluation.agents=[keep_lane]", "evaluation.episodes=2"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_the_whole_group_saves_and_leaves_no_process(number, tmp_path):
+    run = functools.partial(subprocess.Popen, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "ganlane.train", *COMMAND, "total_decisions=1000000000"]
+    process = run(command, env=environment)
+    while not any(len(path.read_text().splitlines()) > 1 for path in tmp_path.rglob("metrics.csv")):
+        assert process.poll() is None
+        time.sleep(0.1)
+    os.killpg(process.pid, number)
+    message = process.communicate(timeout=120)[1]
+    assert process.returncode == 128 + number
+    assert "go on with: ganlane train resume=" in message
+    assert "Traceback" not in message
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+
+
+# --- device=cuda
+
+
+@NO_CUDA
+def test_on_a_gpu_nothing_of_a_run_is_elsewhere():
+    traffic = make_traffic(IdmTrafficConfig(), ROAD)
+    env = make_env(traffic, ROAD, ObservationConfig(), num_envs=32, device="cuda")
+    learner = Rainbow(RainbowConfig(**SMALL), 23, device="cuda")
+    run = Run(env, learner)
+    for _ in range(4):
+        step = collect(run)
+        learner.store(run.window.push(step))
+    learner.update()
+    tensors = [
+        *run.source.carrier.values(True, True),
+        *step.values(True, True),
+        *learner.replay[:].values(True, True),
+    ]
+    tensors += [*learner.network.parameters(), *run.meter.sums.values(), run.meter.returns]
+    assert {tensor.device.type for tensor in tensors} == {"cuda"}

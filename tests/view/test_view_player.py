@@ -1,0 +1,133 @@
+"""The player's page holds the episodes, and nothing that could load or run anything else."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from itertools import accumulate
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from view_scenes import straight
+
+from ganlane.errors import UserError
+from ganlane.view import EpisodeLabel, player_page, write_player
+from ganlane.view.player.encoding import UNITS, episode_data, series, steps
+
+
+def told(page):
+    """The data in a page."""
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
+
+
+@given(st.lists(st.floats(-5000, 5000), min_size=1, max_size=50), st.sampled_from([0.01, 0.001, 0.1]))
+def test_a_series_is_exact_to_half_its_unit_however_long(values, unit):
+    read = np.array(list(accumulate(series(np.array(values), unit)))) * unit
+    assert np.abs(read - values).max() <= 0.5 * unit + 1e-9
+
+
+def test_steps_are_the_changes_alone():
+    assert steps(np.array([3, 3, 3, 1, 1, 2])) == [0, 3, 3, 1, 5, 2]
+    assert steps(np.array([np.nan, np.nan, 0.333333])) == [0, None, 2, 0.33]
+    assert steps(np.array([True, True, False])) == [0, 1, 2, 0]
+
+
+def test_the_page_says_where_everybody_is():
+    episode = straight([0, 30], [1, 2], frames=40)
+    data = told(player_page([episode]))
+    (shown,) = data["episodes"]
+    assert (shown["agent"], shown["traffic"], shown["lanes"]) == ("mobil", "idm", 3)
+    x = np.array(list(accumulate(shown["x"][1]))) * data["units"]["x"]
+    assert x == pytest.approx(episode.x[:, 1], abs=0.006)
+    assert shown["action_values"] == []
+    assert shown["reward"] == []
+
+
+def test_reward_and_values_belong_to_the_decision_that_begins():
+    reward = np.array([np.nan, 1.0, 1.0, 1.0, 5.0, 5.0])
+    values = np.array([[np.nan], [7.0], [7.0], [7.0], [8.0], [8.0]])
+    data = episode_data(straight([0], [1], frames=6, reward=reward, action_values=values))
+    assert data["reward"] == [0, 1.0, 3, 5.0]
+    assert data["action_values"] == [[0, 7.0, 3, 8.0]]
+
+
+def test_comfort_is_of_the_ego():
+    time = np.arange(30) * 0.1
+    episode = straight([0, 50], [1, 1], frames=30)
+    acceleration = np.stack([-2.0 * time, 9.0 * np.ones(30)], axis=1)
+    episode = replace(episode, acceleration=acceleration)
+    comfort = episode.comfort()
+    assert comfort["hardest_braking"] == pytest.approx(-5.8)
+    assert comfort["rms_acceleration"] == pytest.approx(np.sqrt(np.mean((2 * time) ** 2)), abs=1e-3)
+    # 28 of 30 frames have a jerk of -2 m/s3.
+    assert comfort["rms_jerk"] == pytest.approx(2.0 * np.sqrt(28 / 30), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["</script><script>alert(1)</script>", "<!-- {{script}}", "a & b \"c\" 'd' \u2028", "<img src=x onerror=y>"],
+)
+def test_a_name_cannot_become_part_of_the_page(name):
+    episode = replace(straight([0], [1]), label=EpisodeLabel(name, "{{style}}"))
+    plain = player_page([straight([0], [1])])
+    page = player_page([episode])
+    assert told(page)["episodes"][0]["agent"] == name
+    assert told(page)["episodes"][0]["traffic"] == "{{style}}"
+    for mark in ("<script", "</script", "<!--", "<img"):
+        assert page.count(mark) == plain.count(mark), mark
+
+
+def test_only_the_pages_own_scripts_may_run_and_nothing_may_be_loaded():
+    page = player_page([straight([0], [1])])
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[1]
+    assert policy.startswith("default-src 'none'; ")
+    for element, directive in (("style", "style-src"), ("script", "script-src")):
+        text = re.search(rf"<{element}>(.*?)</{element}>", page, re.S)[1]
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{directive} 'sha256-{digest}'" in policy
+    assert not re.search(r"https?://|src=|@import", page)
+
+
+def noisy(frames, vehicles=9):
+    """Driving that does not compress: accelerations, headings and lateral positions of noise."""
+    generator = np.random.default_rng(0)
+    episode = straight(np.arange(vehicles) * 30.0, [k % 3 for k in range(vehicles)], frames=frames)
+    shape = episode.x.shape
+    return replace(
+        episode,
+        y=episode.y + generator.normal(0, 0.05, shape),
+        heading=generator.normal(0, 0.01, shape),
+        speed=episode.speed + generator.normal(0, 0.3, shape),
+        acceleration=generator.normal(0, 1.0, shape),
+    )
+
+
+def test_three_episodes_of_four_minutes_stay_under_two_megabytes():
+    page = player_page([noisy(2500)] * 3)
+    assert len(page.encode()) < 2_000_000
+
+
+def test_a_page_that_is_too_large_takes_fewer_samples_and_keeps_the_last():
+    episode = noisy(600)
+    whole = player_page([episode])
+    page = player_page([episode], max_bytes=len(whole) // 2)
+    (shown,) = told(page)["episodes"]
+    times = np.array(list(accumulate(shown["time"]))) * UNITS["time"]
+    assert len(page) < len(whole) // 2
+    assert np.diff(times)[:-1].min() > 0.1
+    assert times[-1] == pytest.approx(59.9)
+    with pytest.raises(UserError, match="max_bytes"):
+        player_page([episode], max_bytes=1000)
+
+
+def test_a_page_is_written_whole(tmp_path):
+    path = write_player([straight([0], [1])], tmp_path / "page.html")
+    assert path.read_text(encoding="utf-8") == player_page([straight([0], [1])])
+    assert [file.name for file in tmp_path.iterdir()] == ["page.html"]
+    with pytest.raises(UserError, match="no episode"):
+        write_player([], tmp_path / "none.html")

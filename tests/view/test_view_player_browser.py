@@ -1,0 +1,156 @@
+"""The player in a real browser: it plays, scrubs, follows and draws, without an error and without a request."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from view_browser import browser_page, find_browser
+from view_scenes import straight
+
+from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import IdmMobilTrafficConfig
+from ganlane.sim.random import Stream
+from ganlane.view import EpisodeLabel, record_episode, write_player
+
+BROWSER = find_browser()
+if BROWSER is None:
+    pytest.skip("no chromium found; CI installs it: apt-get install chromium", allow_module_level=True)
+
+CLOCK = "parseFloat(document.getElementById('time').textContent)"
+
+
+def learned(frames=60):
+    """An episode with action values and rewards, as a trained agent leaves one."""
+    time = np.arange(frames) * 0.1
+    values = 10.0 + np.stack([np.sin(time), np.cos(time), -time], axis=1)
+    told = {"reward": np.sin(time), "action_values": values, "acceleration": np.sin(np.outer(time, [1.0, 2.0, 3.0]))}
+    label = EpisodeLabel("agent </script><b>x", "idm", 3, 4)
+    return straight([0, 25, -20], [1, 2, 0], frames, outcome="hard_crash", label=label, **told)
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("player")
+    path = write_player([straight([0, 40], [1, 2], 100), learned()], folder / "player.html")
+    with browser_page(BROWSER, folder / "profile") as page:
+        yield page, path
+
+
+@pytest.fixture
+def page(pages):
+    opened, path = pages
+    opened.open(path)
+    yield opened
+    assert opened.errors == []
+
+
+def ink(page, selector, colour, tolerance=12):
+    """How many pixels of a canvas have (nearly) this colour."""
+    return page.value(
+        f"(() => {{ const c = document.querySelector({selector!r});"
+        "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0;"
+        f"const near = (k) => {list(colour)}.every((value, i) => Math.abs(d[k + i] - value) <= {tolerance});"
+        "for (let k = 0; k < d.length; k += 4) if (near(k)) n++; return n; })()"
+    )
+
+
+def scrub(page, time_s):
+    page.value(
+        f"(() => {{ const s = document.getElementById('scrub'); s.value = {time_s}; "
+        "s.dispatchEvent(new Event('input')); })()"
+    )
+
+
+EGO, BLUE, ORANGE, GREEN, RED = (255, 150, 28), (86, 160, 220), (230, 120, 0), (47, 192, 143), (255, 62, 62)
+FIRST, SECOND = ".episode:nth-child(1)", ".episode:nth-child(2)"
+
+
+def test_the_page_shows_every_episode(page):
+    assert page.value("document.querySelectorAll('.episode').length") == 2
+    assert page.value(f"document.querySelector('{SECOND} .title').textContent") == "agent </script><b>x on idm"
+    assert page.value("document.querySelectorAll('.title b').length") == 0
+    for episode in (FIRST, SECOND):
+        assert ink(page, f"{episode} .road", EGO) > 20
+
+
+def test_play_goes_on_and_pause_stops(page):
+    assert page.value(CLOCK) == 0.0
+    page.click("#play")
+    page.wait_for(f"{CLOCK} > 0.5")
+    assert page.value("document.getElementById('play').textContent") == "Pause"
+    page.click("#play")
+    stopped = page.value(CLOCK)
+    page.value("new Promise((done) => setTimeout(done, 200))")
+    assert page.value(CLOCK) == stopped > 0.5
+
+
+def test_speed_is_simulated_seconds_per_second(page):
+    page.value("(() => { const s = document.getElementById('speed'); s.value = '0.25'; })()")
+    page.click("#play")
+    passed = page.value(
+        f"new Promise((done) => {{ const from = [performance.now(), {CLOCK}];"
+        f"setTimeout(() => done(({CLOCK} - from[1]) / (performance.now() - from[0]) * 1000), 2000); }})"
+    )
+    assert passed == pytest.approx(0.25, abs=0.12)
+
+
+def test_play_ends_with_the_longest_episode(page):
+    scrub(page, 9.7)
+    page.click("#play")
+    page.wait_for("document.getElementById('play').textContent === 'Play'")
+    assert page.value(CLOCK) == pytest.approx(9.9)
+    page.click("#play")
+    page.wait_for(f"{CLOCK} < 5")
+
+
+def test_scrubbing_sets_the_time_and_the_picture(page):
+    before = ink(page, f"{SECOND} .road", RED)
+    scrub(page, 5.9)
+    assert page.value(CLOCK) == pytest.approx(5.9)
+    assert "hard crash" in page.value(f"document.querySelector('{SECOND} .now').textContent")
+    assert ink(page, f"{SECOND} .road", RED) > before + 50
+
+
+def test_a_learned_agent_has_a_curve_per_action_and_others_have_none(page):
+    assert page.value(f"document.querySelectorAll('{FIRST} [data-chart=q]').length") == 0
+    assert page.value(f"document.querySelectorAll('{FIRST} [data-chart=reward]').length") == 0
+    for colour in (BLUE, ORANGE, GREEN):
+        assert ink(page, f"{SECOND} [data-chart=q]", colour) > 50
+    for chart in ("reward", "acceleration", "jerk"):
+        assert ink(page, f"{SECOND} [data-chart={chart}]", BLUE) > 50
+
+
+def test_a_click_into_a_curve_goes_there(page):
+    page.click(f"{SECOND} [data-chart=q]", share=0.5)
+    assert 3.5 < page.value(CLOCK) < 7.0
+
+
+def test_keys_step_and_play(page):
+    page.key("ArrowRight", code="ArrowRight", windowsVirtualKeyCode=39)
+    page.key("ArrowRight", code="ArrowRight", windowsVirtualKeyCode=39, modifiers=8)
+    assert page.value(CLOCK) == pytest.approx(1.1)
+    page.key("ArrowLeft", code="ArrowLeft", windowsVirtualKeyCode=37)
+    assert page.value(CLOCK) == pytest.approx(1.0)
+    page.key(" ", code="Space", windowsVirtualKeyCode=32)
+    page.wait_for(f"{CLOCK} > 1.2")
+
+
+def test_without_following_the_ego_drives_out_of_the_picture(page):
+    scrub(page, 9.0)
+    assert ink(page, f"{FIRST} .road", EGO) > 20
+    scrub(page, 0.0)
+    page.click("#follow")
+    scrub(page, 9.0)
+    assert ink(page, f"{FIRST} .road", EGO) == 0
+
+
+def test_a_shipped_agents_episode_plays(pages, tmp_path):
+    config = EnvConfig(goal_m=60.0)
+    driver = make_driver("agent_idm", config)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config, Stream.REPORT), config, driver.observation)
+    episode = record_episode(env, driver.policy, 0, 0, driver.name, "idm_mobil")
+    opened, _ = pages
+    opened.open(write_player([episode], tmp_path / "agent.html"))
+    assert [ink(opened, "[data-chart=q]", colour) > 50 for colour in (BLUE, ORANGE, GREEN)] == [True] * 3
+    assert opened.errors == []

@@ -32,9 +32,11 @@ DRIVERS = ("mobil", "agent_idm", "keep_lane")
 
 def rides_of(name: str, told: argparse.Namespace) -> list[Ride]:
     """The rides of one driver."""
-    driver = load_agent(name, vehicles=told.vehicles)
+    driver, begun = load_agent(name, vehicles=told.vehicles), time.monotonic()
     env = environment(told, driver.observation)
-    return drive(env, driver.policy, range(told.episodes), told.seed)
+    rides = drive(env, driver.policy, range(told.episodes), told.seed)
+    print(f"{name}: {told.episodes} episodes driven in {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
+    return rides
 
 
 def environment(told: argparse.Namespace, observation: Any = None) -> Any:

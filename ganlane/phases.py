@@ -25,7 +25,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.memory import keep_freed_memory
 from ganlane.sim.random import Stream
-from ganlane.training import TensorBoardLog, TrainingConfig, TrainingResult, find_checkpoint, train
+from ganlane.training import TrainingConfig, TrainingResult, find_checkpoint, make_logs, train
 from ganlane.training.collectors import MultiSource, RaySource, SingleSource, Source, Team
 from ganlane.transforms import observation_size
 
@@ -76,7 +76,7 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
             _rhythm(config, phase),
             phase.folder,
             evaluate=_selection(config, phase) if config.evaluate_every else None,
-            logs=[TensorBoardLog(phase.folder / "tensorboard")] if config.logger.kind == "tensorboard" else [],
+            logs=make_logs(config.logger, phase.folder, describe(config, phase)),
             metadata=describe(config, phase),
             resume=resume,
             identity=identity(config, phase),

@@ -68,7 +68,8 @@ class ExploringPolicy(TensorDictModuleBase):
         action = values.argmax(-1)
         if explore and self.epsilon > 0.0:
             action = self._mix(action, torch.ones_like(values) if self.legal is None else self.legal(tensordict))
-        return tensordict.set(keys.ACTION, action)
+        chosen = values.gather(-1, action[..., None])
+        return tensordict.set(keys.ACTION, action).set("chosen_action_value", chosen)
 
     def _mix(self, action: Tensor, legal: Tensor) -> Tensor:
         """Replace a fraction epsilon of the actions by legal ones, drawn uniformly."""

@@ -47,8 +47,8 @@ def make_env(
             ``{"name": "gan", "noise_scale": 0.5}``.
         num_envs: N, environments side by side.
         env: an option of the group ``env``: ``highway``, ``dense``, or a scenario such as ``cut_in``.
-        observation: ``table3``, ``table3_progress``, ``lane_view``, ``table3_lane_view``, ``fixed_order``, or a
-            mapping.
+        observation: ``table3``, ``table3_progress``, ``lane_view``, ``lane_view_drift``,
+            ``table3_lane_view``, ``fixed_order``, or a mapping.
         reward: ``paper``, or a mapping of what differs from it, ``{"hard_crash": -200}``.
         transforms: your own, after observation and reward.
         seed: base of the random numbers.

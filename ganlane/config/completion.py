@@ -47,8 +47,8 @@ def _asked(arguments: Sequence[str]) -> tuple[str, str]:
         action, equals, shell = argument.partition("=")
         if equals and action in ACTIONS and shell in SHELLS:
             return action, shell
-    given = " ".join(arguments)
-    raise UserError(f'{given}: expected for instance eval "$({PROGRAM} -sc install=bash)"; shells: {", ".join(SHELLS)}.')
+    example = f'eval "$({PROGRAM} -sc install=bash)"'
+    raise UserError(f"{' '.join(arguments)}: expected for instance {example}; shells: {', '.join(SHELLS)}.")
 
 
 def candidates(line: str, commands: Collection[str]) -> list[str]:

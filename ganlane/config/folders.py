@@ -48,8 +48,11 @@ def put_back_after_mistakes(folder: Path) -> Iterator[None]:
     except (UserError, OSError):
         from ganlane.files import write_bytes
 
-        for name, content in kept.items():
-            write_bytes(folder / name, content)
+        for name in (OVERRIDES, CONFIG):
+            if name in kept:
+                write_bytes(folder / name, kept[name])
+            else:
+                (folder / name).unlink(missing_ok=True)
         raise
 
 

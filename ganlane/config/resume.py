@@ -35,8 +35,25 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
     if run is None:
         print(f"resume=auto: no unfinished run below {_RUNS / command}; a new one is started.", file=sys.stderr)
         return without_repetitions([*overrides, "resume=null"])
-    stored = [str(override) for override in OmegaConf.load(run / OVERRIDES)]
+    stored = _stored(run / OVERRIDES)
     return without_repetitions([*stored, *overrides, f"resume='{run}'", f"hydra.run.dir='{run}'"])
+
+
+def _stored(path: Path) -> list[str]:
+    """The command line of a run.
+
+    Raises:
+        UserError: the file is not a list of overrides.
+    """
+    try:
+        found = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception:  # what is no YAML, or no text, fails in many ways
+        found = None
+    if not isinstance(found, list) or not all(isinstance(override, str) for override in found):
+        raise UserError(
+            f"{path}: damaged, expected a list of key=value; write the run's command line there, or start a new run."
+        )
+    return [str(override) for override in found]
 
 
 def _asked(overrides: Sequence[str]) -> str | None:

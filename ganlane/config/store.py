@@ -16,7 +16,7 @@ from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorConfig
 from ganlane.config.init import InitConfig, NoInitConfig
-from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig
+from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.prepare import PrepareConfig
 from ganlane.config.realism import RealismConfig
@@ -75,7 +75,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "collector": {"single": CollectorConfig},
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},
-    "logger": {"csv": LoggerConfig, "tensorboard": TensorBoardLoggerConfig},
+    "logger": {"csv": LoggerConfig, "tensorboard": TensorBoardLoggerConfig, "wandb": WandbLoggerConfig},
 }
 SUFFIX = "_schema"
 

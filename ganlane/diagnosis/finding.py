@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-
 #: What to do where a part cannot even be looked at.
 BROKEN = "mend what is MISSING above, then run ganlane doctor again"
 

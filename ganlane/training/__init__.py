@@ -9,6 +9,6 @@
 from ganlane.training.checkpoints import find_checkpoint
 from ganlane.training.config import TrainingConfig, TrainingResult
 from ganlane.training.loop import train
-from ganlane.training.tensorboard import TensorBoardLog
+from ganlane.training.further import make_logs
 
-__all__ = ["TensorBoardLog", "TrainingConfig", "TrainingResult", "find_checkpoint", "train"]
+__all__ = ["TrainingConfig", "TrainingResult", "find_checkpoint", "make_logs", "train"]

@@ -37,12 +37,11 @@ class WandbLog:
         mode = os.environ.get("WANDB_MODE") or "offline"
         folder.mkdir(parents=True, exist_ok=True)
         name = "/".join(folder.absolute().parts[-2:])
-        # Without a console of its own: it would take the progress bar's stream away.
-        quiet = wandb.Settings(console="off")
+        options: dict[str, Any] = {"project": project, "name": name, "dir": str(folder), "mode": mode}
         try:
-            self._run = wandb.init(
-                project=project, name=name, dir=str(folder), mode=mode, config=dict(about or {}), settings=quiet
-            )
+            # Without W&B's console, which would take the progress bar's stream away.
+            settings = wandb.Settings(console="off")
+            self._run = wandb.init(config=dict(about or {}), settings=settings, **options)
         except (wandb.Error, ValueError) as error:
             raise UserError(
                 f"logger=wandb with WANDB_MODE={mode}: W&B did not start ({error}); use WANDB_MODE=offline or "

@@ -16,6 +16,7 @@ from ganlane.transforms.table3 import ObservationScale, Others
 NEARNESS_M = 15.0
 CAR_LENGTH_M = 4.5
 LANE_VIEW_SIZE = 18
+DRIFT_SIZE = 6
 
 
 #: Lane to the left, own, to the right, each ahead (+1) and behind (-1).
@@ -31,10 +32,12 @@ def lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
     return torch.round(others.lane * widest)
 
 
-def lane_view(others: Others, lanes: int | Tensor, scale: ObservationScale) -> Tensor:
+def lane_view(others: Others, lanes: int | Tensor, scale: ObservationScale, drift: bool = False) -> Tensor:
     """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) for nobody.
 
-    The gap is over the range of sight; somebody beside the ego counts as behind.
+    The gap is over the range of sight; somebody beside the ego counts as behind. With ``drift`` [N, 24]: a fourth
+    number tells where in its lane that vehicle is (:attr:`Others.drift`), by which a lane change shows before its
+    middle; this is information that Table III does not have.
     """
     side, way = (others.position.new_tensor(each)[:, None] for each in (_SIDES, _WAYS))
     distance = others.position[:, None, :] * way
@@ -43,9 +46,14 @@ def lane_view(others: Others, lanes: int | Tensor, scale: ObservationScale) -> T
     counts = in_sight & there & (lane_offset(others, lanes)[:, None, :] == side)
     distance = torch.add(distance, ~counts, alpha=_NOBODY)
     nearest = distance.amin(-1, keepdim=True)
-    speed = torch.add(others.speed[:, None, :], distance > nearest, alpha=_NOBODY).amin(-1, keepdim=True)
-    found = nearest <= 1.0
+    farther, found = distance > nearest, nearest <= 1.0
+
+    def of_the_nearest(field: Tensor) -> Tensor:
+        value = torch.add(field[:, None, :], farther, alpha=_NOBODY).amin(-1, keepdim=True)
+        return torch.where(found, value, 0.0)
+
     gap_m = (nearest * scale.range_m - CAR_LENGTH_M).clamp_min(0.0)
     gap = torch.where(found, gap_m / scale.range_m, 1.0)
     nearness = torch.where(found, torch.exp(-gap_m / NEARNESS_M), 0.0)
-    return torch.cat((gap, nearness, torch.where(found, speed, 0.0)), dim=-1).flatten(1)
+    seen = (gap, nearness, of_the_nearest(others.speed), *((of_the_nearest(others.drift),) if drift else ()))
+    return torch.cat(seen, dim=-1).flatten(1)

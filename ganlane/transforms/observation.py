@@ -16,7 +16,7 @@ from ganlane.errors import UserError
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.transforms.fixed_order import fixed_order, places
-from ganlane.transforms.lane_view import LANE_VIEW_SIZE, lane_view
+from ganlane.transforms.lane_view import DRIFT_SIZE, LANE_VIEW_SIZE, lane_view
 from ganlane.transforms.sensors import perceived
 from ganlane.transforms.table3 import (
     ObservationScale,
@@ -29,12 +29,16 @@ from ganlane.transforms.table3 import (
 
 
 class Form(NamedTuple):
-    """What follows the own state: the list, nearest first; the lane view; own lane change; a place for every role."""
+    """What follows the own state: the list, nearest first; the lane view; own lane change; a place for every role.
+
+    ``drift`` adds to the lane view where in their lanes the others are.
+    """
 
     listed: bool = False
     viewed: bool = False
     progress: bool = False
     placed: bool = False
+    drift: bool = False
 
 
 OBSERVATIONS: Final = {
@@ -42,6 +46,7 @@ OBSERVATIONS: Final = {
     "table3_progress": Form(listed=True, progress=True),
     "lane_view": Form(viewed=True, progress=True),
     "table3_lane_view": Form(listed=True, viewed=True, progress=True),
+    "lane_view_drift": Form(viewed=True, progress=True, drift=True),
     "fixed_order": Form(placed=True, progress=True),
 }
 
@@ -50,7 +55,7 @@ def observation_size(name: str, vehicles: int) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
     form, others = OBSERVATIONS[name], vehicles - 1
     listed = 3 * (form.listed * others + form.placed * places(others))
-    return 3 + listed + form.viewed * LANE_VIEW_SIZE + form.progress * 2
+    return 3 + listed + form.viewed * LANE_VIEW_SIZE + form.drift * DRIFT_SIZE + form.progress * 2
 
 
 class ObservationTransform(Transform):
@@ -61,7 +66,8 @@ class ObservationTransform(Transform):
         vehicles: M, the ego included.
         form: ``table3`` (the paper's literal 3 + 3 (M - 1) numbers), ``table3_progress`` (and the ego's own
             lane change: progress 0 to 1, direction -1, 0 or 1), ``lane_view`` (own state, lane view, lane
-            change), ``table3_lane_view`` (all of it), ``fixed_order`` (as ``table3_progress``, with a place for
+            change), ``lane_view_drift`` (and where in their lanes the others are), ``table3_lane_view`` (list and lane
+            view), ``fixed_order`` (as ``table3_progress``, with a place for
             every lane and role in the list's stead).
         scale: normalisers.
 
@@ -100,7 +106,7 @@ class ObservationTransform(Transform):
         if form.placed:
             parts.append(as_list(fixed_order(others, distance_to_ego(seen, road), road.lanes)))
         if form.viewed:
-            parts.append(lane_view(others, road.lanes, self.scale))
+            parts.append(lane_view(others, road.lanes, self.scale, form.drift))
         if form.progress:
             parts.append(torch.stack((progress, direction.to(progress.dtype)), dim=1))
         return torch.cat(parts, dim=1)

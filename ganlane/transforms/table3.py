@@ -23,13 +23,15 @@ class ObservationScale:
 class Others(NamedTuple):
     """The other vehicles as the ego sees them, each [N, M - 1], normalised and clipped to [-1, 1].
 
-    Relative position, relative speed, lane difference (to the left is positive), and whether there is one.
+    Relative position, relative speed, lane difference (to the left is positive), whether there is one; and, which
+    Table III does not have, where in its lane it is: 0 in the middle, 1 on the line to the left, -1 to the right.
     """
 
     position: Tensor
     speed: Tensor
     lane: Tensor
     valid: Tensor
+    drift: Tensor
 
 
 def own_state(vehicles: Vehicles, road: Road) -> Tensor:
@@ -51,8 +53,18 @@ def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> O
     lane = ((road.lane_of(others.y) - road.lane_of(ego.y)) / widest).clamp(-1.0, 1.0)
     there = others.valid
     return Others(
-        torch.where(there, position, 1.0), torch.where(there, speed, 0.0), torch.where(there, lane, 0.0), there
+        torch.where(there, position, 1.0),
+        torch.where(there, speed, 0.0),
+        torch.where(there, lane, 0.0),
+        there,
+        torch.where(there, drift_of(others.y, road), 0.0),
     )
+
+
+def drift_of(y: Tensor, road: Road) -> Tensor:
+    """Distance to the left of the middle of one's lane over half of the lane's width, clipped to [-1, 1]."""
+    off_m = y - road.centre_of(road.lane_of(y), y.dtype)
+    return (2.0 * off_m / road.lane_width_m).clamp(-1.0, 1.0)
 
 
 def nearest_first(others: Others, distance: Tensor) -> Others:

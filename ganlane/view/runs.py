@@ -30,7 +30,7 @@ PANELS = (
     Drawn("mean return", "mean_return"),
     Drawn("crash rate", "crash_rate"),
     Drawn("lane changes per km", "lane_changes_per_km"),
-    Drawn("mean Q; dashed: realised discounted return", "mean_q", "mean_discounted_return"),
+    Drawn("mean Q (replayed); dashed: discounted return", "mean_q", "mean_discounted_return"),
     Drawn("evaluation: mean return", f"{EVALUATION}mean_reward"),
     Drawn("evaluation: crash rate", f"{EVALUATION}crash_rate"),
     Drawn("evaluation: lane changes per km", f"{EVALUATION}lane_changes_per_km"),

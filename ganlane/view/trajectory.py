@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -124,9 +125,9 @@ class Trajectory:
         first = int(np.searchsorted(self.time_s, start_s - 1e-9))
         if first == len(self):
             raise UserError(f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it.")
-        told = {each.name: getattr(self, each.name) for each in fields(self)}
-        per_frame = {name: value for name, value in told.items() if isinstance(value, np.ndarray) and value.size}
-        return replace(self, **{name: value[first:] for name, value in per_frame.items()})
+        told: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        later = {name: value[first:] for name, value in told.items() if isinstance(value, np.ndarray) and value.size}
+        return Trajectory(**{**told, **later})
 
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""

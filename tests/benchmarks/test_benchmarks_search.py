@@ -16,7 +16,7 @@ def make_run(folder, config, evaluations=(), metrics=((1000, 2.0),)):
     lines = ["decisions,wall_s", *(f"{decisions},{seconds}" for decisions, seconds in metrics)]
     (folder / "metrics.csv").write_text("\n".join(lines) + "\n")
     if evaluations:
-        head = "decisions,mean_reward,mean_reward_se,crash_rate,lane_changes_per_km"
+        head = "decisions,mean_reward,standard_error,crash_rate,lane_changes_per_km"
         rows = [",".join(map(str, row)) for row in evaluations]
         (folder / "evaluation.csv").write_text("\n".join([head, *rows]) + "\n")
 

@@ -22,10 +22,12 @@ def scene(rows, valid=None):
     )
 
 
-def observe(form, rows, valid=None, lanes=3, progress=0.0, direction=0):
+def observe(form, rows, valid=None, lanes=3, progress=0.0, direction=0, sideways=0.0):
     transform = ObservationTransform(Road(lanes), len(rows), form)
     ones = torch.ones(1, dtype=torch.float64)
-    return transform.observe(scene(rows, valid), progress * ones, torch.tensor([direction]), transform.road)[0]
+    vehicles = scene(rows, valid)
+    vehicles = vehicles.with_(y=vehicles.y + sideways)
+    return transform.observe(vehicles, progress * ones, torch.tensor([direction]), transform.road)[0]
 
 
 EGO = (0.0, 1, 20.0, 25.0)
@@ -88,6 +90,14 @@ def test_the_lane_view_holds_the_nearest_ahead_and_behind_in_three_lanes():
     assert view[3].tolist() == pytest.approx([30.0 / 200, torch.exp(torch.tensor(-2.0)).item(), -0.2])
     for index in (1, 2, 4, 5):
         assert view[index].tolist() == nothing
+
+
+def test_a_lane_change_shows_in_the_drift_before_its_middle():
+    rows = [EGO, (50.0, 2, 26.0, 20.0), (-34.5, 1, 14.0, 20.0)]
+    sideways = torch.tensor([[0.0, -1.2, 0.5]])
+    view = observe("lane_view_drift", rows, sideways=sideways)[3:-2].reshape(6, 4)
+    assert view[:, 3].tolist() == pytest.approx([-0.6, 0.0, 0.0, 0.25, 0.0, 0.0])
+    assert torch.equal(view[:, :3].flatten(), observe("lane_view", rows)[3:-2])
 
 
 @pytest.mark.parametrize("form", list(OBSERVATIONS))

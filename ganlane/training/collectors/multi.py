@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -20,12 +20,12 @@ class MultiSource(WorkerSource):
     name = "multi"
 
     def start(
-        self, environments: list[Callable[[], EnvBase]], policies: list[Callable[[], Any]], frames: int
+        self, environments: Sequence[Callable[[], EnvBase]], policies: Sequence[Callable[[], Any]], frames: int
     ) -> BaseCollector:
         """One process per worker, with one thread each."""
         return MultiSyncCollector(
-            environments,
-            policy_factory=policies,
+            list(environments),
+            policy_factory=list(policies),
             frames_per_batch=frames * self.team.workers,
             cat_results=0,
             use_buffers=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -40,7 +40,7 @@ class RaySource(WorkerSource):
             raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
 
     def start(
-        self, environments: list[Callable[[], EnvBase]], policies: list[Callable[[], Any]], frames: int
+        self, environments: Sequence[Callable[[], EnvBase]], policies: Sequence[Callable[[], Any]], frames: int
     ) -> BaseCollector:
         """An actor per worker."""
         from torchrl.collectors.distributed import RayCollector
@@ -52,8 +52,8 @@ class RaySource(WorkerSource):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return RayCollector(
-                environments,
-                policy_factory=policies,
+                list(environments),
+                policy_factory=list(policies),
                 frames_per_batch=frames * self.team.workers,
                 total_frames=sys.maxsize,  # its default, -1, is none at all
                 sync=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -73,7 +73,7 @@ class WorkerSource(Source):
 
     @abstractmethod
     def start(
-        self, environments: list[Callable[[], EnvBase]], policies: list[Callable[[], Any]], frames: int
+        self, environments: Sequence[Callable[[], EnvBase]], policies: Sequence[Callable[[], Any]], frames: int
     ) -> BaseCollector:
         """A collector that makes these environments and policies; ``frames`` decisions of each worker at a time."""
 

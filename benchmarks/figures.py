@@ -15,8 +15,7 @@ from pathlib import Path
 from PIL import Image
 
 from ganlane.data import default_scenes, read_scenes, scene_lane_widths
-from ganlane.evaluation.realism_recordings import recorded_frame, recordings_of
-from ganlane.evaluation.realism_simulation import StartOptions, drive_recordings
+from ganlane.evaluation.realism import StartOptions, drive_recordings, recorded_frame, recordings_of
 from ganlane.generator import Discriminator, load_generator, shipped_generator
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road

@@ -11,7 +11,7 @@
 set -eu
 export OMP_NUM_THREADS=1
 python="${PYTHON:-python}"
-rivals='against=[gan,idm_mobil,idm,ganlane.evaluation.realism_drivers.HeadwayIdm]'
+rivals='against=[gan,idm_mobil,idm,ganlane.evaluation.realism.drivers.HeadwayIdm]'
 
 "$python" -m ganlane.realism traffic=gan_calibrated "$rivals" scenes=all long_against=true \
     report=docs/realism.md figures=docs/figures

@@ -24,9 +24,7 @@ from ganlane.config.realism import RealismConfig
 from ganlane.errors import UserError
 
 if TYPE_CHECKING:
-    from ganlane.evaluation.realism_folds import Fold
-    from ganlane.evaluation.realism_simulation import Factory
-    from ganlane.evaluation.realism_starts import Starts
+    from ganlane.evaluation.realism import Factory, Fold, Starts
 
 
 def _say(text: str) -> None:
@@ -78,7 +76,7 @@ def _with_weights(name: str, traffic: Any, weights: Mapping[str, Path]) -> Any:
 
 def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
     """Who starts from which of ``scenes``: the held-out ones (or all), or all by folds."""
-    from ganlane.evaluation.realism_folds import Fold, check_cover, fold_weights
+    from ganlane.evaluation.realism import Fold, check_cover, fold_weights
     from ganlane.generator import HELD_OUT
 
     if not config.fold_weights:
@@ -106,8 +104,7 @@ def drive_from_starts(config: RealismConfig, makers: Mapping[str, Factory], path
     """Everybody from recorded scenes, or from spawned ones where there are none."""
     from ganlane.build import make_road
     from ganlane.data import read_scenes
-    from ganlane.evaluation.realism_simulation import StartOptions
-    from ganlane.evaluation.realism_starts import recorded_starts, spawned_starts
+    from ganlane.evaluation.realism import StartOptions, recorded_starts, spawned_starts
 
     if path is None:
         spawn = config.env.spawn_parameters()
@@ -122,18 +119,18 @@ def drive_from_starts(config: RealismConfig, makers: Mapping[str, Factory], path
 
 def i80_beside(config: RealismConfig, path: Path | None) -> dict[str, Path]:
     """The I-80 files beside the scenes, by name, as far as they are wanted."""
-    from ganlane.evaluation.realism_i80 import FILES, i80_files
+    from ganlane.evaluation.realism import I80_FILES, i80_files
 
     files = {} if path is None or config.i80 is False else i80_files(path.parent)
     if config.i80 and not files:
-        raise UserError(f"i80=true: none of {', '.join(FILES.values())} lies beside the scenes; use i80=false.")
+        raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies beside the scenes; use i80=false.")
     return files
 
 
 def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
     """One long run of a traffic per number of vehicles."""
     from ganlane.build import make_road
-    from ganlane.evaluation.realism_long import LongRunParameters, long_run
+    from ganlane.evaluation.realism import LongRunParameters, long_run
 
     spawn, runs = config.env.spawn_parameters(), []
     for vehicles in config.long_vehicles if config.vehicle_km > 0 else []:
@@ -148,7 +145,7 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
 
 def rows_of(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
     """The rows of a traffic's card, by quantity."""
-    from ganlane.evaluation.realism_card import quantity_rows
+    from ganlane.evaluation.realism import quantity_rows
 
     others = {name: each for name, each in starts.driven.items() if name != traffic}
     own, held_against = starts.driven[traffic], (starts.recorded, starts.reference, starts.paired)
@@ -171,7 +168,7 @@ def show(
     """The tables on stdout; tables and figures where a document wants them."""
     from datetime import date
 
-    from ganlane.evaluation.realism_document import document_text, update_document
+    from ganlane.evaluation.realism import document_text, update_document
     from ganlane.files import write_bytes
 
     print(*tables, sep="\n\n")
@@ -197,8 +194,7 @@ def command_line(folder: Path) -> str:
 
 def publish(starts: Starts) -> None:
     """Write the file that ships, with the floors as they were just measured."""
-    from ganlane.evaluation.realism_card import floors_of
-    from ganlane.evaluation.realism_reference import SHIPPED_REFERENCE
+    from ganlane.evaluation.realism import SHIPPED_REFERENCE, floors_of
 
     source = Path(starts.reference.source).name
     floors = floors_of(starts.driven, starts.recorded)
@@ -208,7 +204,7 @@ def publish(starts: Starts) -> None:
 
 def check_targets(config: RealismConfig, path: Path | None) -> None:
     """Raise :class:`UserError` where something cannot be written in the end, before anything is driven."""
-    from ganlane.evaluation.realism_document import require_markers
+    from ganlane.evaluation.realism import require_markers
 
     if config.publish and path is None:
         raise UserError("publish=true: the file that ships is made from recordings; give data.path=FILE.")
@@ -222,11 +218,7 @@ def realism(config: RealismConfig, folder: Path) -> str:
     """Drive, measure, print, draw, keep."""
     from ganlane.build import set_threads
     from ganlane.evaluation import write_results
-    from ganlane.evaluation.realism_card import from_starts
-    from ganlane.evaluation.realism_checks import card_checks
-    from ganlane.evaluation.realism_document import card_text
-    from ganlane.evaluation.realism_i80 import i80_cards
-    from ganlane.evaluation.realism_long_summary import totals
+    from ganlane.evaluation.realism import card_checks, card_text, from_starts, i80_cards, totals
 
     config = config.shortened()
     set_threads(config.threads)

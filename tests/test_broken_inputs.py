@@ -376,7 +376,8 @@ def test_an_agent_with_an_impossible_network_is_refused(name, value, capsys):
     save_weights(
         "broken.safetensors", "agent", weights, {**metadata, "network": {**metadata["network"], name: value}}
     )
-    assert "broken.safetensors" in refusal(capsys, "evaluate", "agents=[broken.safetensors]", "traffics=[idm]")
+    short = ("traffics=[idm]", "episodes=1", "env.goal_m=20")
+    assert "broken.safetensors" in refusal(capsys, "evaluate", "agents=[broken.safetensors]", *short)
 
 
 def run_folder(checkpoint: bytes, overrides: str = "[traffic=idm]") -> Path:

@@ -11,8 +11,7 @@ from PIL import Image
 
 from ganlane.config.realism import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.evaluation.realism_quantities import QUANTITIES
-from ganlane.evaluation.realism_reference import SHIPPED_REFERENCE
+from ganlane.evaluation.realism import QUANTITIES, SHIPPED_REFERENCE
 from ganlane.files import load_weights, save_weights
 from ganlane.generator import shipped_generator
 from ganlane.realism import main
@@ -184,7 +183,7 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, reco
 
 
 def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, monkeypatch, tmp_path):
-    import ganlane.evaluation.realism_reference as module
+    import ganlane.evaluation.realism as module
 
     assert not RealismConfig().publish
     there = tmp_path / "shipped.json"

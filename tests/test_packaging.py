@@ -57,5 +57,8 @@ def test_the_wheel_holds_configuration_and_weights(tmp_path):
         shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob(f"*.{kind}")}
         assert shipped
         assert shipped <= names
+    pages = [path for path in (PACKAGE / "view" / "player").iterdir() if path.suffix in (".html", ".css", ".js")]
+    assert pages
+    assert {f"ganlane/view/player/{path.name}" for path in pages} <= names
     assert "ganlane/py.typed" in names
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]

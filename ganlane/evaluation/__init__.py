@@ -8,6 +8,7 @@ on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resa
 :func:`text_table` and :func:`markdown_table` print it; :func:`write_results` and :func:`write_episodes` keep it.
 Which crashes nobody could have avoided, :func:`beam_search` tells, which looks for a way through an episode on the
 simulator itself (:mod:`~ganlane.evaluation.crash_floor`).
+Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them against recorded driving.
 """
 
 from ganlane.evaluation.beam_search import Plan, beam_search

@@ -10,9 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
-from ganlane.evaluation.realism_card import FLOORS
-from ganlane.evaluation.realism_quantities import QUANTITIES, UNITS
-from ganlane.evaluation.realism_starts import Starts
+from ganlane.evaluation.realism import FLOORS, QUANTITIES, UNITS, Starts
 from ganlane.files import atomic_path
 from ganlane.view.plot import INK, LINES, PAPER, Line, Panel
 from ganlane.view.realism_distances import draw_distances
@@ -71,7 +69,7 @@ def draw_drift(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Image.Im
     """Mean and spread of the speeds of long runs over time; the recorded spread as a level.
 
     Args:
-        runs: as :func:`ganlane.evaluation.realism_long_summary.summary` gives them.
+        runs: as :func:`ganlane.evaluation.realism.long_summary.summary` gives them.
         spread_mps: the recorded mean spread within a frame.
     """
     legend = _colours([f"{run['vehicles']} vehicles" for run in runs])

@@ -22,7 +22,7 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Image.Image:
     """A block of rows per quantity: dot and interval of each traffic, ceiling and floor as upright lines.
 
     Args:
-        quantities: rows of :func:`ganlane.evaluation.realism_card.quantity_rows`.
+        quantities: rows of :func:`ganlane.evaluation.realism.card.quantity_rows`.
         traffic: the card's own.
     """
     others = list(next(iter(quantities.values()))["against"])

@@ -36,7 +36,7 @@ def draw_space_time(scene: str, lane: int, courses: Mapping[str, pl.DataFrame]) 
     Args:
         scene: its name.
         lane: whose vehicles are drawn.
-        courses: name to trajectories (:func:`ganlane.evaluation.realism_recordings.frame_of`) of the same scene.
+        courses: name to trajectories (:func:`ganlane.evaluation.realism.recordings.frame_of`) of the same scene.
     """
     colours = dict(zip(courses, (INK, *LINES)))
     lines = [line for name, frame in courses.items() for line in lane_lines(frame, lane, colours[name])]

@@ -76,11 +76,14 @@ class RaySource(WorkerSource):
         return batch.flatten(0, 1)
 
     def failure(self, error: Exception) -> str | None:
-        """No cluster, or an actor that is gone."""
+        """No cluster, an actor that is gone, or no Ray."""
+        import ray
         from ray.exceptions import RayActorError
 
         if isinstance(error, ConnectionError):
             return f"no Ray cluster answers at collector.address={self.address}, start one or leave the address out"
         if isinstance(error, RayActorError):
             return "a worker died or its machine was lost"
+        if not ray.is_initialized():
+            return f"Ray could not be started ({str(error).partition('.')[0]}), see whether the machine is overloaded"
         return None

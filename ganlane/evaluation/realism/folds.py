@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
 from ganlane.errors import UserError
-from ganlane.evaluation.realism_card import Driven
-from ganlane.evaluation.realism_quantities import QUANTITIES, Measured
-from ganlane.evaluation.realism_simulation import Factory, StartOptions
+from ganlane.evaluation.realism.driving import Driven
+from ganlane.evaluation.realism.quantities import QUANTITIES, Measured
+from ganlane.evaluation.realism.simulation import Factory
 from ganlane.files import load_weights
 
 
@@ -72,9 +72,3 @@ def merged(parts: Sequence[Driven]) -> Driven:
     samples = {name: pl.concat([part.measured.samples[name] for part in parts]) for name in QUANTITIES}
     counts = {name: np.concatenate([part.counts[name] for part in parts]) for name in QUANTITIES}
     return Driven(counts, Measured(samples, changes, km))
-
-
-def mean_options(parts: Sequence[Mapping[str, StartOptions]], options: StartOptions) -> dict[str, StartOptions]:
-    """By traffic, the mean of the folds' fitted desired speeds: for where no fold belongs."""
-    means = {name: float(np.mean([part[name].desired_above_mps for part in parts])) for name in parts[0]}
-    return {name: replace(options, desired_above_mps=excess) for name, excess in means.items()}

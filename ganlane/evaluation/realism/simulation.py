@@ -21,9 +21,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.evaluation.realism_headways import with_shown_headways
-from ganlane.evaluation.realism_recordings import Recording, frame_of
-from ganlane.evaluation.realism_script import Script, enter, enters, leave, parked
+from ganlane.evaluation.realism.headways import with_shown_headways
+from ganlane.evaluation.realism.recordings import Recording, frame_of
+from ganlane.evaluation.realism.script import Script, enter, enters, leave, parked
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

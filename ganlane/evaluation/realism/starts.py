@@ -1,10 +1,9 @@
-"""From where everybody drives: the recorded scenes, or, without recordings, spawned ones."""
+"""Everybody from the same starts, and what that is held against: here, the recorded scenes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,26 +11,13 @@ import polars as pl
 
 from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.evaluation.realism_card import (
-    FLOORS,
-    Driven,
-    Report,
-    drive_all,
-    driven_of,
-    fit_excess,
-    measure_recordings,
-)
-from ganlane.evaluation.realism_folds import Fold, mean_options, merged
-from ganlane.evaluation.realism_long import LongRunParameters, spawned_frame
-from ganlane.evaluation.realism_quantities import QUANTITIES, Measured, measure
-from ganlane.evaluation.realism_recordings import SHORTEST_S, Recording, recordings_of
-from ganlane.evaluation.realism_reference import SHIPPED_REFERENCE, Reference, quantiles_of, rate, reference_of
-from ganlane.evaluation.realism_simulation import Factory, StartOptions
-from ganlane.sim.road import Road
-from ganlane.sim.spawn import SpawnParameters
-
-#: Without recordings: vehicles of an episode, its seconds, and episodes per repeat.
-_SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8
+from ganlane.evaluation.realism.driving import FLOORS, Driven, Report, drive_all, measure_recordings
+from ganlane.evaluation.realism.fitting import desired_speeds, mean_options
+from ganlane.evaluation.realism.folds import Fold, merged
+from ganlane.evaluation.realism.quantities import QUANTITIES, Measured
+from ganlane.evaluation.realism.recordings import SHORTEST_S, recordings_of
+from ganlane.evaluation.realism.reference import Reference, quantiles_of, rate, reference_of
+from ganlane.evaluation.realism.simulation import StartOptions
 
 
 @dataclass(frozen=True)
@@ -155,47 +141,3 @@ def _check_names(held_out: Sequence[str], names: Sequence[str], source: str) -> 
 def _seen(measured: Measured) -> dict[str, Any]:
     changes, km = sum(measured.lane_changes.values()), sum(measured.vehicle_km.values())
     return rate(changes, km) | {"quantiles": quantiles_of(measured)}
-
-
-def desired_speeds(
-    makers: Mapping[str, Factory], fitted: Sequence[Recording], common: StartOptions, report: Report
-) -> dict[str, StartOptions]:
-    """How each traffic is driven: desired speeds fitted to ``fitted``, if there are any; floors as ``common``."""
-    chosen = {name: common for name in FLOORS}
-    for name, make in makers.items():
-        chosen[name] = common
-        if fitted:
-            report(f"{name}: fitting desired speeds on {len(fitted)} scenes")
-            chosen[name] = replace(common, desired_above_mps=fit_excess(make, fitted, common))
-    return chosen
-
-
-def spawned_starts(
-    makers: Mapping[str, Factory],
-    road: Road,
-    spawn: SpawnParameters,
-    repeats: int,
-    seed: int,
-    report: Report,
-    path: Path = SHIPPED_REFERENCE,
-) -> Starts:
-    """Without recordings: everybody from the same spawned scenes, held against the histograms that ship.
-
-    Args:
-        makers: traffics by name, the card's own first.
-        road, spawn: where and how vehicles start (Table II at the paper's density).
-        repeats: 8 episodes of 30 vehicles and 30 s each.
-        seed: of the random numbers.
-        report: told what begins.
-        path: the histograms.
-    """
-    reference, rows = Reference.load(path), _SPAWNED_ROWS * repeats
-    report(f"no recordings here: spawned starts against {path.name}; give data.path=FILE for the fair comparison")
-    parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
-    scenes = [f"spawned-{row}" for row in range(rows)]
-    widths, driven = dict.fromkeys(scenes, float(road.lane_width_m)), {}
-    for name, make in makers.items():
-        report(f"{name} from {rows} spawned starts")
-        driven[name] = driven_of(measure(spawned_frame(make, road, parameters, rows), widths), scenes)
-    seen = rate(reference.lane_changes, reference.vehicle_km) | {"quantiles": reference.quantiles}
-    return Starts("spawned", [], [], {}, driven, reference.counts, seen, reference)

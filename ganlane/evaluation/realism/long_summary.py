@@ -9,8 +9,7 @@ import numpy as np
 
 from ganlane.data import lane_changes_of_arrays
 from ganlane.evaluation.counts import poisson_interval
-from ganlane.evaluation.realism_events import EventCounter
-from ganlane.evaluation.realism_guard import GuardMeter
+from ganlane.evaluation.realism.counters import EventCounter, GuardMeter
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.road import Road
 

@@ -20,13 +20,14 @@ from ganlane.data.lane_widths import STANDARD_LANE_WIDTH_M
 from ganlane.data.schema import FRAME_S
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
-from ganlane.evaluation.realism_card import Report, drive_all, measure_recordings, quantity_rows, units_of
-from ganlane.evaluation.realism_distances import ceiling
-from ganlane.evaluation.realism_recordings import Recording, stretches
-from ganlane.evaluation.realism_simulation import Factory, StartOptions
+from ganlane.evaluation.realism.card import quantity_rows
+from ganlane.evaluation.realism.distances import ceiling
+from ganlane.evaluation.realism.driving import Report, drive_all, measure_recordings, units_of
+from ganlane.evaluation.realism.recordings import Recording, stretches
+from ganlane.evaluation.realism.simulation import Factory, StartOptions
 
 #: Name to file.
-FILES: Final = {"lane_1": "i80_1600_lane1.csv", "pairs": "i80_1600_pairs.csv", "following": "i80_following.csv"}
+I80_FILES: Final = {"lane_1": "i80_1600_lane1.csv", "pairs": "i80_1600_pairs.csv", "following": "i80_following.csv"}
 #: What can be said of one lane.
 I80_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
 STRETCH_S: Final = 15.0
@@ -39,14 +40,14 @@ _NUMBERS = {"frame": pl.Int64, "x": pl.Float64}
 
 def i80_files(folder: Path) -> dict[str, Path]:
     """Those of the three files that lie in ``folder``, by name."""
-    return {name: folder / file for name, file in FILES.items() if (folder / file).is_file()}
+    return {name: folder / file for name, file in I80_FILES.items() if (folder / file).is_file()}
 
 
 def read_i80(name: str, path: Path) -> list[Recording]:
     """Stretches of 15 s from one of the files.
 
     Args:
-        name: which of :data:`FILES` it is.
+        name: which of :data:`I80_FILES` it is.
         path: the file.
 
     Raises:
@@ -139,7 +140,7 @@ def i80_cards(
     resamples: int,
     report: Report,
 ) -> dict[str, Any]:
-    """By file, the rows of :func:`ganlane.evaluation.realism_card.quantity_rows`; nothing is fitted to the site.
+    """By file, the rows of :func:`ganlane.evaluation.realism.card.quantity_rows`; nothing is fitted to the site.
 
     Args:
         makers: traffics by name, the card's own first.

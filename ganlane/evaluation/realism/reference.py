@@ -12,8 +12,8 @@ import numpy as np
 
 from ganlane.errors import UserError
 from ganlane.evaluation.counts import poisson_interval
-from ganlane.evaluation.realism_distances import Array, ceiling
-from ganlane.evaluation.realism_quantities import QUANTITIES, Measured
+from ganlane.evaluation.realism.distances import Array, ceiling
+from ganlane.evaluation.realism.quantities import QUANTITIES, Measured
 from ganlane.files import write_json
 from ganlane.paths import CHECKPOINTS
 

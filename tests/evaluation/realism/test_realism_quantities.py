@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ganlane.evaluation.realism_quantities import QUANTITIES, measure
-from ganlane.evaluation.realism_recordings import Recording, recorded_frame, stretches
+from ganlane.evaluation.realism.quantities import QUANTITIES, measure
+from ganlane.evaluation.realism.recordings import Recording, recorded_frame, stretches
 
 
 def recording(x, y=None, name="scene", lanes=3, present=None):

@@ -5,17 +5,14 @@ import polars as pl
 import pytest
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
-from ganlane.evaluation.realism_card import drive, fit_excess, measure_recordings, quantity_rows
-from ganlane.evaluation.realism_distances import pooled_distance
-from ganlane.evaluation.realism_drivers import ConstantVelocity, RandomDriving
-from ganlane.evaluation.realism_quantities import QUANTITIES
-from ganlane.evaluation.realism_recordings import Recording, recorded_frame, recordings_of
-from ganlane.evaluation.realism_simulation import StartOptions, drive_recordings
+from ganlane.evaluation.realism.distances import pooled_distance
+from ganlane.evaluation.realism.drivers import ConstantVelocity, RandomDriving
+from ganlane.evaluation.realism.driving import drive, measure_recordings
+from ganlane.evaluation.realism.recordings import Recording, recorded_frame, recordings_of
+from ganlane.evaluation.realism.simulation import StartOptions, drive_recordings
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic import IdmMobilTraffic, TrafficModule
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
-
-WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"]
 
 
 def steady(**changed):
@@ -121,42 +118,6 @@ def test_every_traffic_stays_finite_from_recorded_starts(make):
     for name in ("x", "y"):
         assert there[name].is_finite().all()
     assert there["lane"].is_between(0, 2).all()
-
-
-def test_the_excess_that_was_used_is_the_one_that_is_fitted():
-    def eager(road):
-        return Eager(road)
-
-    class Eager(ConstantVelocity):
-        """Drives at its desired speed at once."""
-
-        def move(self, vehicles, memory, key, step):
-            return super().move(vehicles.with_(speed=vehicles.desired_speed), memory, key, step)
-
-    time = np.arange(80)[:, None] * 0.1
-    random = np.random.default_rng(0)
-    speed = 10.0 + 8.0 * random.uniform(size=30)
-    x = 100.0 * np.arange(30) + speed * time
-    shown = np.broadcast_to(np.where(np.arange(80)[:, None] == 0, 10.0, speed), x.shape).copy()
-    size = np.ones(30)
-    scene = Recording("a", "a", 1, 3.5, x, 0 * x, shown, x >= 0, 4 * size, 2 * size, size > 0)
-    assert fit_excess(eager, [scene], StartOptions(repeats=1), (1.0, 4.0, 8.0)) == 4.0
-
-
-def test_a_card_puts_the_model_between_its_ceiling_and_its_floors():
-    frame = synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2))
-    recordings = recordings_of(frame, scene_lane_widths(frame))
-    units = [each.name for each in recordings]
-    measured = measure_recordings(recordings)
-    recorded = {name: measured.counts(units, name) for name in QUANTITIES}
-    makers = {"cruise": ConstantVelocity, "random": RandomDriving, "constant_velocity": ConstantVelocity}
-    driven = {name: drive(make, recordings, StartOptions()) for name, make in makers.items()}
-    own = driven.pop("cruise")
-    rows = quantity_rows(own, {**driven, "rival": driven["random"]}, recorded, None, resamples=100)
-    assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
-    assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
-    assert rows["speed"]["against"].keys() == {"rival"}
-    assert all(rows[name]["samples"] > 0 for name in WITHOUT_CHANGES)
 
 
 def test_the_floor_drives_neither_backwards_nor_smoothly():

@@ -7,10 +7,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ganlane.evaluation.realism_drivers import HeadwayIdm
-from ganlane.evaluation.realism_headways import balanced_headways, with_shown_headways
-from ganlane.evaluation.realism_recordings import Recording
-from ganlane.evaluation.realism_simulation import StartOptions, drive_recordings
+from ganlane.evaluation.realism.drivers import HeadwayIdm
+from ganlane.evaluation.realism.headways import balanced_headways, with_shown_headways
+from ganlane.evaluation.realism.recordings import Recording
+from ganlane.evaluation.realism.simulation import StartOptions, drive_recordings
 from ganlane.sim.following import following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.road import Road

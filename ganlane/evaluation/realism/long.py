@@ -11,16 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import polars as pl
 import torch
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.evaluation.realism_events import EventCounter
-from ganlane.evaluation.realism_guard import GuardMeter, watched
-from ganlane.evaluation.realism_long_summary import DRIFT_S, GOAL_M, Course, measured, summary
-from ganlane.evaluation.realism_recordings import Recording, frame_of
-from ganlane.evaluation.realism_simulation import Factory, step_traffic
+from ganlane.evaluation.realism.counters import EventCounter, GuardMeter, watched
+from ganlane.evaluation.realism.long_summary import DRIFT_S, GOAL_M, Course, measured, summary
+from ganlane.evaluation.realism.simulation import Factory, step_traffic
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.random import absorb, episode_key
 from ganlane.sim.road import Road
@@ -74,7 +71,7 @@ def long_run(
     while km < parameters.vehicle_km:
         rows = _rows(parameters, parameters.vehicle_km - km)
         with watched(traffic, meter):
-            course = _drive(traffic, parameters, episodes, rows, events)
+            course = drive_spawned(traffic, parameters, episodes, rows, events)
         part = measured(course, road)
         parts.append(part)
         km, episodes = km + part["vehicle_km"], episodes + rows
@@ -104,10 +101,10 @@ def spawned(traffic: TrafficModule, parameters: LongRunParameters, key: Tensor) 
     return vehicles.with_(valid=vehicles.valid & (index > 0))
 
 
-def _drive(
+def drive_spawned(
     traffic: TrafficModule, parameters: LongRunParameters, first: int, rows: int, events: EventCounter
 ) -> Course:
-    """One batch of episodes from ``first`` on."""
+    """One batch of ``rows`` episodes from number ``first`` on, from spawned starts; ``events`` counts."""
     counters = {keys.SEED: torch.full((rows,), parameters.seed), keys.EPISODE: first + torch.arange(rows)}
     key = episode_key(traffic.stream, counters[keys.SEED], counters[keys.EPISODE])
     state = spawned(traffic, parameters, key)
@@ -130,19 +127,3 @@ def _arrived(state: Vehicles, start: Tensor) -> bool:
 
 def _snapshot(state: Vehicles) -> tuple[np.ndarray, ...]:
     return tuple(getattr(state, name)[:, 1:].numpy() for name in ("x", "y", "speed"))
-
-
-def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows: int) -> pl.DataFrame:
-    """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` seconds, as recordings are measured."""
-    traffic = make(road)
-    course = _drive(traffic, parameters, 0, rows, EventCounter(road))
-    shape, body = course.x[:, 0].shape, parameters.spawn
-    nothing, everywhere = np.zeros(shape), np.ones(shape, dtype=bool)
-    length, width = np.full(shape[1], body.length_m), np.full(shape[1], body.width_m)
-    frames = []
-    for row in range(rows):
-        name, lanes, lane_width = f"spawned-{row}", int(road.lanes), float(road.lane_width_m)
-        states = (nothing, nothing, nothing, everywhere)
-        made = Recording(name, name, lanes, lane_width, *states, length, width, everywhere[0])
-        frames.append(frame_of(made, course.x[:, row], course.y[:, row], everywhere, name))
-    return pl.concat(frames)

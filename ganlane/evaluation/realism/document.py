@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.evaluation.provenance import code_version, machine
-from ganlane.evaluation.realism_table import checks_text, long_table, quantities_table, starts_table
+from ganlane.evaluation.realism.table import checks_text, long_table, quantities_table, starts_table
 from ganlane.files import split_at_markers, write_between_markers
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ganlane.evaluation.realism_recordings import Recording
+from ganlane.evaluation.realism.recordings import Recording
 from ganlane.sim.lanes import ENTRY_M
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

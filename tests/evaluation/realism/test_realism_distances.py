@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.distance import jensenshannon
 
-from ganlane.evaluation.realism_card import verdict
-from ganlane.evaluation.realism_distances import ceiling, distance, distance_difference, jensen_shannon
+from ganlane.evaluation.realism.card import verdict
+from ganlane.evaluation.realism.distances import ceiling, distance, distance_difference, jensen_shannon
 from ganlane.evaluation.statistics import Estimate
 
 COUNTS = arrays(np.float64, (2, 7), elements=st.integers(0, 50)).filter(lambda rows: rows.sum(1).min() > 0)

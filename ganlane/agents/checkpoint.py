@@ -61,7 +61,7 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
     try:
         stored = dict(metadata["network"])
         config = NetworkConfig(**{**stored, "hidden": tuple(stored["hidden"])})
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, UserError) as error:
         raise UserError(
             f"{path}: its description of the network is not understood ({error}); train the agent anew with this "
             "version of ganlane."

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from math import isfinite
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +23,8 @@ from ganlane.errors import UserError
 
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]
+#: No layer is wider: a damaged file must not ask for all memory.
+LARGEST = 65536
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,19 @@ class NetworkConfig:
     v_min: float = -120.0
     v_max: float = 120.0
     noisy_sigma: float = 0.5
+
+    def __post_init__(self) -> None:
+        sizes = {"observation_size": self.observation_size, "actions": self.actions, "atoms": self.atoms}
+        sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
+        for name, size in sizes.items():
+            if not isinstance(size, int) or not 1 <= size <= LARGEST:
+                raise UserError(f"network {name}={size!r}: expected a whole number from 1 to {LARGEST}.")
+        for name in ("noisy", "dueling", "distributional"):
+            if not isinstance(getattr(self, name), bool):
+                raise UserError(f"network {name}={getattr(self, name)!r}: expected true or false.")
+        ends = (self.v_min, self.v_max, self.noisy_sigma)
+        if not all(isinstance(end, int | float) and isfinite(end) for end in ends) or self.v_min >= self.v_max:
+            raise UserError(f"network v_min={self.v_min!r}, v_max={self.v_max!r}: expected finite numbers in order.")
 
     @property
     def outputs(self) -> int:

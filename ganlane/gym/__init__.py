@@ -19,13 +19,15 @@ from __future__ import annotations
 
 from typing import Final
 
-import gymnasium
-
 ENV_ID: Final = "ganlane/Highway-v0"
 
 
 def register_envs() -> None:
-    """Tell gymnasium of the environments; again does no harm."""
+    """Tell gymnasium of the environments; again does no harm. Without gymnasium it does nothing."""
+    try:
+        import gymnasium
+    except ModuleNotFoundError:  # the rest of the package works; 'ganlane doctor' says what is missing
+        return
     if ENV_ID not in gymnasium.registry:
         gymnasium.register(
             ENV_ID,

@@ -23,7 +23,7 @@ def save_checkpoint(path: str | Path, state: dict[str, Any]) -> None:
         torch.save({"kind": KIND, "version": VERSION, "state": state}, part)
 
 
-def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> Any:
     """Read what :func:`save_checkpoint` wrote; never executes code.
 
     Raises:
@@ -41,7 +41,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> dic
         ) from error
     if not isinstance(content, dict) or content.get("kind") != KIND or content.get("version") != VERSION:
         raise UserError(f"resume={path}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
-    return content["state"]
+    return content.get("state")  # whether a run can go on from it, the run knows
 
 
 def find_checkpoint(resume: str | Path | None, search: str | Path) -> Path | None:

@@ -15,6 +15,9 @@ from ganlane.training.checkpoints import load_checkpoint
 from ganlane.training.collectors import Source, source_of
 from ganlane.training.meter import Meter
 
+#: What the checkpoint of a run holds.
+PARTS = {"agent", "window", "carrier", "meter", "counters", "identity"}
+
 
 class Run:
     """State of a run of ``agent`` in ``env``, batch [N].
@@ -69,6 +72,8 @@ class Run:
             UserError: unreadable, or of another run.
         """
         state = load_checkpoint(path, self.agent.device)
+        if not isinstance(state, dict) or not state.keys() >= PARTS:
+            raise UserError(f"resume={path}: parts of the run are missing in it; give another checkpoint.")
         refuse_another_run(path, state["identity"], self.identity)
         exact = state["window"] is not None
         try:

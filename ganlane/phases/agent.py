@@ -1,0 +1,63 @@
+"""The agent of a phase: made, checked against what it starts from, kept at the end."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+
+from ganlane.agents import Rainbow, read_agent, save_agent
+from ganlane.agents.drivers import legal_actions
+from ganlane.agents.network import load_parameters
+from ganlane.build import make_road, observation_of
+from ganlane.config.train import TrainConfig
+from ganlane.errors import UserError
+from ganlane.phases.description import describe
+from ganlane.phases.phase import AGENT_FILE, Phase
+from ganlane.training import TrainingResult
+from ganlane.transforms import observation_size
+
+
+def make_agent(config: TrainConfig, trained: bool = False) -> Rainbow:
+    """A fresh agent for the observation of ``config``; one about to be given ``trained`` weights explores little."""
+    rainbow = config.agent.rainbow()
+    if trained:
+        rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
+    size = observation_size(config.observation.form, config.env.vehicles)
+    legal = partial(legal_actions, road=make_road(config.env))
+    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal)
+
+
+def check_observation(name: str, config: TrainConfig) -> None:
+    """Refuse to start from an agent that was trained on another observation."""
+    theirs = asdict(config.observation.read_by(observation_of(read_agent(name)[2])))
+    ours = asdict(config.observation)
+    for key, value in theirs.items():
+        if value != ours[key]:
+            option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
+            raise UserError(
+                f"init.path={name}: this agent was trained with {option}, the run has {ours[key]}; "
+                f"give {option} or start with init=none."
+            )
+
+
+def keep(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
+    """Write the agent of the phase: the best one where the run chose among several, else the last.
+
+    Its metadata hold, beside the description, the length of the run and, for the best one, its figures on the
+    stream kept for selection.
+    """
+    best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)
+    if result.best is not None and best.is_file():
+        weights, _, known = read_agent(best)
+        load_parameters(agent.network, weights)
+        chosen = {name: value for name, value in known["training"].items() if name not in metadata["training"]}
+        metadata["selected"] = {**chosen, "episodes": config.selection_episodes, "stream": "select"}
+    metadata["training"] |= {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
+    save_agent(phase.folder / AGENT_FILE, agent, metadata)
+
+
+def length_of(agent: Path) -> dict[str, float]:
+    """Decisions, updates and wall time of the finished phase that left ``agent``."""
+    training = read_agent(agent)[2]["training"]
+    return {name: training[name] for name in ("decisions", "updates", "wall_s")}

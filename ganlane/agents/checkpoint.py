@@ -85,8 +85,11 @@ def load_agent(
     weights, config, metadata = read_agent(name)
     if observation_size is not None:
         check_observation_size(name, config, observation_size)
-    network = QNetwork(config)
-    load_parameters(network, weights)
+    try:
+        network = QNetwork(config)
+        load_parameters(network, weights)
+    except UserError as error:
+        raise UserError(f"agent {name}: {error}") from error
     return GreedyPolicy(network.to(device)), metadata
 
 

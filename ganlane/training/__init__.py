@@ -8,7 +8,7 @@
 
 from ganlane.training.checkpoints import find_checkpoint
 from ganlane.training.config import TrainingConfig, TrainingResult
-from ganlane.training.loop import train
 from ganlane.training.further import make_logs
+from ganlane.training.loop import train
 
 __all__ = ["TrainingConfig", "TrainingResult", "find_checkpoint", "make_logs", "train"]

@@ -66,8 +66,8 @@ class ObservationTransform(Transform):
         vehicles: M, the ego included.
         form: ``table3`` (the paper's literal 3 + 3 (M - 1) numbers), ``table3_progress`` (and the ego's own
             lane change: progress 0 to 1, direction -1, 0 or 1), ``lane_view`` (own state, lane view, lane
-            change), ``lane_view_drift`` (and where in their lanes the others are), ``table3_lane_view`` (list and lane
-            view), ``fixed_order`` (as ``table3_progress``, with a place for
+            change), ``lane_view_drift`` (and where in their lanes the others are), ``table3_lane_view`` (list and
+            lane view), ``fixed_order`` (as ``table3_progress``, with a place for
             every lane and role in the list's stead).
         scale: normalisers.
 

@@ -16,7 +16,8 @@ from training.toy import ToyRoad
 
 from ganlane.agents import Rainbow, RainbowConfig, load_agent
 from ganlane.errors import UserError
-from ganlane.training import TrainingConfig, train
+from ganlane.training import TrainingConfig
+from ganlane.training import train as train_until_stopped
 from ganlane.training.checkpoints import load_checkpoint
 from ganlane.training.run import Run
 from ganlane.training.saver import Saver
@@ -44,6 +45,14 @@ def agent(seed=0, **options):
 
 def settings(decisions, **options):
     return TrainingConfig(decisions, **{"log_every": 400, "progress": False, **options})
+
+
+def train(*arguments, **options):
+    """A run to its end; one that a signal stops (`timeout` sends one) would fail as if with other weights."""
+    result = train_until_stopped(*arguments, **options)
+    if result.stopped_by is not None:
+        pytest.exit(f"a run was stopped by signal {result.stopped_by}", returncode=128 + result.stopped_by)
+    return result
 
 
 def rows(path):
@@ -148,7 +157,7 @@ def test_a_signal_ends_the_run_after_its_step_with_a_checkpoint(number, tmp_path
             return super()._step(tensordict)
 
     handler = signal.getsignal(number)
-    stopped = train(Interrupting(8), agent(), settings(2400), tmp_path / "parts")
+    stopped = train_until_stopped(Interrupting(8), agent(), settings(2400), tmp_path / "parts")
     assert stopped.stopped_by == number
     assert stopped.decisions == 160
     assert signal.getsignal(number) == handler
@@ -213,6 +222,8 @@ def test_writing_checkpoints_takes_at_most_a_fiftieth_of_the_time(tmp_path, monk
 
 KILLED = """
 import sys
+import torch
+torch.set_num_threads(1)
 sys.path[:0] = [{tests!r}]
 from training.test_training_loop import ToyRoad, agent, settings, train
 import ganlane.training.saver as saver

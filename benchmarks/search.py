@@ -13,6 +13,7 @@ import argparse
 import csv
 import io
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,6 +128,17 @@ def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def compact(rows: Sequence[Mapping[str, str]], options: Sequence[str]) -> list[dict[str, str]]:
+    """The same rows with the options in one cell: only those in which a run differs from what most of them have."""
+    usual = {name: Counter(row[name] for row in rows).most_common(1)[0][0] for name in options}
+    short = []
+    for row in rows:
+        own = " ".join(f"{name}={row[name]}" for name in options if row[name] != usual[name])
+        rest = {name: value for name, value in row.items() if name not in {"run", *options}}
+        short.append({"what differs": f"`{own}`" if own else "(the middle)", **rest})
+    return short
+
+
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     """The rows as a table."""
     lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
@@ -150,15 +162,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--csv", type=Path, help="where to write the table as CSV")
     given = parser.parse_args(arguments)
     try:
-        rows = table(read_runs(given.folders))
+        runs = read_runs(given.folders)
+        rows = table(runs)
+        text = markdown(compact(rows, differing(runs)))
         if given.report:
-            write_between_markers(given.report, BEGIN, END, markdown(rows))
+            write_between_markers(given.report, BEGIN, END, text)
     except UserError as error:
         print(f"search: {error}", file=sys.stderr)
         return 2
     if given.csv:
         write_bytes(given.csv, as_csv(rows).encode())
-    print(markdown(rows))
+    print(text)
     return 0
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from benchmarks.search import BEGIN, END, differing, main, read_runs, table
+from benchmarks.search import BEGIN, END, compact, differing, main, read_runs, table
 
 
 def make_run(folder, config, evaluations=(), metrics=((1000, 2.0),)):
@@ -63,6 +63,19 @@ def test_runs_are_ranked_by_their_best_evaluation(sweep):
     assert [second[name] for name in ("run", "best", "last", "decisions/s")] == ["sweep/2", "12.5", "12.5", "250"]
 
 
+def test_a_reader_sees_only_what_is_unlike_most_runs(sweep):
+    for name in ("3", "4"):
+        make_run(sweep / name, "seed: 0\nagent: {gamma: 0.98, noisy: true, hidden: [64]}\n")
+    runs = read_runs([sweep])
+    shown = [row["what differs"] for row in compact(table(runs), differing(runs))]
+    assert shown == [
+        "`agent.gamma=0.99 agent.noisy=false`",
+        "`agent.hidden=[256,256]`",
+        "(the middle)",
+        "(the middle)",
+    ]
+
+
 def test_runs_are_read_in_hydras_order(sweep):
     assert [run.name for run in read_runs([sweep])] == ["sweep/2", "sweep/10"]
 
@@ -92,9 +105,9 @@ def test_the_table_goes_into_a_document_and_a_csv_file(sweep, tmp_path, capsys):
     page.write_text(f"# Search\n\n{BEGIN}\nold\n{END}\n\nThe end.\n")
     assert main([str(sweep), "--report", str(page), "--csv", str(sheet)]) == 0
     lines = page.read_text().splitlines()
-    assert lines[3].startswith("| run | agent.gamma | agent.noisy | agent.hidden | decisions | best |")
-    assert lines[4] == f"|{' --- |' * 13}"
-    assert "| [64] |" in lines[5]
+    assert lines[3].startswith("| what differs | decisions | best |")
+    assert lines[4] == f"|{' --- |' * 10}"
+    assert "agent.hidden=[256,256]" in lines[6]
     assert lines[-1] == "The end."
     assert "old" not in lines
     with sheet.open(newline="") as file:

@@ -65,7 +65,7 @@ def test_runs_are_ranked_by_their_best_evaluation(sweep):
 
 def test_a_reader_sees_only_what_is_unlike_most_runs(sweep):
     for name in ("3", "4"):
-        make_run(sweep / name, "seed: 0\nagent: {gamma: 0.98, noisy: true, hidden: [64]}\n")
+        make_run(sweep / name, "seed: 0\nenv: {lanes: 3}\nagent: {gamma: 0.98, noisy: true, hidden: [64]}\n")
     runs = read_runs([sweep])
     shown = [row["what differs"] for row in compact(table(runs), differing(runs))]
     assert shown == [

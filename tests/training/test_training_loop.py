@@ -48,7 +48,7 @@ def settings(decisions, **options):
 
 
 def train(*arguments, **options):
-    """A run to its end; one that a signal stops (`timeout` sends one) would fail as if with other weights."""
+    """A run to its end: one that a signal stops, say the SIGTERM of `timeout`, would fail here as other weights."""
     result = train_until_stopped(*arguments, **options)
     if result.stopped_by is not None:
         pytest.exit(f"a run was stopped by signal {result.stopped_by}", returncode=128 + result.stopped_by)

@@ -24,7 +24,8 @@ class RainbowConfig:
     ``decide_when_free``: see :class:`~ganlane.agents.free_decisions.FreeDecisionWindow`.
     ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is the share of
     random legal actions, drawn beside the noise (docs/agent.md). ``adam_eps=None`` stands for
-    0.005 / ``batch_size``. ``warmup`` is the number of transitions before the first update.
+    0.005 / ``batch_size``. The learning rate falls to ``learning_rate_end`` within ``learning_rate_decisions``, if an
+    end is given. ``warmup`` is the number of transitions before the first update.
     """
 
     hidden: tuple[int, ...] = (256, 256)
@@ -49,6 +50,8 @@ class RainbowConfig:
     decisions_per_update: int = 64
     target_period: int = 500
     learning_rate: float = 2.5e-4
+    learning_rate_end: float | None = None
+    learning_rate_decisions: int = 0
     adam_eps: float | None = None
     gradient_clip: float = 10.0
     alpha: float = 0.5

@@ -83,10 +83,14 @@ class Rainbow:
         return kind(self.config.n_step, self.config.gamma)
 
     def anneal(self, decisions: int) -> None:
-        """Set the share of random actions after ``decisions``."""
+        """Set the share of random actions and the learning rate after ``decisions``."""
         config = self.config
         share = annealed(config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions)
         self.policy.epsilon = share
+        if config.learning_rate_end is not None:
+            now = annealed(config.learning_rate, config.learning_rate_end, decisions, config.learning_rate_decisions)
+            for group in self.optimizer.param_groups:
+                group["lr"] = now
 
     def store(self, transition: TensorDict | None) -> None:
         """Add transitions, batch [N], with the keys of :meth:`NStepWindow.push`; None adds nothing."""

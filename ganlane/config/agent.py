@@ -44,6 +44,8 @@ class AgentConfig:
     decisions_per_update: int = 64
     target_period: int = 500
     learning_rate: float = 2.5e-4
+    learning_rate_end: float | None = None
+    learning_rate_decisions: int = 0
     adam_eps: float | None = None
     gradient_clip: float = 10.0
     alpha: float = 0.5
@@ -68,6 +70,8 @@ class AgentConfig:
             v_max=number(),
             noisy_sigma=at_least(0),
             learning_rate=above(0),
+            learning_rate_end=optional(above(0)),
+            learning_rate_decisions=at_least(0),
             adam_eps=optional(above(0)),
             gradient_clip=above(0),
             beta_updates=at_least(0),

@@ -128,6 +128,17 @@ def test_a_share_epsilon_of_the_actions_is_random_and_legal():
     assert explorer.policy.epsilon == RainbowConfig().epsilon
 
 
+def test_the_learning_rate_falls_in_a_straight_line_and_stays():
+    falling = Rainbow(
+        RainbowConfig(**SMALL, learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_decisions=100), SIZE
+    )
+    rates = []
+    for decisions in (0, 50, 100, 200):
+        falling.anneal(decisions)
+        rates.append(falling.optimizer.param_groups[0]["lr"])
+    assert rates == pytest.approx([1e-3, 5.5e-4, 1e-4, 1e-4])
+
+
 def test_noisy_agents_draw_random_actions_too_unless_epsilon_is_0():
     noisy = Rainbow(RainbowConfig(**SMALL), SIZE)
     assert noisy.policy.epsilon == RainbowConfig().epsilon_start

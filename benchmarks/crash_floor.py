@@ -24,7 +24,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation import write_results
 from ganlane.evaluation.crash_floor import Way, driver_row, floor_rows, search_left, ways_of_drivers
 from ganlane.evaluation.rides import Ride, drive
-from ganlane.files import write_between_markers
+from ganlane.files import split_at_markers, write_between_markers
 from ganlane.memory import keep_freed_memory
 
 DRIVERS = ("mobil", "agent_idm", "keep_lane")
@@ -90,13 +90,17 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def markers(told: argparse.Namespace) -> tuple[str, str]:
+    """Lines of the document between which the tables of this traffic stand."""
+    return f"<!-- begin crash floor {told.traffic} -->", f"<!-- end crash floor {told.traffic} -->"
+
+
 def publish(told: argparse.Namespace, tables: dict[str, Any], ways: Sequence[Way]) -> str:
     """Print the tables, write them, and with --report put them into the document; where the results are."""
     text = "\n".join([*floor_table(tables["floor"], told.episodes), "", *driver_table(tables["drivers"])])
     print(text, flush=True)
     if told.report is not None:
-        begin, end = (f"<!-- {edge} crash floor {told.traffic} -->" for edge in ("begin", "end"))
-        write_between_markers(told.report, begin, end, f"\n{text}\n")
+        write_between_markers(told.report, *markers(told), f"\n{text}\n")
     seeds = {"stream": "report", "seed": told.seed, "episodes": [0, told.episodes - 1]}
     numbers = {**tables, "ways": [written(way) for way in ways]}
     folder = told.folder or Path("outputs/crash_floor") / told.traffic
@@ -105,6 +109,8 @@ def publish(told: argparse.Namespace, tables: dict[str, Any], ways: Sequence[Way
 
 def measure(told: argparse.Namespace) -> str:
     """Drive and search; the results are published after every stage, since the later ones take long."""
+    if told.report is not None:
+        split_at_markers(told.report, *markers(told))  # refused now rather than after hours of driving
     begun, line = time.monotonic(), ""
     driven = {name: rides_of(name, told) for name in told.drivers}
     ways, env = ways_of_drivers(driven.values(), range(told.episodes)), environment(told)

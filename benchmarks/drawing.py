@@ -56,6 +56,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trajectory = episode(0.1 * (arguments.frames * arguments.rounds + 1))
+    if len(trajectory) <= arguments.frames * arguments.rounds:
+        parser.error(f"the episode has {len(trajectory)} frames, one of them for warming up; ask for fewer in all")
     painter = FramePainter(trajectory, WindowParameters(arguments.width, arguments.height))
     painter.draw(0)
     if arguments.profile:

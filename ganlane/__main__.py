@@ -10,7 +10,7 @@ from collections.abc import Sequence
 COMMANDS = {
     "train": "train an agent on a traffic, then evaluate it beside others",
     "evaluate": "agents x traffics on the same episodes, as one table",
-    "render": "an episode of an agent on a traffic as a film",
+    "render": "episodes as a film, page or table; learning curves of runs",
     "prepare": "recordings into one schema, with a report of what they show",
     "train_generator": "fit a generator to recorded traffic",
     "realism": "how close a traffic comes to recorded driving",

@@ -2,10 +2,10 @@
 
     ganlane bench suite=sim
     ganlane bench suite=sim quick=true
-    ganlane bench suite=sim batches=[1,1024] threads=[1] modes=[eager] repetitions=9
+    ganlane bench suite=sim 'batches=[1,1024]' 'threads=[1]' 'modes=[eager]' repetitions=9
     ganlane bench suite=sim report=docs/performance.md
     ganlane bench suite=traffic report=docs/performance.md
-    ganlane bench suite=train modes=[eager] train_batches=[512] seconds=2
+    ganlane bench suite=train 'modes=[eager]' 'train_batches=[512]' seconds=2
 
 Writes results.json into its run folder, and with ``report`` the tables into that document.
 """

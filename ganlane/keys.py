@@ -38,6 +38,8 @@ STEP: Final = "step"
 #: The episodes' keys [N] int64 (:func:`ganlane.sim.random.episode_key`), handed to the traffic once a decision.
 EPISODE_KEY: Final = "episode_key"
 ACTION: Final = "action"
+#: What a policy that tells thinks its action worth, [N] or [N, 1]; named as in TorchRL.
+CHOSEN_VALUE: Final = "chosen_action_value"
 OBSERVATION: Final = "observation"
 REWARD: Final = "reward"
 

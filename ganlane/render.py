@@ -2,8 +2,8 @@
 
     ganlane render agent=mobil traffic=idm_mobil episode=3
     ganlane render agent=agent_idm traffic=gan format=mp4 out=film.mp4
-    ganlane render agents=[mobil,agent_idm] traffic=gan episode=3 out=player.html
-    ganlane render agent=mobil traffic=gan_calibrated episodes=[0,1,2] out=simulated.parquet
+    ganlane render 'agents=[mobil,agent_idm]' traffic=gan episode=3 out=player.html
+    ganlane render agent=mobil traffic=gan_calibrated 'episodes=[0,1,2]' out=simulated.parquet
     ganlane render run=outputs/train/FIRST,outputs/train/SECOND out=curves.png
 
 The episodes are those of ``ganlane evaluate`` with the same seed.
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
+from ganlane.config.overrides import quoted
 from ganlane.config.render import FILMS, RenderConfig
 
 if TYPE_CHECKING:
@@ -99,8 +100,7 @@ def _listed(argument: str) -> str:
     key, _, value = argument.partition("=")
     if key != "run" or not value or value[0] in "['\"" or value == "null":
         return argument
-    quoted = ("'" + path.replace("'", "\\'") + "'" for path in value.split(","))
-    return f"run=[{','.join(quoted)}]"
+    return f"run=[{','.join(map(quoted, value.split(',')))}]"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

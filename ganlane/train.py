@@ -29,7 +29,7 @@ def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate what came out."""
     from ganlane.build import make_driver, make_traffic, set_threads
     from ganlane.compare import compare, publish
-    from ganlane.phases import AGENT_FILE, checkpoint_of, length_of, phases_of, run_phase
+    from ganlane.phases import AGENT_FILE, check_finished, checkpoint_of, length_of, phases_of, run_phase
 
     set_threads(config.threads)
     for traffic in config.all_traffic():  # a mistake in any of them shows before hours of training, not after
@@ -38,6 +38,7 @@ def train(config: TrainConfig, folder: Path) -> str:
     outcome: dict[str, dict[str, float]] = {}
     for phase in phases_of(config, folder):
         if phase.name == "pretrain" and (phase.folder / AGENT_FILE).is_file():
+            check_finished(config, phase)
             outcome[phase.name] = length_of(phase.folder / AGENT_FILE)
             continue
         result = run_phase(config, phase, checkpoint_of(phase, config.resume))

@@ -5,11 +5,11 @@
     ganlane train_generator data=ngsim data.path=ngsim.csv
     ganlane train_generator data=highd data.path=highD/data
     ganlane train_generator generator=paper data=scenes folds=5
-    ganlane evaluate traffics=[gan] generator.path=outputs/train_generator/RUN/generator_paper.safetensors
+    ganlane evaluate 'traffics=[gan]' generator.path=outputs/train_generator/RUN/generator_paper.safetensors
 
 Writes generator_PRESET.safetensors (weights, metrics, lane-change statistics) and results.json into its run folder.
-With folds=5 five more generators are fitted, each without the scenes of its fold, and results.json pools their errors
-on these; with ablations=true the preset is also fitted with one part changed at a time. resume=FOLDER goes on with
+With folds=5 five more generators are fitted, each without the scenes of its fold, and kept beside it as
+generator_PRESET_fold_1.safetensors and so on; results.json pools their errors on these scenes. With ablations=true the preset is also fitted with one part changed at a time. resume=FOLDER goes on with
 what an earlier run has fitted.
 """
 
@@ -29,6 +29,8 @@ from ganlane.errors import UserError
 if TYPE_CHECKING:
     import polars as pl
 
+    from ganlane.generator import FitResult
+
 
 def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     """Read, fit, print the held-out errors beside constant velocity, save."""
@@ -40,6 +42,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
         HELD_OUT,
         ablate,
         ablation_table,
+        assign_folds,
         cross_validate,
         fit_generator,
         fit_key,
@@ -53,8 +56,15 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     held_out = config.data.held_out_scenes(frame["scene"].unique().to_list(), HELD_OUT)
     preset = config.generator.preset_name()
     fit_config = config.generator.fit_config(config.seed)
+    scenes = scene_tracks(frame)
+    if config.folds:
+        assign_folds(scenes, config.folds)  # refused now rather than after hours of ablations
     fits = Path(config.resume or folder) / "fits"
     numbers: dict[str, Any] = {}
+
+    def keep_fold(number: int, fold: FitResult) -> None:
+        fold.save(folder / f"generator_{preset}_fold_{number}.safetensors", code=code_version())
+
     if config.ablations:
         with FitProgress() as progress:
             rows = ablate(preset, frame, fit_config, held_out, fits, progress.next_fit, progress)
@@ -62,10 +72,11 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
         numbers["ablations"] = rows
     if config.folds:
         with FitProgress() as progress:
-            folds = cross_validate(preset, frame, fit_config, config.folds, fits, progress.next_fit, progress)
+            told = (progress.next_fit, progress, keep_fold)
+            folds = cross_validate(preset, frame, fit_config, config.folds, fits, *told, source=str(source))
         print(fold_tables(folds))
         numbers["folds"] = folds
-    key = fit_key(preset, fit_config, split_for_fit(scene_tracks(frame), held_out))
+    key = fit_key(preset, fit_config, split_for_fit(scenes, held_out))
     with FitProgress() as progress:
         result = fit_generator(
             preset,

@@ -96,6 +96,7 @@ def test_runs_are_drawn_beside_each_other(capsys, tmp_path):
     [
         ("run=a", "run=['a']"),
         ("run=a/b=c,d e", "run=['a/b=c','d e']"),
+        ("run=it's,b", "run=['it\\'s','b']"),
         ("run=[a,b]", "run=[a,b]"),
         ("run=null", "run=null"),
         ("out=a,b", "out=a,b"),

@@ -113,9 +113,10 @@ def transfer(agent: Rainbow, name: str | Path) -> dict[str, Any]:
     own = agent.network.config
     check_observation_size(name, config, own.observation_size)
     theirs, ours = (asdict(c) for c in (config, own))
-    differing = [key for key in ours if ours[key] != theirs[key] and key != "noisy_sigma"]
+    aside = {"noisy_sigma"} | ({"encoder_width", "encoder_layers"} if own.encoder == "none" else set())
+    differing = [key for key in ours if ours[key] != theirs[key] and key not in aside]
     if differing:
-        wanted = " ".join(f"agent.{key}={theirs[key]}" for key in differing).replace("(", "[").replace(")", "]")
+        wanted = " ".join(f"agent.{key}={_typed(theirs[key])}" for key in differing)
         here = ", ".join(str(ours[key]) for key in differing)
         raise UserError(
             f"agent {name}: it has another network than this run (here: {here}); start with init=none, or set "
@@ -123,3 +124,8 @@ def transfer(agent: Rainbow, name: str | Path) -> dict[str, Any]:
         )
     agent.load_weights(weights)
     return metadata
+
+
+def _typed(value: Any) -> str:
+    """As one types it on the command line."""
+    return f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else str(value)

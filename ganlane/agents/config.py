@@ -75,6 +75,11 @@ class RainbowConfig:
                 f"agent.v_min={self.v_min}, agent.v_max={self.v_max}, agent.atoms={self.atoms}: expected v_min below "
                 "v_max and at least 2 atoms; widen the support."
             )
+        if (self.learning_rate_end is None) != (self.learning_rate_decisions == 0):
+            raise UserError(
+                f"agent.learning_rate_end={self.learning_rate_end}, agent.learning_rate_decisions="
+                f"{self.learning_rate_decisions}: one means nothing without the other; give both or neither."
+            )
         if not self.batch_size <= self.warmup <= self.capacity:
             raise UserError(
                 f"agent.warmup={self.warmup}: expected at least agent.batch_size={self.batch_size} and at most "

@@ -52,7 +52,8 @@ class NetworkConfig:
     noisy_sigma: float = 0.5
 
     def __post_init__(self) -> None:
-        sizes = {"observation_size": self.observation_size, "actions": self.actions, "atoms": self.atoms}
+        sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}
+        sizes |= {"encoder_width": self.encoder_width, "encoder_layers": self.encoder_layers}
         sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
         for name, size in sizes.items():
             if not isinstance(size, int) or not 1 <= size <= LARGEST:

@@ -49,7 +49,7 @@ class ExploringPolicy(TensorDictModuleBase):
     """
 
     in_keys = [keys.OBSERVATION]  # noqa: RUF012
-    out_keys = [keys.ACTION]  # noqa: RUF012
+    out_keys = [keys.ACTION, keys.CHOSEN_VALUE]  # noqa: RUF012
 
     def __init__(self, network: QNetwork, generator: torch.Generator, legal: LegalActions | None = None) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class ExploringPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``."""
+        """Write ``action`` and ``chosen_action_value``."""
         explore = exploration_type() in (None, ExplorationType.RANDOM)
         if explore:
             redraw_noise(self.network, self.generator)
@@ -69,7 +69,7 @@ class ExploringPolicy(TensorDictModuleBase):
         if explore and self.epsilon > 0.0:
             action = self._mix(action, torch.ones_like(values) if self.legal is None else self.legal(tensordict))
         chosen = values.gather(-1, action[..., None])
-        return tensordict.set(keys.ACTION, action).set("chosen_action_value", chosen)
+        return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 
     def _mix(self, action: Tensor, legal: Tensor) -> Tensor:
         """Replace a fraction epsilon of the actions by legal ones, drawn uniformly."""

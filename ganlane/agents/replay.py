@@ -50,6 +50,8 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """The transitions in use (tensors by dotted key), the place of the next one, the sampler: plain data."""
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
     tensors = {".".join(_path(key)): rows.get(key) for key in TRANSITION_KEYS} if len(buffer) else {}
+    if len(buffer) < buffer.storage.max_size:  # a view would be saved with all of the storage behind it
+        tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     state = {"rows": tensors, "cursor": buffer.writer._cursor, "sampler": buffer.sampler.state_dict()}
     return {**state, "writes": buffer.write_count}
 

@@ -47,7 +47,7 @@ def evaluate(
 
     On the command line::
 
-        ganlane evaluate agents=[mobil,random_legal,agent_idm] traffics=[idm_mobil,gan] episodes=1000 env.lanes=4
+        ganlane evaluate 'agents=[mobil,random_legal,agent_idm]' 'traffics=[idm_mobil,gan]' episodes=1000 env.lanes=4
 
     Args:
         agents: names, what :func:`ganlane.api.load_agent` returned, or policies of your own; ``mobil`` and

@@ -32,7 +32,7 @@ def realism(
 
     On the command line::
 
-        ganlane realism traffic=gan_calibrated against=[idm_mobil] data.path=recordings.csv vehicle_km=100
+        ganlane realism traffic=gan_calibrated 'against=[idm_mobil]' data.path=recordings.csv vehicle_km=100
 
     Args:
         traffic: as in :func:`ganlane.api.make_env`.
@@ -69,7 +69,7 @@ def bench(
         run = bench("sim", quick=True, batches=[1, 1024], threads=[1])
         polars.DataFrame(run.results["rows"])
 
-    On the command line: ``ganlane bench suite=sim quick=true batches=[1,1024] threads=[1]``.
+    On the command line: ``ganlane bench suite=sim quick=true 'batches=[1,1024]' 'threads=[1]'``.
 
     Args:
         suite: what to measure.

@@ -80,7 +80,7 @@ def load_agent(
         env = make_env(traffic="gan", num_envs=64, observation=agent.observation)
         rollout = env.rollout(100, agent.policy)
 
-    On the command line: ``ganlane evaluate agents=[agent_idm]``.
+    On the command line: ``ganlane evaluate 'agents=[agent_idm]'``.
 
     Args:
         name: a shipped agent, a rule-based driver (``mobil``, ``mobil_egoistic``, ``keep_lane``, ``random_legal``,

@@ -18,7 +18,7 @@ from ganlane.config.compose import VERSION_BASE, check, typed
 from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
 from ganlane.config.help import print_help
 from ganlane.config.messages import CONFIG_ERRORS, FILE_ERRORS, sentence
-from ganlane.config.overrides import parse_arguments, without_repetitions
+from ganlane.config.overrides import parse_arguments, quoted, without_repetitions
 from ganlane.config.resume import with_resumed
 from ganlane.config.store import register
 from ganlane.errors import UserError
@@ -73,7 +73,7 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
         folder = checked.sweep_folder if flags.multirun else checked.run_folder
         mode = "sweep" if flags.multirun else "run"
         # The folder's name holds the time: given here, so that it is the one that was looked at.
-        overrides = without_repetitions([*overrides, f"hydra.{mode}.dir='{folder}'"])
+        overrides = without_repetitions([*overrides, f"hydra.{mode}.dir={quoted(folder)}"])
         with cleared_after_mistakes(folder):
             _hydra(command, task, [*(["-m"] if flags.multirun else []), *overrides])
 

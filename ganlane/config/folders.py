@@ -14,14 +14,14 @@ from ganlane.errors import UserError
 OVERRIDES = "overrides.yaml"
 CONFIG = "config.yaml"
 #: Files that cost time to make.
-EARNED = ("results.json", "agent.safetensors", "last.pt")
+EARNED = ("results.json", "agent.safetensors", "last.pt", "fits/*.pt", "generator_*.safetensors")
 
 
 @contextmanager
 def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterator[None]:
     """Remove what a user's mistake leaves of a folder that was not there before, and of the folders above it.
 
-    What a run has earned stays: a folder with results, a trained agent or a checkpoint in it is never removed.
+    What a run has earned stays: a folder with results, trained weights or a checkpoint in it is never removed.
 
     Args:
         folder: the run's or the sweep's.

@@ -9,7 +9,7 @@ from typing import NoReturn
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.override_parser.types import Override, OverrideType, Quote, QuotedString
 
 from ganlane.errors import UserError
 from ganlane.paths import conf_folder
@@ -49,6 +49,11 @@ def _refuse_idle_flags(flags: Namespace) -> None:
 def _renamed(override: str, aliases: Mapping[str, str]) -> str:
     key, equals, value = override.partition("=")
     return f"{aliases.get(key, key)}{equals}{value}"
+
+
+def quoted(value: object) -> str:
+    """``value`` as Hydra reads it back, whatever signs are in it: ``it's`` becomes ``'it\\'s'``."""
+    return QuotedString(str(value), Quote.single).with_quotes()
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:

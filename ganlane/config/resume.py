@@ -9,7 +9,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from ganlane.config.folders import OVERRIDES
-from ganlane.config.overrides import parse, without_repetitions
+from ganlane.config.overrides import parse, quoted, without_repetitions
 from ganlane.errors import UserError
 
 _RUNS = Path("outputs")
@@ -36,7 +36,7 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
         print(f"resume=auto: no unfinished run below {_RUNS / command}; a new one is started.", file=sys.stderr)
         return without_repetitions([*overrides, "resume=null"])
     stored = _stored(run / OVERRIDES)
-    return without_repetitions([*stored, *overrides, f"resume='{run}'", f"hydra.run.dir='{run}'"])
+    return without_repetitions([*stored, *overrides, f"resume={quoted(run)}", f"hydra.run.dir={quoted(run)}"])
 
 
 def _stored(path: Path) -> list[str]:
@@ -69,6 +69,8 @@ def run_folder(path: Path) -> Path:
     """
     from ganlane.training import find_checkpoint
 
+    if path.is_file() and path.name != "last.pt":
+        raise UserError(f"resume={path}: a run goes on from its last.pt alone; give the run's folder.")
     candidates = [path, *path.parents[:3]] if path.exists() else []
     for folder in candidates:
         if (folder / OVERRIDES).is_file() and any(folder.rglob("last.pt")):

@@ -4,7 +4,7 @@
 ``road, stream, idm, mobil, steering`` that its signature asks for, with the option's further keys, and with
 ``parameters``. A model of your own needs no more than its import path::
 
-    python -m ganlane.evaluate traffics=[my.module.MyTraffic]
+    python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
     python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic +traffic.parameters.pace=0.9
 """
 

@@ -35,7 +35,11 @@ EXTRAS: Final = {
         "peers of ganlane bench",
         ("highway-env>=1.10", "stable-baselines3>=2.4", "eclipse-sumo>=1.20", "libsumo>=1.20"),
     ),
+    "wandb": ("logger=wandb", ("wandb>=0.18",)),
     "ray": ("distributed collection", ("ray>=2.40",)),
+    "sweeps": ("sweeps in several processes", ("hydra-joblib-launcher>=1.2",)),
+    "slurm": ("sweeps as Slurm jobs", ("hydra-submitit-launcher>=1.2",)),
+    "ray-sweeps": ("sweeps on a Ray cluster", ("hydra-ray-launcher>=1.2.1",)),
     "docs": ("building these pages", ("mkdocs-material>=9.5", "mkdocstrings[python]>=0.27")),
 }
 #: Distributions whose module has another name.

@@ -32,10 +32,11 @@ class FitResult:
         preset: ``"paper"`` or ``"calibrated"``.
         module: the generator with the weights that did best on the validation scenes.
         metrics: of these weights on the held-out scenes, for ``"all"`` and each scene; the paper's preset also
-            has ``"discriminator": {"held_out_accuracy"}``.
+            has ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's, which are scored together.
         config: what it was fitted with, as plain data.
         data: scenes fitted, of validation and held out, vehicles and rows.
-        statistics: of the recordings (``DrivingStatistics.to_dict()``).
+        statistics: of all recordings, held out or not (``DrivingStatistics.to_dict()``); a fold's are of its other
+            scenes.
         updates: updates after which the weights were taken (early stopping).
         seconds: time of the fit, with its evaluations on the validation scenes.
     """
@@ -80,7 +81,7 @@ def fit_generator(
 
     The weights returned are those at the update at which they did best on the validation scenes, a small part of
     the scenes that are not held out (:func:`ganlane.generator.folds.split_for_fit`). The metrics are theirs on the
-    held-out scenes, which had no say in anything.
+    held-out scenes, which had no say in the weights or in when to stop. The driving statistics are of all scenes.
 
     Args:
         preset: ``"paper"`` (positions only, open loop) or ``"calibrated"`` (anchored, closed-loop rollouts).
@@ -107,7 +108,7 @@ def fit_generator(
         module=task.generator.eval().requires_grad_(False),
         metrics=metrics,
         config=asdict(task.config),
-        data=_describe(source, frame, split),
+        data=describe(source, frame, split),
         statistics=driving_statistics(frame, widths).to_dict(),
         updates=loop.best_update,
         seconds=loop.seconds,
@@ -138,7 +139,8 @@ def fit_task(
     )
 
 
-def _describe(source: str, frame: pl.DataFrame, split: Split) -> dict[str, Any]:
+def describe(source: str, frame: pl.DataFrame, split: Split) -> dict[str, Any]:
+    """The recordings ``frame`` of the file ``source``, and what each scene was for."""
     return {
         "file": Path(source).name,
         "rows": frame.height,

@@ -6,7 +6,7 @@ Agents are chosen by episodes of a stream of their own (:mod:`ganlane.phases.sel
 weights is in :mod:`ganlane.phases.description`.
 """
 
-from ganlane.phases.agent import check_observation, length_of, make_agent
+from ganlane.phases.agent import check_finished, check_observation, length_of, make_agent
 from ganlane.phases.description import describe, identity
 from ganlane.phases.phase import AGENT_FILE, Phase, checkpoint_of, phases_of
 from ganlane.phases.run import run_phase
@@ -15,6 +15,7 @@ from ganlane.phases.source import make_source, training_env, worker_env
 __all__ = [
     "AGENT_FILE",
     "Phase",
+    "check_finished",
     "check_observation",
     "checkpoint_of",
     "describe",

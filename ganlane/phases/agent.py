@@ -15,6 +15,7 @@ from ganlane.errors import UserError
 from ganlane.phases.description import describe
 from ganlane.phases.phase import AGENT_FILE, Phase
 from ganlane.training import TrainingResult
+from ganlane.training.run import flat
 from ganlane.transforms import observation_size
 
 
@@ -55,6 +56,23 @@ def keep(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResu
         metadata["selected"] = {**chosen, "episodes": config.selection_episodes, "stream": "select"}
     metadata["training"] |= {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
     save_agent(phase.folder / AGENT_FILE, agent, metadata)
+
+
+def check_finished(config: TrainConfig, phase: Phase) -> None:
+    """Refuse to go on after a first phase that was another one than ``config`` asks for.
+
+    Raises:
+        UserError: it had another length or traffic.
+    """
+    training = read_agent(phase.folder / AGENT_FILE)[2]["training"]
+    done, asked = training["decisions"], phase.total_decisions
+    if not asked <= done < asked + config.collector.environments:
+        raise UserError(
+            f"pretrain.total_decisions={asked}: this phase is over, after {done} decisions; resume with what the run "
+            "was started with."
+        )
+    if flat(training["traffic"]) != flat(asdict(phase.traffic)):
+        raise UserError("traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same.")
 
 
 def length_of(agent: Path) -> dict[str, float]:

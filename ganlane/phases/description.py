@@ -17,6 +17,7 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "traffic": asdict(phase.traffic),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
+        "init": config.init.path,
         "collector": {name: value for name, value in asdict(config.collector).items() if name != "address"},
         "seed": config.seed,
     }

@@ -60,8 +60,8 @@ def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralCha
 def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
     """Gaussian of the recorded accelerations over one second."""
     recorded = statistics.acceleration_smoothed
-    default = SuddenAccelerations()
-    return SuddenAccelerations(mean=recorded.mean or default.mean, sd=recorded.sd or default.sd)
+    told = {name: getattr(recorded, name) for name in ("mean", "sd") if getattr(recorded, name) is not None}
+    return SuddenAccelerations(**told)
 
 
 def simulated_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParameters:

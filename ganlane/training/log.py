@@ -112,6 +112,9 @@ class Logs:
         self.folder, self.first, self.further = folder, decisions, list(further)
         self.metrics = CsvLog(folder / "metrics.csv", [*COLUMNS, *shares], decisions)
         self.evaluation: CsvLog | None = None
+        before = read_rows(folder / "evaluation.csv")
+        if before:  # of a resumed run; rows beyond its checkpoint go
+            self.evaluation = CsvLog(folder / "evaluation.csv", list(before[0]), decisions)
         self.progress = Progress(config.total_decisions, decisions) if config.progress else None
         self._last, self._last_s = decisions, monotonic()
 

@@ -65,6 +65,7 @@ def train(
 
 def _loop(run: Run, config: TrainingConfig, evaluate: Evaluate | None, log: Logs, saver: Saver) -> int | None:
     """The algorithm; the number of the signal that ended it early, or None."""
+    run.source.open(run.agent)
     if run.decisions == 0:
         saver.save()  # so that there is something to go on from, whenever the run is killed
     with StopRequest() as stop:
@@ -79,6 +80,8 @@ def _loop(run: Run, config: TrainingConfig, evaluate: Evaluate | None, log: Logs
                 assess(run, evaluate, config.best_metric, log, saver)
             if saver.due():
                 saver.save()
+        if evaluate is not None and stop.signal is None and run.assessed < run.decisions:
+            assess(run, evaluate, config.best_metric, log, saver)
         saver.save()
     return stop.signal
 
@@ -104,7 +107,7 @@ def learn(run: Run) -> None:
 
 
 def figures(run: Run) -> dict[str, float]:
-    """A row of metrics: the only place where the loop waits for the device."""
+    """A row of metrics, read from the device."""
     agent = run.agent
     row = {"decisions": run.decisions, "updates": agent.updates, "wall_s": run.wall_s, **run.meter.read()}
     return row | {"sigma": float(agent.sigma()), "epsilon": agent.policy.epsilon}
@@ -112,6 +115,7 @@ def figures(run: Run) -> dict[str, float]:
 
 def assess(run: Run, evaluate: Evaluate, best_metric: str, log: Logs, saver: Saver) -> None:
     """Evaluate the greedy policy and keep the best agent so far."""
+    run.assessed = run.decisions
     row = dict(evaluate(run.agent.greedy))
     log.write_evaluation({"decisions": run.decisions, **row})
     if best_metric not in row:
@@ -120,3 +124,4 @@ def assess(run: Run, evaluate: Evaluate, best_metric: str, log: Logs, saver: Sav
     if run.best is None or row[best_metric] > run.best:
         run.best = row[best_metric]
         saver.save_weights("best", row)
+        saver.save()  # a resumed run must know of the best, or a worse one could take its place

@@ -18,8 +18,6 @@ RATES = {
     "out_of_road": "out_of_road_rate",
     "timeout": "timeout_rate",
 }
-#: Where TorchRL's policies, and others that tell, write the value of the action they chose, [N] or [N, 1].
-CHOSEN_VALUE = "chosen_action_value"
 #: Sums over the running episode of every environment.
 RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
 
@@ -66,7 +64,7 @@ class Meter:
         self.to_go += self.weight * reward
         self.weight = 1.0 + self.gamma * self.weight
         self.lengths += 1.0
-        chosen = step.get(CHOSEN_VALUE, None)
+        chosen = step.get(keys.CHOSEN_VALUE, None)
         if chosen is not None:
             self.values += chosen.reshape(-1)
         self._finish(after, done, chosen is not None)

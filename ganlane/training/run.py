@@ -34,6 +34,8 @@ class Run:
         self.meter = Meter(self.environments, agent.network.config.actions, agent.config.gamma, agent.device)
         self.decisions, self.owed = 0, 0
         self.best: float | None = None
+        #: Decisions at the last evaluation.
+        self.assessed = 0
         self._before_s, self._started_s = 0.0, time.monotonic()
 
     @property

@@ -69,6 +69,8 @@ class Trajectory:
     action_values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     #: Reward of the decision that a frame belongs to, [T]; not a number before the first; empty where nobody told it.
     reward: FloatArray = field(default_factory=lambda: np.empty(0))
+    #: Jerk as it was driven, where frames before these were left out (:meth:`since`), m/s3, [T, M]; empty otherwise.
+    driven_jerk: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -97,8 +99,10 @@ class Trajectory:
     def jerk(self) -> FloatArray:
         """Change of the acceleration since the frame before, m/s3, [T, M].
 
-        0 in the first two frames and after a jump: nobody has driven before the first.
+        0 in the episode's first two frames and after a jump: nobody has driven before the first.
         """
+        if self.driven_jerk.size:
+            return self.driven_jerk
         change = np.diff(self.acceleration, axis=0, prepend=self.acceleration[:1]) / self.frame_s
         begins = np.arange(len(self))[:, None] < 2
         return np.where(begins | self.jumped(), 0.0, change)
@@ -126,6 +130,7 @@ class Trajectory:
         if first == len(self):
             raise UserError(f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it.")
         told: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        told["driven_jerk"] = self.jerk()
         later = {name: value[first:] for name, value in told.items() if isinstance(value, np.ndarray) and value.size}
         return Trajectory(**{**told, **later})
 

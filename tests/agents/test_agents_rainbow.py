@@ -104,9 +104,13 @@ def test_the_greedy_policy_has_no_noise_whatever_the_context():
         assert torch.equal(explorer.greedy(data.clone())["action"], expected)
 
 
-def test_the_policy_writes_the_action_alone():
-    data = agent().policy(observations(3))
-    assert set(data.keys()) == {"observation", "action"}
+def test_the_policy_writes_the_action_and_what_it_thinks_it_worth():
+    learner = agent()
+    data = learner.policy(observations(3))
+    assert set(data.keys()) == {"observation", *learner.policy.out_keys}
+    assert set(learner.policy.out_keys) == {"action", "chosen_action_value"}
+    assert data["chosen_action_value"].shape == (3, 1)
+    assert set(learner.greedy(observations(3)).keys()) == {"observation", "action"}
     assert data["action"].dtype == torch.int64
 
 
@@ -137,6 +141,12 @@ def test_the_learning_rate_falls_in_a_straight_line_and_stays():
         falling.anneal(decisions)
         rates.append(falling.optimizer.param_groups[0]["lr"])
     assert rates == pytest.approx([1e-3, 5.5e-4, 1e-4, 1e-4])
+
+
+@pytest.mark.parametrize("half", [{"learning_rate_end": 1e-4}, {"learning_rate_decisions": 100}])
+def test_half_of_a_falling_learning_rate_is_refused(half):
+    with pytest.raises(UserError, match="give both or neither"):
+        RainbowConfig(**SMALL, **half)
 
 
 def test_noisy_agents_draw_random_actions_too_unless_epsilon_is_0():

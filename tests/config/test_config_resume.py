@@ -7,7 +7,7 @@ import os
 import pytest
 
 from ganlane.config.folders import OVERRIDES
-from ganlane.config.overrides import single_runs, without_repetitions
+from ganlane.config.overrides import parse, quoted, single_runs, without_repetitions
 from ganlane.config.resume import newest_unfinished, with_resumed
 from ganlane.errors import UserError
 
@@ -68,3 +68,15 @@ def test_a_sweep_is_every_combination():
     assert [sorted(run) for run in runs] == [
         sorted([f"seed={seed}", f"traffic={traffic}", "threads=1"]) for seed in (0, 1) for traffic in ("idm", "gan")
     ]
+
+
+@pytest.mark.parametrize("name", ["it's", "a'b'", "two words, [one]", "back\\\\", "back\\\\'s"])
+def test_a_folder_may_be_called_anything(name, tmp_path):
+    run = tmp_path / name
+    make_run(run, ["seed=3"])
+    merged = with_resumed("train", [f"resume={quoted(run)}"], multirun=False)
+    assert {override.key_or_group: override.value() for override in parse(merged)} == {
+        "seed": 3,
+        "resume": str(run),
+        "hydra.run.dir": str(run),
+    }

@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+import ganlane.evaluation
+import ganlane.generator
+from ganlane.config.folders import cleared_after_mistakes
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.generator.checkpoint import load_generator
 from ganlane.train_generator import main
@@ -68,3 +71,32 @@ def test_mistakes_are_told_in_one_sentence(argument, part, recordings, capsys, t
     assert part in err
     assert err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["recordings.csv"]
+
+
+def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monkeypatch, tmp_path):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ganlane.evaluation, "write_results", full)
+    assert main([recordings, *FEW]) == 2
+    assert "No space left" in capsys.readouterr().err
+    assert len(list(tmp_path.rglob("fits/*.pt"))) == 1
+    assert len(list(tmp_path.rglob("generator_paper.safetensors"))) == 1
+
+
+@pytest.mark.parametrize("kept", ["fits/*.pt", "generator_*.safetensors"])
+def test_each_of_the_two_is_kept_by_itself(kept, tmp_path):
+    folder, file = tmp_path / "run", tmp_path / "run" / kept.replace("*", "paper")
+    with pytest.raises(OSError, match="full"), cleared_after_mistakes(folder):
+        file.parent.mkdir(parents=True)
+        file.touch()
+        raise OSError("full")
+    assert file.is_file()
+
+
+def test_too_many_folds_are_refused_before_ablations_are_fitted(recordings, capsys, monkeypatch):
+    fitted = []
+    monkeypatch.setattr(ganlane.generator, "ablate", lambda *given: fitted.append(given))
+    assert main([recordings, "ablations=true", "folds=9", *FEW]) == 2
+    assert "folds=9" in capsys.readouterr().err
+    assert not fitted

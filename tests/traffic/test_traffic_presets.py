@@ -1,10 +1,12 @@
 """The generated traffics that ship, with the weights that ship."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from ganlane.data import DrivingStatistics
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.files import load_weights, save_weights
@@ -12,7 +14,7 @@ from ganlane.generator import shipped_generator
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.traffic import Guard
-from ganlane.traffic.presets import SIMULATED_ANCHOR, gan_calibrated_traffic, gan_traffic
+from ganlane.traffic.presets import SIMULATED_ANCHOR, gan_calibrated_traffic, gan_traffic, sudden_accelerations
 
 
 def drive(traffic, n, decisions, visit, first_episode=0):
@@ -176,3 +178,14 @@ def test_calibrated_weights_fitted_without_traits_are_refused(tmp_path):
 def test_a_washout_or_further_inputs_that_no_fit_can_have_are_refused(tmp_path, settings):
     with pytest.raises(UserError, match="fit it again"):
         gan_calibrated_traffic(path=fitted_with(tmp_path, **settings))
+
+
+@pytest.mark.parametrize(
+    ("recorded", "driven"), [((0.0, 0.0), (0.0, 0.0)), ((0.3, 0.5), (0.3, 0.5)), ((None, None), (0.0, 0.8))]
+)
+def test_recorded_accelerations_of_zero_are_not_missing_ones(recorded, driven):
+    _, metadata = load_weights(shipped_generator("paper"), "generator")
+    statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
+    smoothed = replace(statistics.acceleration_smoothed, mean=recorded[0], sd=recorded[1])
+    sudden = sudden_accelerations(replace(statistics, acceleration_smoothed=smoothed))
+    assert (sudden.mean, sudden.sd) == driven

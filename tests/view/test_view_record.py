@@ -163,6 +163,8 @@ def test_a_part_of_a_recording_keeps_its_numbers():
     assert later.time_s[0] == pytest.approx(1.0)
     assert np.array_equal(later.x, trajectory.x[10:])
     assert np.array_equal(later.reward, trajectory.reward[10:])
+    assert np.array_equal(later.since(1.5).jerk(), trajectory.jerk()[15:])
+    assert later.jerk()[:2].any()
     assert later.outcome == trajectory.outcome
     with pytest.raises(UserError, match="choose a part"):
         trajectory.since(1000.0)

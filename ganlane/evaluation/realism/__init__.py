@@ -27,10 +27,10 @@ The modules in the order in which they are to be read:
    :mod:`~ganlane.evaluation.realism.table` is the card as text, :mod:`~ganlane.evaluation.realism.document` puts it
    into a page.
 
-The command is ``ganlane realism`` (:mod:`ganlane.realism`), the figures are in :mod:`ganlane.view.realism`.
+The command is ``ganlane realism`` (:mod:`ganlane.realism`, :mod:`ganlane.cards`), the figures are in :mod:`ganlane.view.realism`.
 """
 
-from ganlane.evaluation.realism.card import floors_of, from_starts, quantity_rows, verdict
+from ganlane.evaluation.realism.card import floors_of, from_starts, quantity_rows, rows_of, verdict
 from ganlane.evaluation.realism.checks import card_checks
 from ganlane.evaluation.realism.counters import EventCounter, GuardMeter, watched
 from ganlane.evaluation.realism.distances import (
@@ -108,6 +108,7 @@ __all__ = [
     "recordings_of",
     "reference_of",
     "require_markers",
+    "rows_of",
     "spawned_frame",
     "spawned_starts",
     "stretches",

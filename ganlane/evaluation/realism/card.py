@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ganlane.evaluation.realism.distances import RESAMPLES, distance, distance_difference, pooled_distance
+from ganlane.evaluation.realism.distances import (
+    RESAMPLES,
+    ceiling,
+    distance,
+    distance_difference,
+    pooled_distance,
+)
 from ganlane.evaluation.realism.driving import FLOORS, Driven
-from ganlane.evaluation.realism.quantities import QUANTITIES, UNITS
-from ganlane.evaluation.realism.reference import Reference, quantiles_of, rate
+from ganlane.evaluation.realism.quantities import UNITS
+from ganlane.evaluation.realism.reference import quantiles_of, rate
+from ganlane.evaluation.realism.starts import Starts
 from ganlane.evaluation.statistics import Estimate
 
 
@@ -19,9 +26,8 @@ def quantity_rows(
     driven: Driven,
     others: Mapping[str, Driven],
     recorded: Mapping[str, np.ndarray],
-    reference: Reference | None,
+    floors: Mapping[str, Mapping[str, float]],
     paired: bool = True,
-    quantities: Sequence[str] = tuple(QUANTITIES),
     resamples: int = RESAMPLES,
 ) -> dict[str, Any]:
     """By quantity: distance, ceiling, floor, constant velocity, and the difference to each of ``others``.
@@ -29,38 +35,29 @@ def quantity_rows(
     Args:
         driven: the traffic.
         others: further traffics from the same starts; ``random`` and ``constant_velocity`` become the floors.
-        recorded: by quantity, [units, bins].
-        reference: gives ceilings, and the floors where ``others`` has none; None where there are none.
+        recorded: by quantity, [units, bins]; its quantities are the rows. Their halves give the ceilings.
+        floors: by driver and quantity, where ``others`` does not have it.
         paired: whether the recorded units are those that were driven.
-        quantities: which.
         resamples: of the bootstrap.
     """
-    ceilings = reference.ceilings if reference else {}
-    shipped = reference.floors if reference else {}
-    rows = {}
-    for name in quantities:
-        own = distance(driven.counts[name], recorded[name], paired, resamples)
-        floors = {
-            floor: pooled_distance(others[floor].counts[name], recorded[name])
-            if floor in others
-            else shipped.get(floor, {}).get(name)
-            for floor in FLOORS
-        }
-        rows[name] = {
+    rivals = {name: each for name, each in others.items() if name not in FLOORS}
+    ends = {**floors, **floors_of({name: each for name, each in others.items() if name in FLOORS}, recorded)}
+    return {
+        name: {
             "unit": UNITS[name],
-            **_estimate("distance", own),
-            "ceiling": ceilings.get(name),
-            "floor": _known(floors["random"]),
-            "constant_velocity": _known(floors["constant_velocity"]),
+            **_estimate("distance", distance(driven.counts[name], counts, paired, resamples)),
+            "ceiling": ceiling(counts),
+            "floor": ends.get("random", {}).get(name),
+            "constant_velocity": ends.get("constant_velocity", {}).get(name),
             "samples": int(driven.counts[name].sum()),
-            "recorded_samples": int(recorded[name].sum()),
+            "recorded_samples": int(counts.sum()),
             "against": {
-                other: _against(driven.counts[name], rival.counts[name], recorded[name], paired, resamples)
-                for other, rival in others.items()
-                if other not in FLOORS
+                rival: _against(driven.counts[name], each.counts[name], counts, paired, resamples)
+                for rival, each in rivals.items()
             },
         }
-    return rows
+        for name, counts in recorded.items()
+    }
 
 
 def floors_of(driven: Mapping[str, Driven], recorded: Mapping[str, np.ndarray]) -> dict[str, dict[str, float]]:
@@ -68,6 +65,7 @@ def floors_of(driven: Mapping[str, Driven], recorded: Mapping[str, np.ndarray]) 
     rows = {
         floor: {name: pooled_distance(driven[floor].counts[name], counts) for name, counts in recorded.items()}
         for floor in FLOORS
+        if floor in driven
     }
     return {
         floor: {name: value for name, value in row.items() if math.isfinite(value)} for floor, row in rows.items()
@@ -96,6 +94,13 @@ def _estimate(name: str, estimate: Estimate) -> dict[str, Any]:
 
 def _known(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) else None
+
+
+def rows_of(starts: Starts, traffic: str, resamples: int = RESAMPLES) -> dict[str, Any]:
+    """The rows of a traffic's card, by quantity: held against everybody else from the same starts."""
+    others = {name: each for name, each in starts.driven.items() if name != traffic}
+    floors = starts.reference.floors
+    return quantity_rows(starts.driven[traffic], others, starts.recorded, floors, starts.paired, resamples)
 
 
 def from_starts(driven: Mapping[str, Driven]) -> dict[str, Any]:

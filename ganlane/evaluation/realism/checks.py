@@ -48,15 +48,20 @@ def _near(own: Mapping[str, Any], recorded: Mapping[str, Any]) -> bool | None:
 
 
 def _run_checks(run: Mapping[str, Any], recorded_rate: Mapping[str, Any], spread_mps: float) -> dict[str, Any]:
-    low, high = recorded_rate["per_vehicle_km_ci"] or (0.0, 0.0)
+    changes, overlaps = run["lane_changes_per_vehicle_km"], run["overlaps_per_1000_vehicle_km"]
+    recorded = recorded_rate["per_vehicle_km_ci"]
     spreads = [at["spread_mps"] for at in run["speeds"].values() if at["spread_mps"] is not None]
     wide = None if not spreads else min(spreads) >= 0.5 * spread_mps
     return {
         "vehicles": run["vehicles"],
-        "lane_changes_inside_recorded_interval": low <= run["lane_changes_per_vehicle_km"] <= high,
-        "overlaps_under_1_per_1000_vehicle_km": run["overlaps_per_1000_vehicle_km"] < 1.0,
+        "lane_changes_inside_recorded_interval": _inside(changes, recorded),
+        "overlaps_under_1_per_1000_vehicle_km": None if overlaps is None else overlaps < 1.0,
         "nobody_off_the_road": run["off_road"] == 0,
         "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,
         "spread_at_least_half_the_recorded": wide,
         "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < _MOST_GUARD,
     }
+
+
+def _inside(value: float | None, interval: Sequence[float] | None) -> bool | None:
+    return None if value is None or not interval else interval[0] <= value <= interval[1]

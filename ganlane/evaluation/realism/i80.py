@@ -21,7 +21,6 @@ from ganlane.data.schema import FRAME_S
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 from ganlane.evaluation.realism.card import quantity_rows
-from ganlane.evaluation.realism.distances import ceiling
 from ganlane.evaluation.realism.driving import Report, drive_all, measure_recordings, units_of
 from ganlane.evaluation.realism.recordings import Recording, stretches
 from ganlane.evaluation.realism.simulation import Factory, StartOptions
@@ -157,9 +156,5 @@ def i80_cards(
         recorded = {quantity: measured.counts(units, quantity) for quantity in I80_QUANTITIES}
         own, *_ = makers
         others = {other: each for other, each in driven.items() if other != own}
-        cards[name] = quantity_rows(
-            driven[own], others, recorded, None, quantities=I80_QUANTITIES, resamples=resamples
-        )
-        for quantity, row in cards[name].items():
-            row["ceiling"] = ceiling(recorded[quantity])
+        cards[name] = quantity_rows(driven[own], others, recorded, {}, resamples=resamples)
     return cards

@@ -18,6 +18,8 @@ DRIFT_S = (10.0, 60.0, 150.0, 300.0)
 GOAL_M = 5000.0
 #: Levels of the acceleration's quantiles.
 QUANTILES = (0.05, 0.95)
+#: Events that are told as numbers.
+_EVENTS = ("off_road", "standstills_in_free_flow")
 
 
 class Course(NamedTuple):
@@ -76,33 +78,47 @@ def summary(
     episodes: int,
     vehicles: int,
 ) -> dict[str, Any]:
-    """The numbers of a long run; rates are per vehicle-km, with exact 95 % intervals."""
+    """The numbers of a long run; rates are per vehicle-km, with exact 95 % intervals, None where nobody moved."""
     km = sum(part["vehicle_km"] for part in parts)
-    changes = poisson_interval(sum(part["lane_changes"] for part in parts))
-    overlaps = poisson_interval(events.overlaps)
-    acceleration = np.concatenate([part["acceleration"] for part in parts])
+    changes = sum(part["lane_changes"] for part in parts)
     durations = np.concatenate([part["durations"] for part in parts])
-    drift = {
-        f"{seconds:g} s": _mean([row for part in parts for row in part["drift"][index]])
-        for index, seconds in enumerate(DRIFT_S)
-    }
+    acceleration = np.concatenate([part["acceleration"] for part in parts])
     return {
         "vehicles": vehicles,
         "episodes": episodes,
         "vehicle_km": km,
-        "lane_changes": int(changes.value),
-        "lane_changes_per_vehicle_km": changes.value / km,
-        "lane_changes_per_vehicle_km_ci": [bound / km for bound in changes.interval or ()],
+        "lane_changes": changes,
         "lane_change_duration_mean_s": float(durations.mean()) if len(durations) else None,
         "overlaps": events.overlaps,
-        "overlaps_per_1000_vehicle_km": 1000.0 * overlaps.value / km,
-        "overlaps_per_1000_vehicle_km_ci": [1000.0 * bound / km for bound in overlaps.interval or ()],
+        **rates(changes, events.overlaps, km),
         "off_road": events.off_road,
         "standstills_in_free_flow": events.standstills,
         "acceleration_quantiles": {f"{level:g}": float(np.quantile(acceleration, level)) for level in QUANTILES},
-        "speeds": drift | {f"{GOAL_M:g} m": _mean([row for part in parts for row in part["at_goal"]])},
+        "speeds": _drift(parts),
         "guard_share": meter.share,
     }
+
+
+def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
+    """Both counts per vehicle-km and per 1000 of them, with exact 95 % intervals; None where nobody moved."""
+    numbers: dict[str, Any] = {}
+    for name, events, scale in (
+        ("lane_changes_per_vehicle_km", lane_changes, 1.0),
+        ("overlaps_per_1000_vehicle_km", overlaps, 1000.0),
+    ):
+        count = poisson_interval(events)
+        numbers[name] = scale * count.value / km if km > 0.0 else None
+        numbers[f"{name}_ci"] = [scale * bound / km for bound in count.interval or ()] if km > 0.0 else None
+    return numbers
+
+
+def _drift(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float | int | None]]:
+    """Mean speed and spread after each of :data:`DRIFT_S`, and where :data:`GOAL_M` were covered."""
+    drift = {
+        f"{seconds:g} s": _mean([row for part in parts for row in part["drift"][index]])
+        for index, seconds in enumerate(DRIFT_S)
+    }
+    return drift | {f"{GOAL_M:g} m": _mean([row for part in parts for row in part["at_goal"]])}
 
 
 def _mean(rows: list[tuple[float, ...] | None]) -> dict[str, float | int | None]:
@@ -115,15 +131,6 @@ def _mean(rows: list[tuple[float, ...] | None]) -> dict[str, float | int | None]
 
 def totals(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Lane changes, overlaps and the like over all long runs, with exact 95 % intervals; None without any."""
-    km = sum(run["vehicle_km"] for run in runs)
-    numbers: dict[str, Any] = {
-        name: sum(run[name] for run in runs) if runs else None for name in ("off_road", "standstills_in_free_flow")
-    }
-    for key, scale, name in (
-        ("lane_changes", 1.0, "lane_changes_per_vehicle_km"),
-        ("overlaps", 1000.0, "overlaps_per_1000_vehicle_km"),
-    ):
-        count = poisson_interval(sum(run[key] for run in runs))
-        numbers[name] = count.value * scale / km if km else None
-        numbers[f"{name}_ci"] = [bound * scale / km for bound in count.interval or ()] if km else None
-    return numbers
+    sums = {key: sum(run[key] for run in runs) for key in ("lane_changes", "overlaps", "vehicle_km", *_EVENTS)}
+    events = {name: sums[name] if runs else None for name in _EVENTS}
+    return {**events, **rates(sums["lane_changes"], sums["overlaps"], sums["vehicle_km"])}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -15,7 +15,7 @@ from ganlane.evaluation.realism.driving import FLOORS, Driven, Report, drive_all
 from ganlane.evaluation.realism.fitting import desired_speeds, mean_options
 from ganlane.evaluation.realism.folds import Fold, merged
 from ganlane.evaluation.realism.quantities import QUANTITIES, Measured
-from ganlane.evaluation.realism.recordings import SHORTEST_S, recordings_of
+from ganlane.evaluation.realism.recordings import SHORTEST_S, Recording, recordings_of
 from ganlane.evaluation.realism.reference import Reference, quantiles_of, rate, reference_of
 from ganlane.evaluation.realism.simulation import StartOptions
 
@@ -58,7 +58,7 @@ class Starts:
         return unseen if len(unseen) < len(self.scenes) else []
 
     def only(self, scenes: Sequence[str]) -> Starts:
-        """The same driving, from these of its scenes alone."""
+        """The same driving, from these of its scenes alone, held against these."""
         rows = [self.scenes.index(name) for name in scenes]
         recorded = {name: counts[rows] for name, counts in self.recorded.items()}
         driven = {
@@ -101,35 +101,53 @@ def recorded_starts(
     names = [each.name for each in every]
     _check_names([name for fold in folds for name in fold.held_out], names, source)
     long = [each for each in every if len(each.x) * FRAME_S >= SHORTEST_S]
-    parts, driving, chosen = [], [], []
-    for fold in folds:
-        scenes = [each for each in long if each.name in fold.starts]
-        if not scenes:
-            continue
-        others = [each for each in long if each.name not in fold.held_out] if fit else []
-        driving.append(desired_speeds(fold.makers, others, options, report))
-        parts.append(drive_all(fold.makers, scenes, driving[-1], report))
-        chosen += scenes
+    parts = [_drive_fold(fold, long, options, fit, report) for fold in folds]
+    parts = [part for part in parts if part.scenes]
     if not parts:
         raise UserError(f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all.")
-    seen = driving_statistics(frame, widths)
-    whole = {
-        "lane_changes": seen.lane_changes.count,
-        "vehicle_km": seen.exposure.vehicle_km,
-        "speed_spread_mps": seen.speed_sd_in_frame or 0.0,
-    }
-    reference = reference_of(measure_recordings(every), names, whole, source)
+    chosen = [each for part in parts for each in part.scenes]
     rows = [names.index(each.name) for each in chosen]
+    reference = reference_of(measure_recordings(every), names, _whole(frame, widths), source)
     return Starts(
         kind="recorded",
         scenes=[each.name for each in chosen],
         held_out=[list(fold.held_out) for fold in folds],
-        options=mean_options(driving, options),
-        driven={name: merged([part[name] for part in parts]) for name in parts[0]},
+        options=mean_options([part.options for part in parts], options),
+        driven={name: merged([part.driven[name] for part in parts]) for name in parts[0].driven},
         recorded={name: reference.counts[name][rows] for name in QUANTITIES},
         seen=_seen(measure_recordings(chosen)),
         reference=reference,
     )
+
+
+class _Part(NamedTuple):
+    """What a fold's traffics drove, and how."""
+
+    scenes: list[Recording]
+    options: Mapping[str, StartOptions]
+    driven: Mapping[str, Driven]
+
+
+def _drive_fold(
+    fold: Fold, recordings: Sequence[Recording], options: StartOptions, fit: bool, report: Report
+) -> _Part:
+    """A fold's traffics from its scenes, with desired speeds fitted on the others; nothing without scenes."""
+    scenes = [each for each in recordings if each.name in fold.starts]
+    if not scenes:
+        return _Part([], {}, {})
+    others = [each for each in recordings if each.name not in fold.held_out] if fit else []
+    chosen = desired_speeds(fold.makers, others, options, report)
+    return _Part(scenes, chosen, drive_all(fold.makers, scenes, chosen, report))
+
+
+def _whole(frame: pl.DataFrame, widths: Mapping[str, float]) -> dict[str, float]:
+    """What all frames show, nothing left out: lane changes, vehicle-km, spread of speeds within a frame."""
+    seen = driving_statistics(frame, widths)
+    return {
+        "lane_changes": seen.lane_changes.count,
+        "vehicle_km": seen.exposure.vehicle_km,
+        "speed_spread_mps": seen.speed_sd_in_frame or 0.0,
+    }
 
 
 def _check_names(held_out: Sequence[str], names: Sequence[str], source: str) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 _NOTHING = "-"
+#: The check of a guard, and its answer where there is none.
+_GUARD, _WITHOUT_GUARD = "guard_under_5_percent", "no guard"
 
 
 def _number(value: float | None, digits: int = 3) -> str:
@@ -80,7 +82,7 @@ def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
     for level in runs[0]["acceleration_quantiles"]:
         cells = [_number(run["acceleration_quantiles"][level], 2) for run in runs]
         rows.append([f"acceleration, {100 * float(level):g} % quantile", *cells])
-    shares = [_NOTHING if run["guard_share"] is None else f"{100 * run['guard_share']:.1f} %" for run in runs]
+    shares = ["none" if run["guard_share"] is None else f"{100 * run['guard_share']:.1f} %" for run in runs]
     rows.append(["the guard's share", *shares])
     return _aligned(rows)
 
@@ -96,7 +98,9 @@ def checks_text(checks: Mapping[str, Any]) -> str:
         )
     for run in checks["long_runs"]:
         told = ", ".join(
-            f"{name.replace('_', ' ')}: {words[value]}" for name, value in run.items() if name != "vehicles"
+            f"{name.replace('_', ' ')}: {_WITHOUT_GUARD if name == _GUARD and value is None else words[value]}"
+            for name, value in run.items()
+            if name != "vehicles"
         )
         lines.append(f"{run['vehicles']} vehicles: {told}")
     return "\n".join(lines)

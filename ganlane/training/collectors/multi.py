@@ -45,6 +45,8 @@ class MultiSource(WorkerSource):
         if not codes and not isinstance(error, EOFError | BrokenPipeError | ConnectionResetError):
             return None
         who = ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items()) or "a worker"
+        if any((code or 0) > 0 for code in codes.values()):
+            return f"{who} failed; its own message is above"
         return (
             f"{who} died, killed from outside or for want of memory (fewer collector.workers or num_envs need less)"
         )

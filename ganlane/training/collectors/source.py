@@ -19,6 +19,13 @@ class Source(ABC):
     #: Whether a resumed run is the one it would have been, bit for bit.
     exact: bool
 
+    def open(self, agent: Rainbow) -> None:  # noqa: B027 (most sources have nothing to do)
+        """Start what collecting needs; :meth:`step` does it otherwise.
+
+        Raises:
+            UserError: it cannot be started.
+        """
+
     @abstractmethod
     def step(self, agent: Rainbow) -> TensorDictBase:
         """One decision of every environment, batch [N], on the agent's device.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -91,12 +91,16 @@ class WorkerSource(Source):
             self._collect(agent)
         return self._steps.popleft()
 
-    def _collect(self, agent: Rainbow) -> None:
+    def open(self, agent: Rainbow) -> None:
+        """Start the workers."""
+        with self._told():
+            self._start(agent)
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Turn the loss of a worker into one sentence."""
         try:
-            if self.collector is None:
-                self._start(agent)
-            self._hand_over(agent)
-            batch = read_by_loop(self.arranged(next(self._batches)))
+            yield
         except Exception as error:
             reason = self.failure(error)
             if reason is None:
@@ -104,6 +108,13 @@ class WorkerSource(Source):
             raise UserError(
                 f"collector={self.name}: {reason}; go on from the last checkpoint with resume."
             ) from error
+
+    def _collect(self, agent: Rainbow) -> None:
+        with self._told():
+            if self.collector is None:
+                self._start(agent)
+            self._hand_over(agent)
+            batch = read_by_loop(self.arranged(next(self._batches)))
         self._last = batch[:, -1].get("next").select(keys.SEED, keys.EPISODE, strict=False)
         self._steps.extend(batch.to(agent.device).unbind(1))
 

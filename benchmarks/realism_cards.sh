@@ -5,13 +5,13 @@
 #     sh benchmarks/realism_cards.sh
 #
 # With generators of k folds, one file per preset and fold, a card in which nobody drives where it was fitted is made
-# too; docs/realism.md then needs the markers "realism gan_calibrated folds":
+# too, between the markers "realism gan_calibrated folds" of docs/realism.md. "train_generator folds=5" keeps them:
 #
-#     FOLDS=a.safetensors,b.safetensors sh benchmarks/realism_cards.sh
+#     FOLDS=$(ls outputs/folds/*/generator_*_fold_*.safetensors | paste -sd,) sh benchmarks/realism_cards.sh
 set -eu
 export OMP_NUM_THREADS=1
 python="${PYTHON:-python}"
-rivals='against=[gan,idm_mobil,idm,ganlane.evaluation.realism.drivers.HeadwayIdm]'
+rivals='against=[gan,idm_mobil,idm,idm_faults,ganlane.evaluation.realism.drivers.HeadwayIdm]'
 
 "$python" -m ganlane.realism traffic=gan_calibrated "$rivals" scenes=all long_against=true \
     report=docs/realism.md figures=docs/figures

@@ -24,18 +24,27 @@ from ganlane.config.realism import RealismConfig
 def realism(config: RealismConfig, folder: Path) -> str:
     """Drive, measure, print, draw, keep."""
     from ganlane.build import set_threads
-    from ganlane.cards import (
-        check_targets,
-        drive_card,
-        draw,
-        i80_beside,
-        makers_of,
-        publish,
-        scenes_path,
-        show,
-    )
+    from ganlane.cards import check_targets, draw, drive_card, publish, scenes_path, show
     from ganlane.evaluation import write_results
     from ganlane.evaluation.realism import card_text
 
     config = config.shortened()
     set_threads(config.threads)
+    path = scenes_path(config)
+    check_targets(config, path)
+    card = drive_card(config, path)
+    drawn, numbers = draw(card, folder), card.numbers()
+    if config.publish:
+        publish(card.starts)
+    show(config, folder, card_text(numbers, card.long_runs), numbers, drawn)
+    seeds = {"stream": "report", "seed": config.seed}
+    return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; the exit status."""
+    return run_command("realism", realism, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -9,8 +9,8 @@
 
 Writes generator_PRESET.safetensors (weights, metrics, lane-change statistics) and results.json into its run folder.
 With folds=5 five more generators are fitted, each without the scenes of its fold, and kept beside it as
-generator_PRESET_fold_1.safetensors and so on; results.json pools their errors on these scenes. With ablations=true the preset is also fitted with one part changed at a time. resume=FOLDER goes on with
-what an earlier run has fitted.
+generator_PRESET_fold_1.safetensors and so on; results.json pools their errors on these scenes. With ablations=true
+the preset is also fitted with one part changed at a time. resume=FOLDER goes on with what an earlier run has fitted.
 """
 
 from __future__ import annotations

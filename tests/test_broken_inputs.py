@@ -1,7 +1,7 @@
 """Whatever is broken, a command ends with status 2 and one sentence, without a traceback, and leaves nothing behind.
 
-Wrong configuration values are made from the dataclasses: every key gets a value of a wrong type, and every key that has
-a range one outside of it, once. Files are damaged in every way that came to mind.
+Wrong configuration values are made from the dataclasses: every key gets a value of a wrong type, and every key that
+has a range one outside of it, once. Files are damaged in every way that came to mind.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.evaluation.realism import check_cover, fold_weights
 from ganlane.train_generator import main
 
 FEW = ["generator.loop.updates=2", "generator.loop.evaluate_every=1", "generator.batch=4"]
@@ -32,6 +33,15 @@ def test_errors_stand_beside_constant_velocity(recordings, capsys):
     assert results["ade_m"].keys() == results["fde_m"].keys() == kinds
     assert list(results["scenes"]) == results["data"]["held_out"]
     assert not set(results["data"]["held_out"]) & set(results["data"]["fitted"])
+
+
+def test_the_folds_generators_are_kept_and_cover_every_scene(recordings, capsys):
+    assert main([f"data.path={recordings}", *FEW, "folds=3"]) == 0
+    folder = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: ")).parent
+    paths = [folder / f"generator_paper_fold_{number}.safetensors" for number in (1, 2, 3)]
+    folds = fold_weights(paths)
+    assert [weights["paper"] for weights in folds.values()] == paths
+    check_cover(list(folds), sorted(pl.read_csv(recordings)["scene"].unique()))
 
 
 def broken(path: Path, how: str) -> None:

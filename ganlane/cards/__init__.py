@@ -1,26 +1,16 @@
 """Realism cards from plain configs: which traffics drive, what they drive, and where the tables go.
 
-:func:`makers_of` and :func:`folds_of` say who drives from which scenes (:mod:`ganlane.cards.traffics`);
-:func:`drive_from_starts`, :func:`i80_beside` and :func:`long_runs` let them drive (:mod:`ganlane.cards.driving`);
-:mod:`ganlane.cards.output` prints, draws and writes into documents. What is measured, and how, is in
-:mod:`ganlane.evaluation.realism`.
+1. :mod:`ganlane.cards.traffics`: who drives, and from which scenes.
+2. :mod:`ganlane.cards.driving`: recorded or spawned starts, I-80, long runs.
+3. :mod:`ganlane.cards.card`: all of it, as the numbers that are kept.
+4. :mod:`ganlane.cards.output`: tables, documents, figures, and the file that ships.
+
+What is measured, and how, is in :mod:`ganlane.evaluation.realism`.
 """
 
-from ganlane.cards.driving import drive_from_starts, i80_beside, long_runs, scenes_path
-from ganlane.cards.output import check_targets, command_line, draw, publish, show
-from ganlane.cards.traffics import PRESETS, folds_of, makers_of
+from ganlane.cards.card import Card, drive_card
+from ganlane.cards.driving import scenes_path
+from ganlane.cards.output import check_targets, draw, publish, show
+from ganlane.cards.traffics import folds_of, makers_of
 
-__all__ = [
-    "PRESETS",
-    "check_targets",
-    "command_line",
-    "draw",
-    "drive_from_starts",
-    "folds_of",
-    "i80_beside",
-    "long_runs",
-    "makers_of",
-    "publish",
-    "scenes_path",
-    "show",
-]
+__all__ = ["Card", "check_targets", "draw", "drive_card", "folds_of", "makers_of", "publish", "scenes_path", "show"]

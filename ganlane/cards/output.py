@@ -9,6 +9,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from ganlane.cards.card import Card
 from ganlane.cards.driving import say
 from ganlane.config.folders import OVERRIDES
 from ganlane.config.realism import RealismConfig
@@ -29,16 +30,14 @@ def check_targets(config: RealismConfig, path: Path | None) -> None:
         raise UserError(f"figures={config.figures}: no such folder; make it, or name another.")
 
 
-def draw(
-    starts: Starts, runs: Sequence[Mapping[str, Any]], own: Mapping[str, Any], name: str, to: Path
-) -> list[Path]:
-    """The figures of the traffic ``name``, whose rows are ``own``, into the folder ``to``."""
-    pictures = card_pictures(starts, runs, own, name)
+def draw(card: Card, to: Path) -> list[Path]:
+    """The figures of a card, into the folder ``to``."""
+    pictures = card_pictures(card.starts, card.runs, card.quantities, card.traffic)
     return [write_figure(picture, to / f"{title}.png") for title, picture in pictures.items()]
 
 
 def show(
-    config: RealismConfig, folder: Path, numbers: Mapping[str, Any], tables: list[str], drawn: list[Path]
+    config: RealismConfig, folder: Path, tables: list[str], numbers: Mapping[str, Any], drawn: Sequence[Path]
 ) -> None:
     """The tables on stdout; tables and figures where a document wants them."""
     print(*tables, sep="\n\n")

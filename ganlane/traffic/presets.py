@@ -45,7 +45,7 @@ SIMULATED_ANCHOR: AnchorParameters = replace(
 
 
 def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
-    """Equations 9 to 11 with the numbers of the recordings that the generator was fitted to."""
+    """Equations 9 to 11 with the numbers of all recordings that were given to the fit, held-out scenes too."""
     changes = statistics.lane_changes
     numbers = (changes.t_m_srlc_steps, changes.lateral_speed.mean, changes.lateral_speed.sd)
     if None in numbers:
@@ -58,7 +58,7 @@ def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralCha
 
 
 def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
-    """Gaussian of the recorded accelerations over one second."""
+    """Gaussian of the recorded accelerations over one second, of all scenes."""
     recorded = statistics.acceleration_smoothed
     told = {name: getattr(recorded, name) for name in ("mean", "sd") if getattr(recorded, name) is not None}
     return SuddenAccelerations(**told)

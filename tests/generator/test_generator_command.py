@@ -86,11 +86,15 @@ def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monk
 
 @pytest.mark.parametrize("kept", ["fits/*.pt", "generator_*.safetensors"])
 def test_each_of_the_two_is_kept_by_itself(kept, tmp_path):
-    folder, file = tmp_path / "run", tmp_path / "run" / kept.replace("*", "paper")
-    with pytest.raises(OSError, match="full"), cleared_after_mistakes(folder):
+    file = tmp_path / "run" / kept.replace("*", "paper")
+
+    def fit():
         file.parent.mkdir(parents=True)
         file.touch()
         raise OSError("full")
+
+    with pytest.raises(OSError, match="full"), cleared_after_mistakes(tmp_path / "run"):
+        fit()
     assert file.is_file()
 
 

@@ -1,9 +1,11 @@
 from dataclasses import replace
 
+import polars as pl
 import pytest
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.data import SyntheticTraffic, measure_exposure, synthetic_scenes
 from ganlane.generator.calibrated import CalibratedConfig
+from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.cross_validation import cross_validate
 from ganlane.generator.fitting import PaperConfig
 from ganlane.generator.fold_tables import fold_tables
@@ -67,3 +69,30 @@ def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(frame, tmp_pa
     assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
     assert scores["open_loop"]["windows"] > rollout["windows"]
     assert "Social-GAN (published)" in fold_tables(scores)
+
+
+@pytest.mark.parametrize(("preset", "config"), [("paper", PAPER), ("calibrated", CALIBRATED)])
+def test_the_folds_generators_are_told_and_forecast_what_was_scored(preset, config, frame, tmp_path):
+    told = {}
+    scores = cross_validate(preset, frame, config, 3, tmp_path, on_fold=told.__setitem__, source="folder/made.csv")
+    again = {}
+    cross_validate(preset, frame, config, 3, tmp_path, on_fold=again.__setitem__)
+    assert list(told) == list(again) == [1, 2, 3]
+    for (number, fold), split in zip(told.items(), scores["splits"]):
+        path = tmp_path / f"{number}.safetensors"
+        fold.save(path)
+        generator, metadata = load_generator(path, preset)
+        assert metadata["data"]["held_out"] == split["held_out"]
+        assert metadata["data"]["file"] == "made.csv"
+        assert {name: weights.tolist() for name, weights in generator.state_dict().items()} == {
+            name: weights.tolist() for name, weights in again[number].module.state_dict().items()
+        }
+
+
+def test_a_folds_driving_statistics_are_those_of_its_other_scenes(frame, tmp_path):
+    told = {}
+    cross_validate("paper", frame, PAPER, 3, tmp_path, on_fold=told.__setitem__)
+    for fold in told.values():
+        others = frame.filter(~pl.col("scene").is_in(fold.data["held_out"]))
+        assert 0.0 < fold.statistics["exposure"]["vehicle_km"] == measure_exposure(others).vehicle_km
+        assert fold.statistics["exposure"]["vehicle_km"] < measure_exposure(frame).vehicle_km

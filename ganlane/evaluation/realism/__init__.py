@@ -27,7 +27,8 @@ The modules in the order in which they are to be read:
    :mod:`~ganlane.evaluation.realism.table` is the card as text, :mod:`~ganlane.evaluation.realism.document` puts it
    into a page.
 
-The command is ``ganlane realism`` (:mod:`ganlane.realism`, :mod:`ganlane.cards`), the figures are in :mod:`ganlane.view.realism`.
+The command is ``ganlane realism`` (:mod:`ganlane.realism` and :mod:`ganlane.cards`), the figures are in
+:mod:`ganlane.view.realism`.
 """
 
 from ganlane.evaluation.realism.card import floors_of, from_starts, quantity_rows, rows_of, verdict

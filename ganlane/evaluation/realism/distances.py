@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy.special import stdtrit
 
 from ganlane.evaluation.statistics import Estimate, percentile_levels, resample_counts
 
@@ -46,8 +46,8 @@ def distance(
 
     A resample holds some units twice and others not at all, so its distance is biased upwards; near 0 all of them lie
     above the estimate. Hence the basic (reverse percentile) interval, taken of the squared distance, in which that
-    bias adds up, cut off at 0 and widened to hold the estimate. The percentile interval misses a perfect model's 0
-    always, BCa as well (``benchmarks/realism_coverage.py``).
+    bias adds up, cut off at 0 and widened to hold the estimate. Percentile and BCa intervals consist of resamples,
+    none of which is 0, so they miss a perfect model's distance (``benchmarks/realism_coverage.py``).
 
     Args:
         simulated, recorded: [units, bins].
@@ -59,9 +59,9 @@ def distance(
     known = drawn[np.isfinite(drawn)]
     if not np.isfinite(value) or len(known) < 2:
         return Estimate(value, None, None)
-    high, low = np.quantile(known**2, percentile_levels())
-    low, high = np.sqrt(np.maximum(2.0 * value**2 - np.array([low, high]), 0.0))
-    return Estimate(value, min(value, float(low)), max(value, float(high)))
+    tails = np.quantile(known**2, percentile_levels())
+    low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
+    return Estimate(value, min(value, float(low)), min(1.0, max(value, float(high))))
 
 
 def distance_difference(
@@ -86,13 +86,11 @@ def distance_difference(
     if not np.isfinite(value) or len(known) < 2:
         return Estimate(value, None, None)
     error = float(known.std()) * np.sqrt(units / (units - 1))
-    reach = float(stats.t.ppf(percentile_levels()[1], units - 1)) * error / max(one + other, _TINY)
-    return Estimate(value, value - reach, value + reach)
+    reach = float(stdtrit(units - 1, percentile_levels()[1])) * error / max(one + other, _TINY)
+    return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 
-def _resampled(
-    models: Sequence[Array], recorded: Array, paired: bool, resamples: int, seed: int
-) -> list[Array]:
+def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int, seed: int) -> list[Array]:
     """Distances [R] of each of ``models`` from resampled units, the same ones for all; none of a single unit."""
     units = len(recorded) if paired else len(models[0])
     if units < 2:

@@ -140,7 +140,7 @@ def _drive_fold(
     return _Part(scenes, chosen, drive_all(fold.makers, scenes, chosen, report))
 
 
-def _whole(frame: pl.DataFrame, widths: Mapping[str, float]) -> dict[str, float]:
+def _whole(frame: pl.DataFrame, widths: dict[str, float]) -> dict[str, float]:
     """What all frames show, nothing left out: lane changes, vehicle-km, spread of speeds within a frame."""
     seen = driving_statistics(frame, widths)
     return {

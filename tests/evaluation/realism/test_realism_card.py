@@ -2,6 +2,7 @@
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.evaluation.realism.card import quantity_rows
+from ganlane.evaluation.realism.distances import ceiling
 from ganlane.evaluation.realism.drivers import ConstantVelocity, RandomDriving
 from ganlane.evaluation.realism.driving import drive, measure_recordings
 from ganlane.evaluation.realism.quantities import QUANTITIES
@@ -20,8 +21,20 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors():
     makers = {"cruise": ConstantVelocity, "random": RandomDriving, "constant_velocity": ConstantVelocity}
     driven = {name: drive(make, recordings, StartOptions()) for name, make in makers.items()}
     own = driven.pop("cruise")
-    rows = quantity_rows(own, {**driven, "rival": driven["random"]}, recorded, None, resamples=100)
+    rows = quantity_rows(own, {**driven, "rival": driven["random"]}, recorded, {}, resamples=100)
     assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
     assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
     assert rows["speed"]["against"].keys() == {"rival"}
     assert all(rows[name]["samples"] > 0 for name in WITHOUT_CHANGES)
+    assert all(rows[name]["ceiling"] == ceiling(recorded[name]) for name in WITHOUT_CHANGES)
+
+
+def test_floors_that_were_not_driven_are_those_that_were_measured_before():
+    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=6.0))
+    recordings = recordings_of(frame, scene_lane_widths(frame))
+    own, measured = drive(ConstantVelocity, recordings, StartOptions()), measure_recordings(recordings)
+    recorded = {"speed": measured.counts([each.name for each in recordings], "speed")}
+    rows = quantity_rows(own, {}, recorded, {"random": {"speed": 0.5}}, resamples=100)
+    assert rows.keys() == {"speed"}
+    assert rows["speed"]["floor"] == 0.5
+    assert rows["speed"]["constant_velocity"] is None

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.distance import jensenshannon
+from scipy.stats import binom
 
 from ganlane.evaluation.realism.card import verdict
 from ganlane.evaluation.realism.distances import ceiling, distance, distance_difference, jensen_shannon
@@ -72,3 +73,61 @@ def test_one_scene_gives_no_interval_and_no_verdict():
 def test_interval_holds_the_distance_of_scenes_that_differ():
     estimate = distance(scenes(0.15, 6), scenes(0.0, 7), resamples=400)
     assert estimate.low < estimate.value < estimate.high
+
+
+def draws(shift, number, trials=40):
+    """Recordings and a model that lies by ``shift`` beside them, of scenes with means of their own."""
+    random = np.random.default_rng(number)
+    for _ in range(trials):
+        means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
+        size = random.integers(15, 60, number)
+        yield [
+            np.stack([np.bincount(random.binomial(20, p, times * n), minlength=21) for p, n in zip(at, size)]) * 1.0
+            for at, times in ((means, 1), (means + shift, 4), (means + shift, 4))
+        ]
+
+
+@pytest.mark.parametrize("number", [4, 11])
+def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
+    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)]
+    assert all(each.low <= each.value <= each.high for each in intervals)
+    assert sum(each.low == 0.0 for each in intervals) >= 0.9 * len(intervals)
+
+
+@pytest.mark.parametrize("number", [4, 11])
+def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
+    many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
+    true = float(jensen_shannon(*(binom.pmf(np.arange(21)[:, None], 20, at).sum(1) for at in (many, many + 0.1))))
+    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.1, number)]
+    assert sum(each.low <= true <= each.high for each in intervals) >= 0.85 * len(intervals)
+    assert sum(each.low > 0.0 for each in intervals) >= 0.9 * len(intervals)
+
+
+@pytest.mark.parametrize(("number", "shift"), [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)])
+def test_two_equally_good_models_are_seldom_told_apart(number, shift):
+    verdicts = [
+        verdict(distance_difference(*models, recorded, resamples=300)) for recorded, *models in draws(shift, number)
+    ]
+    assert verdicts.count("undecided") >= 0.9 * len(verdicts)
+
+
+@given(COUNTS, COUNTS, COUNTS)
+def test_every_interval_holds_its_estimate(recorded, first, second):
+    for estimate in (
+        distance(first, recorded, resamples=20),
+        distance_difference(first, second, recorded, resamples=20),
+    ):
+        assert estimate.low <= estimate.value <= estimate.high
+    assert distance(first, recorded, resamples=20).low >= 0.0
+
+
+def test_a_model_does_not_differ_from_itself():
+    model = scenes(0.1, 3)
+    assert distance_difference(model, model, scenes(0.0, 5), resamples=50) == Estimate(0.0, 0.0, 0.0)
+
+
+def test_unpaired_units_are_resampled_on_the_side_of_the_model():
+    model, recorded = scenes(0.1, 3, 5), scenes(0.0, 5, 8)
+    estimate = distance(model, recorded, paired=False, resamples=100)
+    assert estimate.low <= estimate.value <= estimate.high
+    assert distance(model[:1], recorded, paired=False).interval is None

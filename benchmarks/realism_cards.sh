@@ -1,6 +1,7 @@
 #!/bin/sh
 # Every traffic's realism card into docs/realism.md, and the figures into docs/figures. Run it from the repository's
-# root, with the recordings in GANLANE_DATA or ../shared/data; about ten minutes on one core.
+# root, with the recordings in GANLANE_DATA or ../shared/data; it took about ten minutes on one core before idm_faults
+# was among the rivals.
 #
 #     sh benchmarks/realism_cards.sh
 #

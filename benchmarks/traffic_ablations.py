@@ -370,7 +370,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--vehicle-km", type=float, default=200.0, help="at least, per variant")
     parser.add_argument("--vehicles", type=int, default=9)
     parser.add_argument("--batch", type=int, default=128, help="episodes side by side")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of an episode")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of an episode")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--fitted", action="append", default=[], metavar="LABEL=FILE", help="further weights")
     parser.add_argument("--only", nargs="*", help="variants whose name holds one of these words")

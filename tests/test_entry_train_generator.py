@@ -36,12 +36,14 @@ def test_errors_stand_beside_constant_velocity(recordings, capsys):
 
 
 def test_the_folds_generators_are_kept_and_cover_every_scene(recordings, capsys):
+    frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=6.5))
+    write_scene_csv(frame, recordings)
     assert main([f"data.path={recordings}", *FEW, "folds=3"]) == 0
     folder = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: ")).parent
     paths = [folder / f"generator_paper_fold_{number}.safetensors" for number in (1, 2, 3)]
     folds = fold_weights(paths)
     assert [weights["paper"] for weights in folds.values()] == paths
-    check_cover(list(folds), sorted(pl.read_csv(recordings)["scene"].unique()))
+    check_cover(list(folds), sorted(frame["scene"].unique()))
 
 
 def broken(path: Path, how: str) -> None:

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from ganlane.config.agent import AgentConfig, DqnConfig
 from ganlane.config.bench import BenchConfig
-from ganlane.config.collector import CollectorConfig
+from ganlane.config.collector import CollectorConfig, MultiCollectorConfig, RayCollectorConfig
 from ganlane.config.data import DataConfig, HighdDataConfig, NgsimDataConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
@@ -72,7 +72,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
     "observation": {"observation": ObservationConfig},
     "reward": {"paper": RewardConfig},
-    "collector": {"single": CollectorConfig},
+    "collector": {"single": CollectorConfig, "multi": MultiCollectorConfig, "ray": RayCollectorConfig},
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},
     "logger": {"csv": LoggerConfig, "tensorboard": TensorBoardLoggerConfig, "wandb": WandbLoggerConfig},

@@ -56,12 +56,12 @@ def test_a_variant_that_was_driven_with_these_settings_is_not_driven_again(tmp_p
 
 def test_the_table_stands_between_the_markers_with_its_command(tmp_path):
     document = tmp_path / "traffic.md"
-    document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    document.write_text(f"before\n{BEGIN}\nwhat stood here\n{END}\nafter\n")
     assert run(tmp_path, "--only", "gan without the guard", "--report", str(document)) == 0
     text = document.read_text()
     assert text.startswith("before\n")
     assert text.endswith("after\n")
-    assert "old" not in text
+    assert "what stood here" not in text
     assert "| `gan`, without the guard | " in text
     assert "python benchmarks/traffic_ablations.py --vehicle-km 0.05" in text
     assert str(document) not in text

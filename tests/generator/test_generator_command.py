@@ -74,12 +74,12 @@ def test_mistakes_are_told_in_one_sentence(argument, part, recordings, capsys, t
 
 
 def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monkeypatch, tmp_path):
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied", "results.json")
 
-    monkeypatch.setattr(ganlane.evaluation, "write_results", full)
+    monkeypatch.setattr(ganlane.evaluation, "write_results", refuse)
     assert main([recordings, *FEW]) == 2
-    assert "No space left" in capsys.readouterr().err
+    assert "results.json" in capsys.readouterr().err
     assert len(list(tmp_path.rglob("fits/*.pt"))) == 1
     assert len(list(tmp_path.rglob("generator_paper.safetensors"))) == 1
 

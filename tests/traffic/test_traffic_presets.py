@@ -143,7 +143,7 @@ def fitted_with(folder, *without, **settings):
 
 
 def anchor_of(traffic):
-    return dict(traffic.named_parts())["generator"].parameters
+    return dict(traffic.named_parts())["generator"].anchor
 
 
 def test_calibrated_weights_drive_with_the_washout_and_the_further_inputs_they_were_fitted_with(tmp_path):

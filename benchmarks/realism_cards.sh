@@ -1,7 +1,7 @@
 #!/bin/sh
 # Every traffic's realism card into docs/realism.md, and the figures into docs/figures. Run it from the repository's
-# root, with the recordings in GANLANE_DATA or ../shared/data; it took about ten minutes on one core before idm_faults
-# was among the rivals.
+# root, with the recordings in GANLANE_DATA or ../shared/data; about nine minutes on one core of a busy machine, and
+# as long again for the card by folds.
 #
 #     sh benchmarks/realism_cards.sh
 #

@@ -51,8 +51,8 @@ class WorkerSource(Source):
     """Steps from TorchRL's collectors, on the CPUs of the workers.
 
     The workers take ``team.steps`` steps with the same weights, and wait while the learner works on them. They are
-    started by the first :meth:`step`. Row ``w * team.environments + i`` of a step is row i of worker w, which starts
-    with episode ``w * 2**40 + i``.
+    started by :meth:`open`, at the latest by the first :meth:`step`. Row ``w * team.environments + i`` of a step is
+    row i of worker w, which starts with episode ``w * 2**40 + i``.
 
     Args:
         make_env: makes the environments of one worker.
@@ -92,9 +92,10 @@ class WorkerSource(Source):
         return self._steps.popleft()
 
     def open(self, agent: Rainbow) -> None:
-        """Start the workers."""
-        with self._told():
-            self._start(agent)
+        """Start the workers, if they are not at work."""
+        if self.collector is None:
+            with self._told():
+                self._start(agent)
 
     @contextmanager
     def _told(self) -> Iterator[None]:
@@ -110,9 +111,8 @@ class WorkerSource(Source):
             ) from error
 
     def _collect(self, agent: Rainbow) -> None:
+        self.open(agent)
         with self._told():
-            if self.collector is None:
-                self._start(agent)
             self._hand_over(agent)
             batch = read_by_loop(self.arranged(next(self._batches)))
         self._last = batch[:, -1].get("next").select(keys.SEED, keys.EPISODE, strict=False)

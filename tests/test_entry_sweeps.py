@@ -9,23 +9,10 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+import entry_tiny
 import pytest
 
-TINY = [
-    "env.goal_m=40",
-    "traffic=idm",
-    "init=none",
-    "observation=table3_progress",
-    "total_decisions=320",
-    "log_every=160",
-    "collector.num_envs=16",
-    "agent.hidden=[16,16]",
-    "agent.batch_size=32",
-    "agent.warmup=64",
-    "agent.capacity=1000",
-    "evaluation.agents=[random_legal]",
-    "evaluation.episodes=2",
-]
+TINY = [*entry_tiny.TINY, "evaluation.agents=[random_legal]"]
 #: Option of hydra/launcher to the package that brings it and what it is told beside.
 LAUNCHERS = {
     "basic": ("hydra", []),

@@ -10,26 +10,13 @@ import threading
 import time
 from pathlib import Path
 
+import entry_tiny
 import pytest
 
 from ganlane.agents import read_agent
 from ganlane.train import main
 
-TINY = [
-    "env.goal_m=40",
-    "traffic=idm",
-    "init=none",
-    "observation=table3_progress",
-    "total_decisions=320",
-    "log_every=160",
-    "collector.num_envs=16",
-    "agent.hidden=[16,16]",
-    "agent.batch_size=32",
-    "agent.warmup=64",
-    "agent.capacity=1000",
-    "evaluation.agents=[mobil,random_legal]",
-    "evaluation.episodes=2",
-]
+TINY = [*entry_tiny.TINY, "evaluation.agents=[mobil,random_legal]"]
 
 
 @pytest.fixture(autouse=True)

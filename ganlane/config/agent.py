@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from ganlane.config.checks import above, at_least, between, check, every, number, one_of, optional
@@ -81,10 +81,12 @@ class AgentConfig:
         )
         self.rainbow()
 
-    def rainbow(self) -> RainbowConfig:
-        """As the agent takes it; checks what concerns several keys at once."""
+    def rainbow(self, decisions: int = 1) -> RainbowConfig:
+        """As the agent takes it for a phase of ``decisions``; checks what concerns several keys at once."""
         from ganlane.agents import RainbowConfig
 
+        if self.learning_rate_end is not None and self.learning_rate_decisions == 0:
+            return plain_copy(replace(self, learning_rate_decisions=decisions), RainbowConfig)
         return plain_copy(self, RainbowConfig)
 
 

@@ -13,7 +13,15 @@ if TYPE_CHECKING:
     from ganlane.transforms.table3 import ObservationScale
 
 #: As in :data:`ganlane.transforms.OBSERVATIONS`; repeated here so that a wrong name is found without loading torch.
-FORMS = ("table3", "table3_progress", "lane_view", "lane_view_drift", "table3_lane_view", "fixed_order")
+FORMS = (
+    "table3",
+    "table3_progress",
+    "lane_view",
+    "lane_view_drift",
+    "lane_view_overlap",
+    "table3_lane_view",
+    "fixed_order",
+)
 #: Those laid out as Table III is, from one vehicle to the next: what ``agent.encoder=shared`` can read.
 LISTS = ("table3", "table3_progress", "fixed_order")
 

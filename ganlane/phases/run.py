@@ -26,7 +26,7 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
     """
-    agent = make_agent(config, trained=phase.init is not None)
+    agent = make_agent(config, phase)
     if phase.init is not None and resume is None:
         check_observation(phase.init, config)
         transfer(agent, phase.init)

@@ -32,12 +32,15 @@ def lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
     return torch.round(others.lane * widest)
 
 
-def lane_view(others: Others, lanes: int | Tensor, scale: ObservationScale, drift: bool = False) -> Tensor:
+def lane_view(
+    others: Others, lanes: int | Tensor, scale: ObservationScale, drift: bool = False, overlap: bool = False
+) -> Tensor:
     """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) for nobody.
 
     The gap is over the range of sight; somebody beside the ego counts as behind. With ``drift`` [N, 24]: a fourth
     number tells where in its lane that vehicle is (:attr:`Others.drift`), by which a lane change shows before its
-    middle; this is information that Table III does not have.
+    middle; this is information that Table III does not have. With ``overlap`` the gap goes below 0 where the two
+    bodies overlap along the road; without, all of them look alike, from bumper to bumper to side by side.
     """
     side, way = (others.position.new_tensor(each)[:, None] for each in (_SIDES, _WAYS))
     distance = others.position[:, None, :] * way
@@ -52,7 +55,7 @@ def lane_view(others: Others, lanes: int | Tensor, scale: ObservationScale, drif
         value = torch.add(field[:, None, :], farther, alpha=_NOBODY).amin(-1, keepdim=True)
         return torch.where(found, value, 0.0)
 
-    gap_m = (nearest * scale.range_m - CAR_LENGTH_M).clamp_min(0.0)
+    gap_m = (nearest * scale.range_m - CAR_LENGTH_M).clamp_min(-CAR_LENGTH_M if overlap else 0.0)
     gap = torch.where(found, gap_m / scale.range_m, 1.0)
     nearness = torch.where(found, torch.exp(-gap_m / NEARNESS_M), 0.0)
     seen = (gap, nearness, of_the_nearest(others.speed), *((of_the_nearest(others.drift),) if drift else ()))

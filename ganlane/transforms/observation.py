@@ -31,7 +31,7 @@ from ganlane.transforms.table3 import (
 class Form(NamedTuple):
     """What follows the own state: the list, nearest first; the lane view; own lane change; a place for every role.
 
-    ``drift`` adds to the lane view where in their lanes the others are.
+    ``drift`` adds to the lane view where in their lanes the others are, ``overlap`` lets its gaps go below 0.
     """
 
     listed: bool = False
@@ -39,6 +39,7 @@ class Form(NamedTuple):
     progress: bool = False
     placed: bool = False
     drift: bool = False
+    overlap: bool = False
 
 
 OBSERVATIONS: Final = {
@@ -47,6 +48,7 @@ OBSERVATIONS: Final = {
     "lane_view": Form(viewed=True, progress=True),
     "table3_lane_view": Form(listed=True, viewed=True, progress=True),
     "lane_view_drift": Form(viewed=True, progress=True, drift=True),
+    "lane_view_overlap": Form(viewed=True, progress=True, drift=True, overlap=True),
     "fixed_order": Form(placed=True, progress=True),
 }
 
@@ -66,9 +68,9 @@ class ObservationTransform(Transform):
         vehicles: M, the ego included.
         form: ``table3`` (the paper's literal 3 + 3 (M - 1) numbers), ``table3_progress`` (and the ego's own
             lane change: progress 0 to 1, direction -1, 0 or 1), ``lane_view`` (own state, lane view, lane
-            change), ``lane_view_drift`` (and where in their lanes the others are), ``table3_lane_view`` (list and
-            lane view), ``fixed_order`` (as ``table3_progress``, with a place for
-            every lane and role in the list's stead).
+            change), ``lane_view_drift`` (and where in their lanes the others are), ``lane_view_overlap`` (and how far
+            those beside the ego overlap it), ``table3_lane_view`` (list and lane view), ``fixed_order`` (as
+            ``table3_progress``, with a place for every lane and role in the list's stead).
         scale: normalisers.
 
     Raises:
@@ -106,7 +108,7 @@ class ObservationTransform(Transform):
         if form.placed:
             parts.append(as_list(fixed_order(others, distance_to_ego(seen, road), road.lanes)))
         if form.viewed:
-            parts.append(lane_view(others, road.lanes, self.scale, form.drift))
+            parts.append(lane_view(others, road.lanes, self.scale, form.drift, form.overlap))
         if form.progress:
             parts.append(torch.stack((progress, direction.to(progress.dtype)), dim=1))
         return torch.cat(parts, dim=1)

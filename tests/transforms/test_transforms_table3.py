@@ -100,6 +100,19 @@ def test_a_lane_change_shows_in_the_drift_before_its_middle():
     assert torch.equal(view[:, :3].flatten(), observe("lane_view", rows)[3:-2])
 
 
+@pytest.mark.parametrize(("ahead_m", "gap_m"), [(0.0, -4.5), (1.5, -3.0), (4.5, 0.0), (30.0, 25.5)])
+@pytest.mark.parametrize("way", [1, -1])
+def test_gaps_below_zero_tell_how_far_beside_somebody_is(ahead_m, gap_m, way):
+    rows = [EGO, (way * ahead_m, 2, 26.0, 20.0)]
+    row = 0 if way * ahead_m > 0 else 1
+    view = observe("lane_view_overlap", rows)[3:-2].reshape(6, 4)
+    assert view[row, 0].item() == pytest.approx(gap_m / 200)
+    assert view[row, 1].item() == pytest.approx(torch.exp(torch.tensor(-gap_m / 15)).item())
+    assert view[1 - row].tolist() == [1.0, 0.0, 0.0, 0.0]
+    flat = observe("lane_view_drift", rows)[3:-2].reshape(6, 4)
+    assert flat[row, 0].item() == pytest.approx(max(gap_m, 0.0) / 200)
+
+
 @pytest.mark.parametrize("form", list(OBSERVATIONS))
 def test_every_form_has_the_size_it_says_and_a_spec_that_holds(form):
     base = HighwayEnv(IdmMobilTraffic(), num_envs=3)

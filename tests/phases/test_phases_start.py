@@ -41,9 +41,9 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(tmp_path):
 
 
 def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_path):
-    told = ["experiment=paper", "agent.learning_rate_end=1e-5", "pretrain.total_decisions=5000", "total_decisions=900"]
+    told = ["experiment=paper", "agent.learning_rate_end=1e-5", "pretrain.total_decisions=5000", "total_decisions=90"]
     config = check("train", told).config
     lengths = [make_agent(config, phase).config.learning_rate_decisions for phase in phases_of(config, tmp_path)]
-    assert lengths == [5000, 900]
+    assert lengths == [5000, 90]
     config.agent.learning_rate_decisions = 300
     assert make_agent(config, phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300

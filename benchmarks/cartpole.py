@@ -17,7 +17,6 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -26,7 +25,7 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
-from ganlane.files import write_between_markers
+from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
 from ganlane.training import TrainingConfig, train
 
 BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"
@@ -132,22 +131,29 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def main() -> None:
-    """Run all seeds, print the table, and write it where asked."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """What the command line says."""
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--report", type=Path, help=f"a document with the lines {BEGIN} and {END}")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    outcomes = []
-    for seed in range(arguments.seeds):
-        outcomes.append(run(seed, arguments.frames))
+    add_report(parser, BEGIN, END)
+    return parser.parse_args(arguments)
+
+
+def measure(told: argparse.Namespace) -> str:
+    """Run all seeds; the table, in the document too where one is named."""
+    section, outcomes = ReportSection(told.report, BEGIN, END), []
+    for seed in range(told.seeds):
+        outcomes.append(run(seed, told.frames))
         print("seed {}: 475 at {} frames, best {}, {}".format(*outcomes[-1].cells()), flush=True)
-    print(table(outcomes))
-    if arguments.report:
-        write_between_markers(arguments.report, BEGIN, END, table(outcomes))
+    section.write(table(outcomes))
+    return table(outcomes)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure; the exit status."""
+    return run_script(measure, parse(arguments))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -17,14 +17,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from ganlane.api import load_agent, make_env
-from ganlane.errors import UserError
+from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
 from ganlane.evaluation import write_results
 from ganlane.evaluation.crash_floor import Way, driver_row, floor_rows, search_left, ways_of_drivers
 from ganlane.evaluation.rides import Ride, drive
-from ganlane.files import split_at_markers, write_between_markers
 from ganlane.memory import keep_freed_memory
 
 DRIVERS = ("mobil", "agent_idm", "keep_lane")
@@ -77,7 +74,7 @@ def written(way: Way) -> dict[str, Any]:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """What the command line says."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--traffic", default="gan")
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--beam", type=int, nargs="+", default=[8, 32, 128], help="growing sizes")
@@ -86,21 +83,20 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--vehicles", type=int, default=9, help="the ego included")
     parser.add_argument("--rows", type=int, default=32, help="highways that are stepped at once")
     parser.add_argument("--folder", type=Path, help="default: outputs/crash_floor/TRAFFIC")
-    parser.add_argument("--report", type=Path, help="a document with the markers of this traffic")
+    add_report(parser, *markers("TRAFFIC"))
     return parser.parse_args(arguments)
 
 
-def markers(told: argparse.Namespace) -> tuple[str, str]:
+def markers(traffic: str) -> tuple[str, str]:
     """Lines of the document between which the tables of this traffic stand."""
-    return f"<!-- begin crash floor {told.traffic} -->", f"<!-- end crash floor {told.traffic} -->"
+    return f"<!-- begin crash floor {traffic} -->", f"<!-- end crash floor {traffic} -->"
 
 
-def publish(told: argparse.Namespace, tables: dict[str, Any], ways: Sequence[Way]) -> str:
+def publish(told: argparse.Namespace, section: ReportSection, tables: dict[str, Any], ways: Sequence[Way]) -> str:
     """Print the tables, write them, and with --report put them into the document; where the results are."""
     text = "\n".join([*floor_table(tables["floor"], told.episodes), "", *driver_table(tables["drivers"])])
     print(text, flush=True)
-    if told.report is not None:
-        write_between_markers(told.report, *markers(told), f"\n{text}\n")
+    section.write(f"\n{text}\n")
     seeds = {"stream": "report", "seed": told.seed, "episodes": [0, told.episodes - 1]}
     numbers = {**tables, "ways": [written(way) for way in ways]}
     folder = told.folder or Path("outputs/crash_floor") / told.traffic
@@ -109,8 +105,8 @@ def publish(told: argparse.Namespace, tables: dict[str, Any], ways: Sequence[Way
 
 def measure(told: argparse.Namespace) -> str:
     """Drive and search; the results are published after every stage, since the later ones take long."""
-    if told.report is not None:
-        split_at_markers(told.report, *markers(told))  # refused now rather than after hours of driving
+    keep_freed_memory()
+    section = ReportSection(told.report, *markers(told.traffic))
     begun, line = time.monotonic(), ""
     driven = {name: rides_of(name, told) for name in told.drivers}
     ways, env = ways_of_drivers(driven.values(), range(told.episodes)), environment(told)
@@ -121,21 +117,13 @@ def measure(told: argparse.Namespace) -> str:
             "drivers": [driver_row(name, rides, ways) for name, rides in driven.items()],
             "seconds": time.monotonic() - begun,
         }
-        line = publish(told, tables, ways)
+        line = publish(told, section, tables, ways)
     return line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure; the exit status."""
-    told = parse(arguments)
-    torch.set_num_threads(1)
-    keep_freed_memory()
-    try:
-        print(measure(told))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_script(measure, parse(arguments))
 
 
 if __name__ == "__main__":

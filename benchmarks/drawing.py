@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import argparse
 import cProfile
+import io
 import pstats
 import statistics
+import sys
 import time
+from collections.abc import Sequence
 
-import torch
-
+from ganlane.benchmarks.script import parser_of, run_script
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
+from ganlane.errors import UserError
 from ganlane.sim.random import Stream
 from ganlane.view import FramePainter, Trajectory, WindowParameters, record_episode
 
@@ -45,30 +48,48 @@ def rounds(painter: FramePainter, frames: int, count: int) -> tuple[list[float],
     return by_clock, by_cpu
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+def profile(painter: FramePainter, frames: int) -> str:
+    """Where the time of a round goes."""
+    with cProfile.Profile() as taken:
+        rounds(painter, frames, 1)
+    text = io.StringIO()
+    pstats.Stats(taken, stream=text).sort_stats("tottime").print_stats(20)
+    return text.getvalue()
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """What the command line says."""
+    parser = parser_of(__doc__)
     parser.add_argument("--width", type=int, default=1280)
     parser.add_argument("--height", type=int, default=320)
     parser.add_argument("--frames", type=int, default=80, help="per round")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--profile", action="store_true", help="where the time goes")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    trajectory = episode(0.1 * (arguments.frames * arguments.rounds + 1))
-    if len(trajectory) <= arguments.frames * arguments.rounds:
-        parser.error(f"the episode has {len(trajectory)} frames, one of them for warming up; ask for fewer in all")
-    painter = FramePainter(trajectory, WindowParameters(arguments.width, arguments.height))
+    return parser.parse_args(arguments)
+
+
+def measure(told: argparse.Namespace) -> str:
+    """Draw all rounds; a line per clock."""
+    wanted = told.frames * told.rounds
+    trajectory = episode(0.1 * (wanted + 1))
+    if len(trajectory) <= wanted:
+        raise UserError(
+            f"the episode has {len(trajectory)} frames, one of them for warming up; ask for fewer in all."
+        )
+    painter = FramePainter(trajectory, WindowParameters(told.width, told.height))
     painter.draw(0)
-    if arguments.profile:
-        with cProfile.Profile() as profile:
-            rounds(painter, arguments.frames, 1)
-        pstats.Stats(profile).sort_stats("tottime").print_stats(20)
-        return
-    print(f"{arguments.width} x {arguments.height}, {trajectory.vehicles} vehicles, {arguments.rounds} rounds")
-    for unit, found in zip(("s", "CPU-s"), rounds(painter, arguments.frames, arguments.rounds)):
-        print(f"{statistics.median(found):.0f} frames/{unit} (best {max(found):.0f})")
+    if told.profile:
+        return profile(painter, told.frames)
+    lines = [f"{told.width} x {told.height}, {trajectory.vehicles} vehicles, {told.rounds} rounds"]
+    for unit, found in zip(("s", "CPU-s"), rounds(painter, told.frames, told.rounds)):
+        lines.append(f"{statistics.median(found):.0f} frames/{unit} (best {max(found):.0f})")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure; the exit status."""
+    return run_script(measure, parse(arguments))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -10,10 +10,13 @@ generator_courses.png (its Figure 2: a scene that the generator was not fitted t
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
 
+from ganlane.benchmarks.script import parser_of, run_script
 from ganlane.data import default_scenes, read_scenes, scene_lane_widths
 from ganlane.evaluation.realism import StartOptions, drive_recordings, recorded_frame, recordings_of
 from ganlane.generator import Discriminator, load_generator, shipped_generator
@@ -51,16 +54,27 @@ def courses(scene: str, lane: int) -> Image.Image:
     return draw_space_time(scene, lane, {"recorded": recorded_frame([recording]), "gan_calibrated": driven})
 
 
-def main() -> None:
-    """Draw and write."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """What the command line says."""
+    parser = parser_of(__doc__)
     parser.add_argument("--folder", type=Path, default=Path("docs/figures"))
     parser.add_argument("--scene", default="us101-b", help="a scene that the generator was not fitted to")
     parser.add_argument("--lane", type=int, default=2, help="0 is the rightmost")
-    arguments = parser.parse_args()
-    write_figure(architecture(), arguments.folder / "generator_architecture.png")
-    write_figure(courses(arguments.scene, arguments.lane), arguments.folder / "generator_courses.png")
+    return parser.parse_args(arguments)
+
+
+def draw(told: argparse.Namespace) -> str:
+    """Draw and write; where the figures are."""
+    written = [told.folder / f"generator_{name}.png" for name in ("architecture", "courses")]
+    write_figure(architecture(), written[0])
+    write_figure(courses(told.scene, told.lane), written[1])
+    return "\n".join(map(str, written))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw; the exit status."""
+    return run_script(draw, parse(arguments))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -10,13 +10,13 @@ the percentile bootstrap's.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtr
 
+from ganlane.benchmarks.script import parser_of
 from ganlane.evaluation.realism.distances import Array, distance, distance_difference, jensen_shannon
 from ganlane.evaluation.statistics import Estimate, percentile_levels, resample_counts
 
@@ -106,7 +106,7 @@ def shares(estimates: list[Estimate], true: float) -> str:
 
 def main() -> None:
     """Draw, and print a line per kind of interval."""
-    asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    asked = parser_of(__doc__)
     asked.add_argument("--scenes", type=int, nargs="+", default=[11, 4])
     asked.add_argument("--trials", type=int, default=200)
     asked.add_argument("--resamples", type=int, default=500)

@@ -21,7 +21,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from ganlane.errors import UserError
+from ganlane.errors import UserError, as_typed
 from ganlane.files import write_between_markers, write_bytes
 from ganlane.training.log import read_rows
 from ganlane.training.run import flat
@@ -98,7 +98,7 @@ def _row(run: SearchRun, options: Sequence[str]) -> dict[str, str]:
     seconds = float(end.get("wall_s") or 0.0)
     return {
         "run": run.name,
-        **{name: _shown(run.options.get(name)) for name in options},
+        **{name: as_typed(run.options.get(name)) for name in options},
         "decisions": _count(end),
         "best": _number(best, SCORE),
         "best s.e.": _number(best, "standard_error"),
@@ -117,15 +117,6 @@ def _count(row: Mapping[str, str]) -> str:
 
 def _number(row: Mapping[str, str], name: str, form: str = "{:.1f}") -> str:
     return form.format(float(row[name])) if row.get(name) else ""
-
-
-def _shown(value: Any) -> str:
-    """As one would type it on the command line."""
-    if isinstance(value, list):
-        return f"[{','.join(map(_shown, value))}]"
-    if value is None or isinstance(value, bool):
-        return "null" if value is None else str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def compact(rows: Sequence[Mapping[str, str]], options: Sequence[str]) -> list[dict[str, str]]:

@@ -1,4 +1,4 @@
-"""A policy of your own beside MOBIL, on the same episodes, in the same table.
+"""A policy of your own beside MOBIL and a shipped agent, on the same episodes, in the same table.
 
 A policy is anything that writes ``action``: a network that reads ``observation``, or, as here, a rule that reads the
 raw state. Run it with ``python examples/own_policy.py``. On the command line the same class is
@@ -7,18 +7,14 @@ raw state. Run it with ``python examples/own_policy.py``. On the command line th
 
 from __future__ import annotations
 
-import polars as pl
 import torch
-from torchrl.envs import TransformedEnv
 
-from ganlane.agents.drivers import DRIVERS, Driver
-from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.evaluation import evaluation_rows, run_episodes, text_table
+import ganlane
+from ganlane.agents.drivers import Driver
+from ganlane.evaluation import text_table
 from ganlane.keys import KEEP, LEFT, RIGHT
 from ganlane.sim import Road, Stream, leader, safe_change
 from ganlane.sim.ego import ego_scene
-from ganlane.traffic import IdmMobilTraffic
-from ganlane.transforms import RewardTransform
 
 
 class LargestGap(Driver):
@@ -43,20 +39,11 @@ class LargestGap(Driver):
         return action[:, 0]
 
 
-def main():
-    """Evaluate four drivers on 24 short episodes of the stream that is kept for reports."""
-    road, stream = Road(lanes=3), Stream.REPORT
-    drivers = {name: DRIVERS[name](road, stream) for name in ("mobil", "keep_lane", "random_legal")}
-    drivers["largest_gap"] = LargestGap(road, stream)
-    env = HighwayEnv(
-        IdmMobilTraffic(road, stream), num_envs=24, episode=EpisodeParameters(goal_m=500.0), stream=stream
-    )
-    env = TransformedEnv(env, RewardTransform())
-    frames = [
-        run_episodes(env, driver, range(24), seed=0).with_columns(agent=pl.lit(name), traffic=pl.lit("idm_mobil"))
-        for name, driver in drivers.items()
-    ]
-    print(text_table(evaluation_rows(pl.concat(frames))))
+def main(episodes=24, goal_m=500.0):
+    """Evaluate four drivers on short episodes of the stream that is kept for reports."""
+    mine = ganlane.Driver("largest_gap", LargestGap(Road(lanes=3), Stream.REPORT))
+    drivers = ["mobil", "agent_idm", "random_legal", mine]
+    print(text_table(ganlane.evaluate(drivers, ["idm_mobil"], episodes, goal_m=goal_m).to_dicts()))
 
 
 if __name__ == "__main__":

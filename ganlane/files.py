@@ -16,26 +16,72 @@ from safetensors.torch import save
 
 from ganlane.errors import UserError
 
+#: Bytes that are written to find out whether there is room; libraries leave smaller rests unused.
+_PROBE_BYTES = 2**20
+
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success sync it and rename it into place.
 
     A process killed at any instant leaves either the old file or the new one, never a part of one.
+
+    Raises:
+        OSError: the file system refuses. It names ``path`` and has an ``errno``, whatever the library that wrote
+            made of it.
+        UserError: a folder or a device stands there.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    os.close(handle)
-    part = Path(name)
+    _refuse_all_but_files(path)
+    part = _new_part(path)
     try:
         yield part
         with part.open("rb+") as written:
             os.fsync(written.fileno())
         part.chmod(0o644)
         part.replace(path)
+    except Exception as error:
+        refused = _refusal(error, part)
+        if refused is None:
+            raise
+        raise OSError(refused.errno, refused.strerror, str(path)) from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def _refuse_all_but_files(path: Path) -> None:
+    """Renaming onto ``/dev/null`` would replace it, where one may."""
+    if path.exists() and not path.is_file():
+        what = "a folder" if path.is_dir() else "a device or a pipe"
+        raise UserError(f"{path}: {what}, where a file was to be written; give the name of a file.")
+
+
+def _new_part(path: Path) -> Path:
+    """An empty file beside ``path``, whose folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    os.close(handle)
+    return Path(name)
+
+
+def _refusal(error: Exception, part: Path) -> OSError | None:
+    """What the file system said when ``part`` was written; None where the error is about something else.
+
+    Libraries tell of a full disk in words of their own (torch: "unexpected pos 576 vs 534"), so it is asked again.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        return error if error.filename in (None, str(part)) else None
+    try:
+        with part.open("ab") as file:
+            file.write(bytes(_PROBE_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as refused:
+        return refused
+    return None
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

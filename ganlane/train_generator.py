@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,71 +29,113 @@ from ganlane.errors import UserError
 if TYPE_CHECKING:
     import polars as pl
 
-    from ganlane.generator import FitResult
+    from ganlane.generator import CalibratedConfig, FitResult, PaperConfig, Preset, SceneTracks
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What is fitted, to what, and where it is kept: unfinished fits in ``states``, weights in ``folder``."""
+
+    preset: Preset
+    config: PaperConfig | CalibratedConfig
+    source: str
+    frame: pl.DataFrame
+    scenes: list[SceneTracks]
+    held_out: tuple[str, ...]
+    states: Path
+    folder: Path
+
+    def weights(self, suffix: str = "") -> Path:
+        """The file of a generator's weights."""
+        return self.folder / f"generator_{self.preset}{suffix}.safetensors"
 
 
 def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     """Read, fit, print the held-out errors beside constant velocity, save."""
     from ganlane.build import set_threads
     from ganlane.evaluation import write_results
-    from ganlane.evaluation.provenance import code_version
-    from ganlane.fit_report import FitProgress, metrics_table, results_of
-    from ganlane.generator import (
-        HELD_OUT,
-        ablate,
-        ablation_table,
-        assign_folds,
-        cross_validate,
-        fit_generator,
-        fit_key,
-        fold_tables,
-        scene_tracks,
-        split_for_fit,
-    )
+    from ganlane.fit_report import results_of
+    from ganlane.generator import assign_folds
 
     set_threads(config.threads)
-    source, frame = _recordings(config.data)
-    held_out = config.data.held_out_scenes(frame["scene"].unique().to_list(), HELD_OUT)
-    preset = config.generator.preset_name()
-    fit_config = config.generator.fit_config(config.seed)
-    scenes = scene_tracks(frame)
+    fit = _asked(config, folder)
     if config.folds:
-        assign_folds(scenes, config.folds)  # refused now rather than after hours of ablations
-    fits = Path(config.resume or folder) / "fits"
-    numbers: dict[str, Any] = {}
-
-    def keep_fold(number: int, fold: FitResult) -> None:
-        fold.save(folder / f"generator_{preset}_fold_{number}.safetensors", code=code_version())
-
+        assign_folds(fit.scenes, config.folds)  # refused now rather than after hours of ablations
+    further: dict[str, Any] = {}
     if config.ablations:
-        with FitProgress() as progress:
-            rows = ablate(preset, frame, fit_config, held_out, fits, progress.next_fit, progress)
-        print(ablation_table(rows))
-        numbers["ablations"] = rows
+        further["ablations"] = _ablations(fit)
     if config.folds:
-        with FitProgress() as progress:
-            told = (progress.next_fit, progress, keep_fold)
-            folds = cross_validate(preset, frame, fit_config, config.folds, fits, *told, source=str(source))
-        print(fold_tables(folds))
-        numbers["folds"] = folds
-    key = fit_key(preset, fit_config, split_for_fit(scenes, held_out))
+        further["folds"] = _folds(fit, config.folds)
+    numbers = results_of(_fitted(fit, further.get("folds"))) | further
+    path = write_results(folder, numbers, asdict(config), {"seed": config.seed, "held_out": fit.held_out})
+    return f"results: {path}"
+
+
+def _asked(config: TrainGeneratorConfig, folder: Path) -> _Fit:
+    """The fit that ``config`` asks for, its recordings read."""
+    from ganlane.generator import HELD_OUT, scene_tracks
+
+    source, frame = _recordings(config.data)
+    return _Fit(
+        preset=config.generator.preset_name(),
+        config=config.generator.fit_config(config.seed),
+        source=str(source),
+        frame=frame,
+        scenes=scene_tracks(frame),
+        held_out=config.data.held_out_scenes(frame["scene"].unique().to_list(), HELD_OUT),
+        states=Path(config.resume or folder) / "fits",
+        folder=folder,
+    )
+
+
+def _ablations(fit: _Fit) -> dict[str, dict[str, Any]]:
+    """Fit the preset with one part changed at a time; print and return the rows."""
+    from ganlane.fit_report import FitProgress
+    from ganlane.generator import ablate, ablation_table
+
+    with FitProgress() as progress:
+        rows = ablate(fit.preset, fit.frame, fit.config, fit.held_out, fit.states, progress.next_fit, progress)
+    print(ablation_table(rows))
+    return rows
+
+
+def _folds(fit: _Fit, count: int) -> dict[str, Any]:
+    """Fit without the scenes of one fold at a time, keep these generators; print and return the pooled errors."""
+    from ganlane.evaluation.provenance import code_version
+    from ganlane.fit_report import FitProgress
+    from ganlane.generator import cross_validate, fold_tables
+
+    def keep(number: int, fold: FitResult) -> None:
+        fold.save(fit.weights(f"_fold_{number}"), code=code_version())
+
+    with FitProgress() as progress:
+        told = (progress.next_fit, progress, keep)
+        folds = cross_validate(fit.preset, fit.frame, fit.config, count, fit.states, *told, source=fit.source)
+    print(fold_tables(folds))
+    return folds
+
+
+def _fitted(fit: _Fit, folds: dict[str, Any] | None) -> FitResult:
+    """The fit itself: print its errors, save its weights with what the ``folds`` gave."""
+    from ganlane.evaluation.provenance import code_version
+    from ganlane.fit_report import FitProgress, metrics_table
+    from ganlane.generator import fit_generator, fit_key, split_for_fit
+
+    key = fit_key(fit.preset, fit.config, split_for_fit(fit.scenes, fit.held_out))
     with FitProgress() as progress:
         result = fit_generator(
-            preset,
-            frame,
-            held_out=held_out,
-            config=fit_config,
-            source=str(source),
-            resume_path=fits / f"generator_{key}.pt",
+            fit.preset,
+            fit.frame,
+            held_out=fit.held_out,
+            config=fit.config,
+            source=fit.source,
+            resume_path=fit.states / f"generator_{key}.pt",
             on_progress=progress,
         )
     print(metrics_table(result.metrics))
-    weights = folder / f"generator_{preset}.safetensors"
-    result.save(weights, numbers.get("folds"), code_version())
-    print(f"weights: {weights}")
-    numbers = results_of(result) | numbers
-    path = write_results(folder, numbers, asdict(config), {"seed": config.seed, "held_out": held_out})
-    return f"results: {path}"
+    result.save(fit.weights(), folds, code_version())
+    print(f"weights: {fit.weights()}")
+    return result
 
 
 def _recordings(data: DataConfig) -> tuple[Path, pl.DataFrame]:

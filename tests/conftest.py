@@ -6,6 +6,7 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 from hypothesis import settings
 
@@ -20,3 +21,12 @@ torch.set_num_threads(1)
 # Time limits per example fail on a busy machine, and a suite should find the same faults in every run.
 settings.register_profile("ganlane", deadline=None, derandomize=True, database=None)
 settings.load_profile("ganlane")
+
+
+@pytest.fixture
+def hydra_from_memory(monkeypatch):
+    """For tests of what a command says about a value: see ``reference.hydra_memory``."""
+    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from reference.hydra_memory import load_from_memory
+
+    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", load_from_memory)

@@ -14,25 +14,18 @@ import subprocess
 import sys
 import types
 from collections.abc import Iterator
-from contextlib import contextmanager
-from copy import copy
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.singleton import Singleton
-from omegaconf import OmegaConf, open_dict
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import OmegaConf
+from reference.hydra_memory import composed, own_part
 from safetensors.torch import save_file
 
 from ganlane.__main__ import COMMANDS, main
-from ganlane.config.compose import VERSION_BASE, typed
-from ganlane.config.store import SCHEMAS, register
+from ganlane.config.compose import typed
+from ganlane.config.store import SCHEMAS
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.files import load_weights, save_weights
@@ -40,6 +33,9 @@ from ganlane.paths import CHECKPOINTS, conf_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 AGENT, GENERATOR = CHECKPOINTS / "agent_idm.safetensors", CHECKPOINTS / "generator_paper.safetensors"
+
+
+pytestmark = pytest.mark.usefixtures("hydra_from_memory")
 
 
 @pytest.fixture(autouse=True)
@@ -92,59 +88,6 @@ class Key:
         return " ".join((self.command, *self.chosen, self.name))
 
 
-@contextmanager
-def fresh_hydra() -> Iterator[None]:
-    """Room for a Hydra while another one is at work."""
-    state = copy(Singleton._instances.get(GlobalHydra))
-    try:
-        GlobalHydra.instance().clear()
-        yield
-    finally:
-        if state is not None:
-            Singleton._instances[GlobalHydra] = state
-
-
-def composed(command: str, options: tuple[str, ...] = ()) -> Any:
-    """As Hydra composes it with these options of groups, its own part included; read from YAML once."""
-    if (command, options) not in CONFIGS:
-        register()
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(ConfigLoaderImpl, "load_configuration", LOAD)
-            with fresh_hydra(), initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):
-                CONFIGS[command, options] = compose(command, overrides=list(options), return_hydra_config=True)
-    return CONFIGS[command, options].copy()
-
-
-CONFIGS: dict[tuple[str, tuple[str, ...]], Any] = {}
-
-
-def own_part(config: Any) -> Any:
-    """Without what is Hydra's."""
-    with open_dict(config):
-        del config["hydra"]
-    return config
-
-
-def load_from_memory(self: Any, config_name: str, overrides: list[str], *_: Any, **__: Any) -> Any:
-    """In place of Hydra's own, which reads thirty YAML files three times for a command line."""
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    chosen = [override for override in parsed if (conf_folder() / override.key_or_group).is_dir()]
-    config = composed(config_name, tuple(str(override.input_line) for override in chosen))
-    ConfigLoaderImpl._apply_overrides_to_config([override for override in parsed if override not in chosen], config)
-    config.hydra.overrides.task = [override.input_line for override in parsed if not override.is_hydra_override()]
-    config.hydra.runtime.cwd = str(Path.cwd())
-    return config
-
-
-LOAD = ConfigLoaderImpl.load_configuration
-
-
-@pytest.fixture(autouse=True)
-def _hydra_from_memory(monkeypatch):
-    """Hydra composes each choice of options once for all tests; keys are set, and refused, by Hydra itself."""
-    monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", load_from_memory)
-
-
 def keys_of(config: Any, command: str, chosen: tuple[str, ...] = (), prefix: str = "") -> Iterator[Key]:
     """All keys below a dataclass, with their declared types."""
     kinds = get_type_hints(type(config))
@@ -175,8 +118,17 @@ def keys_of_options() -> Iterator[Key]:
             continue
         chosen = (name, *needs.get(name, ()))
         known = {key.name for key in KEYS if key.command == command}
-        config = getattr(typed(in_memory(Key(command, "", None, chosen))), group)
-        yield from (key for key in keys_of(config, command, chosen, f"{group}.") if key.name not in known)
+        for key in keys_of(option_of(command, group, option, chosen), command, chosen, f"{group}."):
+            if key.name not in known:
+                yield key
+
+
+def option_of(command: str, group: str, option: str, chosen: tuple[str, ...]) -> Any:
+    """What an option's dataclass holds; composing takes hundreds of times as long, so only where it has to be."""
+    try:
+        return SCHEMAS[group][option]()
+    except UserError:
+        return getattr(typed(in_memory(Key(command, "", None, chosen))), group)
 
 
 def in_memory(key: Key, *more: tuple[str, Any]) -> Any:
@@ -189,7 +141,8 @@ def in_memory(key: Key, *more: tuple[str, Any]) -> Any:
     return config
 
 
-KEYS = [key for command in COMMANDS for key in keys_of(typed(own_part(composed(command))), command)]
+TYPED = {command: typed(own_part(composed(command))) for command in COMMANDS}
+KEYS = [key for command, config in TYPED.items() for key in keys_of(config, command)]
 OPTION_KEYS = list(keys_of_options())
 
 
@@ -211,13 +164,34 @@ ABSURD: dict[Any, tuple[Any, ...]] = {
 }
 
 
+def with_value(config: Any, names: list[str], value: Any) -> Any:
+    """A copy of a dataclass in which a key, however deep, has another value; its ranges are checked."""
+    first, *deeper = names
+    if isinstance(config, dict):
+        return {**config, first: with_value(config[first], deeper, value)}
+    below = with_value(getattr(config, first), deeper, value) if deeper else value
+    return dataclasses.replace(config, **{first: below})
+
+
 def refused_in_memory(key: Key, value: Any) -> bool:
-    """Whether the dataclasses refuse the value; some hundred times as fast as the command."""
+    """Whether the dataclasses refuse the value; some thousand times as fast as the command."""
     try:
-        typed(in_memory(key, (key.name, value)))
-    except (UserError, OmegaConfBaseException):
+        if not key.chosen:
+            with_value(TYPED[key.command], key.name.split("."), value)
+        else:
+            group, option = key.chosen[0].split("=")
+            config = option_of(key.command, group, option, key.chosen)
+            with_value(config, key.name.split(".")[1:], value)
+    except (UserError, TypeError):  # of the wrong kind altogether: Hydra looks at no range
         return True
-    return False
+    return not is_list_of_kind(key.kind, value)
+
+
+def is_list_of_kind(kind: Any, value: Any) -> bool:
+    """Whether a list holds what it is declared to hold; anything else passes."""
+    kinds = [part for part in (kind, *get_args(kind)) if get_origin(part) is list]
+    wanted = get_args(kinds[0])[0] if kinds else str
+    return wanted is str or not isinstance(value, list) or all(isinstance(each, (int, float)) for each in value)
 
 
 def as_typed(value: Any) -> str:
@@ -583,9 +557,8 @@ def test_a_broken_scene_is_refused(name, here, capsys):
 
 # --- whole commands
 
-#: As a user types them; those that load torch last.
-WHOLE = (
-    "train env.lanes=0",
+#: As a user types them, each refused by another part of the package.
+LINES = (
     "train env.lane=3",
     "train seed=zero",
     "train total_decisions=-1",
@@ -593,8 +566,19 @@ WHOLE = (
     "train resume=nowhere",
     "evaluate agents=[mobil,mobil]",
     "render format=avi",
-    "prepare data=ngsim",
     "train_generator folds=1",
+)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_mistake_is_refused(line, capsys):
+    assert refusal(capsys, *line.split())
+
+
+#: The same in a process of its own, once for a value and once for either kind of file;
+#: a number out of range is in `test_entry_commands`.
+WHOLE = (
+    "prepare data=ngsim",
     "evaluate agents=[broken.safetensors] traffics=[idm]",
     "train resume=run",
 )

@@ -75,6 +75,7 @@ def test_training_is_measured_and_reported(tmp_path, capsys):
     assert "| ganlane training | idm_mobil | eager | cpu | 1 | 4 |" in text
 
 
+@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

@@ -72,7 +72,7 @@ def test_cfg_of_an_unknown_key_ends_with_status_2(empty_folder, capsys):
     assert "no_such_key: no such key" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("flags", [["--cfg", "job"], ["--cfg", "job", "--resolve"], ["--info"]], ids=" ".join)
+@pytest.mark.parametrize("flags", [["--cfg", "job", "--resolve"], ["--info"]], ids=" ".join)
 def test_hydras_views_of_the_config_work_in_a_fresh_process(flags, tmp_path):
     """There nothing has filled the ConfigStore before."""
     done = command("-m", "ganlane.train", *flags, cwd=tmp_path)

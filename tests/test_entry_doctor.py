@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
-from ganlane.config.completion import candidates
 from ganlane.diagnosis import Finding, State, missing, report
 from ganlane.diagnosis.contents import cache, checkpoints, outputs, recordings
 from ganlane.diagnosis.machine import machine
@@ -152,40 +151,3 @@ def test_the_page_names_every_command():
     page = (ROOT / "docs" / "command_line.md").read_text()
     for name in (*COMMANDS, *PLAIN_COMMANDS):
         assert re.search(rf"^\| `{name}` \|", page, flags=re.MULTILINE), name
-
-
-@pytest.mark.parametrize(
-    ("line", "some"),
-    [
-        ("ganlane ", {"train", "evaluate", "doctor"}),
-        ("ganlane tr", {"train", "train_generator"}),
-        ("ganlane train traffic=", {"traffic=gan", "traffic=idm"}),
-        ("ganlane train traffic=gan_", {"traffic=gan_calibrated"}),
-        ("ganlane train traffic=gan env.lan", {"env.lanes=", "env.lane_width_m="}),
-        ("ganlane train ", {"traffic=", "total_decisions="}),
-    ],
-)
-def test_the_shell_completes_commands_options_and_keys(line, some):
-    found = candidates(line, [*COMMANDS, *PLAIN_COMMANDS])
-    assert some <= set(found)
-    last = line.rpartition(" ")[2]
-    assert all(word.startswith(last) for word in found)
-    assert not [word for word in found if "schema" in word or word.startswith("hydra")]
-
-
-@pytest.mark.parametrize("line", ["ganlane fly traffic=", "ganlane doctor ", ""])
-def test_there_is_nothing_to_complete_behind_other_words(line):
-    assert candidates(line, list(COMMANDS) if line else []) == []
-
-
-@pytest.mark.parametrize("arguments", [["-sc", "install=bash"], ["train", "-sc", "install=bash"]])
-def test_the_script_for_the_shell_registers_the_console_script(arguments, capsys):
-    assert main(arguments) == 0
-    assert capsys.readouterr().out.rstrip().endswith("-F hydra_bash_completion ganlane")
-
-
-def test_another_shell_is_refused(capsys):
-    assert main(["-sc", "install=tcsh"]) == 2
-    err = capsys.readouterr().err
-    assert "bash, zsh, fish" in err
-    assert err.count("\n") == 1

@@ -78,6 +78,7 @@ def foreign(tmp_path: Path) -> str:
     return str(path)
 
 
+@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

@@ -87,6 +87,7 @@ def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

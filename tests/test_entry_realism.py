@@ -155,6 +155,7 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
     assert "needs the preset paper" in err
 
 
+@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [

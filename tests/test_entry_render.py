@@ -107,6 +107,7 @@ def test_runs_need_no_quotes(given, listed):
     assert with_runs_listed(["-m", given]) == ["-m", given]
 
 
+@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("line", "message"),
     [

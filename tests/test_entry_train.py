@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import threading
 import time
@@ -25,6 +26,17 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """Folder of a tiny run that several tests look at; who goes on with it takes a copy."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(TINY) == 0
+    (results,) = folder.rglob("results.json")
+    return results.parent
+
+
 def train(capsys, *arguments):
     """Run folder and results of a run that succeeds."""
     assert main([*TINY, *arguments]) == 0
@@ -36,8 +48,8 @@ def decisions(folder):
     return [int(row["decisions"]) for row in csv.DictReader((folder / "metrics.csv").open())]
 
 
-def test_a_run_leaves_agent_metrics_config_and_table(capsys):
-    folder, results = train(capsys)
+def test_a_run_leaves_agent_metrics_config_and_table(finished):
+    folder, results = finished, json.loads((finished / "results.json").read_text())
     assert [row["agent"] for row in results["rows"]] == ["trained", "mobil", "random_legal"]
     assert results["decisions"] == 320
     assert results["updates"] > 0
@@ -59,9 +71,9 @@ def test_a_finished_run_goes_on_with_more_decisions_and_its_own_command_line(cap
     assert decisions(folder) == [160, 320, 480]
 
 
-def test_a_run_in_two_parts_ends_like_one_in_a_piece(capsys):
+def test_a_run_in_two_parts_ends_like_one_in_a_piece(finished, capsys, tmp_path):
     whole, _ = train(capsys, "total_decisions=480")
-    parts, _ = train(capsys, "total_decisions=320")
+    parts = shutil.copytree(finished, tmp_path / "parts")
     assert main([f"resume={parts}", "total_decisions=480"]) == 0
     one, other = (read_agent(folder / "agent.safetensors")[0] for folder in (whole, parts))
     assert all((one[name] == other[name]).all() for name in one)
@@ -96,18 +108,16 @@ def test_the_second_phase_starts_from_the_first_ones_agent(capsys):
     assert metadata["training"]["init"] == str(folder / "pretrain" / "agent.safetensors")
 
 
-def test_a_trained_agent_is_a_start_for_another(capsys):
-    folder, _ = train(capsys)
-    start = ["init=idm_ckpt", f"init.path={folder / 'agent.safetensors'}"]
+def test_a_trained_agent_is_a_start_for_another(finished, capsys):
+    start = ["init=idm_ckpt", f"init.path={finished / 'agent.safetensors'}"]
     _, results = train(capsys, "total_decisions=16", *start)
     # Nothing was learnt in 16 decisions: the network is the one it started from.
     same = read_agent(results["agent"])[0]
-    assert all((same[name] == value).all() for name, value in read_agent(folder / "agent.safetensors")[0].items())
+    assert all((same[name] == value).all() for name, value in read_agent(finished / "agent.safetensors")[0].items())
 
 
-def test_a_start_from_another_observation_is_refused(capsys, tmp_path):
-    folder, _ = train(capsys)
-    start = ["init=idm_ckpt", f"init.path={folder / 'agent.safetensors'}", "observation=table3"]
+def test_a_start_from_another_observation_is_refused(finished, capsys, tmp_path):
+    start = ["init=idm_ckpt", f"init.path={finished / 'agent.safetensors'}", "observation=table3"]
     before = sorted(tmp_path.rglob("*"))
     assert main([*TINY, *start]) == 2
     assert "give observation=table3_progress" in capsys.readouterr().err
@@ -130,6 +140,7 @@ def test_a_users_own_traffic_trains(capsys):
     assert results["rows"][0]["traffic"] == "entry_own_parts.Cruise"
 
 
+@pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
@@ -173,8 +184,8 @@ def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monk
     assert any(tmp_path.rglob("last.pt"))
 
 
-def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(capsys):
-    folder, _ = train(capsys)
+def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(finished, capsys, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
     asked = (folder / "overrides.yaml").read_text()
     for change in ("env.vehicles=5", "seed=5", "reward.goal=1000", "collector.num_envs=8"):
         assert main([f"resume={folder}", "total_decisions=640", change]) == 2

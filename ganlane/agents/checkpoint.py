@@ -101,31 +101,3 @@ def check_observation_size(name: str | Path, config: NetworkConfig, observation_
             f"gives [{observation_size}]; use the vehicles, lanes and observation it was trained with, or a "
             "fixed-size observation."
         )
-
-
-def transfer(agent: Rainbow, name: str | Path) -> dict[str, Any]:
-    """Start ``agent`` from a trained one; return the trained one's metadata.
-
-    Raises:
-        UserError: as :func:`load_agent`, or the networks or their supports differ.
-    """
-    weights, config, metadata = read_agent(name)
-    own = agent.network.config
-    check_observation_size(name, config, own.observation_size)
-    theirs, ours = (asdict(c) for c in (config, own))
-    aside = {"noisy_sigma"} | ({"encoder_width", "encoder_layers"} if own.encoder == "none" else set())
-    differing = [key for key in ours if ours[key] != theirs[key] and key not in aside]
-    if differing:
-        wanted = " ".join(f"agent.{key}={_typed(theirs[key])}" for key in differing)
-        here = ", ".join(str(ours[key]) for key in differing)
-        raise UserError(
-            f"agent {name}: it has another network than this run (here: {here}); start with init=none, or set "
-            f"{wanted}."
-        )
-    agent.load_weights(weights)
-    return metadata
-
-
-def _typed(value: Any) -> str:
-    """As one types it on the command line."""
-    return f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else str(value)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from ganlane.agents.encoder import ENCODERS
 from ganlane.agents.network import NetworkConfig
 from ganlane.errors import UserError
 
@@ -66,8 +65,6 @@ class RainbowConfig:
         for name in COUNTS:
             if getattr(self, name) < 1:
                 raise UserError(f"agent.{name}={getattr(self, name)}: expected at least 1; give a positive number.")
-        if self.encoder not in ENCODERS:
-            raise UserError(f"agent.encoder={self.encoder}: no such encoder; choose one of {', '.join(ENCODERS)}.")
         if not 0.0 < self.gamma <= 1.0:
             raise UserError(f"agent.gamma={self.gamma}: expected a discount above 0 and at most 1.")
         if self.v_min >= self.v_max or (self.distributional and self.atoms < 2):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -14,11 +13,11 @@ from ganlane.agents.config import RainbowConfig
 from ganlane.agents.free_decisions import FreeDecisionWindow
 from ganlane.agents.loss import make_loss
 from ganlane.agents.n_step import NStepWindow
-from ganlane.agents.network import QNetwork, load_parameters, parameters_of
+from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters, parameters_of
 from ganlane.agents.noise import mean_sigma, redraw_noise
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
-from ganlane.agents.replay import annealed, load_replay_state, make_replay, replay_state
-from ganlane.errors import UserError
+from ganlane.agents.replay import annealed, make_replay
+from ganlane.agents.resume import agent_state, load_agent_state
 
 
 class Rainbow:
@@ -49,16 +48,9 @@ class Rainbow:
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
         }
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
-            self.network = QNetwork(config.network(observation_size, actions)).to(self.device)
+        self.network = _fresh_network(config.network(observation_size, actions), seed).to(self.device)
         self.loss = make_loss(self.network, config)
-        self.optimizer = torch.optim.Adam(
-            self.network.parameters(),
-            lr=config.learning_rate,
-            eps=0.005 / config.batch_size if config.adam_eps is None else config.adam_eps,
-            fused=True,
-        )
+        self.optimizer = _adam(self.network, config)
         self.replay = make_replay(
             config.capacity,
             config.batch_size,
@@ -149,49 +141,22 @@ class Rainbow:
         return parameters_of(self.network)
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
-        """Everything an exact resume needs, as tensors and plain data; noise is redrawn before use, so not here.
-
-        Without the buffer a resume is not exact anyway, so Adam's moments are kept in bfloat16 alone.
-        """
-        optimizer = self.optimizer.state_dict()
-        return {
-            "config": asdict(self.config),
-            "network": self.weights(),
-            "target": parameters_of(self.loss.target_network),
-            "optimizer": optimizer if with_replay else _halved(optimizer),
-            "generators": {name: generator.get_state() for name, generator in self.generators.items()},
-            "updates": self.updates,
-            "replay": replay_state(self.replay) if with_replay else None,
-        }
+        """Everything an exact resume needs (:func:`ganlane.agents.resume.agent_state`)."""
+        return agent_state(self, with_replay)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict`; if it was made without the buffer, the buffer is empty afterwards.
-
-        Raises:
-            UserError: it is the state of an agent with other hyperparameters or another observation.
-        """
-        # An agent saved before there was an option has its default.
-        saved = {**asdict(RainbowConfig()), **state["config"]}
-        for name, value in asdict(self.config).items():
-            if saved[name] != value:
-                raise UserError(
-                    f"agent.{name}={value}: the saved agent has {saved[name]}; give the same to go on from it."
-                )
-        load_parameters(self.network, state["network"])
-        load_parameters(self.loss.target_network, state["target"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        for name, generator in self.generators.items():
-            generator.set_state(state["generators"][name].cpu())
-        self.updates = state["updates"]
-        self.replay.empty()
-        if state["replay"] is not None:
-            load_replay_state(self.replay, state["replay"])
+        """Restore :meth:`state_dict` (:func:`ganlane.agents.resume.load_agent_state`)."""
+        load_agent_state(self, state)
 
 
-def _halved(optimizer: dict[str, Any]) -> dict[str, Any]:
-    """The state of an optimiser with its moments in bfloat16; loading it brings them back to the weights' type."""
-    state = {
-        row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in moments.items()}
-        for row, moments in optimizer["state"].items()
-    }
-    return {**optimizer, "state": state}
+def _fresh_network(config: NetworkConfig, seed: int) -> QNetwork:
+    """Weights drawn from ``seed``, torch's global random state as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        return QNetwork(config)
+
+
+def _adam(network: QNetwork, config: RainbowConfig) -> torch.optim.Optimizer:
+    """The optimiser of all parameters."""
+    eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
+    return torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=eps, fused=True)

@@ -54,7 +54,8 @@ def train(
 
     Args:
         traffic, env, observation, reward: as in :func:`ganlane.api.make_env`.
-        init: ``idm_ckpt`` (the agent that ships), ``none``, or ``{"name": "idm_ckpt", "path": FILE}``.
+        init: ``idm_ckpt`` (the agent that ships), ``none``, or ``{"name": "idm_ckpt", "path": FILE}``; ``support``
+            and ``optimizer`` are further keys (docs/training.md, 'Transfer').
         total_decisions: of all environments together.
         seed: of everything.
         agent: ``rainbow``, ``dqn``, or a mapping such as ``{"gamma": 0.99}``.

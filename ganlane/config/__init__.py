@@ -10,6 +10,7 @@ options only set the keys of the others. Environments that start in a scene set 
 
 ``app`` is the frame around every command: ``overrides`` reads the command line, ``resume`` adds that of the run to go
 on with, ``compose`` composes and checks (with ``store``), all before ``folders`` makes anything; ``messages`` says in
-a sentence what is wrong, ``help`` explains, ``targets`` imports a user's own parts by name, and ``plain`` hands
-values on to the packages below.
+a sentence what is wrong, ``disk`` what the file system refuses, ``streams`` lets go of an output that nobody reads,
+``help`` explains, ``completion`` completes in a shell, ``targets`` imports a user's own parts by name, and ``plain``
+hands values on to the packages below.
 """

@@ -1,7 +1,7 @@
 """The frame around every command: Hydra inside; exit statuses and errors of one sentence outside.
 
-Exit statuses: 0 done; 2 a user's mistake (one sentence on stderr, nothing left on disk); 130 stopped by Ctrl-C, 143
-by SIGTERM (training saves first).
+Exit statuses: 0 done; 2 a user's mistake, or a disk that refuses (one sentence on stderr, nothing left on disk); 130
+stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the output has left.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.config.compose import VERSION_BASE, check, typed
+from ganlane.config.disk import is_users_matter, numbered_refusals
 from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
 from ganlane.config.help import print_help
-from ganlane.config.messages import CONFIG_ERRORS, FILE_ERRORS, sentence
+from ganlane.config.messages import CONFIG_ERRORS, sentence
 from ganlane.config.overrides import parse_arguments, quoted, without_repetitions
 from ganlane.config.resume import with_resumed
 from ganlane.config.store import register
+from ganlane.config.streams import let_go_of_streams
 from ganlane.errors import UserError
 from ganlane.memory import keep_freed_memory
 from ganlane.paths import conf_folder
@@ -29,6 +31,8 @@ from ganlane.paths import conf_folder
 Task = Callable[[Any, Path], str | None]
 
 USER_ERROR = 2
+#: 128 and the number of SIGPIPE, which Windows does not have.
+READER_LEFT = 141
 
 
 class Stopped(BaseException):
@@ -48,15 +52,28 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
     try:
         with _sigterm_as_exception():
             _run(command, task, arguments)
-    except (UserError, *CONFIG_ERRORS, *FILE_ERRORS) as error:
-        print(f"ganlane {command}: {sentence(error)}", file=sys.stderr)
-        return USER_ERROR
+            sys.stdout.flush()
+    except (UserError, *CONFIG_ERRORS) as error:
+        return _refused(command, error)
+    except OSError as error:
+        reader_left = let_go_of_streams()
+        if reader_left and isinstance(error, BrokenPipeError):
+            return READER_LEFT
+        if not is_users_matter(error):
+            raise
+        return _refused(command, error)
     except KeyboardInterrupt:
         print(f"ganlane {command}: stopped by Ctrl-C.", file=sys.stderr)
         return 128 + signal.SIGINT
     except Stopped as stop:
         return 128 + stop.number
     return 0
+
+
+def _refused(command: str, error: Exception) -> int:
+    """Tell the user; the exit status."""
+    print(f"ganlane {command}: {sentence(error)}", file=sys.stderr)
+    return USER_ERROR
 
 
 def _run(command: str, task: Task, arguments: list[str]) -> None:
@@ -85,7 +102,7 @@ def _hydra(command: str, task: Task, arguments: list[str]) -> None:
 
     # A run has composed once already, to be checked; --cfg and --info come here first.
     register()
-    mistakes: list[UserError] = []
+    mistakes: list[Exception] = []
     here = os.getpid()
 
     def job(composed: Any) -> None:
@@ -93,8 +110,9 @@ def _hydra(command: str, task: Task, arguments: list[str]) -> None:
         try:
             with cleared_after_mistakes(folder, existed=any(folder.iterdir())), put_back_after_mistakes(folder):
                 write_down(composed, folder)
-                last_line = task(typed(composed), folder)
-        except UserError as error:
+                with numbered_refusals():
+                    last_line = task(typed(composed), folder)
+        except (UserError, OSError) as error:
             # Kept rather than raised, since Hydra would print a line of its own; a worker process has to raise.
             mistakes.append(error)
             if os.getpid() != here:

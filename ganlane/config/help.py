@@ -14,7 +14,8 @@ _FLAGS = """flags
   --cfg job            print the whole configuration and stop; with --resolve its references filled in
   --hydra-help         Hydra's own flags; --shell-completion for bash, zsh and fish
 
-exit status: 0 done, 2 a mistake in configuration, file or checkpoint, 130 stopped by Ctrl-C, 143 by SIGTERM"""
+exit status: 0 done, 2 a mistake in configuration, file or checkpoint or a disk that refuses, 130 stopped by Ctrl-C,
+143 by SIGTERM, 141 the reader of the output has left"""
 
 
 def help_text(command: str) -> str:

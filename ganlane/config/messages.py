@@ -10,12 +10,11 @@ from omegaconf import OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ganlane.config.checks import did_you_mean
+from ganlane.config.disk import file_sentence
 from ganlane.errors import UserError
 
 #: What Hydra and OmegaConf raise for a configuration that will not do.
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
-#: What a path that cannot be read or written to raises.
-FILE_ERRORS = (PermissionError, FileNotFoundError, NotADirectoryError, IsADirectoryError, FileExistsError)
 
 #: OmegaConf's names of types in words.
 _TYPES = {"Integer": "a whole number", "Float": "a number", "bool": "true or false", "String": "a text"}
@@ -29,7 +28,7 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, MissingConfigException):  # an OSError, too
         return _missing_option(error)
     if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror}; check the path and its permissions."
+        return file_sentence(error)
     if isinstance(error, OverrideParseException):
         return f"{error.override}: not of the form key=value; quote values with spaces or brackets, {_HELP}."
     found = error if isinstance(error, OmegaConfBaseException) else error.__cause__

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
 from ganlane.data.schema import FRAME_S
 
@@ -23,8 +23,8 @@ def srlc(changes: int, vehicles: int, road_m: float) -> float:
 def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
     """Exact interval of a Poisson mean of which ``count`` events were seen (Garwood 1936)."""
     tail = 0.5 * (1.0 - level)
-    low = 0.5 * chi2.ppf(tail, 2 * count) if count else 0.0
-    return float(low), float(0.5 * chi2.ppf(1.0 - tail, 2 * count + 2))
+    low = gammaincinv(count, tail) if count else 0.0
+    return float(low), float(gammaincinv(count + 1, 1.0 - tail))
 
 
 def steps_between_changes(rate_per_km: float, speed_mps: float, step_s: float = FRAME_S) -> float:

@@ -85,9 +85,7 @@ class HighwayEnv(EnvBase):
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
         self.stream, self.dtype = traffic.stream, dtype
-        count = 9 if vehicles is None else vehicles
-        recorded = traffic.scenes(count, self.ego.visibility, self.spawn_parameters.ego_desired_speed_mps)
-        self.scenes = scenes or recorded or self._random_scenes(count)
+        self.scenes = scenes or self._own_scenes(9 if vehicles is None else vehicles)
         self.vehicles = self.scenes.vehicles
         self.first_episode, self.recycle = first_episode, recycle
         self.recorder: Recorder | None = None
@@ -96,13 +94,18 @@ class HighwayEnv(EnvBase):
         self._seed = seed
         #: Seed and episode [N] of the rows as they were last seen; automatic resets go on from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
+        self._check_parts(vehicles, stream)
+        self._make_specs()
+
+    def _check_parts(self, vehicles: int | None, stream: int | None) -> None:
+        """Refuse parts that do not go together; ``vehicles`` and ``stream`` as the user gave them."""
         self.episode.check()
-        if stream is not None and int(stream) != traffic.stream:
+        if stream is not None and int(stream) != self.stream:
             raise UserError(
-                f"stream={int(stream)}: the traffic was built for stream {traffic.stream}; give both the same one, "
+                f"stream={int(stream)}: the traffic was built for stream {self.stream}; give both the same one, "
                 "or an episode would depend on two of them."
             )
-        if recycle and traffic.own_roads:
+        if self.recycle and self.traffic.own_roads:
             raise UserError(
                 "env.recycle=true with replayed traffic: recorded vehicles go where they went; leave it off."
             )
@@ -110,12 +113,13 @@ class HighwayEnv(EnvBase):
             raise UserError(
                 f"vehicles={vehicles}: the scene has {self.vehicles}, the ego included; leave this number out."
             )
-        self.scenes.check(self.road, idm)
-        self._make_specs()
+        self.scenes.check(self.road, self.rules.idm)
 
-    def _random_scenes(self, vehicles: int) -> Scenes:
+    def _own_scenes(self, vehicles: int) -> Scenes:
+        """The traffic's recorded scenes where it has any, else random ones."""
+        recorded = self.traffic.scenes(vehicles, self.ego.visibility, self.spawn_parameters.ego_desired_speed_mps)
         seen = (self.ego.visibility, self.traffic.visibility)
-        return RandomScenes(self.road, vehicles, self.spawn_parameters, *seen)
+        return recorded or RandomScenes(self.road, vehicles, self.spawn_parameters, *seen)
 
     def _make_specs(self) -> None:
         n, device = self.batch_size[0], self.device

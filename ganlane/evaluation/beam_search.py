@@ -1,9 +1,10 @@
 """A driver who knows what comes: a beam search over lane changes, on the simulator itself.
 
 Per episode up to K states are alive. Each is driven on by one decision with every action that makes a difference
-there; what crashed is dropped, what came to nearly the same is merged, and K of the rest are kept, spread over lanes
-and over progress. The search ends with the first state that reaches the episode's end, or when all are dead. It is a
-heuristic: a sequence that it finds is proof (:func:`ganlane.evaluation.rides.replay`), none found is not.
+there; what crashed is dropped, what came to nearly the same is merged, and K of the rest are kept, spread over
+lanes and over progress (:mod:`~ganlane.evaluation.beam_choice`). The search ends with the first state that reaches
+the episode's end, or when all are dead. It is a heuristic: a sequence that it finds is proof
+(:func:`ganlane.evaluation.rides.replay`), none found is not.
 """
 
 from __future__ import annotations
@@ -19,11 +20,8 @@ from torchrl.envs import EnvBase
 from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.errors import UserError
+from ganlane.evaluation.beam_choice import choose, order
 from ganlane.evaluation.rides import base_of, start_rows, step_rows
-from ganlane.keys import EGO_INDEX
-
-#: States that agree in lane and change under way and within these steps are one: x and y in m, speed in m/s.
-MERGED = {"x": 1.0, "y": 0.5, "speed": 0.5}
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,8 @@ class _Search:
         self._conclude(after, done & ~dead, True)
         alive = ~done & ~self._concluded(owner)
         self._conclude(after, _last_of_their_kind(owner, alive) & ~self._concluded(owner), False)
-        kept = self._choose(after, alive.nonzero()[:, 0])
+        living = alive.nonzero()[:, 0]
+        kept = living[choose(state[living], owner[living], total[living], self.beam, self.by_reward)]
         self.widest = torch.maximum(self.widest, torch.bincount(owner[kept], minlength=len(self.widest)))
         return _Front(state[kept], owner[kept], total[kept], [*front.trail, (rows[kept], action[kept])])
 
@@ -138,32 +137,12 @@ class _Search:
 
     def _conclude(self, front: _Front, rows: Tensor, found: bool) -> None:
         """Note the plans of the episodes that ``rows`` (bool) belong to: the best of each."""
-        best_first = _order(front.owner, -front.total)
+        best_first = order(front.owner, -front.total)
         for row in best_first[rows[best_first]].tolist():
             owner = int(front.owner[row])
             if owner not in self.plans:
                 plan = (self.episodes[owner], found, front.actions(row), float(front.total[row]))
                 self.plans[owner] = Plan(*plan, int(self.widest[owner]))
-
-    def _choose(self, front: _Front, rows: Tensor) -> Tensor:
-        """At most K of ``rows`` per episode, in the order in which they stand."""
-        state, owner = front.state[rows], front.owner[rows]
-        vehicles = state.get(keys.VEHICLES)
-        ego = {name: vehicles.get(name)[:, EGO_INDEX] for name in MERGED}
-        cell = (owner, vehicles.get("target_lane")[:, EGO_INDEX], state.get(keys.EGO).get("change_direction"))
-        near = [torch.floor(value / MERGED[name]) for name, value in ego.items()]
-        gain = front.total[rows] if self.by_reward else ego["x"]
-        distinct = _order(*cell, *near, -gain)
-        distinct = distinct[_rank(*(column[distinct] for column in (*cell, *near))) == 0]
-        # Within a lane: the best first, or the foremost and the hindmost in turn.
-        ranked = distinct[_order(*(column[distinct] for column in cell), -gain[distinct])]
-        place = _rank(*(column[ranked] for column in cell))
-        if not self.by_reward:
-            backwards = _rank(*(column[ranked].flip(0) for column in cell)).flip(0)
-            place = torch.minimum(place, backwards)
-        chosen = ranked[_order(owner[ranked], place)]
-        chosen = chosen[_rank(owner[chosen]) < self.beam]
-        return rows[chosen.sort().values]
 
 
 def _last_of_their_kind(owner: Tensor, alive: Tensor) -> Tensor:
@@ -171,21 +150,3 @@ def _last_of_their_kind(owner: Tensor, alive: Tensor) -> Tensor:
     living = torch.zeros(int(owner.max()) + 1, dtype=torch.bool, device=owner.device)
     living[owner[alive]] = True
     return ~living[owner]
-
-
-def _order(*columns: Tensor) -> Tensor:
-    """Rows sorted by the first column, ties by the second, and so on; the rest as they stand."""
-    order = torch.arange(columns[0].shape[0], device=columns[0].device)
-    for column in reversed(columns):
-        order = order[torch.argsort(column[order], stable=True)]
-    return order
-
-
-def _rank(*columns: Tensor) -> Tensor:
-    """Of sorted rows: how many of the same values stand before each, [rows] int64."""
-    index = torch.arange(columns[0].shape[0], device=columns[0].device)
-    new = torch.zeros_like(index, dtype=torch.bool)
-    new[:1] = True
-    for column in columns:
-        new[1:] |= column[1:] != column[:-1]
-    return index - torch.where(new, index, 0).cummax(0).values if len(index) else index

@@ -4,12 +4,13 @@ Read in this order. From recordings to batches: ``tracks`` (scenes as dense arra
 observed, 8 to predict), ``groups`` (k-means, kept by ``cache``), ``folds`` (who is fitted to, who chooses when to
 stop, who is reported). The network: ``lstm`` (with projections that can be kept), ``pooling`` (over pairs of
 vehicles), ``networks`` (generator and discriminator), ``losses``, ``metrics``. In closed loop: ``history`` and
-``noise`` (what every driver carries along), ``paper`` and ``anchored`` (one step of each preset, the same in fitting
-and in simulation). Fitting: ``loop`` (early stopping, resuming), ``fitting`` (the paper's preset, open loop),
-``stretches``, ``rollouts``, ``traits``, ``rollout_metrics`` and ``calibrated`` (the other one, through whole
-scenes), ``fit`` (one call for both) and ``checkpoint``. Measuring: ``forecasts`` and ``baselines`` (courses of the
-same windows by everybody), ``scores``, ``reports`` (a fit and its forecasts), ``cross_validation`` (k folds by
-scene), ``fold_tables`` (as text) and ``ablations`` (what each part is worth).
+``noise`` (what every driver carries along), ``paper`` and ``anchored`` (one step of each preset, the same in
+fitting and in simulation). Fitting: ``schedule`` (how long, and how far an update goes), ``loop`` (early stopping,
+resuming), ``fitting`` (the paper's preset, open loop), ``stretches``, ``rollouts``, ``traits``, ``rollout_metrics``
+and ``calibrated`` (the other one, through whole scenes), ``fit`` (one call for both) and ``checkpoint``. Measuring:
+``forecasts`` and ``baselines`` (courses of the same windows by everybody), ``scores``, ``reports`` (a fit and its
+forecasts), ``cross_validation`` (k folds by scene), ``fold_tables`` (as text) and ``ablations`` (what each part is
+worth).
 """
 
 from ganlane.generator.ablations import ablate, ablation_table
@@ -22,7 +23,7 @@ from ganlane.generator.fitting import PaperConfig
 from ganlane.generator.fold_tables import fold_tables
 from ganlane.generator.folds import Split, assign_folds, split_for_fit, split_scenes
 from ganlane.generator.groups import Groups, group_windows
-from ganlane.generator.loop import LoopConfig, Progress
+from ganlane.generator.loop import Progress
 from ganlane.generator.losses import LossWeights
 from ganlane.generator.metrics import open_loop
 from ganlane.generator.networks import Discriminator, Generator, GeneratorSizes
@@ -30,6 +31,7 @@ from ganlane.generator.paper import paper_step
 from ganlane.generator.reports import fit_key
 from ganlane.generator.rollout_metrics import rollout_metrics
 from ganlane.generator.rollouts import rollout
+from ganlane.generator.schedule import LoopConfig
 from ganlane.generator.tracks import SceneTracks, scene_tracks
 from ganlane.generator.traits import HEADWAY_QUANTILES_S, headway_quantiles
 from ganlane.generator.windows import Windows, cut_windows

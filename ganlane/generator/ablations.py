@@ -16,8 +16,9 @@ from ganlane.generator.calibrated import CalibratedConfig
 from ganlane.generator.cross_validation import OnFit
 from ganlane.generator.fitting import PaperConfig
 from ganlane.generator.folds import split_for_fit
-from ganlane.generator.loop import LoopConfig, OnProgress
+from ganlane.generator.loop import OnProgress
 from ganlane.generator.reports import Fitted, fit_and_report, rollout_scores
+from ganlane.generator.schedule import LoopConfig
 from ganlane.generator.scores import BASELINE, displacement_errors, errors_of
 from ganlane.generator.tracks import scene_tracks
 

@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from ganlane.errors import UserError
 from ganlane.generator.anchored import ANCHOR, EXTRA_INPUTS, AnchorParameters
-from ganlane.generator.loop import LoopConfig, descend
 from ganlane.generator.losses import distance, energy_score, masked_mean
 from ganlane.generator.metrics import Metrics
 from ganlane.generator.networks import Generator, GeneratorSizes
 from ganlane.generator.rollout_metrics import closed_form_errors, rollout_metrics
 from ganlane.generator.rollouts import rollout
+from ganlane.generator.schedule import LoopConfig, descend
 from ganlane.generator.stretches import RolloutScenes, SceneSource, cut_stretches, scene_sources
 from ganlane.generator.tracks import SceneTracks
 from ganlane.generator.traits import common_traits, fitting_traits, typical_traits

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from ganlane.generator.groups import Groups, group_windows
-from ganlane.generator.loop import LoopConfig, descend
 from ganlane.generator.losses import (
     LossWeights,
     adversarial_loss,
@@ -21,6 +20,7 @@ from ganlane.generator.losses import (
 from ganlane.generator.lstm import DIFFERENCE_SCALE_M
 from ganlane.generator.metrics import Metrics, open_loop
 from ganlane.generator.networks import Discriminator, Generator, GeneratorSizes, displacements_of
+from ganlane.generator.schedule import LoopConfig, descend
 from ganlane.generator.tracks import SceneTracks
 from ganlane.generator.windows import cut_windows
 

@@ -15,29 +15,7 @@ from torch import Tensor, nn
 
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
-
-
-@dataclass(frozen=True)
-class LoopConfig:
-    """How long to fit.
-
-    Attributes:
-        updates: updates at most; the learning rate falls to 0 over them.
-        evaluate_every: updates between two evaluations on the validation scenes.
-        patience: evaluations without improvement before stopping.
-        learning_rate: of Adam, after the warm-up.
-        warmup: updates over which the learning rate rises.
-        largest_gradient: norm at which gradients are cut.
-        max_seconds: stop after this long; None is never.
-    """
-
-    updates: int = 1200
-    evaluate_every: int = 150
-    patience: int = 8
-    learning_rate: float = 4e-3
-    warmup: int = 100
-    largest_gradient: float = 1.0
-    max_seconds: float | None = None
+from ganlane.generator.schedule import LoopConfig, learning_rate
 
 
 @dataclass(frozen=True)
@@ -76,12 +54,6 @@ class FitTask(Protocol):
 
     def evaluate(self) -> float:
         """Score on the validation scenes; lower is better."""
-
-
-def learning_rate(config: LoopConfig, number: int) -> float:
-    """Linear warm-up, then a half cosine to 0."""
-    rise = min(1.0, (number + 1) / max(1, config.warmup))
-    return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))
 
 
 class FitLoop:
@@ -185,11 +157,3 @@ def load_resume(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict) or "counters" not in state:
         raise UserError(f"{path}: not the state of a fit; give the file that a fit keeps, or remove it.")
     return state
-
-
-def descend(optimiser: torch.optim.Optimizer, loss: Tensor, module: nn.Module, largest: float) -> None:
-    """One step of ``optimiser`` down ``loss``, with the gradient's norm cut at ``largest``."""
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    nn.utils.clip_grad_norm_(module.parameters(), largest)
-    optimiser.step()

@@ -9,11 +9,12 @@ from pathlib import Path
 from ganlane.agents import Rainbow, read_agent, save_agent
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
-from ganlane.build import make_road, observation_of
+from ganlane.build import make_road
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.phases.description import describe
 from ganlane.phases.phase import AGENT_FILE, Phase
+from ganlane.phases.start import Start, give, read_start, with_support
 from ganlane.training import TrainingResult
 from ganlane.training.run import flat
 from ganlane.transforms import observation_size
@@ -29,15 +30,36 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
     return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal)
 
 
-def check_observation(name: str, config: TrainConfig) -> None:
+def begin(config: TrainConfig, phase: Phase, resume: str | Path | None) -> tuple[TrainConfig, Rainbow]:
+    """The agent with which ``phase`` begins, or one ready to be restored; and ``config`` with the support it has.
+
+    Raises:
+        UserError: the agent to start from does not fit.
+    """
+    if phase.init is None:
+        return config, make_agent(config, phase)
+    if resume is not None:
+        if config.init.support == "trained":  # that of the run itself: what it once started from may be gone
+            config = with_support(config, read_start(str(resume), "resume"))
+        return config, make_agent(config, phase)
+    start = read_start(phase.init)
+    check_observation(start, config)
+    config = with_support(config, start)
+    agent = make_agent(config, phase)
+    # A second phase starts from the best agent of the first, whose moments are not kept.
+    give(agent, start, moments=config.init.optimizer and phase.init == config.init.path)
+    return config, agent
+
+
+def check_observation(start: Start, config: TrainConfig) -> None:
     """Refuse to start from an agent that was trained on another observation."""
-    theirs = asdict(config.observation.read_by(observation_of(read_agent(name)[2])))
+    theirs = asdict(config.observation.read_by(start.observation))
     ours = asdict(config.observation)
     for key, value in theirs.items():
         if value != ours[key]:
             option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
             raise UserError(
-                f"init.path={name}: this agent was trained with {option}, the run has {ours[key]}; "
+                f"init.path={start.name}: this agent was trained with {option}, the run has {ours[key]}; "
                 f"give {option} or start with init=none."
             )
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from contextlib import closing
 from pathlib import Path
 
-from ganlane.agents import transfer
 from ganlane.config.train import TrainConfig
-from ganlane.phases.agent import check_observation, keep, make_agent
+from ganlane.phases.agent import begin, keep
 from ganlane.phases.description import describe, identity
 from ganlane.phases.phase import Phase
 from ganlane.phases.selection import make_selection
@@ -26,10 +25,7 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
     """
-    agent = make_agent(config, phase)
-    if phase.init is not None and resume is None:
-        check_observation(phase.init, config)
-        transfer(agent, phase.init)
+    config, agent = begin(config, phase, resume)
     with closing(make_source(config, phase)) as source:
         result = train(
             source,

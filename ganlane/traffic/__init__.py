@@ -1,11 +1,13 @@
 """Traffic models: TensorDictModules that move the other vehicles, swappable by ``traffic=NAME``.
 
 All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules,
-:mod:`~ganlane.traffic.social_gan` by the generator; :mod:`~ganlane.traffic.replay` plays recordings. Overlays
+:mod:`~ganlane.traffic.social_gan` and :mod:`~ganlane.traffic.calibrated_gan` by a generator (what the two share is
+in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays recordings. Overlays
 (:mod:`~ganlane.traffic.lane_change`, :mod:`~ganlane.traffic.acceleration`, and drivers' faults in
 :mod:`~ganlane.traffic.faults` and :mod:`~ganlane.traffic.lane_change_faults`) and the
 :mod:`~ganlane.traffic.guard` stand behind a base model in a :class:`TrafficSequential`;
-:mod:`~ganlane.traffic.presets` builds the chains that ship.
+:mod:`~ganlane.traffic.presets` builds the chains that ship, from what the weights say of their recordings
+(:mod:`~ganlane.traffic.fitted`), and :mod:`~ganlane.traffic.driver_faults` the one of drivers who err.
 """
 
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations

@@ -62,6 +62,17 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
     )
 
 
+def steps_left(
+    left: Tensor, u: Tensor, vehicles: Vehicles, faults: BrakingFaults | ReactionFaults, dt: float
+) -> Tensor:
+    """Steps that a fault still lasts, [N, M] int64: ``left``, or all of them where the fault begins now.
+
+    It begins where there is none, with the probability of a step, by the uniform numbers ``u`` [N, M].
+    """
+    begins = (left == 0) & drivers(vehicles) & (u < chance_per_step(faults.per_hour, dt))
+    return torch.where(begins, round(faults.lasts_s / dt), left)
+
+
 @dataclass(frozen=True)
 class BrakingFaults:
     """Phantom braking.
@@ -98,8 +109,7 @@ class PhantomBraking(Overlay):
         """Brake where a fault begins or goes on."""
         f = self.faults
         u = drawn(key, step, vehicles, Purpose.FAULT)
-        begins = (memory["left"] == 0) & drivers(vehicles) & (u < chance_per_step(f.per_hour, self.dt))
-        left = torch.where(begins, round(f.lasts_s / self.dt), memory["left"])
+        left = steps_left(memory["left"], u, vehicles, f, self.dt)
         brakes = (left > 0) & (moved.acceleration > -f.deceleration)
         braking = driven_at(vehicles, moved, torch.full_like(moved.acceleration, -f.deceleration), self.dt)
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
@@ -158,10 +168,8 @@ class LateReaction(Overlay):
         self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
     ) -> tuple[Vehicles, dict[str, Tensor]]:
         """Drive at the acceleration of ``delay_s`` ago where attention lapses."""
-        f = self.faults
         u = drawn(key, step, vehicles, Purpose.LATE_REACTION)
-        lapses = (memory["left"] == 0) & drivers(vehicles) & (u < chance_per_step(f.per_hour, self.dt))
-        left = torch.where(lapses, round(f.lasts_s / self.dt), memory["left"])
+        left = steps_left(memory["left"], u, vehicles, self.faults, self.dt)
         late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
         past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
         return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}

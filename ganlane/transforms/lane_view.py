@@ -14,6 +14,8 @@ from ganlane.transforms.table3 import ObservationScale, Others
 
 #: Scale of the nearness feature, m, and the length taken off the distance between centres, m.
 NEARNESS_M = 15.0
+#: Overlap along the road that adds 1 to the nearness, m: drivers beside brake so hard that one metre decides.
+OVERLAP_M = 1.0
 CAR_LENGTH_M = 4.5
 LANE_VIEW_SIZE = 18
 DRIFT_SIZE = 6
@@ -40,7 +42,8 @@ def lane_view(
     The gap is over the range of sight; somebody beside the ego counts as behind. With ``drift`` [N, 24]: a fourth
     number tells where in its lane that vehicle is (:attr:`Others.drift`), by which a lane change shows before its
     middle; this is information that Table III does not have. With ``overlap`` the gap goes below 0 where the two
-    bodies overlap along the road; without, all of them look alike, from bumper to bumper to side by side.
+    bodies overlap along the road, and the nearness above 1, by 1 per metre; without, all of them look alike, from
+    bumper to bumper to side by side.
     """
     side, way = (others.position.new_tensor(each)[:, None] for each in (_SIDES, _WAYS))
     distance = others.position[:, None, :] * way
@@ -57,6 +60,7 @@ def lane_view(
 
     gap_m = (nearest * scale.range_m - CAR_LENGTH_M).clamp_min(-CAR_LENGTH_M if overlap else 0.0)
     gap = torch.where(found, gap_m / scale.range_m, 1.0)
-    nearness = torch.where(found, torch.exp(-gap_m / NEARNESS_M), 0.0)
+    overlap_m = (-gap_m).clamp_min(0.0)
+    nearness = torch.where(found, torch.exp(-gap_m.clamp_min(0.0) / NEARNESS_M) + overlap_m / OVERLAP_M, 0.0)
     seen = (gap, nearness, of_the_nearest(others.speed), *((of_the_nearest(others.drift),) if drift else ()))
     return torch.cat(seen, dim=-1).flatten(1)

@@ -13,6 +13,7 @@ from ganlane.errors import UserError
 from ganlane.files import atomic_path
 from ganlane.view.frames import FramePainter
 from ganlane.view.gif import scaled, write_gif
+from ganlane.view.mp4 import write_mp4
 
 Picture = npt.NDArray[np.uint8]
 Format = Literal["mp4", "gif", "png"]
@@ -119,7 +120,7 @@ def write_film(
     if kind == "gif":
         write_gif(frames, path, fps, max_bytes, scale)
     elif kind == "mp4":
-        _write_mp4(frames, path, fps, scale)
+        write_mp4(frames, path, fps, scale)
     else:
         _write_png(film_strip(frames), path, scale)
     return Path(path)
@@ -136,32 +137,3 @@ def film_strip(frames: Sequence[Picture], count: int = STRIP_FRAMES) -> Picture:
 def _write_png(picture: Picture, path: str | Path, scale: float) -> None:
     with atomic_path(path) as part:
         scaled(picture, scale).save(part, format="PNG", optimize=True)
-
-
-def _write_mp4(frames: Sequence[Picture], path: str | Path, fps: float, scale: float) -> None:
-    """H.264 through the ffmpeg that imageio-ffmpeg brings along."""
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise UserError(
-            f"{path}: mp4 needs the extra 'video'; run `pip install \"ganlane[video]\"` or choose format=gif."
-        ) from error
-    # H.264 wants even sides.
-    size = scaled(frames[0], scale, multiple=2).size
-    with atomic_path(path) as part:
-        writer = imageio_ffmpeg.write_frames(
-            str(part),
-            size,
-            fps=fps,
-            codec="libx264",
-            quality=None,
-            macro_block_size=2,
-            output_params=["-crf", "20", "-preset", "medium", "-movflags", "+faststart", "-f", "mp4"],
-            ffmpeg_log_level="error",
-        )
-        writer.send(None)
-        try:
-            for picture in frames:
-                writer.send(np.ascontiguousarray(scaled(picture, scale, multiple=2)))
-        finally:
-            writer.close()

@@ -38,17 +38,6 @@ def test_another_observation_size_is_refused_naming_both(saved):
         transfer(agent(size=9), saved)
 
 
-def test_another_support_is_refused_on_transfer(saved):
-    with pytest.raises(UserError, match=r"agent.v_min=-120.0"):
-        transfer(agent(v_min=-10.0), saved)
-
-
-def test_a_transfer_starts_from_the_saved_weights(saved):
-    fresh = agent(seed=3)
-    assert transfer(fresh, saved)["training"] == {"decisions": 7}
-    assert all(torch.equal(a, b) for a, b in zip(fresh.weights().values(), agent().weights().values()))
-
-
 def test_a_truncated_or_foreign_file_is_refused(saved, tmp_path):
     whole = saved.read_bytes()
     saved.write_bytes(whole[: len(whole) // 2])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from agents_transitions import transitions
 from tensordict import TensorDict
 from torchrl.objectives import DistributionalDQNLoss
 
@@ -30,22 +31,6 @@ def shuffled(observation, order):
 
 def agent(size=29, seed=0, **options):
     return Rainbow(RainbowConfig(**{**SMALL, "encoder": "shared", "encoder_width": 8, **options}), size, seed=seed)
-
-
-def transitions(size=29, rows=64):
-    generator = torch.Generator().manual_seed(1)
-    after = {
-        "observation": torch.randn(rows, size, generator=generator),
-        "reward": torch.randn(rows, 1, generator=generator),
-        "terminated": torch.rand(rows, 1, generator=generator) < 0.2,
-    }
-    content = {
-        "observation": torch.randn(rows, size, generator=generator),
-        "action": torch.randint(0, 3, (rows,), generator=generator),
-        "steps_to_next_obs": torch.ones(rows, 1),
-        "next": after,
-    }
-    return TensorDict(content, [rows])
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -86,7 +71,7 @@ def test_any_number_of_leading_dimensions_is_encoded():
 def test_gradients_reach_every_parameter_of_the_encoder(distributional):
     learner = agent(distributional=distributional, encoder_layers=2)
     before = learner.weights()
-    learner.store(transitions())
+    learner.store(transitions(29))
     for _ in range(5):
         learner.update()
     after = learner.weights()
@@ -100,7 +85,7 @@ def test_the_loss_with_an_encoder_equals_torchrls():
         for value in loss.target_network.parameters():
             value.add_(torch.randn_like(value), alpha=0.3)
     parameters = list(loss.network.parameters())
-    data = transitions()
+    data = transitions(29)
     data["next", "done"] = data["next", "terminated"]
     theirs = DistributionalDQNLoss.forward(loss, data.clone())["loss"]
     ours = loss(data.clone())["loss"]
@@ -142,7 +127,7 @@ def test_without_an_encoder_the_network_is_the_one_it_was():
 def test_a_restored_agent_goes_on_to_the_same_weights():
     whole, half = agent(), agent()
     for learner, updates in ((whole, 6), (half, 3)):
-        learner.store(transitions())
+        learner.store(transitions(29))
         for _ in range(updates):
             learner.update()
     restored = agent(seed=7)
@@ -161,8 +146,8 @@ def test_an_observation_of_another_layout_is_refused(size):
 
 def test_an_unknown_encoder_is_refused():
     with pytest.raises(UserError, match="choose one of none, shared"):
-        RainbowConfig(encoder="lstm")
-    with pytest.raises(UserError, match="choose one of none, shared"):
         network(encoder="lstm")
+    with pytest.raises(UserError, match="choose one of none, shared"):
+        agent(encoder="lstm")
     with pytest.raises(UserError, match=r"agent\.encoder_width=0"):
         RainbowConfig(encoder_width=0)

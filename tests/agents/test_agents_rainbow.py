@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from agents_transitions import transitions
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -17,25 +18,9 @@ def agent(seed=0, **options):
     return Rainbow(RainbowConfig(**{**SMALL, **options}), SIZE, seed=seed)
 
 
-def transitions(rows=64, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    after = {
-        "observation": torch.randn(rows, SIZE, generator=generator),
-        "reward": torch.randn(rows, 1, generator=generator),
-        "terminated": torch.rand(rows, 1, generator=generator) < 0.2,
-    }
-    content = {
-        "observation": torch.randn(rows, SIZE, generator=generator),
-        "action": torch.randint(0, 3, (rows,), generator=generator),
-        "steps_to_next_obs": torch.ones(rows, 1),
-        "next": after,
-    }
-    return TensorDict(content, [rows])
-
-
 def trained(updates=5, **options):
     result = agent(**options)
-    result.store(transitions())
+    result.store(transitions(SIZE))
     for _ in range(updates):
         result.update()
     return result
@@ -162,7 +147,7 @@ def test_noisy_agents_draw_random_actions_too_unless_epsilon_is_0():
 
 def test_the_target_is_copied_exactly_every_period():
     learner = agent(target_period=3)
-    learner.store(transitions())
+    learner.store(transitions(SIZE))
     copied = []
     for _ in range(9):
         learner.update()
@@ -173,7 +158,7 @@ def test_the_target_is_copied_exactly_every_period():
 
 def test_every_update_draws_the_noise_of_both_networks_anew():
     learner = agent()
-    learner.store(transitions())
+    learner.store(transitions(SIZE))
     modules = (learner.network, learner.loss.target_network)
     before = [module.head.weight_epsilon.clone() for module in modules]
     learner.update()
@@ -189,7 +174,7 @@ def test_updates_change_every_parameter_sigmas_included():
 
 def test_the_objective_is_the_mean_of_weight_times_loss():
     learner = agent(beta_start=1.0)
-    learner.store(transitions())
+    learner.store(transitions(SIZE))
     learner.replay.update_priority(torch.arange(64), torch.linspace(0.1, 5.0, 64))
     learner.replay.sample()
     seen = {}
@@ -206,7 +191,7 @@ def test_the_objective_is_the_mean_of_weight_times_loss():
 
 def test_an_update_gives_the_drawn_items_their_new_priority():
     learner = agent()
-    learner.store(transitions())
+    learner.store(transitions(SIZE))
     before = learner.replay.sampler.priorities.clone()
     learner.update()
     assert not torch.equal(before, learner.replay.sampler.priorities)
@@ -219,16 +204,16 @@ SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
 def test_each_component_can_be_switched_off_and_the_rest_learns(off):
     options = {"learning_rate": 3e-3, "target_period": 1000, "noisy_sigma": 0.1}
     learner = agent(**{name: False for name in off}, **options)
-    learner.store(transitions())
-    before = learner.loss(transitions())["loss"].mean()
+    learner.store(transitions(SIZE))
+    before = learner.loss(transitions(SIZE))["loss"].mean()
     for _ in range(80):
         learner.update()
-    assert learner.loss(transitions())["loss"].mean() < 0.95 * before
+    assert learner.loss(transitions(SIZE))["loss"].mean() < 0.95 * before
 
 
 def test_metrics_are_tensors_without_dimensions():
     learner = agent()
-    learner.store(transitions())
+    learner.store(transitions(SIZE))
     metrics = learner.update()
     assert {"loss", "mean_q", "clamped_fraction", "priority", "gradient_norm"} == set(metrics)
     assert all(value.shape == () and not value.requires_grad for value in metrics.values())

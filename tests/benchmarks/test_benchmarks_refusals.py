@@ -22,7 +22,5 @@ def test_a_document_without_the_markers_is_refused_before_anybody_drives(page, t
 
 def test_more_frames_than_the_episode_has_are_refused(monkeypatch, capsys):
     monkeypatch.setattr(drawing, "episode", lambda length_s: range(400))
-    monkeypatch.setattr(sys, "argv", ["drawing.py", "--frames", "80", "--rounds", "5"])
-    with pytest.raises(SystemExit, match="2"):
-        drawing.main()
+    assert drawing.main(["--frames", "80", "--rounds", "5"]) == 2
     assert "the episode has 400 frames" in capsys.readouterr().err

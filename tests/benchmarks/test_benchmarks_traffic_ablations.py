@@ -8,15 +8,9 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from benchmarks.traffic_ablations import (
-    BEGIN,
-    END,
-    Bfloat16Generator,
-    PlanningGenerator,
-    calibrated_variants,
-    gan_variants,
-    main,
-)
+from benchmarks.ablations.networks import Bfloat16Generator, PlanningGenerator
+from benchmarks.ablations.variants import calibrated_variants, gan_variants
+from benchmarks.traffic_ablations import BEGIN, END, main
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.generator.networks import Observation
 

@@ -5,29 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from reference.hydra_memory import composed, own_part
 
 from ganlane.__main__ import COMMANDS, main
-from ganlane.config.compose import VERSION_BASE, typed
+from ganlane.config.compose import typed
 from ganlane.config.messages import sentence
-from ganlane.config.store import register
 from ganlane.errors import UserError
-from ganlane.paths import conf_folder
 
-
-def composed(command: str) -> DictConfig:
-    from hydra import compose, initialize_config_dir
-
-    register()
-    with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):
-        config = compose(command, return_hydra_config=True)
-    with open_dict(config):
-        del config["hydra"]
-    return config
-
-
-COMPOSED = {command: composed(command) for command in COMMANDS}
+COMPOSED = {command: own_part(composed(command)) for command in COMMANDS}
 
 
 def leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -62,21 +63,27 @@ NEEDS = {("env", "scene"): [f"env.scene.path={Path(__file__).parents[1] / 'refer
 OPTIONS = sorted((path.parent.name, path.stem) for path in conf_folder().glob("*/*.yaml"))
 
 
+@cache
+def config_of(command, *overrides):
+    """Composed and checked once for all tests, which only look at it."""
+    return check(command, list(overrides)).config
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_composes_with_its_defaults(command):
-    assert dataclasses.is_dataclass(check(command, []).config)
+    assert dataclasses.is_dataclass(config_of(command))
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes(group, option):
     # The shipped agent may not be there yet, but its option must compose all the same.
-    check(USED_BY.get(group, "train"), [f"{group}={option}", *NEEDS.get((group, option), [])])
+    config_of(USED_BY.get(group, "train"), f"{group}={option}", *NEEDS.get((group, option), []))
 
 
 @pytest.mark.parametrize(("group", "option"), [pair for pair in OPTIONS if pair[0] != "experiment"])
 def test_yaml_and_dataclass_hold_the_same_values(group, option):
     needed = NEEDS.get((group, option), [])
-    composed = check(USED_BY.get(group, "train"), [f"{group}={option}", *needed]).config
+    composed = config_of(USED_BY.get(group, "train"), f"{group}={option}", *needed)
     value = getattr(composed, group)
     if needed:
         assert value == type(value)(scene=value.scene)
@@ -87,7 +94,7 @@ def test_yaml_and_dataclass_hold_the_same_values(group, option):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_root_yaml_and_dataclass_hold_the_same_values(command):
-    composed = check(command, []).config
+    composed = config_of(command)
     default = type(composed)()
     for field in dataclasses.fields(composed):
         value = getattr(composed, field.name)
@@ -183,7 +190,7 @@ def test_who_learns_only_when_free_cannot_turn_back():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_sensors_are_perfect_unless_an_error_is_asked_for(form):
-    assert check("train", [f"observation={form}"]).config.observation.sensors is None
+    assert config_of("train", f"observation={form}").observation.sensors is None
     late = check("train", [f"observation={form}", "observation.sensors.delay_s=2"]).config.observation
     assert late == ObservationConfig(form, sensors=SensorsConfig(delay_s=2.0))
 

@@ -7,8 +7,8 @@ from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.ablations import ablate, ablation_table, variants
 from ganlane.generator.calibrated import CalibratedConfig
 from ganlane.generator.fitting import PaperConfig
-from ganlane.generator.loop import LoopConfig
 from ganlane.generator.networks import GeneratorSizes
+from ganlane.generator.schedule import LoopConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 LOOP = LoopConfig(updates=8, evaluate_every=8, warmup=4)

@@ -9,8 +9,8 @@ from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.cross_validation import cross_validate
 from ganlane.generator.fitting import PaperConfig
 from ganlane.generator.fold_tables import fold_tables
-from ganlane.generator.loop import LoopConfig
 from ganlane.generator.networks import GeneratorSizes
+from ganlane.generator.schedule import LoopConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)

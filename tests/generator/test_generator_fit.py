@@ -11,9 +11,9 @@ from ganlane.generator.calibrated import CalibratedConfig
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import fit_generator
 from ganlane.generator.fitting import PaperConfig
-from ganlane.generator.loop import LoopConfig, learning_rate
 from ganlane.generator.losses import LossWeights
 from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.schedule import LoopConfig, learning_rate
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 HELD_OUT = ("synthetic-1",)

@@ -8,7 +8,7 @@ from ganlane.agents import save_agent
 from ganlane.config.compose import check
 from ganlane.errors import UserError
 from ganlane.paths import conf_folder
-from ganlane.phases import AGENT_FILE, check_finished, check_observation, describe, make_agent, phases_of
+from ganlane.phases import AGENT_FILE, check_finished, check_observation, describe, make_agent, phases_of, read_start
 
 EXPERIMENTS = sorted(
     str(path.relative_to(conf_folder() / "experiment").with_suffix(""))
@@ -20,7 +20,7 @@ EXPERIMENTS = sorted(
 def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(overrides):
     config = check("train", overrides).config
     if config.init.path is not None:
-        check_observation(config.init.path, config)
+        check_observation(read_start(config.init.path), config)
 
 
 def test_the_search_is_of_at_most_16_runs():

@@ -10,7 +10,8 @@ from ganlane.generator.networks import Generator, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.spawn import spawn
-from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
+from ganlane.traffic.calibrated_gan import AnchoredGanTraffic
+from ganlane.traffic.social_gan import SocialGanTraffic
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 ROAD = Road(3, 4.0)

@@ -107,7 +107,8 @@ def test_gaps_below_zero_tell_how_far_beside_somebody_is(ahead_m, gap_m, way):
     row = 0 if way * ahead_m > 0 else 1
     view = observe("lane_view_overlap", rows)[3:-2].reshape(6, 4)
     assert view[row, 0].item() == pytest.approx(gap_m / 200)
-    assert view[row, 1].item() == pytest.approx(torch.exp(torch.tensor(-gap_m / 15)).item())
+    nearness = 1 - gap_m if gap_m <= 0 else torch.exp(torch.tensor(-gap_m / 15)).item()
+    assert view[row, 1].item() == pytest.approx(nearness)
     assert view[1 - row].tolist() == [1.0, 0.0, 0.0, 0.0]
     flat = observe("lane_view_drift", rows)[3:-2].reshape(6, 4)
     assert flat[row, 0].item() == pytest.approx(max(gap_m, 0.0) / 200)

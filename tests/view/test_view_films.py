@@ -11,7 +11,7 @@ from PIL import Image
 from view_scenes import straight
 
 from ganlane.errors import UserError
-from ganlane.view import Film, FramePainter, film_strip, write_film
+from ganlane.view import Film, FramePainter, film_strip, mp4, write_film
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +90,29 @@ def test_an_mp4_has_all_frames(film, tmp_path):
     shown = np.frombuffer(frames[3], np.uint8).reshape(160, 640, 3).astype(int)
     drawn = np.asarray(Image.fromarray(film[3]).resize((640, 160), Image.Resampling.LANCZOS)).astype(int)
     assert np.abs(shown - drawn).mean() < 6.0
+
+
+def test_half_an_mp4_on_a_full_disk_is_none(film, tmp_path):
+    """ffmpeg fails, and only its exit status says so."""
+    pytest.importorskip("imageio_ffmpeg")
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**12, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            write_film(film[:10], tmp_path / "a.mp4", fps=10, scale=0.5)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename == str(tmp_path / "a.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_ffmpeg_that_refuses_is_quoted(film, tmp_path, monkeypatch):
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setattr(mp4, "_ENCODING", "-c:v no_such_codec -f mp4")
+    with pytest.raises(UserError, match=r"a\.mp4: ffmpeg cannot write it \(.*choose format=gif"):
+        write_film(film[:2], tmp_path / "a.mp4", fps=10)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_the_extra_video_the_message_names_it(film, tmp_path, monkeypatch):

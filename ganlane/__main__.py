@@ -32,6 +32,30 @@ def usage() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
+    try:
+        status = dispatch(arguments)
+        sys.stdout.flush()
+        return status
+    except OSError as error:
+        return _output_refused(error)
+
+
+def _output_refused(error: OSError) -> int:
+    """The exit status where standard output takes no more, as :func:`ganlane.config.app.run_command` has it."""
+    from ganlane.config.app import READER_LEFT, USER_ERROR
+    from ganlane.config.disk import file_sentence, is_users_matter
+    from ganlane.config.streams import let_go_of_streams
+
+    if let_go_of_streams() and isinstance(error, BrokenPipeError):
+        return READER_LEFT
+    if not is_users_matter(error):
+        raise error
+    print(f"ganlane: {file_sentence(error)}", file=sys.stderr)
+    return USER_ERROR
+
+
+def dispatch(arguments: Sequence[str] | None = None) -> int:
+    """Do what the command line asks for; the exit status."""
     command, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if command in ("-h", "--help", "help"):
         print(usage())

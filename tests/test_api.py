@@ -75,7 +75,7 @@ def test_a_loaded_agent_drives_an_environment():
     rollout = env.rollout(3, agent.policy)
     assert rollout["action"].shape == (2, 3)
     assert ganlane.load_agent("mobil").observation is None
-    assert ganlane.make_env("idm", observation=None).reset()["observation"].shape == (1, 23)
+    assert ganlane.make_env("idm", observation=None).reset()["observation"].shape == (1, 29)
     assert ganlane.load_agent("mobil", lanes=5).policy.road.lanes == 5
 
 

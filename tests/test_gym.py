@@ -240,7 +240,7 @@ def test_gymnasiums_own_vectorisation_works_too():
     observation, info = envs.reset(seed=4)
     assert info["seed"].tolist() == [4, 5]
     np.testing.assert_array_equal(observation[1], make().reset(seed=5)[0])
-    assert envs.step(np.zeros(2, int))[0].shape == (2, 23)
+    assert envs.step(np.zeros(2, int))[0].shape == (2, 29)
 
 
 @pytest.mark.skipif(not MASKS_MAY_BE_ABSENT, reason="DictInfoToList needs gymnasium 1.2.2 or newer")
@@ -397,7 +397,7 @@ def test_the_code_in_the_docs_runs():
     assert "100_000" in code
     names = {"np": np}
     exec(code.replace("100_000", "120"), names)
-    assert names["following"].shape == (64, 23)
+    assert names["following"].shape == (64, 29)
     assert names["model"].num_timesteps == 120
 
 

@@ -32,7 +32,7 @@ def evaluate(
     seed: int = 0,
     num_envs: int = 128,
     env: Option = "highway",
-    observation: Option = "lane_view",
+    observation: Option = "lane_view_overlap",
     reward: Option = "paper",
     device: str = "cpu",
     per_episode: bool = False,

@@ -21,7 +21,7 @@ def render(
     out: str | Path | None = None,
     run: str | Path | Sequence[str | Path] | None = None,
     env: Option = "highway",
-    observation: Option = "lane_view",
+    observation: Option = "lane_view_overlap",
     reward: Option = "paper",
     film: Mapping[str, Any] | None = None,
     **overrides: Any,
@@ -48,7 +48,8 @@ def render(
         overrides: keys of the command or of the environment.
 
     Raises:
-        UserError: a wrong value, or a file that cannot be written.
+        UserError: a wrong value.
+        OSError: a file that cannot be written.
     """
     from ganlane.render import render as command
 

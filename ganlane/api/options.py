@@ -23,7 +23,7 @@ Option: TypeAlias = str | Mapping[str, Any] | Any
 DEFAULTS = {
     "env": "highway",
     "traffic": "idm_mobil",
-    "observation": "lane_view",
+    "observation": "lane_view_overlap",
     "reward": "paper",
     "agent": "rainbow",
     "init": "none",

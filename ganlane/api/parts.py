@@ -24,7 +24,7 @@ def make_env(
     num_envs: int = 1,
     *,
     env: Option = "highway",
-    observation: Option = "lane_view",
+    observation: Option = "lane_view_overlap",
     reward: Option = "paper",
     transforms: Sequence[Transform] = (),
     seed: int = 0,
@@ -47,7 +47,7 @@ def make_env(
             ``{"name": "gan", "noise_scale": 0.5}``.
         num_envs: N, environments side by side.
         env: an option of the group ``env``: ``highway``, ``dense``, or a scenario such as ``cut_in``.
-        observation: ``table3``, ``table3_progress``, ``lane_view``, ``lane_view_drift``,
+        observation: ``table3``, ``table3_progress``, ``lane_view``, ``lane_view_drift``, ``lane_view_overlap``,
             ``table3_lane_view``, ``fixed_order``, or a mapping.
         reward: ``paper``, or a mapping of what differs from it, ``{"hard_crash": -200}``.
         transforms: your own, after observation and reward.

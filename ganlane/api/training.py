@@ -31,7 +31,7 @@ def train(
     seed: int = 0,
     agent: Option = "rainbow",
     env: Option = "highway",
-    observation: Option = "lane_view",
+    observation: Option = "lane_view_overlap",
     reward: Option = "paper",
     num_envs: int = 128,
     logger: Option = "csv",

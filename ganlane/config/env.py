@@ -10,8 +10,8 @@ from ganlane.config.plain import plain_copy
 from ganlane.errors import UserError
 
 if TYPE_CHECKING:
-    from ganlane.env import EpisodeParameters
     from ganlane.sim.ego import EgoParameters
+    from ganlane.sim.episode import EpisodeParameters
     from ganlane.sim.idm import IdmParameters
     from ganlane.sim.lanes import Visibility
     from ganlane.sim.mobil import MobilParameters
@@ -165,7 +165,7 @@ class EnvConfig:
 
     def episode_parameters(self) -> EpisodeParameters:
         """Decision period, goal and time-out as the environment takes them."""
-        from ganlane.env import EpisodeParameters
+        from ganlane.sim.episode import EpisodeParameters
 
         return plain_copy(self, EpisodeParameters)
 

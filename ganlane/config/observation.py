@@ -43,9 +43,9 @@ class SensorsConfig:
 
 @dataclass
 class ObservationConfig:
-    """``observation=lane_view`` and the other forms (:class:`ganlane.transforms.ObservationTransform`)."""
+    """``observation=lane_view_overlap`` and the other forms (:class:`ganlane.transforms.ObservationTransform`)."""
 
-    form: str = "lane_view"
+    form: str = "lane_view_overlap"
     range_m: float = 200.0
     speed_mps: float = 30.0
     #: None: perfect sensors, for which no transform is inserted.

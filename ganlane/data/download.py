@@ -2,7 +2,8 @@
 
 Bytes go to ``.NAME.part`` beside the file, and what the server said of its version to ``.NAME.part.json``. A broken
 connection is taken up again with HTTP's Range, guarded by If-Range, so that two versions of a file are never joined;
-so is a part that an earlier run left. A server that ignores Range sends everything, and the part begins anew.
+so is a part that an earlier run left. A server that ignores Range sends everything, and the part begins anew. What
+the disk refuses is no fault of the network: it is told at once.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from ganlane.data.part_files import forget, note_version, size_of, version_of
+from ganlane.data.part_files import forget, named, note_version, size_of, version_of
 from ganlane.data.source import OnProgress
 from ganlane.errors import UserError
 
@@ -43,6 +46,17 @@ class _Broken(Exception):
     """The connection ended before the file did."""
 
 
+@contextmanager
+def _connection() -> Iterator[None]:
+    """What fails in here is the network; an OSError from elsewhere is the disk's."""
+    try:
+        yield
+    except urllib.error.HTTPError:
+        raise
+    except (OSError, http.client.HTTPException) as error:
+        raise _Broken(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
+
+
 def download(
     url: str,
     path: str | Path,
@@ -61,6 +75,7 @@ def download(
 
     Raises:
         UserError: no http address, the server refuses or cannot be reached, or the checksum differs.
+        OSError: the disk refuses; it names ``path``. What came is kept for the next time.
     """
     path, parameters = Path(path), parameters or DownloadParameters()
     if urllib.parse.urlsplit(url).scheme not in ("http", "https"):
@@ -70,7 +85,8 @@ def download(
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
-    _fetch(url, part, on_progress, parameters)
+    with named(path, nameless=True):
+        _fetch(url, part, on_progress, parameters)
     try:
         _refuse_other(part, sha256, "it was removed; download again, or correct data.sha256")
     except UserError:
@@ -95,8 +111,8 @@ def _fetch(url: str, part: Path, on_progress: OnProgress | None, parameters: Dow
             elif error.code < 500:
                 raise UserError(f"{url}: the server says {error.code} {error.reason}; check data.url.") from error
             reason = f"{error.code} {error.reason}"
-        except (_Broken, OSError, http.client.HTTPException) as error:
-            reason = str(getattr(error, "reason", None) or error) or type(error).__name__
+        except _Broken as error:
+            reason = str(error)
         failures = 0 if size_of(part) > before else failures + 1
         if failures >= parameters.attempts:
             raise UserError(
@@ -115,7 +131,9 @@ def _connect(url: str, part: Path, on_progress: OnProgress | None, timeout_s: fl
     if have and version:
         request.add_header("Range", f"bytes={have}-")
         request.add_header("If-Range", version)
-    with urllib.request.urlopen(request, timeout=timeout_s) as answer:
+    with _connection():
+        answer = urllib.request.urlopen(request, timeout=timeout_s)
+    with answer:
         goes_on = answer.status == http.HTTPStatus.PARTIAL_CONTENT
         if goes_on and _range_start(answer) != have:
             forget(part)
@@ -133,13 +151,23 @@ def _receive(
 ) -> None:
     """Add what comes to the part."""
     with part.open("ab" if have else "wb") as file:
-        while piece := answer.read1(_PIECE):
+        for piece in _pieces(answer):
             file.write(piece)
             have += len(piece)
             if on_progress is not None:
                 on_progress(have, total)
     if total is not None and have < total:
         raise _Broken(f"{have} of {total} bytes came")
+
+
+def _pieces(answer: http.client.HTTPResponse) -> Iterator[bytes]:
+    """What comes, as it comes."""
+    while True:
+        with _connection():
+            piece = answer.read1(_PIECE)
+        if not piece:
+            return
+        yield piece
 
 
 def _range_start(answer: http.client.HTTPResponse) -> int | None:

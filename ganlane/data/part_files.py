@@ -1,8 +1,11 @@
-"""A file that has come in part: how much of it is there, and of which version it is."""
+"""What stands beside a file or folder until it is whole: how much is there, of which version, what errors name."""
 
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from ganlane.files import write_json
@@ -35,3 +38,32 @@ def forget(part: Path) -> None:
 def size_of(part: Path) -> int:
     """Bytes there so far."""
     return part.stat().st_size if part.is_file() else 0
+
+
+@contextmanager
+def named(path: Path, nameless: bool = False) -> Iterator[None]:
+    """Let the file system's errors name ``path``, which the user gave, rather than a part ``.NAME....`` beside it.
+
+    Args:
+        path: what is being made.
+        nameless: errors that name nothing, as those of a write, are about ``path`` too.
+
+    Raises:
+        OSError: as it came, with its ``errno``.
+    """
+    try:
+        yield
+    except OSError as error:
+        known = path if nameless and error.filename is None else _known(error.filename, path)
+        if known is None or error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(known)) from error
+
+
+def _known(told: str | None, path: Path) -> Path | None:
+    """``path``, or what is in it, for what an error told of the part; None where it told of something else."""
+    if not isinstance(told, str):
+        return None
+    place, full = Path(os.path.abspath(path)).parent, Path(os.path.abspath(told))
+    hidden, *inside = full.relative_to(place).parts if full.is_relative_to(place) and full != place else ("",)
+    return path.joinpath(*inside) if hidden.startswith(f".{path.name}.") else None

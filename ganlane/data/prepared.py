@@ -12,6 +12,7 @@ from typing import Final
 
 import polars as pl
 
+from ganlane.data.part_files import named
 from ganlane.data.schema import FRAME_S, sort, validate
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
@@ -103,17 +104,19 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 
     Raises:
         UserError: there is something at ``path`` already.
+        OSError: the file system refuses; it names ``path``, or the file there that was to be.
     """
     path = Path(path)
     if path.is_file() or (path.is_dir() and any(path.iterdir())):
         raise UserError(f"{path}: there already; choose another folder with out=FOLDER, or remove it.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
-    try:
-        yield part
-        part.chmod(0o755)
-        if path.is_dir():
-            path.rmdir()
-        part.replace(path)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    with named(path):
+        part = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
+        try:
+            yield part
+            part.chmod(0o755)
+            if path.is_dir():
+                path.rmdir()
+            part.replace(path)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)

@@ -13,11 +13,12 @@ from torchrl.envs import EnvBase
 from ganlane import keys
 from ganlane.env.decision import Decision, Recorder, known_false
 from ganlane.env.physics import Physics, Substep, outcome
-from ganlane.env.rules import EpisodeParameters, Rules
+from ganlane.env.rules import Rules
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.sim.ego import EgoParameters
+from ganlane.sim.episode import EpisodeParameters
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.random import absorb, episode_key
 from ganlane.sim.recycle import out_of_range

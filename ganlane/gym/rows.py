@@ -17,15 +17,18 @@ from ganlane.agents.drivers import legal_actions
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.sim.road import road_in
+from ganlane.transforms import ObservationTransform, largest_number
 
 Floats = npt.NDArray[np.float32]
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
 SPEED_RATIO_LIMIT: Final = 4.0
 
 
-def observation_space(size: int) -> Box:
-    """Bounds of an observation of ``size`` numbers: speed over desired speed, then numbers from -1 to 1."""
-    low, high = np.full(size, -1.0, np.float32), np.full(size, 1.0, np.float32)
+def observation_space(env: TransformedEnv) -> Box:
+    """Bounds of the observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
+    size = env.observation_spec[keys.OBSERVATION].shape[-1]
+    form = next((each.form for each in env.transform if isinstance(each, ObservationTransform)), "table3")
+    low, high = np.full(size, -1.0, np.float32), np.full(size, largest_number(form), np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
@@ -39,7 +42,7 @@ class Rows:
 
     def __init__(self, env: TransformedEnv) -> None:
         self.env, self.count = env, env.batch_size[0]
-        self.space = observation_space(env.observation_spec[keys.OBSERVATION].shape[-1])
+        self.space = observation_space(env)
         self.state: TensorDictBase | None = None
 
     @torch.no_grad()

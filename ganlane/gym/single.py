@@ -44,7 +44,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     def __init__(
         self,
         traffic: Option = "idm_mobil",
-        observation: Option = "lane_view",
+        observation: Option = "lane_view_overlap",
         reward: Option = "paper",
         seed: int | None = None,
         env: Option = "highway",

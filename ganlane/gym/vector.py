@@ -56,7 +56,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         self,
         num_envs: int = 1,
         traffic: Option = "idm_mobil",
-        observation: Option = "lane_view",
+        observation: Option = "lane_view_overlap",
         reward: Option = "paper",
         seed: int | None = None,
         env: Option = "highway",

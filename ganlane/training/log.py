@@ -55,7 +55,7 @@ class CsvLog:
     """A CSV file with fixed columns, one line per row, complete after every row.
 
     Args:
-        path: the file; if it exists, its rows up to ``decisions`` are kept: a resumed run goes on where the
+        path: the file; if it exists, its whole rows up to ``decisions`` are kept: a resumed run goes on where the
             checkpoint was made, not where the interrupted run had got to.
         columns: in this order; a row's other entries are dropped, missing ones left empty.
         decisions: where the run starts.
@@ -87,11 +87,17 @@ def _short(value: float | str) -> float | str:
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file that :class:`CsvLog` wrote; none if it is absent."""
+    """Rows of a CSV file that :class:`CsvLog` wrote; none if it is absent.
+
+    A row that a full disk or a kill has torn is left out: its last figure may have lost digits.
+    """
     if not path.is_file():
         return []
     with path.open(newline="") as file:
-        return [row for row in csv.DictReader(file) if row.get("decisions")]
+        whole = [line for line in file if line.endswith("\n")]
+    # DictReader gives what a short row lacks as None, and what a long one has too much under None.
+    rows = [row for row in csv.DictReader(whole) if None not in row and None not in row.values()]
+    return [row for row in rows if row.get("decisions")]
 
 
 class Logs:

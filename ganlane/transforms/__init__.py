@@ -8,7 +8,7 @@ stands in the same place::
 :class:`SensorTransform`, before the observation, puts sensor errors between the true state and what the agent sees.
 """
 
-from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, observation_size
+from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, largest_number, observation_size
 from ganlane.transforms.reward import RewardParameters, RewardTransform
 from ganlane.transforms.sensors import SensorParameters, SensorTransform
 
@@ -19,5 +19,6 @@ __all__ = [
     "RewardTransform",
     "SensorParameters",
     "SensorTransform",
+    "largest_number",
     "observation_size",
 ]

@@ -17,6 +17,8 @@ NEARNESS_M = 15.0
 #: Overlap along the road that adds 1 to the nearness, m: drivers beside brake so hard that one metre decides.
 OVERLAP_M = 1.0
 CAR_LENGTH_M = 4.5
+#: The nearness of somebody exactly beside the ego, where overlap counts.
+LARGEST_NEARNESS = 1.0 + CAR_LENGTH_M / OVERLAP_M
 LANE_VIEW_SIZE = 18
 DRIFT_SIZE = 6
 

@@ -16,7 +16,7 @@ from ganlane.errors import UserError
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.transforms.fixed_order import fixed_order, places
-from ganlane.transforms.lane_view import DRIFT_SIZE, LANE_VIEW_SIZE, lane_view
+from ganlane.transforms.lane_view import DRIFT_SIZE, LANE_VIEW_SIZE, LARGEST_NEARNESS, lane_view
 from ganlane.transforms.sensors import perceived
 from ganlane.transforms.table3 import (
     ObservationScale,
@@ -58,6 +58,11 @@ def observation_size(name: str, vehicles: int) -> int:
     form, others = OBSERVATIONS[name], vehicles - 1
     listed = 3 * (form.listed * others + form.placed * places(others))
     return 3 + listed + form.viewed * LANE_VIEW_SIZE + form.drift * DRIFT_SIZE + form.progress * 2
+
+
+def largest_number(name: str) -> float:
+    """What no number of observation ``name`` exceeds, but the first (speed over desired speed, without a bound)."""
+    return LARGEST_NEARNESS if OBSERVATIONS[name].overlap else 1.0
 
 
 class ObservationTransform(Transform):

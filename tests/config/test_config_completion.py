@@ -152,6 +152,7 @@ complete -C 'ganlane train traffic='
 
 def test_fish_completes_and_forgets(environment):
     offered = typed("fish", FISH, environment, "--no-config").splitlines()
+    offered = [each for each in offered if not each.endswith("/")]  # the folders that happen to be here
     assert offered == ["train", "train_generator", *(f"traffic={name}" for name in TRAFFICS)]
 
 

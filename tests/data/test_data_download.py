@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+from pathlib import Path
+
 import pytest
 from reference.file_server import CONTENT, SHA256, Server
 
@@ -111,6 +114,23 @@ def test_a_server_in_trouble_is_asked_again_and_one_that_is_gone_is_named(tmp_pa
         assert len(server.asked) == QUICK.attempts
     with pytest.raises(UserError, match=r"0 bytes came \(.*refused"):
         download(server.url, tmp_path / "f", None, None, QUICK)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_full_disk_is_told_at_once_and_not_as_a_fault_of_the_network(tmp_path):
+    (tmp_path / ".f.part").symlink_to("/dev/full")
+    with Server() as server, pytest.raises(OSError, match="No space left") as caught:
+        download(server.url, tmp_path / "f", SHA256, None, QUICK)
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "f"))
+    assert len(server.asked) == 1
+
+
+def test_a_disk_that_refuses_the_part_is_told_with_the_name_of_the_file(tmp_path):
+    (tmp_path / ".f.part").mkdir()
+    with Server() as server, pytest.raises(IsADirectoryError) as caught:
+        download(server.url, tmp_path / "f", SHA256, None, QUICK)
+    assert caught.value.filename == str(tmp_path / "f")
+    assert len(server.asked) == 1
 
 
 def test_progress_tells_share_and_time_left():

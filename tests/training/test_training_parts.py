@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from ganlane.errors import UserError
 from ganlane.training.checkpoints import LAST, find_checkpoint, load_checkpoint, pack, save_checkpoint, unpack
 from ganlane.training.config import TrainingConfig
-from ganlane.training.log import CsvLog
+from ganlane.training.log import CsvLog, read_rows
 from ganlane.training.meter import Meter
 from ganlane.training.progress import Progress, duration
 from ganlane.training.tensorboard import TensorBoardLog
@@ -96,6 +96,29 @@ def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(tmp_path):
     with path.open() as file:
         found = list(csv.reader(file))
     assert found == [["decisions", "loss"], ["100", "0.333333"], ["200", "0.333333"], ["260", ""]]
+
+
+def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(tmp_path):
+    path = tmp_path / "metrics.csv"
+    log = CsvLog(path, ["loss", "decisions"])  # the last column is the one that can be cut unseen
+    rows = [{"loss": "0.5", "decisions": str(decisions)} for decisions in (100_000, 200_000, 300_000)]
+    for row in rows:
+        log.write(row)
+    log.close()
+    whole = path.read_bytes()
+    for size in range(len(whole) + 1):
+        path.write_bytes(whole[:size])
+        complete = max(0, whole[:size].count(b"\n") - 1)
+        assert read_rows(path) == rows[:complete]
+        CsvLog(path, ["loss", "decisions"], decisions=250_000).close()
+        assert read_rows(path) == rows[: min(complete, 2)]
+
+
+@pytest.mark.parametrize("torn", ["20", "20,0.", "20,0.5,1,30,0.5,1", "20,0.530,0.5,1"])
+def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
+    path = tmp_path / "metrics.csv"
+    path.write_text(f"decisions,loss,sigma\n10,0.5,1\n{torn}\n40,0.5,\n")
+    assert [row["decisions"] for row in read_rows(path)] == ["10", "40"]
 
 
 def test_progress_off_a_terminal_is_a_line_per_row():

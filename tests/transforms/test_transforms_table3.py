@@ -9,7 +9,7 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim import Road, Vehicles
 from ganlane.traffic import IdmMobilTraffic
-from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardTransform, observation_size
+from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardTransform, largest_number, observation_size
 
 
 def scene(rows, valid=None):
@@ -129,3 +129,12 @@ def test_the_papers_form_has_27_numbers_for_nine_vehicles():
 def test_an_unknown_form_is_refused_with_the_known_ones():
     with pytest.raises(UserError, match="table3_progress"):
         ObservationTransform(Road(), 9, "pixels")
+
+
+@pytest.mark.parametrize("form", list(OBSERVATIONS))
+def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form):
+    beside = [EGO, (0.0, 2, 26.0, 20.0), (0.5, 0, 26.0, 20.0), (-30.0, 1, 14.0, 20.0)]
+    values = observe(form, beside)
+    assert values[1:].max() <= largest_number(form)
+    assert values[1:].min() >= -1.0
+    assert largest_number(form) == (5.5 if form == "lane_view_overlap" else 1.0)

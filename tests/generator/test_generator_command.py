@@ -48,7 +48,7 @@ def test_errors_pooled_over_folds_stand_in_results_and_in_the_weights(recordings
 def test_an_earlier_runs_fits_are_not_fitted_again(recordings, capsys):
     _, folder, first = run(capsys, recordings, "folds=2", *FEW)
     kept = {path: path.stat().st_mtime_ns for path in (folder / "fits").iterdir()}
-    _, other, again = run(capsys, recordings, "folds=2", f"resume={folder}", *FEW)
+    _, other, again = run(capsys, recordings, "folds=2", f"resume={folder}", "hydra.run.dir=again", *FEW)
     assert other != folder
     assert again["folds"] == first["folds"]
     assert again["ade_m"] == first["ade_m"]

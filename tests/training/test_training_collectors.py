@@ -51,7 +51,7 @@ def toy(rows, first_episode):
     return ToyRoad(rows)
 
 
-def agent(size=23, seed=0, **options):
+def agent(size=29, seed=0, **options):
     return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
 
 
@@ -342,7 +342,7 @@ def test_a_signal_to_the_whole_group_saves_and_leaves_no_process(number, tmp_pat
 def test_on_a_gpu_nothing_of_a_run_is_elsewhere():
     traffic = make_traffic(IdmTrafficConfig(), ROAD)
     env = make_env(traffic, ROAD, ObservationConfig(), num_envs=32, device="cuda")
-    learner = Rainbow(RainbowConfig(**SMALL), 23, device="cuda")
+    learner = Rainbow(RainbowConfig(**SMALL), 29, device="cuda")
     run = Run(env, learner)
     for _ in range(4):
         step = collect(run)

@@ -4,6 +4,7 @@ import functools
 import importlib.util
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -27,6 +28,7 @@ from ganlane.errors import UserError
 from ganlane.phases import identity, make_source, phases_of
 from ganlane.training import TrainingConfig, train
 from ganlane.training.collectors import MultiSource, RaySource, SingleSource, Team, source_of
+from ganlane.training.collectors.ray_cluster import knock
 from ganlane.training.collectors.remote import EPISODES_PER_WORKER, noise_seed
 from ganlane.training.collectors.signals import shielded_children
 from ganlane.training.collectors.workers import WorkerSource
@@ -309,6 +311,17 @@ def test_two_ray_workers_collect_and_a_dead_one_is_told_in_one_sentence(carried_
     finally:
         source.close()
     assert not ray.is_initialized()
+
+
+def test_nobody_at_an_address_is_found_out_at_once():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        knock(f"127.0.0.1:{port}")
+        knock(f"ray://127.0.0.1:{port}")
+    for address in (f"127.0.0.1:{port}", "ray://127.0.0.1:1", "127.0.0.1:99999"):
+        with pytest.raises(ConnectionError):
+            knock(address)
+    knock("auto")
 
 
 @NO_RAY

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -45,6 +46,8 @@ class RaySource(WorkerSource):
         """An actor per worker."""
         from torchrl.collectors.distributed import RayCollector
 
+        if self.address is not None:
+            knock(self.address)
         # A dictionary each: TorchRL writes the policy of a worker into its own.
         own = [{"postproc": read_by_loop, "auto_register_policy_transforms": False} for _ in environments]
         # TorchRL is told of no weights to send, and warns of it twice: the source hands them over itself.
@@ -87,3 +90,18 @@ class RaySource(WorkerSource):
         if not ray.is_initialized():
             return f"Ray could not be started ({str(error).partition('.')[0]}), see whether the machine is overloaded"
         return None
+
+
+def knock(address: str, patience_s: float = 10.0) -> None:
+    """See whether anybody listens at ``HOST:PORT`` or ``ray://HOST:PORT``; Ray itself asks for minutes.
+
+    Raises:
+        ConnectionError: nobody does.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not port.isdigit():
+        return  # auto, local, or something that Ray has a word for
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), patience_s).close()
+    except (OSError, OverflowError) as error:
+        raise ConnectionError(str(error)) from error

@@ -2,23 +2,16 @@
 
 import pytest
 import torch
+from agents_small import agent, saved_in
 from tensordict import TensorDict
 
-from ganlane.agents import Rainbow, RainbowConfig, agent_file, checkpoint, load_agent, save_agent, transfer
+from ganlane.agents import RainbowConfig, agent_file, checkpoint, load_agent, transfer
 from ganlane.errors import UserError
-
-SMALL = {"hidden": (8, 8), "batch_size": 8, "warmup": 8, "capacity": 100}
-
-
-def agent(size=5, seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
 
 
 @pytest.fixture
 def saved(tmp_path):
-    path = tmp_path / "agent.safetensors"
-    save_agent(path, agent(), {"observation": "table3", "training": {"decisions": 7}})
-    return path
+    return saved_in(tmp_path)
 
 
 def test_a_loaded_agent_drives_like_the_saved_one(saved):

@@ -2,23 +2,16 @@
 
 import pytest
 import torch
+from agents_small import agent, saved_in
 
-from ganlane.agents import Rainbow, RainbowConfig, save_agent, transfer
+from ganlane.agents import save_agent, transfer
 from ganlane.agents.handover import load_moments
 from ganlane.errors import UserError
-
-SMALL = {"hidden": (8, 8), "batch_size": 8, "warmup": 8, "capacity": 100}
-
-
-def agent(size=5, seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
 
 
 @pytest.fixture
 def saved(tmp_path):
-    path = tmp_path / "agent.safetensors"
-    save_agent(path, agent(), {"observation": "table3", "training": {"decisions": 7}})
-    return path
+    return saved_in(tmp_path)
 
 
 def test_another_support_is_refused_on_transfer_naming_both_ways_out(saved):

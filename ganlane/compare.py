@@ -13,6 +13,7 @@ from tqdm import tqdm
 from ganlane.build import Driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
@@ -39,6 +40,7 @@ def compare(
     num_envs: int = 128,
     device: str = "cpu",
     stream: int = Stream.REPORT,
+    mask: MaskConfig | None = None,
 ) -> pl.DataFrame:
     """Run the episodes 0 to ``episodes - 1`` with each driver on each traffic.
 
@@ -49,6 +51,7 @@ def compare(
         observation: for drivers that name none; its sensors for all.
         episodes, seed, stream: which episodes.
         num_envs: episodes side by side, at most.
+        mask: for drivers that name none.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
@@ -60,9 +63,10 @@ def compare(
     with _Progress(len(pairs) * episodes) as progress:
         for traffic, driver in pairs:
             seen = (observation or ObservationConfig()).read_by(driver.observation)
-            made = make_env(modules[traffic], env, seen, reward, rows, seed, device)
+            shield, policy = driver.behind(mask)
+            made = make_env(modules[traffic], env, seen, reward, rows, seed, device, mask=shield)
             report = progress.start(f"{driver.name} on {traffic}")
-            table = run_episodes(made, driver.policy, range(episodes), seed, report)
+            table = run_episodes(made, policy, range(episodes), seed, report)
             named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             tables.append(_with_scenes(named, modules[traffic], seed))
     return pl.concat(tables, how="diagonal")
@@ -106,6 +110,7 @@ def compare_as_told(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.Dat
         config.seed,
         config.num_envs,
         config.device,
+        mask=config.mask,
     )
 
 

@@ -18,6 +18,7 @@ N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI un
 ``road.lane_width_m``                      [N, 1]      the same, m
 ``events.*``                               [N, 1]      what the last decision led to
 ``action``                                 [N] i64     0 keep, 1 left, 2 right
+``action_mask``                            [N, 3] b    which of them are allowed, where there is a mask
 =========================================  ==========  ==================================================
 """
 
@@ -41,6 +42,10 @@ ACTION: Final = "action"
 #: What a policy that tells thinks its action worth, [N] or [N, 1]; named as in TorchRL.
 CHOSEN_VALUE: Final = "chosen_action_value"
 OBSERVATION: Final = "observation"
+#: Which actions are allowed, [N, 3] bool, where the environment has a mask; named as in TorchRL.
+ACTION_MASK: Final = "action_mask"
+#: Whether even keeping the lane asks somebody to brake harder than is safe, [N, 1] bool (mask ``safe``).
+NO_SAFE_ACTION: Final = "no_safe_action"
 REWARD: Final = "reward"
 
 #: Float fields of ``vehicles``.

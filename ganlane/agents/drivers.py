@@ -19,6 +19,7 @@ from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
+from ganlane.transforms.mask import on_road_actions
 
 
 class Driver(TensorDictModuleBase):
@@ -44,7 +45,7 @@ def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
     target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
     lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
-    return torch.stack((target >= 0, target < lanes - 1, target > 0), dim=1)
+    return on_road_actions(target, lanes)
 
 
 class RandomDriver(Driver):

@@ -34,6 +34,7 @@ def evaluate(
     env: Option = "highway",
     observation: Option = "lane_view_overlap",
     reward: Option = "paper",
+    mask: Option = "none",
     device: str = "cpu",
     per_episode: bool = False,
     folder: str | Path | None = None,
@@ -58,7 +59,7 @@ def evaluate(
         seed: of the episodes.
         num_envs: episodes driven side by side; the numbers do not depend on it.
         env, reward: the same for all; ``overrides`` are keys of the environment.
-        observation: for policies that name none.
+        observation, mask: for policies that name none.
         device: ``cpu`` or ``cuda``.
         per_episode: one row per episode instead (:func:`ganlane.evaluation.run_episodes`).
         folder: write ``results.json`` and ``episodes.parquet`` there, as the command does.
@@ -71,7 +72,7 @@ def evaluate(
         UserError: an unknown name, a wrong value, or a policy that does not fit.
     """
     named, given = [_name(agent) for agent in agents], _traffics(traffics)
-    parts: dict[str, Option | None] = {"env": env, "observation": observation, "reward": reward}
+    parts: dict[str, Option | None] = {"env": env, "observation": observation, "reward": reward, "mask": mask}
     told = {"episodes": episodes, "seed": seed, "num_envs": num_envs, "device": device}
     lists = {"agents": named, "traffics": list(given), "traffic_options": {**all_traffics(), **given}}
     config = command_config(EvaluateConfig, parts, {**overrides, **told, **lists})

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from ganlane.config.checks import Rule, at_least, between, check, did_you_mean
 from ganlane.config.env import EnvConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
@@ -46,6 +47,7 @@ class EvaluateConfig(RunConfig):
     num_envs: int = 128
     env: EnvConfig = field(default_factory=EnvConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
+    mask: MaskConfig = field(default_factory=MaskConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     traffic_options: dict[str, TrafficConfig] = field(default_factory=all_traffics)

@@ -17,6 +17,7 @@ from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorConfig
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.prepare import PrepareConfig
 from ganlane.config.realism import RealismConfig
@@ -71,6 +72,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
     "observation": {"observation": ObservationConfig},
+    "mask": {"mask": MaskConfig},
     "reward": {"paper": RewardConfig},
     "collector": {"single": CollectorConfig, "multi": MultiCollectorConfig, "ray": RayCollectorConfig},
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},

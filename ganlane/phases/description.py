@@ -17,6 +17,8 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "traffic": asdict(phase.traffic),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
+        # Left out where there is none, as in the runs of versions that knew no masks.
+        **({"mask": asdict(config.mask)} if config.mask.form != "none" else {}),
         "init": config.init.path,
         "collector": {name: value for name, value in asdict(config.collector).items() if name != "address"},
         "seed": config.seed,
@@ -31,6 +33,7 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     return {
         "observation": config.observation.form,
         "observation_scale": scale,
+        "mask": asdict(config.mask),
         "sensors": asdict(config.observation)["sensors"],
         "environment": environment,
         "env": asdict(config.env),

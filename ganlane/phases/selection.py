@@ -20,7 +20,9 @@ def make_selection(config: TrainConfig, phase: Phase) -> Callable[[GreedyPolicy]
     """Drives the greedy policy through episodes of the stream that is kept for choosing among checkpoints."""
     traffic = make_traffic(phase.traffic, config.env, Stream.SELECT)
     rows = min(config.selection_episodes, config.evaluation.num_envs)
-    env = make_env(traffic, config.env, config.observation, config.reward, rows, config.seed, config.device)
+    env = make_env(
+        traffic, config.env, config.observation, config.reward, rows, config.seed, config.device, mask=config.mask
+    )
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
         return figures(run_episodes(env, policy, range(config.selection_episodes), config.seed))

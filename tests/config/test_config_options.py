@@ -26,6 +26,7 @@ from ganlane.config.generator import (
     PaperGeneratorConfig,
     WeightOptions,
 )
+from ganlane.config.mask import MASKS
 from ganlane.config.observation import FORMS, LISTS, ObservationConfig, SensorsConfig
 from ganlane.config.plain import plain_copy
 from ganlane.config.reward import RewardConfig
@@ -88,7 +89,7 @@ def test_yaml_and_dataclass_hold_the_same_values(group, option):
     if needed:
         assert value == type(value)(scene=value.scene)
         return
-    expected = type(value)(form=option) if group == "observation" else type(value)()
+    expected = type(value)(form=option) if group in ("observation", "mask") else type(value)()
     assert value == expected
 
 
@@ -107,8 +108,8 @@ def test_no_schema_is_without_its_yaml():
     register()
     for group, options in SCHEMAS.items():
         names = {path.stem for path in (conf_folder() / group).glob("*.yaml")}
-        if group == "observation":
-            assert names == set(FORMS)
+        if group in ("observation", "mask"):
+            assert names == set({"observation": FORMS, "mask": MASKS}[group])
         else:
             assert set(options) <= names, group
         assert {name + SUFFIX for name in options} <= {

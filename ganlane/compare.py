@@ -110,7 +110,8 @@ def compare_as_told(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.Dat
         config.seed,
         config.num_envs,
         config.device,
-        mask=config.mask,
+        Stream[config.stream.upper()],
+        config.mask,
     )
 
 

@@ -123,6 +123,6 @@ def _traffics(traffics: Sequence[Option] | Mapping[str, Option]) -> dict[str, Tr
 def _keep(folder: Path, table: pl.DataFrame, rows: list[dict[str, Any]], config: EvaluateConfig) -> None:
     """The files of the command."""
     folder.mkdir(parents=True, exist_ok=True)
-    seeds = {"stream": "report", "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
     write_episodes(folder, table)
     write_results(folder, {"rows": rows}, asdict(config), seeds)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.config.checks import Rule, at_least, between, check, did_you_mean
+from ganlane.config.checks import Rule, at_least, between, check, did_you_mean, one_of
 from ganlane.config.env import EnvConfig
 from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
@@ -21,6 +21,8 @@ from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
 
+#: Families of episodes that can be driven for a table: to choose on, to report on.
+STREAMS = ("report", "select")
 #: A list of names without repetitions.
 NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
 
@@ -45,6 +47,7 @@ class EvaluateConfig(RunConfig):
     traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
     episodes: int = 100
     num_envs: int = 128
+    stream: str = "report"
     env: EnvConfig = field(default_factory=EnvConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     mask: MaskConfig = field(default_factory=MaskConfig)
@@ -55,6 +58,7 @@ class EvaluateConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self, "", agents=NAMES, traffics=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+        check(self, "", stream=one_of(STREAMS))
         check_pay(self.env, self.reward)
         self.chosen_traffics()
 

@@ -63,9 +63,10 @@ TERMINAL_EVENTS: Final = ("goal", "hard_crash", "out_of_road")
 TRUNCATING_EVENTS: Final = ("timeout", "scene_end")
 #: Number of soft-crash onsets in the decision, int64.
 SOFT_CRASH: Final = "soft_crash"
-#: The same behind the ego: reported, not penalised.
+#: The same behind the ego: reported, and penalised by ``reward=considerate`` alone.
 SOFT_CRASH_BEHIND: Final = "soft_crash_behind"
 
+#: Terms of the paper's reward; one that charges for ``soft_crash_behind`` has a further one of that name.
 REWARD_TERM_NAMES: Final = ("speed", "lane_change", "out_of_road", "hard_crash", "soft_crash", "goal")
 
 KEEP: Final = 0

@@ -24,6 +24,10 @@ TABLE_II_KEYS = (
     "desired_speed_mps",
     "length_m",
     "width_m",
+    "truck_share",
+    "truck_length_m",
+    "truck_width_m",
+    "truck_desired_speed_mps",
 )
 
 

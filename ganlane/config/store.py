@@ -22,7 +22,7 @@ from ganlane.config.observation import ObservationConfig
 from ganlane.config.prepare import PrepareConfig
 from ganlane.config.realism import RealismConfig
 from ganlane.config.render import RenderConfig
-from ganlane.config.reward import RewardConfig
+from ganlane.config.reward import ConsiderateRewardConfig, RewardConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -73,7 +73,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
     "observation": {"observation": ObservationConfig},
     "mask": {"mask": MaskConfig},
-    "reward": {"paper": RewardConfig},
+    "reward": {"paper": RewardConfig, "considerate": ConsiderateRewardConfig},
     "collector": {"single": CollectorConfig, "multi": MultiCollectorConfig, "ray": RayCollectorConfig},
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},

@@ -28,7 +28,8 @@ def observation_space(env: TransformedEnv) -> Box:
     """Bounds of the observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
     size = env.observation_spec[keys.OBSERVATION].shape[-1]
     form = next((each.form for each in env.transform if isinstance(each, ObservationTransform)), "table3")
-    low, high = np.full(size, -1.0, np.float32), np.full(size, largest_number(form), np.float32)
+    largest = largest_number(form, env.base_env.scenes.longest_m)
+    low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
@@ -117,8 +118,7 @@ class Rows:
             "action_mask": self._mask(at).to(torch.int8),
             **{name: events.get(name)[:, 0] for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)},
         }
-        terms = at.get(keys.REWARD_TERMS)
-        paid = {name: _array(terms.get(name)[:, 0]) for name in keys.REWARD_TERM_NAMES}
+        paid = {name: _array(term[:, 0]) for name, term in at.get(keys.REWARD_TERMS).items()}
         return {**{name: _array(value) for name, value in found.items()}, keys.REWARD_TERMS: paid}
 
 

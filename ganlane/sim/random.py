@@ -51,6 +51,7 @@ class Purpose(IntEnum):
     SENSED_LATERAL = 66
     SENSED_SPEED = 67
     SENSED_DROPOUT = 68
+    SPAWN_TRUCK = 69
 
 
 def _shift(h: Tensor, bits: int) -> Tensor:

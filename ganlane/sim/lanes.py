@@ -26,8 +26,13 @@ ARRIVED_M = 0.3
 
 
 class Visibility(IntEnum):
-    """When others see that a vehicle enters their lane."""
+    """When others see that a vehicle enters their lane.
 
+    ``OF_EPISODE`` stands in a first scene only, where the traffic differs from episode to episode: the traffic
+    replaces it (:meth:`ganlane.traffic.TrafficModule.enter`).
+    """
+
+    OF_EPISODE = -1
     CENTRE = 0
     BODY = 1
     SIGNALLED = 2

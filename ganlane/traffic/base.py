@@ -13,7 +13,7 @@ from ganlane import keys
 from ganlane.compiling import compiled
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.lanes import Visibility
-from ganlane.sim.random import Stream, episode_key
+from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.vehicles import Vehicles
@@ -130,6 +130,19 @@ class TrafficModule(TensorDictModuleBase):
         The environment keeps the old memory of the others, so a module may fill all entries.
         """
         return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])
+
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+        """The start of the episodes with ``key`` [N]: the vehicles as this traffic has them, and its memory.
+
+        Here the vehicles stay as they are and :meth:`init_memory` fills the memory. A traffic that changes what a
+        scene leaves to it (who is seen how, how fast a driver wants to go) overrides this method.
+
+        Args:
+            vehicles: the first scene, fields [N, M].
+            key: the episodes' keys [N] int64.
+            episode: their numbers [N] int64.
+        """
+        return vehicles, self.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""

@@ -21,18 +21,15 @@ from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 
 ENTRY_M = 0.1
+#: Stands in a first scene for a :class:`Visibility` that differs from episode to episode: the traffic knows which.
+VISIBILITY_OF_EPISODE = -1
 #: A lane change is complete, and the next one possible, within this distance of the target lane's centre.
 ARRIVED_M = 0.3
 
 
 class Visibility(IntEnum):
-    """When others see that a vehicle enters their lane.
+    """When others see that a vehicle enters their lane."""
 
-    ``OF_EPISODE`` stands in a first scene only, where the traffic differs from episode to episode: the traffic
-    replaces it (:meth:`ganlane.traffic.TrafficModule.enter`).
-    """
-
-    OF_EPISODE = -1
     CENTRE = 0
     BODY = 1
     SIGNALLED = 2

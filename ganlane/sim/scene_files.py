@@ -150,7 +150,7 @@ def _row(given: Mapping[str, Any], where: str, origin: str) -> SceneVehicle:
 def _value(name: str, value: Any, where: str) -> Any:
     if name != "visibility":
         return _number(name, value, where, whole=name in WHOLE_NUMBERS)
-    kinds = {kind.name.lower(): kind for kind in Visibility if kind != Visibility.OF_EPISODE}
+    kinds = {kind.name.lower(): kind for kind in Visibility}
     if value not in kinds:
         raise UserError(f"{where}: {value!r}: expected one of {', '.join(kinds)}.")
     return kinds[value]

@@ -58,8 +58,9 @@ class TrafficModule(TensorDictModuleBase):
     in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
 
-    #: How the vehicles of this model show their lane changes to others.
-    visibility: Visibility = Visibility.SIGNALLED
+    #: How the vehicles of this model show their lane changes to others; where that differs from episode to episode
+    #: ``VISIBILITY_OF_EPISODE``, which :meth:`enter` replaces.
+    visibility: int = Visibility.SIGNALLED
     #: Whether lanes and lane width differ from row to row (:meth:`road_of`).
     own_roads: bool = False
     #: Per-vehicle memory; empty for a model without any.

@@ -34,7 +34,7 @@ from ganlane.paths import CHECKPOINTS
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.steering import STEERING
-from ganlane.traffic import TrafficModule
+from ganlane.traffic import BlindTraffic, TrafficModule
 from ganlane.transforms import (
     ActionMaskTransform,
     ObservationTransform,
@@ -79,10 +79,13 @@ def make_traffic(traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TR
     )
     if not callable(target) or (inspect.isclass(target) and not issubclass(target, TrafficModule)):
         raise expected
-    made = call_with(target, _offered(env, stream), traffic.arguments(), key)
+    arguments, parts = traffic.arguments(), traffic.parts()
+    if parts:
+        arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
+    made = call_with(target, _offered(env, stream), arguments, key)
     if not isinstance(made, TrafficModule):
         raise expected
-    return made
+    return BlindTraffic(made, traffic.blind_share) if traffic.blind_share else made
 
 
 def make_env(

@@ -163,7 +163,7 @@ class EnvConfig:
         """Refuse first scenes that do not fit on the road, or from which nobody could drive on."""
         self.spawn_parameters().check(self.vehicles, self.lanes, self.idm.parameters())
 
-    def scenes(self, others_visibility: Visibility | None = None) -> Scenes | None:
+    def scenes(self, others_visibility: int | None = None) -> Scenes | None:
         """Where an episode's vehicles start: None for Table II; ``others_visibility`` is the traffic's."""
         return None
 

@@ -10,14 +10,8 @@ from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
-from ganlane.config.traffic import (
-    GanCalibratedTrafficConfig,
-    GanTrafficConfig,
-    IdmMobilTrafficConfig,
-    IdmTrafficConfig,
-    TrafficConfig,
-)
-from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic import TrafficConfig
+from ganlane.config.traffic_mixed import MixedTrafficConfig, reacting_traffics
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
 
@@ -29,14 +23,7 @@ NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a 
 
 def all_traffics() -> dict[str, TrafficConfig]:
     """The options of the group ``traffic``, by name."""
-    return {
-        "idm": IdmTrafficConfig(),
-        "idm_mobil": IdmMobilTrafficConfig(),
-        "gan": GanTrafficConfig(),
-        "gan_calibrated": GanCalibratedTrafficConfig(),
-        "idm_faults": IdmFaultsTrafficConfig(),
-        "replay": ReplayTrafficConfig(),
-    }
+    return {**reacting_traffics(), "mixed": MixedTrafficConfig(), "replay": ReplayTrafficConfig()}
 
 
 @dataclass

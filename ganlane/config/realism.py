@@ -16,13 +16,15 @@ from ganlane.errors import UserError
 _TAKEN = ("random", "constant_velocity")
 #: The traffic that is the recordings themselves.
 _RECORDED = "replay"
+#: No traffic of its own: its parts have cards.
+_MIXED = "mixed"
 _QUICK_KM = 5.0
 _QUICK_S = 30.0
 
 
 def drivable() -> dict[str, TrafficConfig]:
-    """The options of the group ``traffic`` that can have a card, by name: all but the recordings themselves."""
-    return {name: traffic for name, traffic in all_traffics().items() if name != _RECORDED}
+    """The options of the group ``traffic`` that can have a card, by name: not the recordings, and no mixture."""
+    return {name: traffic for name, traffic in all_traffics().items() if name not in (_RECORDED, _MIXED)}
 
 
 @dataclass
@@ -67,6 +69,8 @@ class RealismConfig(RunConfig):
             raise UserError(f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu.")
         if self.traffic.label() == _RECORDED:
             raise UserError("traffic=replay: it is the recordings themselves; choose a traffic that drives.")
+        if self.traffic.label() == _MIXED:
+            raise UserError("traffic=mixed: a card is of one traffic; make one of each of its parts.")
         if self.data.format != "scenes":
             raise UserError(
                 f"data={self.data.format}: the card reads scenes; run ganlane prepare data={self.data.format} first, "

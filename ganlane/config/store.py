@@ -37,6 +37,8 @@ from ganlane.config.traffic import (
     IdmTrafficConfig,
 )
 from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic_mixed import MixedTrafficConfig
+from ganlane.config.traffic_random import IdmRandomTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
@@ -67,6 +69,8 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "gan": GanTrafficConfig,
         "gan_calibrated": GanCalibratedTrafficConfig,
         "idm_faults": IdmFaultsTrafficConfig,
+        "idm_random": IdmRandomTrafficConfig,
+        "mixed": MixedTrafficConfig,
         "replay": ReplayTrafficConfig,
     },
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},

@@ -20,7 +20,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.sim.ego import EgoParameters
 from ganlane.sim.episode import EpisodeParameters
 from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.random import absorb, episode_key
+from ganlane.sim.random import episode_key
 from ganlane.sim.recycle import out_of_range
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.scenes import RandomScenes, Scenes
@@ -171,8 +171,7 @@ class HighwayEnv(EnvBase):
         """All rows at the start of their episodes; EnvBase keeps those of the rows that were not asked for."""
         seed, episode = self.last_episodes = self._episodes(tensordict)
         key = episode_key(self.stream, seed, episode)
-        vehicles = self.scenes(key, self.dtype).with_finite_padding()
-        memory = self.traffic.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
+        vehicles, memory = self.traffic.enter(self.scenes(key, self.dtype).with_finite_padding(), key, episode)
         zero = torch.zeros(self.batch_size, dtype=self.dtype, device=self.device)
         rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
         rest |= {name: zero[:, None].bool() for name in DONE_FLAGS}

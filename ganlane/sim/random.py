@@ -51,7 +51,9 @@ class Purpose(IntEnum):
     SENSED_LATERAL = 66
     SENSED_SPEED = 67
     SENSED_DROPOUT = 68
-    SPAWN_TRUCK = 69
+    BLIND_EPISODE = 69
+    DRIVER = 70  # and the 15 purposes after it: what is each driver's own (traffic=idm_random)
+    SPAWN_TRUCK = 90
 
 
 def _shift(h: Tensor, bits: int) -> Tensor:

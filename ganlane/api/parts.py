@@ -49,7 +49,7 @@ def make_env(
         env: an option of the group ``env``: ``highway``, ``dense``, or a scenario such as ``cut_in``.
         observation: ``table3``, ``table3_progress``, ``lane_view``, ``lane_view_drift``, ``lane_view_overlap``,
             ``table3_lane_view``, ``fixed_order``, or a mapping.
-        reward: ``paper``, or a mapping of what differs from it, ``{"hard_crash": -200}``.
+        reward: ``paper``, ``considerate``, or a mapping of what differs from it, ``{"hard_crash": -200}``.
         transforms: your own, after observation and reward.
         seed: base of the random numbers.
         stream: family of the episodes: ``train``, ``select`` or ``report`` (that of ``evaluate``).

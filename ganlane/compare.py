@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import polars as pl
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ganlane.build import Driver, make_env, make_traffic
@@ -43,7 +45,7 @@ def compare(
     """Run the episodes 0 to ``episodes - 1`` with each driver on each traffic.
 
     Args:
-        drivers: see :func:`ganlane.build.make_driver`; each gets an environment with its own observation.
+        drivers: see :func:`ganlane.build.make_driver`; each drives with its own observation.
         traffics: name to config.
         env, reward: the same for all.
         observation: for drivers that name none; its sensors for all.
@@ -57,12 +59,17 @@ def compare(
     modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(num_envs, episodes), []
+    made: tuple[tuple[str, ObservationConfig], EnvBase] | None = None
     with _Progress(len(pairs) * episodes) as progress:
         for traffic, driver in pairs:
             seen = (observation or ObservationConfig()).read_by(driver.observation)
-            made = make_env(modules[traffic], env, seen, reward, rows, seed, device)
+            make = partial(make_env, modules[traffic], env, seen, reward, seed=seed, device=device)
+            if made is None or made[0] != (traffic, seen):
+                # Drivers that see the same share an environment, which is compiled once then.
+                made = (traffic, seen), make(rows)
+            smaller = None if env.compile else make
             report = progress.start(f"{driver.name} on {traffic}")
-            table = run_episodes(made, driver.policy, range(episodes), seed, report)
+            table = run_episodes(made[1], driver.policy, range(episodes), seed, report, smaller)
             named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             tables.append(_with_scenes(named, modules[traffic], seed))
     return pl.concat(tables, how="diagonal")

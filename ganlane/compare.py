@@ -21,6 +21,8 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.evaluation import (
     crashes_by_scene,
     evaluation_rows,
+    paired_rows,
+    paired_table,
     run_episodes,
     text_table,
     write_episodes,
@@ -125,7 +127,8 @@ def publish(
 ) -> str:
     """Print the table of a comparison, write its episodes and ``results.json``; the line that names the latter.
 
-    Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
+    With two drivers or more a second table, and ``paired`` in the record, say by how much the first one is ahead of
+    each of the others on the same episodes (:func:`ganlane.evaluation.paired_rows`). Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
 
     Args:
         table: what :func:`compare` returned.
@@ -133,11 +136,14 @@ def publish(
         config, seeds: of the run, for the record.
         numbers: what the record holds beside ``rows``.
     """
-    rows = evaluation_rows(table)
+    rows, paired = evaluation_rows(table), paired_rows(table)
     print(text_table(rows))
+    if paired:
+        print(f"\n{paired_table(paired)}")
     write_episodes(folder, table)
     recorded = recorded_crashes(table)
-    known = {"rows": rows, **({"crashes_by_scene": recorded} if recorded else {}), **(numbers or {})}
+    scenes = {"crashes_by_scene": recorded} if recorded else {}
+    known = {"rows": rows, "paired": paired, **scenes, **(numbers or {})}
     return f"results: {write_results(folder, known, config, seeds)}"
 
 

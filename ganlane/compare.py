@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import polars as pl
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ganlane.build import Driver, make_env, make_traffic
@@ -20,6 +22,8 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.evaluation import (
     crashes_by_scene,
     evaluation_rows,
+    paired_rows,
+    paired_table,
     run_episodes,
     text_table,
     write_episodes,
@@ -45,7 +49,7 @@ def compare(
     """Run the episodes 0 to ``episodes - 1`` with each driver on each traffic.
 
     Args:
-        drivers: see :func:`ganlane.build.make_driver`; each gets an environment with its own observation.
+        drivers: see :func:`ganlane.build.make_driver`; each drives with its own observation.
         traffics: name to config.
         env, reward: the same for all.
         observation: for drivers that name none; its sensors for all.
@@ -60,13 +64,18 @@ def compare(
     modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(num_envs, episodes), []
+    made: tuple[tuple[str, ObservationConfig], EnvBase] | None = None
     with _Progress(len(pairs) * episodes) as progress:
         for traffic, driver in pairs:
             seen = (observation or ObservationConfig()).read_by(driver.observation)
             shield, policy = driver.behind(mask)
-            made = make_env(modules[traffic], env, seen, reward, rows, seed, device, mask=shield)
+            make = partial(make_env, modules[traffic], env, seen, reward, seed=seed, device=device, mask=shield)
+            if made is None or made[0] != (traffic, seen, shield):
+                # Drivers that see the same share an environment, which is compiled once then.
+                made = (traffic, seen, shield), make(rows)
+            smaller = None if env.compile else make
             report = progress.start(f"{driver.name} on {traffic}")
-            table = run_episodes(made, policy, range(episodes), seed, report)
+            table = run_episodes(made[1], policy, range(episodes), seed, report, smaller)
             named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             tables.append(_with_scenes(named, modules[traffic], seed))
     return pl.concat(tables, how="diagonal")
@@ -124,7 +133,8 @@ def publish(
 ) -> str:
     """Print the table of a comparison, write its episodes and ``results.json``; the line that names the latter.
 
-    Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
+    With two drivers or more a second table, and ``paired`` in the record, say by how much the first one is ahead of
+    each of the others on the same episodes (:func:`ganlane.evaluation.paired_rows`). Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
 
     Args:
         table: what :func:`compare` returned.
@@ -132,11 +142,14 @@ def publish(
         config, seeds: of the run, for the record.
         numbers: what the record holds beside ``rows``.
     """
-    rows = evaluation_rows(table)
+    rows, paired = evaluation_rows(table), paired_rows(table)
     print(text_table(rows))
+    if paired:
+        print(f"\n{paired_table(paired)}")
     write_episodes(folder, table)
     recorded = recorded_crashes(table)
-    known = {"rows": rows, **({"crashes_by_scene": recorded} if recorded else {}), **(numbers or {})}
+    scenes = {"crashes_by_scene": recorded} if recorded else {}
+    known = {"rows": rows, "paired": paired, **scenes, **(numbers or {})}
     return f"results: {write_results(folder, known, config, seeds)}"
 
 

@@ -23,10 +23,15 @@ from ganlane.transforms.mask import on_road_actions
 
 
 class Driver(TensorDictModuleBase):
-    """A rule-based policy: reads the raw state, writes ``action`` [N] int64 through :meth:`act`."""
+    """A rule-based policy: reads the raw state, writes ``action`` [N] int64 through :meth:`act`.
+
+    One of your own that remembers something per row in the module itself sets ``rows_must_stay = True``: an
+    evaluation then never moves a running episode to another row, or into a smaller batch.
+    """
 
     in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
+    rows_must_stay = False
 
     def __init__(self, road: Road, stream: int = Stream.TRAIN) -> None:
         super().__init__()

@@ -63,6 +63,8 @@ class GreedyPolicy(TensorDictModuleBase):
 
     in_keys = [keys.OBSERVATION]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
+    #: Nothing is held per row, so an evaluation may move running episodes to other rows.
+    rows_must_stay = False
 
     def __init__(self, network: QNetwork) -> None:
         super().__init__()

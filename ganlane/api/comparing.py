@@ -17,7 +17,7 @@ from ganlane.compare import compare_as_told
 from ganlane.config.evaluate import EvaluateConfig, all_traffics
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
-from ganlane.evaluation import evaluation_rows, write_episodes, write_results
+from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import plain
 
 #: A driver's name, a loaded driver, or a policy of your own (named by its class).
@@ -125,4 +125,4 @@ def _keep(folder: Path, table: pl.DataFrame, rows: list[dict[str, Any]], config:
     folder.mkdir(parents=True, exist_ok=True)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
     write_episodes(folder, table)
-    write_results(folder, {"rows": rows}, asdict(config), seeds)
+    write_results(folder, {"rows": rows, "paired": paired_rows(table)}, asdict(config), seeds)

@@ -63,6 +63,9 @@ class TrafficModule(TensorDictModuleBase):
     visibility: int = Visibility.SIGNALLED
     #: Whether lanes and lane width differ from row to row (:meth:`road_of`).
     own_roads: bool = False
+    #: Whether a running episode has to keep its row of the batch, since the module holds something per row outside
+    #: ``traffic`` (a foreign simulator). New episodes then show by their (seed, episode) with step 0.
+    rows_must_stay: bool = False
     #: Per-vehicle memory; empty for a model without any.
     memory_fields: MemoryFields = {}  # noqa: RUF012
 

@@ -55,6 +55,7 @@ class TrafficSequential(TrafficModule):
         super().__init__(base.road, base.stream)
         self.parts = nn.ModuleDict(parts)
         self.visibility = base.visibility
+        self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""

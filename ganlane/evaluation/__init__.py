@@ -5,7 +5,7 @@ The path of a number: :func:`run_episodes` drives the episodes 0 to E - 1 and gi
 bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for crashes
 (:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
 on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resamples whole scenes;
-:func:`text_table` and :func:`markdown_table` print it; :func:`write_results` and :func:`write_episodes` keep it.
+:func:`text_table` prints it; :func:`write_results` and :func:`write_episodes` keep it.
 Which crashes nobody could have avoided, :func:`beam_search` tells, which looks for a way through an episode on the
 simulator itself (:mod:`~ganlane.evaluation.crash_floor`).
 Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them against recorded driving.
@@ -17,7 +17,7 @@ from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
 from ganlane.evaluation.crash_floor import Way, floor_rows, search_left, ways_of_drivers
 from ganlane.evaluation.episodes import run_episodes
-from ganlane.evaluation.layout import markdown_table, text_table
+from ganlane.evaluation.layout import text_table
 from ganlane.evaluation.provenance import code_version, machine
 from ganlane.evaluation.results import results_record, write_episodes, write_results
 from ganlane.evaluation.rides import Ride, drive, replay
@@ -49,7 +49,6 @@ __all__ = [
     "floor_rows",
     "interquartile_mean",
     "machine",
-    "markdown_table",
     "mean_interval",
     "normalized_percent",
     "paired_difference",

@@ -12,7 +12,6 @@ Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them agains
 """
 
 from ganlane.evaluation.beam_search import Plan, beam_search
-from ganlane.evaluation.branching import Branches, branch
 from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
 from ganlane.evaluation.crash_floor import Way, floor_rows, search_left, ways_of_drivers
@@ -32,7 +31,6 @@ from ganlane.evaluation.statistics import (
 from ganlane.evaluation.table import evaluation_rows
 
 __all__ = [
-    "Branches",
     "CrashesByScene",
     "Estimate",
     "NormalizedScore",
@@ -40,7 +38,6 @@ __all__ = [
     "Ride",
     "Way",
     "beam_search",
-    "branch",
     "clopper_pearson",
     "code_version",
     "crashes_by_scene",

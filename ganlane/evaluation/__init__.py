@@ -6,15 +6,12 @@ bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for
 (:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
 on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resamples whole scenes;
 :func:`text_table` prints it; :func:`write_results` and :func:`write_episodes` keep it.
-Which crashes nobody could have avoided, :func:`beam_search` tells, which looks for a way through an episode on the
-simulator itself (:mod:`~ganlane.evaluation.crash_floor`).
+:func:`drive` keeps the actions of its episodes, and :func:`replay` drives them again.
 Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them against recorded driving.
 """
 
-from ganlane.evaluation.beam_search import Plan, beam_search
 from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
-from ganlane.evaluation.crash_floor import Way, floor_rows, search_left, ways_of_drivers
 from ganlane.evaluation.episodes import run_episodes
 from ganlane.evaluation.layout import text_table
 from ganlane.evaluation.provenance import code_version, machine
@@ -34,16 +31,12 @@ __all__ = [
     "CrashesByScene",
     "Estimate",
     "NormalizedScore",
-    "Plan",
     "Ride",
-    "Way",
-    "beam_search",
     "clopper_pearson",
     "code_version",
     "crashes_by_scene",
     "drive",
     "evaluation_rows",
-    "floor_rows",
     "interquartile_mean",
     "machine",
     "mean_interval",
@@ -55,9 +48,7 @@ __all__ = [
     "replay",
     "results_record",
     "run_episodes",
-    "search_left",
     "text_table",
-    "ways_of_drivers",
     "write_episodes",
     "write_results",
 ]

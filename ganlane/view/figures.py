@@ -126,8 +126,10 @@ def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line
     """Names in their colours along the top, in as many rows as they need."""
     handles = [*(Line2D([], [], color=colour, label=name, lw=2) for name, colour in colours.items()), *others]
     widths_in = [0.65 + 0.08 * len(str(handle.get_label())) for handle in handles]  # about, at this size of letters
-    room_in = figure.get_figwidth()
-    columns = len(handles) if sum(widths_in) < room_in else max(1, int(room_in / max(widths_in)))
+    for columns in range(len(handles), 0, -1):
+        parts = np.array_split(widths_in, columns)  # names run down the columns
+        if sum(part.max() for part in parts) <= figure.get_figwidth():
+            break
     figure.legend(handles=handles, loc="outside upper left", ncols=columns)
 
 

@@ -11,25 +11,174 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image
+import numpy as np
+import polars as pl
+import torch
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
+from torch import Tensor, nn
 
 from ganlane.benchmarks.script import parser_of, run_script
-from ganlane.data import default_scenes, read_scenes, scene_lane_widths
+from ganlane.data import FRAME_S, default_scenes, read_scenes, scene_lane_widths
 from ganlane.evaluation.realism import StartOptions, drive_recordings, recorded_frame, recordings_of
-from ganlane.generator import Discriminator, load_generator, shipped_generator
+from ganlane.generator import Discriminator, Generator, load_generator, shipped_generator
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.traffic import TrafficModule
 from ganlane.traffic.presets import gan_calibrated_traffic
-from ganlane.view.architecture import discriminator_blocks, draw_architecture, generator_blocks
-from ganlane.view.realism import write_figure
-from ganlane.view.space_time import draw_space_time
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, palette, save_figure
+
+#: Boxes in a row of the drawing of a network, and inches from one box to the next, across and down.
+_ACROSS, _STEP_X, _STEP_Y = 4, 2.0, 1.15
 
 
-def architecture() -> Image.Image:
+@dataclass(frozen=True)
+class Block:
+    """A part of a network: its name, what it does (two lines), the shape of its output, and its number of weights."""
+
+    title: str
+    does: tuple[str, str]
+    shape: tuple[int, ...]
+    parameters: int = 0
+
+
+def _count(*modules: nn.Module) -> int:
+    return sum(each.numel() for module in modules for each in module.parameters())
+
+
+@torch.no_grad()
+def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
+    """The generator's parts in order, run on ``vehicles`` vehicles to see the shapes (batch left out)."""
+    sizes = generator.sizes
+    observed = torch.zeros(1, vehicles, sizes.observed, 2)
+    seen = generator.observe(observed, observed[:, :, 0], torch.ones(1, vehicles, dtype=torch.bool))
+    seen = seen._replace(extra=torch.zeros(1, vehicles, sizes.extra_inputs))
+    hidden = generator.encoder.encode(seen.projections)
+    pooled = generator.pooling(hidden, seen.position, seen.displacement, seen.valid)
+    context, noise = generator.summarise(seen), torch.zeros(1, vehicles, sizes.noise)
+    outputs = generator(seen, noise)
+    encoder, decoder, pooling = generator.encoder, generator.decoder, generator.pooling
+    projected = seen.projections
+    assert isinstance(projected, Tensor)
+    extra = f", {sizes.extra_inputs} further inputs" if sizes.extra_inputs else ""
+    width = encoder.embed.out_features
+    return [
+        Block("observed displacements", ("of every vehicle,", "m per 0.1 s"), _shape(observed)),
+        Block("embedding", (f"{encoder.embed.in_features} to {width}, ReLU,", "to the LSTM's gates"),
+              _shape(projected), _count(encoder.embed, encoder.input)),
+        Block("LSTM encoder", (f"{projected.shape[2]} motions,", "last state"), _shape(hidden),
+              encoder.recurrent.numel()),
+        Block("pooling over pairs", (f"{pooling.neighbours} nearest, to {pooling.per_pair.out_features}, ReLU,",
+              f"to {pooling.second.out_features}, maximum"), _shape(pooled), _count(pooling)),
+        Block("context", ("of state and pooled", f"neighbours{extra}"), _shape(context), _count(generator.context)),
+        Block("noise", ("a latent vector z a driver,", "joined to the context"), _shape(noise)),
+        Block("LSTM decoder", (f"{sizes.predicted} steps from context", f"and noise ({decoder.hidden} numbers)"),
+              (vehicles, outputs.shape[-2], decoder.hidden), _count(decoder)),
+        Block("predicted displacements", ("a residual on the", "last displacement"), _shape(outputs),
+              _count(generator.head)),
+    ]  # fmt: skip
+
+
+@torch.no_grad()
+def discriminator_blocks(discriminator: Discriminator, steps: int, vehicles: int = 9) -> list[Block]:
+    """The discriminator's parts, run on ``steps`` displacements of ``vehicles`` vehicles."""
+    shown = torch.zeros(1, vehicles, steps, 2)
+    encoder = discriminator.encoder
+    projected = encoder.project(shown[..., 1:, :], shown.diff(dim=-2))
+    return [
+        Block("displacements", ("observed, then recorded", "or predicted"), _shape(shown)),
+        Block("embedding", (f"{encoder.embed.in_features} to {encoder.embed.out_features}, ReLU,",
+              "to the LSTM's gates"), _shape(projected), _count(encoder.embed, encoder.input)),
+        Block("LSTM encoder", (f"{projected.shape[2]} motions,", "last state"), _shape(encoder.encode(projected)),
+              encoder.recurrent.numel()),
+        Block("logit", ("recorded or", "predicted"), _shape(discriminator(shown)), _count(discriminator.head)),
+    ]  # fmt: skip
+
+
+def _shape(tensor: Tensor) -> tuple[int, ...]:
+    """Without the batch."""
+    return tuple(tensor.shape[1:])
+
+
+@rc_context(STYLE)
+def draw_architecture(networks: Mapping[str, Sequence[Block]]) -> Figure:
+    """Rows of boxes for each network, four in a row, with an arrow from each to the next."""
+    rows = [
+        (name if first == 0 else "", blocks[first : first + _ACROSS], colour)
+        for (name, blocks), colour in zip(networks.items(), COLOURS)
+        for first in range(0, len(blocks), _ACROSS)
+    ]
+    width, height = _ACROSS * _STEP_X, len(rows) * _STEP_Y
+    figure = Figure(figsize=(width, height), layout="none")
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(0, width), ylim=(height, 0))
+    axes.set_axis_off()
+    for row, (name, blocks, colour) in enumerate(rows):
+        axes.text(0.12, row * _STEP_Y + 0.14, name, color=colour, va="center", size=10)
+        for place, block in enumerate(blocks):
+            left, top = place * _STEP_X + 0.12, row * _STEP_Y + 0.28
+            _draw_block(axes, left, top, block, colour)
+            if place + 1 < len(blocks):
+                ends = {"xy": (left + 1.98, top + 0.4), "xytext": (left + 1.68, top + 0.4)}
+                axes.annotate(
+                    "", **ends, arrowprops={"arrowstyle": "-|>", "color": FAINT, "shrinkA": 0, "shrinkB": 0}
+                )
+    return figure
+
+
+def _draw_block(axes: Axes, left: float, top: float, block: Block, colour: str) -> None:
+    """A box of 1.65 by 0.8 inches with its four lines."""
+    style = "round,pad=0,rounding_size=0.07"
+    axes.add_patch(FancyBboxPatch((left, top), 1.65, 0.8, boxstyle=style, fc="white", ec=colour, lw=1.5))
+    axes.text(left + 0.08, top + 0.14, block.title, va="center", size=8.5)
+    for line, text in enumerate(block.does):
+        axes.text(left + 0.08, top + 0.3 + 0.15 * line, text, va="center", color=FAINT, size=7)
+    axes.text(left + 0.08, top + 0.67, str(list(block.shape)), va="center", color=colour, size=8.5)
+    if block.parameters:
+        axes.text(
+            left + 1.57, top + 0.67, f"{block.parameters} weights", va="center", ha="right", color=FAINT, size=7
+        )
+
+
+def lane_courses(frame: pl.DataFrame, lane: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Time, s, and position, m, of every vehicle of one scene that appears in ``lane``.
+
+    Args:
+        frame: one scene in the schema, sorted by track.
+        lane: 0 is the rightmost.
+    """
+    tracks = [track for track in frame.partition_by("vehicle", maintain_order=True) if track["lane"][0] == lane]
+    return [(track["frame"].to_numpy() * FRAME_S, track["x"].to_numpy()) for track in tracks]
+
+
+@rc_context(STYLE)
+def draw_space_time(scene: str, lane: int, courses: Mapping[str, pl.DataFrame]) -> Figure:
+    """Positions over time of one lane's vehicles, the first of ``courses`` in black and the others dashed over it.
+
+    Args:
+        scene: its name.
+        lane: whose vehicles are drawn.
+        courses: name to trajectories (:func:`ganlane.evaluation.realism.recordings.frame_of`) of the same scene.
+    """
+    first, *others = courses
+    colours = {first: INK, **palette(others)}
+    figure = Figure(figsize=(7.5, 4.3))
+    axes = figure.subplots()
+    axes.set(title=f"{scene}, lane {lane}", xlabel="time, s", ylabel="position, m")
+    for name, frame in courses.items():
+        for time_s, x_m in lane_courses(frame, lane):
+            axes.plot(time_s, x_m, "-" if name == first else "--", color=colours[name])
+    add_legend(figure, colours)
+    return figure
+
+
+def architecture() -> Figure:
     """Both networks of the paper's preset."""
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
     sizes = generator.sizes
@@ -42,7 +191,7 @@ def architecture() -> Image.Image:
     )
 
 
-def courses(scene: str, lane: int) -> Image.Image:
+def courses(scene: str, lane: int) -> Figure:
     """The vehicles of one lane as recorded, and as the calibrated traffic drives them from the same start."""
 
     def make(road: Road) -> TrafficModule:
@@ -66,8 +215,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def draw(told: argparse.Namespace) -> str:
     """Draw and write; where the figures are."""
     written = [told.folder / f"generator_{name}.png" for name in ("architecture", "courses")]
-    write_figure(architecture(), written[0])
-    write_figure(courses(told.scene, told.lane), written[1])
+    save_figure(architecture(), written[0])
+    save_figure(courses(told.scene, told.lane), written[1])
     return "\n".join(map(str, written))
 
 

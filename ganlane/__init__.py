@@ -29,6 +29,7 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from ganlane._version import __version__
 from ganlane.gym import register_envs
 
 if TYPE_CHECKING:
@@ -55,8 +56,6 @@ if TYPE_CHECKING:
         SensorParameters,
         SensorTransform,
     )
-
-__version__ = "0.1.0"
 
 #: Where each name comes from.
 _HOMES = {

@@ -6,6 +6,8 @@ import importlib
 import sys
 from collections.abc import Sequence
 
+from ganlane._version import __version__
+
 #: Command to what it does; each is a module of the package with a ``main``, and has a configuration.
 COMMANDS = {
     "train": "train an agent on a traffic, then evaluate it beside others",
@@ -61,8 +63,6 @@ def dispatch(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return 0
     if command == "--version":
-        from ganlane import __version__
-
         print(__version__)
         return 0
     if set(COMPLETION_FLAGS) & {command, *rest}:

@@ -13,6 +13,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from ganlane._version import __version__
+
 NEEDED_IS_MISSING = 1
 USER_ERROR = 2
 
@@ -26,7 +28,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments:
         print(f"ganlane doctor: {arguments[0]}: it takes no keys; run ganlane doctor alone.", file=sys.stderr)
         return USER_ERROR
-    from ganlane import __version__
     from ganlane.diagnosis import examine, missing, report
 
     found = examine()

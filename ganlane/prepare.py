@@ -31,7 +31,7 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     from ganlane.data import ByteProgress, default_scenes, download, long_report, prepare_recordings, short_report
     from ganlane.evaluation import write_results
     from ganlane.files import write_bytes
-    from ganlane.view import write_recordings
+    from ganlane.view.figures import draw_recordings, save_figure
 
     begun = time.perf_counter()
     source = Path(config.data.path) if config.data.path else default_scenes()
@@ -42,7 +42,7 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     out = Path(config.out) if config.out else folder / "scenes"
     with ByteProgress("read") as progress:
         prepared = prepare_recordings(config.data.format, source, out, parameters, config.scene_s, progress, _show)
-    sheet = write_recordings(prepared.statistics, folder / "report.png")
+    sheet = save_figure(draw_recordings(prepared.statistics), folder / "report.png")
     write_bytes(folder / "report.md", long_report(prepared, str(source), sheet.name).encode())
     print(f"{short_report(prepared)}\nscenes: {out}\nreport: {folder / 'report.md'}")
     cost = {"wall_s": time.perf_counter() - begun, "peak_memory_mb": _peak_memory_mb()}

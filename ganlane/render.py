@@ -4,7 +4,7 @@
     ganlane render agent=agent_idm traffic=gan format=mp4 out=film.mp4
     ganlane render 'agents=[mobil,agent_idm]' traffic=gan episode=3 out=player.html
     ganlane render agent=mobil traffic=gan_calibrated 'episodes=[0,1,2]' out=simulated.parquet
-    ganlane render run=outputs/train/FIRST,outputs/train/SECOND out=curves.png
+    ganlane render run=outputs/train/FIRST,outputs/train/SECOND out=curves.png      (or .svg, .pdf)
 
 The episodes are those of ``ganlane evaluate`` with the same seed.
 """
@@ -76,10 +76,12 @@ def _film(config: RenderConfig, episode: Trajectory, out: Path) -> str:
 
 def _curves(config: RenderConfig, runs: Sequence[str], folder: Path) -> str:
     """Draw the learning curves of ``runs``."""
-    from ganlane.view import write_runs
+    from ganlane.view import read_runs
+    from ganlane.view.figures import draw_runs, save_figure
 
-    out = Path(config.out) if config.out is not None else folder / "curves.png"
-    return f"curves: {write_runs(runs, out, config.curves.columns, config.curves.smooth)}"
+    out = Path(config.out) if config.out is not None else folder / f"curves.{config.kind}"
+    figure = draw_runs(read_runs(runs), config.curves.columns, config.curves.smooth)
+    return f"curves: {save_figure(figure, out, config.kind)}"
 
 
 def _name(config: RenderConfig) -> str:

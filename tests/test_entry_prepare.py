@@ -30,7 +30,7 @@ def here(tmp_path, monkeypatch):
 
 def results(out: str) -> dict:
     path = Path(out.splitlines()[-1].removeprefix("results: "))
-    assert Image.open(path.with_name("report.png")).size == (1440, 540)
+    assert Image.open(path.with_name("report.png")).size == (1440, 588)
     assert path.with_name("report.md").read_text().startswith("# Recordings: ")
     return json.loads(path.read_text())
 

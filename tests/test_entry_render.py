@@ -87,8 +87,19 @@ def test_runs_are_drawn_beside_each_other(capsys, tmp_path):
         (tmp_path / name / "metrics.csv").write_text("decisions,mean_return,crash_rate\n1,2,0.5\n10,3,0.2\n")
     assert main(["run=first,it's", "out=curves.png"]) == 0
     assert capsys.readouterr().out == "curves: curves.png\n"
-    assert Image.open(tmp_path / "curves.png").size == (2 * 480, 260 + 34)
+    assert Image.open(tmp_path / "curves.png").format == "PNG"
     assert main(["run=first", "curves.columns=[crash_rate]", "curves.smooth=2"]) == 0
+
+
+@pytest.mark.parametrize(("asked", "file", "begins"), [
+    ("out=curves.svg", "curves.svg", b"<?xml"),
+    ("out=curves.pdf", "curves.pdf", b"%PDF"),
+    ("format=svg out=curves", "curves", b"<?xml"),
+])  # fmt: skip
+def test_curves_come_in_the_format_that_is_asked_for(asked, file, begins, tmp_path):
+    (tmp_path / "metrics.csv").write_text("decisions,mean_return\n1,2\n10,3\n")
+    assert main([f"run={tmp_path}", *asked.split()]) == 0
+    assert (tmp_path / file).read_bytes().startswith(begins)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +130,8 @@ def test_runs_need_no_quotes(given, listed):
         ("format=gif out=film.mp4", "the ending says mp4 and format gif"),
         ("out=film.avi", "expected one of gif, mp4, png, html, csv, parquet"),
         ("run=nowhere", "nowhere: no such file; expected the metrics.csv"),
-        ("run=nowhere format=gif", "learning curves are a png"),
+        ("out=film.svg", "for learning curves only"),
+        ("run=nowhere format=gif", "learning curves are one of png, svg, pdf"),
         ("run=[]", "a list, not empty"),
         ("curves.smooth=0", "at least 1"),
         (

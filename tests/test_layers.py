@@ -12,7 +12,7 @@ import ganlane
 PACKAGE = Path(ganlane.__file__).parent
 #: From the bottom up; what stands in one line may import each other's neighbours to the left only within itself.
 ORDER = [
-    {"keys", "errors", "files", "paths", "compiling", "memory"},
+    {"_version", "keys", "errors", "files", "paths", "compiling", "memory"},
     {"data", "sim"},
     {"generator"},
     {"traffic"},

@@ -20,8 +20,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
-def test_versions_agree():
-    assert PROJECT["project"]["version"] == ganlane.__version__
+def test_the_version_stands_in_one_place():
+    assert PROJECT["project"]["dynamic"] == ["version"]
+    stated = ROOT / PROJECT["tool"]["hatch"]["version"]["path"]
+    assert f'__version__ = "{ganlane.__version__}"' in stated.read_text()
+    assert f"## [{ganlane.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_the_console_script_is_the_dispatcher():
@@ -45,6 +48,7 @@ def test_a_conf_folder_of_somebody_else_is_not_ours(tmp_path, monkeypatch):
 def test_the_wheel_holds_configuration_and_weights(tmp_path):
     wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling is not installed; CI builds the wheel")
     (artifact,) = wheel.WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    assert Path(artifact).name.startswith(f"ganlane-{ganlane.__version__}-")
     with zipfile.ZipFile(artifact) as packed:
         names = set(packed.namelist())
     missing = [

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.peers import highway_env_peer, ours, report, sumo_peer
+from benchmarks.peers.plot import draw
 from benchmarks.peers.scene import OBSTACLE, SCENES, SETTLED_MPS, SLOW_AND_GO, Scene, Trace, settling
 from benchmarks.peers.schemes import LAW, Law, Scheme, equilibrium_gap, integrate
 from benchmarks.peers.simulators import PEERS, Peer, require_peers, versions
@@ -133,8 +134,6 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     print(report.page(figures))
     write_json(out / "peers.json", figures)
-    from benchmarks.peers.plot import draw
-
     draw(traces, figures, out / "peers.png")
     write_bytes(arguments.page, report.fill(arguments.page.read_text(), figures).encode())
     print(f"results: {out / 'peers.json'}")

@@ -14,7 +14,7 @@ from benchmarks.peers import highway_env_peer, sumo_peer
 from benchmarks.peers.highway_env_peer import Distances
 from benchmarks.peers.scene import LENGTH_M, Trace
 from benchmarks.peers.schemes import Law, Scheme
-from ganlane import __version__
+from ganlane._version import __version__
 from ganlane.errors import UserError
 
 

@@ -17,7 +17,8 @@ from ganlane.errors import UserError
 from ganlane.evaluation import realism as package
 from ganlane.evaluation.realism import Starts, document_text, floors_of, require_markers, update_document
 from ganlane.files import write_bytes
-from ganlane.view.realism import card_pictures, write_figure
+from ganlane.view.figures import save_figure
+from ganlane.view.realism import card_figures
 
 
 def check_targets(config: RealismConfig, path: Path | None) -> None:
@@ -32,8 +33,8 @@ def check_targets(config: RealismConfig, path: Path | None) -> None:
 
 def draw(card: Card, to: Path) -> list[Path]:
     """The figures of a card, into the folder ``to``."""
-    pictures = card_pictures(card.starts, card.runs, card.quantities, card.traffic)
-    return [write_figure(picture, to / f"{title}.png") for title, picture in pictures.items()]
+    figures = card_figures(card.starts, card.runs, card.quantities, card.traffic)
+    return [save_figure(figure, to / f"{name}.png") for name, figure in figures.items()]
 
 
 def show(

@@ -17,7 +17,9 @@ from ganlane.errors import UserError
 
 #: Films of one episode; pages and tables of any number of episodes.
 FILMS = ("gif", "mp4", "png")
-FORMATS = (*FILMS, "html", "csv", "parquet")
+#: Learning curves.
+CHARTS = ("png", "svg", "pdf")
+FORMATS = (*FILMS, "html", "csv", "parquet", "svg", "pdf")
 MOST_EPISODES = 12
 
 
@@ -119,8 +121,14 @@ class RenderConfig(RunConfig):
     def _check_kind(self) -> None:
         """What is asked for, what the file is called and how many episodes there are must fit together."""
         _check_suffix(self.out, self.kind)
-        if self.run is not None and self.kind != "png":
-            raise UserError(f"format={self.kind}: learning curves are a png; leave format out with run=PATH.")
+        if self.run is not None and self.kind not in CHARTS:
+            raise UserError(
+                f"format={self.kind}: learning curves are one of {', '.join(CHARTS)}; choose one of these."
+            )
+        if self.run is None and self.kind in ("svg", "pdf"):
+            raise UserError(
+                f"format={self.kind}: for learning curves only; episodes are gif, mp4, png, html, csv or parquet."
+            )
         if self.kind == "mp4":
             require_video()
         count = len(self.pairs())

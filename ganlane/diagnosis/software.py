@@ -19,6 +19,7 @@ REQUIRED: Final = (
     "tensordict>=0.14.3,<0.15",
     "gymnasium>=1.1,<2",
     "hydra-core>=1.3.2,<1.4",
+    "matplotlib>=3.8",
     "numpy>=1.26",
     "polars>=1.20",
     "pillow>=10.1",

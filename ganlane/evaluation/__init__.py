@@ -5,20 +5,16 @@ The path of a number: :func:`run_episodes` drives the episodes 0 to E - 1 and gi
 bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for crashes
 (:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
 on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resamples whole scenes;
-:func:`paired_rows` holds the first driver against the others on the same episodes;
-:func:`text_table`, :func:`markdown_table` and :func:`paired_table` print them; :func:`write_results` and :func:`write_episodes` keep it.
-Which crashes nobody could have avoided, :func:`beam_search` tells, which looks for a way through an episode on the
-simulator itself (:mod:`~ganlane.evaluation.crash_floor`).
+:func:`paired_rows` compares the first driver with the others on the same episodes; :func:`text_table` and
+:func:`paired_table` print them; :func:`write_results` and :func:`write_episodes` keep it. :func:`drive` keeps the
+actions of its episodes, and :func:`replay` drives them again.
 Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them against recorded driving.
 """
 
-from ganlane.evaluation.beam_search import Plan, beam_search
-from ganlane.evaluation.branching import Branches, branch
 from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
-from ganlane.evaluation.crash_floor import Way, floor_rows, search_left, ways_of_drivers
 from ganlane.evaluation.episodes import run_episodes
-from ganlane.evaluation.layout import markdown_table, paired_table, text_table
+from ganlane.evaluation.layout import paired_table, text_table
 from ganlane.evaluation.paired import paired_rows
 from ganlane.evaluation.provenance import code_version, machine
 from ganlane.evaluation.results import results_record, write_episodes, write_results
@@ -34,24 +30,17 @@ from ganlane.evaluation.statistics import (
 from ganlane.evaluation.table import evaluation_rows
 
 __all__ = [
-    "Branches",
     "CrashesByScene",
     "Estimate",
     "NormalizedScore",
-    "Plan",
     "Ride",
-    "Way",
-    "beam_search",
-    "branch",
     "clopper_pearson",
     "code_version",
     "crashes_by_scene",
     "drive",
     "evaluation_rows",
-    "floor_rows",
     "interquartile_mean",
     "machine",
-    "markdown_table",
     "mean_interval",
     "normalized_percent",
     "paired_difference",
@@ -63,9 +52,7 @@ __all__ = [
     "replay",
     "results_record",
     "run_episodes",
-    "search_left",
     "text_table",
-    "ways_of_drivers",
     "write_episodes",
     "write_results",
 ]

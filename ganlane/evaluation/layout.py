@@ -1,4 +1,4 @@
-"""An evaluation's rows as text: aligned for a terminal, or as a Markdown table."""
+"""An evaluation's rows as text, aligned for a terminal."""
 
 from __future__ import annotations
 
@@ -102,12 +102,3 @@ def _aligned(headings: Cells, cells: Sequence[Cells], names: int) -> Cells:
         return "  ".join(fitted).rstrip()
 
     return [aligned(headings), "  ".join("-" * width for width in widths), *(aligned(line) for line in cells)]
-
-
-def markdown_table(rows: Sequence[Row]) -> str:
-    """The rows as a Markdown table, numbers to the right, with the missing scores' reasons below it."""
-    headings, cells = _grid(rows)
-    rulers = ["---" if i < _NAMES else "---:" for i in range(len(headings))]
-    lines = ["| " + " | ".join(line) + " |" for line in [headings, rulers, *cells]]
-    notes = _notes(rows)
-    return "\n".join([*lines, "", *notes] if notes else lines)

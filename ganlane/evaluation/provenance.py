@@ -10,14 +10,13 @@ from typing import Any
 
 import torch
 
-import ganlane
-
-_PACKAGE = Path(ganlane.__file__).resolve().parent
+from ganlane._version import __version__
+from ganlane.paths import PACKAGE
 
 
 def _git(*arguments: str) -> str | None:
     """Output of a git command in the package's folder; None where git is absent or says no."""
-    command = ["git", "-C", str(_PACKAGE), *arguments]
+    command = ["git", "-C", str(PACKAGE), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
@@ -30,7 +29,7 @@ def code_version() -> dict[str, Any]:
 
     An installed copy inside somebody else's checkout has no revision: git must know the package's own file.
     """
-    version: dict[str, Any] = {"version": ganlane.__version__, "revision": None, "modified": None}
+    version: dict[str, Any] = {"version": __version__, "revision": None, "modified": None}
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
         version["revision"] = _git("rev-parse", "HEAD")
         version["modified"] = bool(_git("status", "--porcelain", "--untracked-files=no", "--", "."))

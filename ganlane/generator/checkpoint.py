@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-import ganlane
+from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.files import load_weights, save_weights
 from ganlane.generator.anchored import EXTRA_INPUTS
@@ -63,7 +63,7 @@ def save_generator(
         "driving_statistics": dict(driving_statistics),
         "folds": None if folds is None else dict(folds),
         "code": {} if code is None else dict(code),
-        "ganlane": ganlane.__version__,
+        "ganlane": __version__,
     }
     save_weights(path, KIND, generator.state_dict(), metadata)
 

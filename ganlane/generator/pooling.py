@@ -79,12 +79,6 @@ class PairPooling(nn.Module):
         second = apply(self.second, first).add_(~seen[..., None], alpha=-_BEYOND)
         return torch.relu(second.amax(dim=-2))
 
-    @staticmethod
-    def pair_features(position: Tensor, displacement: Tensor, index: Tensor | None) -> Tensor:
-        """Relative position and relative displacement [B, G, K, 4] of the neighbours at ``index``, scaled."""
-        state = _scaled(position, displacement)
-        return gather_vehicles(state, index) - state[..., None, :]
-
 
 def _scaled(position: Tensor, displacement: Tensor) -> Tensor:
     scale = position.new_tensor((*_POSITION_SCALE_M, *_MOTION_SCALE_M))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -125,9 +124,3 @@ def open_loop_scores(windows: Windows, forecasts: Forecasts, fold: np.ndarray, l
         "direction": direction,
         "direction_whole_window": direction_scores(forecasts, windows.future, windows.past[..., 1].sum(1)),
     }
-
-
-def worse_parts(scores: Mapping[str, Any], kind: str, least: int = 500) -> list[str]:
-    """Lanes and classes of at least ``least`` windows in which ``kind`` is worse than the baseline."""
-    parts = scores["parts"].items()
-    return [name for name, row in parts if row["windows"] >= least and row["ade_change_percent"][kind] > 0]

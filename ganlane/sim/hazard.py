@@ -1,8 +1,6 @@
-"""Equation 10: when a driver of generated traffic starts a lane change, and how long that takes on average."""
+"""Equation 10: when a driver of generated traffic starts a lane change."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
@@ -11,14 +9,10 @@ from torch import Tensor
 def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
     """Probability ``t / t_m`` per step of starting a change, for ``clock`` steps since the last one ended.
 
-    Read literally (equation 10) it grows until a change is certain at ``t = t_m``.
+    Read literally (equation 10) it grows until a change is certain at ``t = t_m``. The mean wait is then about
+    ``sqrt(pi t_m / 2)`` steps, not ``t_m``.
     """
     return (clock / mean_steps).clamp(0.0, 1.0)
-
-
-def literal_mean_wait(mean_steps: float) -> float:
-    """Mean number of steps that :func:`literal_hazard` waits, about ``sqrt(pi t_m / 2)``; not ``t_m``."""
-    return math.sqrt(math.pi * mean_steps / 2.0)
 
 
 def distance_hazard(speed: Tensor, changes_per_km: float, dt: float) -> Tensor:

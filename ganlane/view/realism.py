@@ -1,50 +1,29 @@
-"""Figures of the realism card: recorded and simulated distributions, and the drift of long runs."""
+"""Figures of the realism card: recorded and simulated distributions, distances, and the drift of long runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from PIL import Image, ImageDraw
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from ganlane.evaluation.realism import FLOORS, QUANTITIES, UNITS, Starts
-from ganlane.files import atomic_path
-from ganlane.view.plot import INK, LINES, PAPER, Line, Panel
-from ganlane.view.realism_distances import draw_distances
-from ganlane.view.style import Colour, put_text
+from ganlane.view.figures import FAINT, GRID, INK, STYLE, FloatArray, add_legend, palette, panel_grid, plot_line
 
-RECORDED: Colour = INK
-_WIDTH, _HEIGHT, _LEGEND, _ACROSS = 420, 240, 34, 3
+RECORDED = INK
 
 
-def _sheet(panels: Sequence[Panel], legend: Mapping[str, Colour]) -> Image.Image:
-    """Panels in rows of three below a legend."""
-    across = min(_ACROSS, len(panels))
-    down = -(-len(panels) // across)
-    sheet = Image.new("RGB", (across * _WIDTH, down * _HEIGHT + _LEGEND), PAPER)
-    for index, panel in enumerate(panels):
-        sheet.paste(panel.draw(), (index % across * _WIDTH, index // across * _HEIGHT + _LEGEND))
-    draw, column = ImageDraw.Draw(sheet), 64
-    for name, colour in legend.items():
-        draw.line((column, 20, column + 22, 20), fill=colour, width=3)
-        column += 30 + put_text(sheet, (column + 30, 11), name, 14, INK) + 28
-    return sheet
-
-
-def _colours(names: Sequence[str]) -> dict[str, Colour]:
-    return {name: LINES[index % len(LINES)] for index, name in enumerate(names)}
-
-
+@rc_context(STYLE)
 def draw_distributions(
-    edges: Mapping[str, npt.NDArray[np.float64]],
-    recorded: Mapping[str, npt.NDArray[np.float64]],
-    simulated: Mapping[str, Mapping[str, npt.NDArray[np.float64]]],
+    edges: Mapping[str, FloatArray],
+    recorded: Mapping[str, FloatArray],
+    simulated: Mapping[str, Mapping[str, FloatArray]],
     units: Mapping[str, str],
-) -> Image.Image:
-    """One panel per quantity: the recorded density, and each traffic's.
+) -> Figure:
+    """One panel per quantity: the recorded density, and each traffic's; none where nothing was counted.
 
     Args:
         edges: by quantity, of its bins [B + 1].
@@ -52,47 +31,86 @@ def draw_distributions(
         simulated: by traffic, then quantity.
         units: by quantity.
     """
-    colours = _colours(list(simulated))
-    panels = []
-    for name, bounds in edges.items():
-        middle, width = 0.5 * (bounds[1:] + bounds[:-1]), np.diff(bounds)
-        every = [(counts[name], colours[traffic]) for traffic, counts in simulated.items()]
-        lines = [
-            Line(middle, counts / max(float(counts.sum()), 1.0) / width, colour)
-            for counts, colour in [*every, (recorded[name], RECORDED)]
-        ]
-        panels.append(Panel(f"{name.replace('_', ' ')}, density", lines, _WIDTH, _HEIGHT, units[name]))
-    return _sheet(panels, {"recorded": RECORDED, **colours})
+    figure, grid = panel_grid(len(edges))
+    colours = {**palette(list(simulated)), "recorded": RECORDED}
+    for axes, (name, bounds) in zip(grid, edges.items()):
+        unit = _pretty(units[name])
+        axes.set(title=name.replace("_", " "), xlabel=unit, ylabel=f"density, per {unit}")
+        axes.set_xlim(bounds[0], bounds[-1])
+        for driver, counts in {**simulated, "recorded": recorded}.items():
+            if total := float(counts[name].sum()):
+                middle = 0.5 * (bounds[1:] + bounds[:-1])
+                plot_line(axes, middle, counts[name] / total / np.diff(bounds), color=colours[driver])
+    add_legend(figure, {"recorded": RECORDED, **colours})
+    return figure
 
 
-def draw_drift(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Image.Image:
+@rc_context(STYLE)
+def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
+    """Distances to recorded driving: a block of rows per quantity with each traffic's value and interval.
+
+    Upright lines are the ends of the scale: recordings against each other, and random driving.
+
+    Args:
+        quantities: rows of :func:`ganlane.evaluation.realism.card.quantity_rows`.
+        traffic: the card's own.
+    """
+    others = list(next(iter(quantities.values()))["against"])
+    colours = palette([traffic, *others])
+    block = len(colours) + 1
+    figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
+    axes = figure.subplots()
+    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0), xlabel="Jensen-Shannon distance to recorded driving")
+    axes.set_yticks([block * (index + 0.5) for index in range(len(quantities))])
+    axes.set_yticklabels([name.replace("_", " ") for name in quantities], color=INK, size=9)
+    axes.tick_params("y", length=0)
+    axes.grid(False, axis="y")
+    for index, row in enumerate(quantities.values()):
+        top = block * index
+        axes.axhline(top, color=GRID, lw=0.8)
+        for mark, colour in (("ceiling", INK), ("floor", FAINT)):
+            if row[mark] is not None:
+                axes.vlines(row[mark], top + 0.3, top + block - 0.3, color=colour, lw=1.6)
+        for line, (driver, colour) in enumerate(colours.items()):
+            shown = row if driver == traffic else row["against"][driver]
+            if shown["distance"] is not None:
+                low, high = shown["distance_ci"] or (shown["distance"], shown["distance"])
+                axes.plot([low, high], [top + line + 1] * 2, color=colour)
+                axes.plot(shown["distance"], top + line + 1, "o", color=colour, ms=5)
+    ends = {"half against half": INK, "random": FAINT}
+    marks = [Line2D([], [], color=colour, label=name, marker="|", ls="", ms=10) for name, colour in ends.items()]
+    add_legend(figure, {name.rpartition(".")[2]: colour for name, colour in colours.items()}, marks)
+    return figure
+
+
+@rc_context(STYLE)
+def draw_drift(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
     """Mean and spread of the speeds of long runs over time; the recorded spread as a level.
 
     Args:
         runs: as :func:`ganlane.evaluation.realism.long_summary.summary` gives them.
         spread_mps: the recorded mean spread within a frame.
     """
-    legend = _colours([f"{run['vehicles']} vehicles" for run in runs])
-    panels = []
-    for key, title in (("mean_speed_mps", "mean speed, m/s"), ("spread_mps", "spread of speeds, m/s")):
-        lines = []
-        for run, colour in zip(runs, legend.values()):
+    figure, grid = panel_grid(2)
+    colours = palette([f"{run['vehicles']} vehicles" for run in runs])
+    for axes, (key, title) in zip(grid, {"mean_speed_mps": "mean speed", "spread_mps": "spread of speeds"}.items()):
+        axes.set(title=title, xlabel="time, s", ylabel="m/s")
+        for run, colour in zip(runs, colours.values()):
             timed = [(float(time.split()[0]), at[key]) for time, at in run["speeds"].items() if time.endswith(" s")]
-            x, y = (np.array([np.nan if v is None else v for v in values]) for values in zip(*timed))
-            lines.append(Line(x, y, colour))
-        if key == "spread_mps" and lines:
-            lines.append(Line(lines[0].x, np.full_like(lines[0].x, spread_mps), RECORDED))
-        panels.append(Panel(title, lines, _WIDTH, _HEIGHT, "s"))
-    return _sheet(panels, {"recorded": RECORDED, **legend})
+            x, y = np.array(timed, dtype=np.float64).T  # None, where nobody was left to measure, becomes NaN
+            plot_line(axes, x, y, color=colour)
+    grid[1].axhline(spread_mps, color=RECORDED)
+    add_legend(figure, {"recorded": RECORDED, **colours})
+    return figure
 
 
-def card_pictures(
+def card_figures(
     starts: Starts, runs: Sequence[Mapping[str, Any]], quantities: Mapping[str, Any], traffic: str
-) -> dict[str, Image.Image]:
-    """The pictures of a card by name: ``distributions``, ``distances``, and ``drift`` if there are long runs.
+) -> dict[str, Figure]:
+    """The figures of a card by name: ``distributions``, ``distances``, and ``drift`` if there are long runs.
 
     Args:
-        starts: everybody from the same starts.
+        starts: every traffic from the same starts.
         runs: the traffic's long runs.
         quantities: its rows.
         traffic: its name.
@@ -104,15 +122,13 @@ def card_pictures(
     }
     edges = {name: bins.edges for name, bins in QUANTITIES.items()}
     recorded = {name: counts.sum(0) for name, counts in starts.recorded.items()}
-    pictures = {
+    figures = {
         "distributions": draw_distributions(edges, recorded, simulated, UNITS),
         "distances": draw_distances(quantities, traffic),
     }
-    return pictures | ({"drift": draw_drift(runs, starts.reference.spread_mps)} if runs else {})
+    return figures | ({"drift": draw_drift(runs, starts.reference.spread_mps)} if runs else {})
 
 
-def write_figure(picture: Image.Image, path: Path) -> Path:
-    """Write a picture as PNG, atomically."""
-    with atomic_path(path) as part:
-        picture.save(part, format="PNG", optimize=True)
-    return path
+def _pretty(unit: str) -> str:
+    """A unit with its exponent raised: m/s² for m/s2."""
+    return unit.replace("s2", "s²").replace("s3", "s³")

@@ -1,51 +1,52 @@
-"""Training runs beside each other: what they earned, how they drove, and whether their Q-values were right."""
+"""Figures of training runs: ``metrics.csv`` and ``evaluation.csv`` of their folders as one table per run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import polars as pl
-from PIL import Image
+from polars.exceptions import PolarsError
 
 from ganlane.errors import UserError
-from ganlane.files import atomic_path
-from ganlane.view.curves import X_COLUMN, curve_panel, curve_sheet, draw_curves, lines_of, read_metrics
 
-#: What the columns of ``evaluation.csv`` are called beside those of ``metrics.csv``.
+#: Number of decisions so far: the horizontal axis of every learning curve.
+X_COLUMN = "decisions"
+#: Put before the names of the columns of ``evaluation.csv``.
 EVALUATION = "evaluation_"
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """One panel: a column, and another one that is drawn dashed in the same colours."""
+def read_metrics(path: str | Path) -> pl.DataFrame:
+    """A run's metrics: the file itself, or ``metrics.csv`` in the run's folder.
 
-    title: str
-    column: str
-    dashed: str = ""
-
-
-PANELS = (
-    Drawn("mean return", "mean_return"),
-    Drawn("crash rate", "crash_rate"),
-    Drawn("lane changes per km", "lane_changes_per_km"),
-    Drawn("mean Q (replayed); dashed: discounted return", "mean_q", "mean_discounted_return"),
-    Drawn("evaluation: mean return", f"{EVALUATION}mean_reward"),
-    Drawn("evaluation: crash rate", f"{EVALUATION}crash_rate"),
-    Drawn("evaluation: lane changes per km", f"{EVALUATION}lane_changes_per_km"),
-)
+    Raises:
+        UserError: no such file, it cannot be read, or it has no column ``decisions`` or no rows.
+    """
+    path = Path(path)
+    file = path / "metrics.csv" if path.is_dir() else path
+    if not file.is_file():
+        raise UserError(f"{file}: no such file; expected the metrics.csv of a training run, give its run folder.")
+    try:
+        frame = pl.read_csv(file, infer_schema_length=None)
+    except (PolarsError, UnicodeDecodeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{file}: not a readable CSV file ({reason}); give a run's metrics.csv.") from error
+    if X_COLUMN not in frame.columns or frame.height == 0:
+        raise UserError(f"{file}: expected a column '{X_COLUMN}' and at least one row; give a run's metrics.csv.")
+    return frame
 
 
 def read_run(path: str | Path) -> pl.DataFrame:
-    """``metrics.csv`` of a run's folder, and below it the rows of ``evaluation.csv`` if there is one.
+    """``metrics.csv`` of a run's folder, merged with the rows of ``evaluation.csv`` if there is one.
 
     Returns:
         ``decisions`` and the columns of both files, those of the second with :data:`EVALUATION` before their names;
         null where a row is of the other file.
 
     Raises:
-        UserError: see :func:`ganlane.view.read_metrics`.
+        UserError: see :func:`read_metrics`.
     """
     path = Path(path)
     metrics, evaluation = read_metrics(path), path / "evaluation.csv"
@@ -70,45 +71,22 @@ def run_names(paths: Sequence[str | Path]) -> list[str]:
     raise UserError(f"run={','.join(map(str, paths))}: a folder comes twice; give each run once.")
 
 
-def draw_runs(runs: Mapping[str, pl.DataFrame], columns: Sequence[str] | None = None, smooth: int = 1) -> Image.Image:
-    """The :data:`PANELS` that any of the runs has numbers for, one colour per run.
-
-    Args:
-        runs: name to figures (:func:`read_run`).
-        columns: these columns instead of the panels.
-        smooth: rows that the running mean takes in; 1 for none.
+def read_runs(paths: Sequence[str | Path]) -> dict[str, pl.DataFrame]:
+    """Name (:func:`run_names`) and metrics (:func:`read_run`) of every run folder.
 
     Raises:
-        UserError: there is nothing to draw, or a column that no run has.
+        UserError: see these two.
     """
-    if columns is not None:
-        return draw_curves(runs, columns, smooth)
-    drawn = [each for each in PANELS if any(_has_numbers(frame, each.column) for frame in runs.values())]
-    if not drawn:
-        known = ", ".join(each.column for each in PANELS)
-        raise UserError(f"run={','.join(runs)}: no numbers in any of {known}; give the folder of a training run.")
-    panels = []
-    for each in drawn:
-        dashed = lines_of(runs, each.dashed, smooth, dashed=True) if each.dashed else []
-        panels.append(curve_panel(each.title, [*lines_of(runs, each.column, smooth), *dashed]))
-    return curve_sheet(panels, list(runs))
+    return {name: read_run(path) for name, path in zip(run_names(paths), paths)}
 
 
-def write_runs(
-    paths: Sequence[str | Path], out: str | Path, columns: Sequence[str] | None = None, smooth: int = 1
-) -> Path:
-    """Draw the runs in the folders ``paths`` as a PNG file, atomically, and return its path.
+def running_mean(values: npt.NDArray[np.float64], window: int) -> npt.NDArray[np.float64]:
+    """Mean over the last ``window`` values, without those that are NaN; NaN where the value itself is.
 
-    Raises:
-        UserError: see :func:`read_run`, :func:`run_names` and :func:`draw_runs`.
+    At the start it takes in the values that there are.
     """
-    runs = {name: read_run(path) for name, path in zip(run_names(paths), paths)}
-    sheet = draw_runs(runs, columns, smooth)
-    with atomic_path(out) as part:
-        sheet.save(part, format="PNG", optimize=True)
-    return Path(out)
-
-
-def _has_numbers(frame: pl.DataFrame, column: str) -> bool:
-    known = column in frame.columns and frame.schema[column].is_numeric()
-    return known and bool(frame[column].is_not_null().any())
+    known = np.isfinite(values)
+    total = np.cumsum(np.where(known, values, 0.0))
+    count = np.cumsum(known)
+    total[window:], count[window:] = total[window:] - total[:-window], count[window:] - count[:-window]
+    return np.where(known, total / np.maximum(count, 1), np.nan)

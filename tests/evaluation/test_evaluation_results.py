@@ -58,5 +58,5 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
 
 
 def test_a_copy_in_somebody_elses_checkout_has_no_revision(monkeypatch, tmp_path):
-    monkeypatch.setattr(provenance, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
     assert provenance.code_version() == {"version": ganlane.__version__, "revision": None, "modified": None}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from ganlane.evaluation import evaluation_rows, markdown_table, normalized_percent, text_table
+from ganlane.evaluation import evaluation_rows, normalized_percent, text_table
 
 
 def episodes(agent, rewards, reasons=None, traffic="idm"):
@@ -126,14 +126,6 @@ def test_the_text_table_is_aligned_and_leaves_out_what_never_happened(rows):
 def test_a_missing_score_is_explained_below_the_table():
     rows = evaluation_rows(pl.concat([episodes("a", [1, 2, 3]), episodes("a", [1, 2, 3], traffic="gan")]))
     assert text_table(rows).splitlines()[-1].startswith("% of MOBIL on idm, gan: none, needs mobil")
-    assert markdown_table(rows).splitlines()[-1].startswith("% of MOBIL on idm, gan: none, needs mobil")
-
-
-def test_the_markdown_table_has_as_many_cells_in_every_line(rows):
-    lines = markdown_table(rows).splitlines()
-    assert len(lines) == 5
-    assert len({line.count("|") for line in lines}) == 1
-    assert set(lines[1]) <= set("|-: ")
 
 
 def test_the_lead_over_mobil_is_paired_by_episode_whatever_their_order():

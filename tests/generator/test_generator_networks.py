@@ -75,7 +75,8 @@ def test_the_split_first_layer_equals_the_whole_one(scene):
     pooling = PairPooling(12, 10, 6, 8)
     hidden, motion = torch.randn(3, 13, 12), torch.randn(3, 13, 2)
     index, seen = nearest(position, mask, 8)
-    pairs = pooling.pair_features(position, motion, index)
+    state = torch.cat([position / torch.tensor([20.0, 4.0]), motion / torch.tensor([0.4, 0.05])], dim=-1)
+    pairs = gather_vehicles(state, index) - state[..., None, :]
     whole = nn.Linear(4 + 12, 10)
     with torch.no_grad():
         whole.weight.copy_(torch.cat([pooling.per_pair.weight, pooling.per_vehicle.weight], dim=1))

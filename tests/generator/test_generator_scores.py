@@ -9,7 +9,6 @@ from ganlane.generator.scores import (
     parts_of,
     rmse_by_second,
     side_classifier_share,
-    worse_parts,
 )
 from ganlane.generator.windows import Windows
 
@@ -58,13 +57,14 @@ def test_parts_are_lanes_and_classes_with_enough_windows():
     assert {name: int(rows.sum()) for name, rows in parts.items()} == {"lane 1": 3, "lane 2": 2, "car": 4, "truck": 2}
 
 
-def test_a_part_that_is_worse_than_the_baseline_is_named():
+def test_every_part_is_held_against_the_baseline():
     future = np.ones((4, 8, 2))
     windows = windows_of([1, 1, 2, 2], [4, 4, 4, 4], future)
     forecasts = {"constant_velocity": future + 1.0, "mean": future + np.array([0.1, 0.1, 3.0, 3.0])[:, None, None]}
     scores = open_loop_scores(windows, forecasts, np.array([0, 0, 1, 1]), least_part=1)
-    assert worse_parts(scores, "mean", least=1) == ["lane 2", "car"]
-    assert worse_parts(scores, "mean", least=3) == ["car"]
+    change = {name: row["ade_change_percent"]["mean"] for name, row in scores["parts"].items()}
+    assert change == {"lane 1": pytest.approx(-90.0), "lane 2": pytest.approx(200.0), "car": pytest.approx(55.0)}
+    assert {name: row["windows"] for name, row in scores["parts"].items()} == {"lane 1": 2, "lane 2": 2, "car": 4}
     assert scores["folds"]["0"]["ade_change_percent"]["mean"] == pytest.approx(-90.0)
     assert scores["scenes"].keys() == {"a", "b"}
     assert scores["windows"] == 4

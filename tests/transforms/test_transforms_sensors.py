@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.worlds import leaves, same_bits
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
@@ -26,7 +25,6 @@ from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluate import main as evaluate
-from ganlane.evaluation.branching import branch
 from ganlane.sim import Road, Vehicles
 from ganlane.sim.random import Stream, episode_key
 from ganlane.traffic import IdmMobilTraffic
@@ -259,34 +257,12 @@ def test_the_specs_hold(sensors):
     check_env_specs(world(sensors), seed=0)
 
 
-def looking():
-    """Turns left where the car that is listed first is near: a policy that depends on what is seen."""
-    turn = lambda seen: torch.where(seen[:, OWN].abs() < 0.1, keys.LEFT, keys.KEEP)  # noqa: E731
-    return TensorDictModule(turn, ["observation"], ["action"])
-
-
 def test_a_saved_state_is_resumed_with_what_was_still_to_be_delivered():
     env = world(EVERYTHING)
     middle = drive(env, 3)[-1]
     resumed = drive(world(EVERYTHING), 4, unpack(pack(middle)))
     for one, other in zip(drive(env, 4, middle), resumed):
         assert same_bits(one, other) == []
-
-
-def test_branching_goes_on_with_the_sensors_of_the_state():
-    env, policy = world(EVERYTHING, 6), looking()
-    state = drive(env, 3)[-1]
-    before = state.clone()
-    branches = branch(env, state, policy, decisions=6)
-    assert same_bits(state.exclude("action"), before.exclude("action")) == []
-    expected, td = torch.zeros(6, 1), state.clone().set("action", torch.zeros(6, dtype=torch.int64))
-    running = torch.ones(6, 1, dtype=torch.bool)
-    for _ in range(6):
-        stepped = env.step(td)
-        expected += torch.where(running, stepped["next", "reward"], 0.0)
-        running &= ~stepped["next", "done"]
-        td = policy(step_mdp(stepped))
-    assert torch.equal(branches.returns[keys.KEEP], expected[:, 0])
 
 
 def test_mobil_reads_the_true_state():

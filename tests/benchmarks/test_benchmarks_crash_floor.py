@@ -4,16 +4,15 @@ import itertools
 
 import pytest
 import torch
-from reference.worlds import vehicles
 from torchrl.envs import TransformedEnv
 
+from benchmarks.beam_search import beam_search
+from benchmarks.crash_floor import driver_row, floor_rows, search_left, ways_of_drivers
 from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
-from ganlane.evaluation.beam_search import beam_search
 from ganlane.evaluation.counts import clopper_pearson
-from ganlane.evaluation.crash_floor import driver_row, floor_rows, search_left, ways_of_drivers
-from ganlane.evaluation.rides import SIDES, contact_side, drive, replay
+from ganlane.evaluation.rides import drive, replay
 from ganlane.keys import KEEP, LEFT, RIGHT
 from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
 from ganlane.sim.random import Stream
@@ -177,22 +176,6 @@ def test_the_floor_lies_under_every_driver_and_falls_with_the_beam():
 def test_without_drivers_every_episode_is_searched():
     ways = search_left(highway(CHASED), ways_of_drivers([], [0, 1]), 0, 4)
     assert [way.stage for way in ways] == ["beam 4", "beam 4"]
-
-
-@pytest.mark.parametrize(
-    ("other", "side"),
-    [
-        ({"x": 4.4, "speed": 10.0}, "ahead"),
-        ({"x": -4.4, "speed": 30.0}, "behind"),
-        ({"y": 2.4, "heading": -0.1}, "side"),
-        ({"x": 4.0, "y": 2.2, "heading": -0.1}, "side"),
-        ({"x": -4.2, "y": 1.0, "speed": 30.0, "heading": 0.1}, "behind"),
-        ({"x": 10.0}, "none"),
-    ],
-)
-def test_where_the_ego_was_hit(other, side):
-    scene = vehicles({"x": 0.0, "y": 0.0, "target_lane": 0}, {"x": 0.0, "y": 0.0, "target_lane": 0, **other})
-    assert SIDES[int(contact_side(scene, Road()))] == side
 
 
 def test_a_search_needs_a_beam():

@@ -1,0 +1,248 @@
+"""Charts by matplotlib: the common style, learning curves of training runs, and what recordings show.
+
+Every function takes data and returns a ``Figure``; :func:`save_figure` writes it as PNG, SVG or PDF. Figures are made
+without pyplot: they need no display, and no global list keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter
+
+from ganlane.data import Histogram, PooledStatistics, survival_curve
+from ganlane.errors import UserError
+from ganlane.files import atomic_path
+from ganlane.view.runs import EVALUATION, X_COLUMN, running_mean
+
+FloatArray = npt.NDArray[np.float64]
+
+INK, FAINT, GRID = "#262a30", "#6e747c", "#e2e5e9"
+#: Okabe and Ito's palette, which colour-blind readers tell apart, with grey for its yellow (too pale on white).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f")
+#: What all figures look like, as matplotlib's rc parameters (whose type differs between its versions).
+STYLE: Any = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": FAINT,
+    "axes.grid": True,
+    "axes.labelcolor": FAINT,
+    "axes.labelsize": 8,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": INK,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "figure.constrained_layout.h_pad": 0.07,
+    "figure.constrained_layout.use": True,
+    "figure.constrained_layout.w_pad": 0.11,
+    "font.size": 9,
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 4,
+    "pdf.fonttype": 42,  # TrueType, so that text in a PDF can be searched and edited
+    "savefig.dpi": 120,
+    "svg.hashsalt": "ganlane",  # the same figure gives the same file
+    "text.color": INK,
+    "xtick.color": FAINT,
+    "xtick.labelsize": 8,
+    "ytick.color": FAINT,
+    "ytick.labelsize": 8,
+}
+#: File formats, and the metadata that would make two files of the same figure differ.
+FORMATS: dict[str, dict[str, None]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
+#: Bins of a drawn density; the histograms' own are finer.
+_DRAWN_BINS = 80
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One panel of the learning curves: a column, its axis label, and a second column drawn dashed."""
+
+    title: str
+    column: str
+    label: str = ""
+    dashed: str = ""
+
+
+PANELS = (
+    Panel("mean return", "mean_return", "reward per episode"),
+    Panel("crash rate", "crash_rate", "share of episodes"),
+    Panel("lane changes", "lane_changes_per_km", "per km"),
+    Panel("mean Q (replayed); dashed: discounted return", "mean_q", "reward", "mean_discounted_return"),
+    Panel("evaluation: mean return", f"{EVALUATION}mean_reward", "reward per episode"),
+    Panel("evaluation: crash rate", f"{EVALUATION}crash_rate", "share of episodes"),
+    Panel("evaluation: lane changes", f"{EVALUATION}lane_changes_per_km", "per km"),
+)
+
+
+def palette(names: Sequence[str]) -> dict[str, str]:
+    """A colour for each name; after seven they come again."""
+    return {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(names)}
+
+
+def save_figure(figure: Figure, path: str | Path, kind: str | None = None) -> Path:
+    """Write a figure, atomically.
+
+    Args:
+        figure: made here or with :func:`panel_grid`.
+        path: of the file.
+        kind: one of :data:`FORMATS`; by default what the file's name ends in.
+
+    Raises:
+        UserError: another format.
+    """
+    kind = kind or Path(path).suffix.removeprefix(".").lower()
+    if kind not in FORMATS:
+        raise UserError(f"{path}: a figure is one of {', '.join(FORMATS)}; give the file one of these endings.")
+    with atomic_path(path) as part, rc_context(STYLE):
+        figure.savefig(part, format=kind, metadata=FORMATS[kind])
+    return Path(path)
+
+
+def panel_grid(count: int, width_in: float = 4.0, height_in: float = 2.3) -> tuple[Figure, list[Axes]]:
+    """A figure with ``count`` panels of this size, inches, three in a row, and room for a legend above."""
+    across = min(3, count)
+    down = -(-count // across)
+    figure = Figure(figsize=(across * width_in, down * height_in + 0.3))
+    grid = figure.subplots(down, across, squeeze=False).ravel()
+    for unused in grid[count:]:
+        unused.remove()
+    return figure, list(grid[:count])
+
+
+def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line2D] = ()) -> None:
+    """Names in their colours along the top, in as many rows as they need."""
+    handles = [*(Line2D([], [], color=colour, label=name, lw=2) for name, colour in colours.items()), *others]
+    widths_in = [0.65 + 0.08 * len(str(handle.get_label())) for handle in handles]  # about, at this size of letters
+    for columns in range(len(handles), 0, -1):
+        parts = np.array_split(widths_in, columns)  # names run down the columns
+        if sum(part.max() for part in parts) <= figure.get_figwidth():
+            break
+    figure.legend(handles=handles, loc="outside upper left", ncols=columns)
+
+
+def plot_line(axes: Axes, x: npt.ArrayLike, y: npt.ArrayLike, **style: Any) -> None:
+    """A line with gaps where ``y`` is NaN; a value between two gaps, which no line would show, is a dot."""
+    known = np.isfinite(np.asarray(y, dtype=np.float64))
+    beside = np.concatenate(([False], known, [False]))
+    lonely = known & ~beside[:-2] & ~beside[2:]
+    axes.plot(x, y, marker="o", markevery=lonely, **style)  # type: ignore[arg-type]
+
+
+@rc_context(STYLE)
+def draw_runs(runs: Mapping[str, pl.DataFrame], columns: Sequence[str] | None = None, smooth: int = 1) -> Figure:
+    """Training runs over the number of decisions, one colour per run.
+
+    Args:
+        runs: name to metrics (:func:`ganlane.view.read_run`).
+        columns: one panel for each of these; by default those of :data:`PANELS` that any run has numbers for.
+        smooth: rows that the running mean takes in; above 1 the rows themselves are drawn faintly.
+
+    Raises:
+        UserError: there is nothing to draw, or a column that no run has.
+    """
+    known = list(dict.fromkeys(name for frame in runs.values() for name in _number_columns(frame)))
+    for name in columns or ():
+        if name not in known:
+            raise UserError(f"column {name}: no run has numbers there; choose among {', '.join(known)}.")
+    chosen = PANELS if columns is None else [Panel(name.replace("_", " "), name) for name in columns]
+    drawn = [panel for panel in chosen if panel.column in known]
+    if not drawn:
+        wanted = ", ".join(panel.column for panel in PANELS)
+        raise UserError(f"run={','.join(runs)}: no numbers in any of {wanted}; give the folder of a training run.")
+    figure, grid = panel_grid(len(drawn))
+    colours = palette(list(runs))
+    for axes, panel in zip(grid, drawn):
+        axes.set(title=panel.title, ylabel=panel.label, xlabel=X_COLUMN)
+        axes.xaxis.set_major_formatter(EngFormatter())
+        for name, frame in runs.items():
+            _plot_column(axes, frame, panel.column, smooth, color=colours[name])
+            _plot_column(axes, frame, panel.dashed, smooth, raw=False, color=colours[name], ls="--", lw=1.2)
+    add_legend(figure, colours)
+    return figure
+
+
+def _number_columns(frame: pl.DataFrame) -> list[str]:
+    """Columns with any number, the number of decisions left out."""
+    return [
+        name
+        for name, kind in frame.schema.items()
+        if kind.is_numeric() and name != X_COLUMN and frame[name].is_not_null().any()
+    ]
+
+
+def _plot_column(axes: Axes, frame: pl.DataFrame, column: str, smooth: int, raw: bool = True, **style: Any) -> None:
+    """A run's line for one column, if it has that column."""
+    if column not in frame.columns:
+        return
+    table = frame.select(pl.col(X_COLUMN, column).cast(pl.Float64)).drop_nulls()
+    x, y = table[X_COLUMN].to_numpy(), table[column].to_numpy()
+    if smooth > 1 and raw:
+        plot_line(axes, x, y, **{**style, "alpha": 0.3, "lw": 0.8})
+    plot_line(axes, x, running_mean(y, smooth) if smooth > 1 else y, **style)
+
+
+def binned_density(histogram: Histogram, low: float, high: float) -> tuple[FloatArray, FloatArray]:
+    """Middles of about 80 bins between ``low`` and ``high``, and the probability density there.
+
+    Args:
+        histogram: of the quantity; it must reach as far as ``low`` and ``high``.
+        low, high: what is drawn, in the quantity's unit.
+    """
+    edges = histogram.bins.edges
+    first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))
+    merged = max(1, int(last - first) // _DRAWN_BINS)
+    number = int(last - first) // merged
+    counts = histogram.counts[first : first + number * merged].reshape(number, merged).sum(axis=1)
+    width = merged * float(edges[1] - edges[0])
+    return edges[first] + width * (np.arange(number) + 0.5), counts / (max(histogram.total, 1) * width)
+
+
+@rc_context(STYLE)
+def draw_recordings(statistics: PooledStatistics) -> Figure:
+    """Speeds, accelerations, lane-change times, headways and gaps of recorded driving, in six panels."""
+    of = statistics.histograms
+    fastest = min(60.0, 1.1 * of["speed"].quantile(1.0) + 1.0)
+    figure, grid = panel_grid(6)
+    densities = (
+        (grid[0], "speed", "m/s", 0.0, fastest, {"": of["speed"]}),
+        (grid[1], "acceleration", "m/s²", -5.0, 5.0,
+         {"as recorded": of["acceleration_raw"], "over 1 s": of["acceleration_smoothed"]}),
+        (grid[3], "followers' headway: median (gap - 2 m) / speed", "s", 0.0, 6.0, {"": of["headway"]}),
+        (grid[4], "time headway: gap / speed", "s", 0.0, 8.0, {"": of["time_headway"]}),
+        (grid[5], "gap to the leader", "m", 0.0, 100.0, {"": of["gap"]}),
+    )  # fmt: skip
+    for axes, title, unit, low, high, histograms in densities:
+        axes.set(title=title, xlabel=unit, ylabel=f"density, per {unit}", xlim=(low, high))
+        for (label, histogram), colour in zip(histograms.items(), COLOURS):
+            axes.plot(*binned_density(histogram, low, high), color=colour, label=label)
+        if len(histograms) > 1:
+            axes.legend(loc="upper right", fontsize=8)
+    _plot_durations(grid[2], statistics)
+    return figure
+
+
+def _plot_durations(axes: Axes, statistics: PooledStatistics) -> None:
+    """Share of lane changes that last longer: with unfinished ones as lower bounds (censored), and without."""
+    axes.set(title="time to change lanes", xlabel="s", ylabel="share that lasts longer")
+    changes = statistics.changes
+    if not changes.complete.any():
+        axes.text(0.5, 0.5, "none recorded from start to end", ha="center", transform=axes.transAxes, color=FAINT)
+        return
+    chosen = {"unfinished ones included": np.ones(len(changes), bool), "finished ones only": changes.complete}
+    for (label, those), colour in zip(chosen.items(), COLOURS):
+        times, shares = survival_curve(changes.duration_s[those], changes.complete[those])
+        axes.step(np.append(0.0, times), np.append(1.0, shares), where="post", color=colour, label=label)
+    axes.legend(loc="upper right", fontsize=8)

@@ -1,0 +1,177 @@
+"""Charts: what is drawn is the data, with its names and units, and files come whole in the format of their ending."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from PIL import Image
+from view_scenes import run_folder
+
+from ganlane.data import Bins, Histogram, PooledStatistics, Scene, SyntheticTraffic, synthetic_scenes
+from ganlane.errors import UserError
+from ganlane.view import read_run
+from ganlane.view.figures import (
+    COLOURS,
+    add_legend,
+    binned_density,
+    draw_recordings,
+    draw_runs,
+    palette,
+    plot_line,
+    save_figure,
+)
+
+
+def panels(figure: Figure) -> dict:
+    return {axes.get_title("left"): axes for axes in figure.axes}
+
+
+def legend(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+@pytest.fixture
+def runs(tmp_path):
+    first = read_run(run_folder(tmp_path / "a"))
+    return {"a": first, "b": read_run(run_folder(tmp_path / "b", slope=2.0, evaluated=False))}
+
+
+def test_a_line_is_the_metric_over_the_decisions(runs):
+    (line,) = panels(draw_runs({"a": runs["a"]}))["crash rate"].lines
+    assert line.get_xdata().tolist() == [10_000 * k for k in range(1, 31)]
+    assert line.get_ydata() == pytest.approx(0.5 - 0.01 * np.arange(30))
+
+
+def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(runs):
+    figure = draw_runs(runs)
+    drawn = {title: [to_hex(line.get_color()) for line in axes.lines] for title, axes in panels(figure).items()}
+    assert legend(figure) == ["a", "b"]
+    assert drawn == {
+        "mean return": [*COLOURS[:2]],
+        "crash rate": [*COLOURS[:2]],
+        "lane changes": [*COLOURS[:2]],
+        "mean Q (replayed); dashed: discounted return": [COLOURS[0]] * 2 + [COLOURS[1]] * 2,
+        "evaluation: mean return": [COLOURS[0]],
+        "evaluation: crash rate": [COLOURS[0]],
+    }
+
+
+def test_axes_say_what_they_measure(runs):
+    drawn = panels(draw_runs(runs))
+    assert {axes.get_xlabel() for axes in drawn.values()} == {"decisions"}
+    assert drawn["lane changes"].get_ylabel() == "per km"
+    assert drawn["evaluation: crash rate"].get_ylabel() == "share of episodes"
+    assert drawn["crash rate"].xaxis.get_major_formatter()(250_000) == "250 k"
+
+
+def test_the_discounted_return_is_dashed_below_the_q_values(runs):
+    axes = panels(draw_runs({"a": runs["a"]}))["mean Q (replayed); dashed: discounted return"]
+    assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
+    assert axes.lines[0].get_ydata()[0] == pytest.approx(0.3)  # the first three rows have no Q-value
+    assert len(axes.lines[0].get_xdata()) == 27
+
+
+def test_a_smoothed_line_is_drawn_over_its_values(runs):
+    raw, smooth = panels(draw_runs({"a": runs["a"]}, smooth=5))["mean return"].lines
+    assert raw.get_ydata() == pytest.approx(np.arange(1.0, 31.0))
+    assert raw.get_alpha() < 1.0
+    assert smooth.get_ydata()[4:] == pytest.approx(np.arange(3.0, 29.0))
+
+
+def test_columns_of_ones_choice_take_the_place_of_the_panels(runs):
+    assert list(panels(draw_runs(runs, ["loss", "evaluation_mean_reward"]))) == ["loss", "evaluation mean reward"]
+
+
+def test_what_cannot_be_drawn_is_named(runs):
+    with pytest.raises(UserError, match=r"column nothing: .* choose among mean_return, crash_rate"):
+        draw_runs(runs, ["nothing"])
+    with pytest.raises(UserError, match="foreign: no numbers"):
+        draw_runs({"foreign": pl.DataFrame({"decisions": [1], "name": ["a"]})})
+
+
+def test_a_value_between_gaps_is_a_dot_and_no_other_is():
+    axes = Figure().subplots()
+    plot_line(axes, range(7), [1.0, np.nan, 2.0, np.nan, 3.0, 4.0, 5.0])
+    (line,) = axes.lines
+    assert np.isnan(line.get_ydata()).tolist() == [False, True, False, True, False, False, False]
+    assert np.flatnonzero(line.get_markevery()).tolist() == [0, 2]
+
+
+def test_long_names_share_the_legend_over_several_rows():
+    for length, rows in ((3, 1), (40, 4)):
+        figure = Figure(figsize=(4.0, 3.0))
+        add_legend(figure, palette([f"{k}".rjust(length, "x") for k in range(4)]))
+        assert -(-4 // figure.legends[0]._ncols) == rows
+
+
+@given(st.lists(st.floats(0.0, 9.99), min_size=1, max_size=200), st.sampled_from([10, 80, 400, 8000]))
+def test_the_area_below_a_density_is_one(values, bins):
+    histogram = Histogram(Bins(0.0, 10.0, bins))
+    histogram.add(values)
+    middles, density = binned_density(histogram, 0.0, 10.0)
+    assert float(np.sum(density)) * float(middles[1] - middles[0]) == pytest.approx(1.0)
+    assert middles[0] > 0.0
+    assert middles[-1] < 10.0
+
+
+def measured(**traffic):
+    statistics = PooledStatistics()
+    for (name,), scene in synthetic_scenes(SyntheticTraffic(**traffic)).group_by("scene"):
+        statistics.add(Scene(name, scene, 3.5))
+    return statistics
+
+
+def test_recordings_are_drawn_in_six_panels_with_their_units():
+    drawn = panels(draw_recordings(measured(lanes=1, seconds=3.0)))
+    assert {title: axes.get_xlabel() for title, axes in drawn.items()} == {
+        "speed": "m/s",
+        "acceleration": "m/s²",
+        "time to change lanes": "s",
+        "followers' headway: median (gap - 2 m) / speed": "s",
+        "time headway: gap / speed": "s",
+        "gap to the leader": "m",
+    }
+    durations = drawn.pop("time to change lanes")
+    assert [text.get_text() for text in durations.texts] == ["none recorded from start to end"]
+    assert all(line.get_ydata().sum() > 0 for axes in drawn.values() for line in axes.lines)
+    labels = [text.get_text() for text in drawn["acceleration"].get_legend().get_texts()]
+    assert labels == ["as recorded", "over 1 s"]
+
+
+def test_lane_changes_are_drawn_as_the_share_that_lasts_longer():
+    statistics = measured()
+    assert statistics.changes.complete.sum() == 3
+    for line in panels(draw_recordings(statistics))["time to change lanes"].lines:
+        times, shares = line.get_xdata(), line.get_ydata()
+        assert line.get_drawstyle() == "steps-post"
+        assert times.tolist() == [0.0, *np.unique(statistics.changes.duration_s)]
+        assert shares == pytest.approx([(statistics.changes.duration_s > time).mean() for time in times])
+
+
+@pytest.mark.parametrize(("ending", "begins"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_the_ending_chooses_the_format_and_the_same_figure_gives_the_same_file(runs, tmp_path, ending, begins):
+    first, again = (save_figure(draw_runs(runs), tmp_path / f"{name}.{ending}") for name in ("first", "again"))
+    assert first.read_bytes().startswith(begins)
+    assert first.read_bytes() == again.read_bytes()
+
+
+def test_a_figure_is_written_whole_or_not_at_all(runs, tmp_path):
+    before = set(tmp_path.iterdir())
+    with Image.open(save_figure(draw_runs(runs), tmp_path / "curves.png")) as picture:
+        assert picture.size == (3 * 480, 2 * 276 + 36)
+    with pytest.raises(UserError, match="png, svg, pdf"):
+        save_figure(draw_runs(runs), tmp_path / "curves.jpg")
+    assert set(tmp_path.iterdir()) - before == {tmp_path / "curves.png"}
+
+
+def test_a_program_s_own_matplotlib_settings_stay(runs, tmp_path):
+    with matplotlib.rc_context():
+        own = dict(matplotlib.rcParams)
+        save_figure(draw_runs(runs), tmp_path / "curves.svg")
+        assert dict(matplotlib.rcParams) == own

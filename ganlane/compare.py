@@ -40,7 +40,7 @@ def compare(
     observation: ObservationConfig | None = None,
     episodes: int = 100,
     seed: int = 0,
-    num_envs: int = 128,
+    num_envs: int = 512,
     device: str = "cpu",
     stream: int = Stream.REPORT,
 ) -> pl.DataFrame:

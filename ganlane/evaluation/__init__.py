@@ -6,7 +6,8 @@ bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for
 (:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
 on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resamples whole scenes;
 :func:`paired_rows` holds the first driver against the others on the same episodes;
-:func:`text_table`, :func:`markdown_table` and :func:`paired_table` print them; :func:`write_results` and :func:`write_episodes` keep it.
+:func:`text_table`, :func:`markdown_table` and :func:`paired_table` print them;
+:func:`write_results` and :func:`write_episodes` keep them.
 Which crashes nobody could have avoided, :func:`beam_search` tells, which looks for a way through an episode on the
 simulator itself (:mod:`~ganlane.evaluation.crash_floor`).
 Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them against recorded driving.

@@ -41,7 +41,7 @@ def compare(
     observation: ObservationConfig | None = None,
     episodes: int = 100,
     seed: int = 0,
-    num_envs: int = 128,
+    num_envs: int = 512,
     device: str = "cpu",
     stream: int = Stream.REPORT,
     mask: MaskConfig | None = None,
@@ -134,7 +134,8 @@ def publish(
     """Print the table of a comparison, write its episodes and ``results.json``; the line that names the latter.
 
     With two drivers or more a second table, and ``paired`` in the record, say by how much the first one is ahead of
-    each of the others on the same episodes (:func:`ganlane.evaluation.paired_rows`). Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
+    each of the others on the same episodes (:func:`ganlane.evaluation.paired_rows`). Where a traffic replays recorded
+    scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
 
     Args:
         table: what :func:`compare` returned.

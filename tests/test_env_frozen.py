@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from reference.worlds import environment, same_bits, step
+from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.env.decision import Decision
@@ -77,3 +78,14 @@ def test_a_decision_without_steps_leaves_everything_as_it_is():
     )
     _, memory = Decision(env.traffic, env.physics, env.rules).drive(td, start, torch.arange(3), substeps=0)
     assert same_bits(memory, td[keys.TRAFFIC]) == []
+
+
+def test_a_row_that_never_ran_and_one_that_ended_may_differ_in_empty_parts():
+    # Between decisions TorchRL drops parts without a memory, which come back in the first step.
+    age = torch.arange(3)
+    before = TensorDict({"a": TensorDict({"age": age}, [3])}, [3])
+    after = TensorDict({"a": TensorDict({"age": age + 10}, [3]), "b": TensorDict({}, [3])}, [3])
+    frozen = Frozen()
+    frozen.note(torch.tensor([True, False, False]), before)
+    frozen.note(torch.tensor([False, True, False]), after)
+    assert frozen.put_back(after.clone())["a", "age"].tolist() == [0, 11, 12]

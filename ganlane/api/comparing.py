@@ -30,7 +30,7 @@ def evaluate(
     episodes: int = 100,
     *,
     seed: int = 0,
-    num_envs: int = 128,
+    num_envs: int = 512,
     env: Option = "highway",
     observation: Option = "lane_view_overlap",
     reward: Option = "paper",

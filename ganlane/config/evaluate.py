@@ -33,7 +33,7 @@ class EvaluateConfig(RunConfig):
     agents: list[str] = field(default_factory=lambda: ["mobil", "keep_lane", "random_legal", "agent_idm"])
     traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
     episodes: int = 100
-    num_envs: int = 128
+    num_envs: int = 512
     stream: str = "report"
     env: EnvConfig = field(default_factory=EnvConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)

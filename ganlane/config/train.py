@@ -42,7 +42,7 @@ class FinalEvaluationConfig:
     agents: list[str] = field(default_factory=lambda: ["mobil", "agent_idm", "keep_lane", "random_legal"])
     traffic: TrafficConfig | None = None
     episodes: int = 100
-    num_envs: int = 128
+    num_envs: int = 512
 
     def __post_init__(self) -> None:
         check(self, "evaluation", agents=NAMES, episodes=at_least(1), num_envs=between(1, 65536))

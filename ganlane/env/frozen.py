@@ -23,7 +23,8 @@ class Frozen:
         if ended.any():
             rows = ended.nonzero()[:, 0]
             self.rows.append(rows)
-            self.memories.append(memory[rows])
+            # TorchRL drops empty parts between decisions, so those of a first moment and of later ones would differ.
+            self.memories.append(memory[rows].filter_empty_())
 
     def put_back(self, memory: TensorDictBase) -> TensorDictBase:
         """``memory`` with the rows that have ended as they were then; its tensors are not written to."""
@@ -37,7 +38,7 @@ def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> T
 
     def replaced(name: str, value: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         if isinstance(value, TensorDictBase):
-            return _with_rows(value, rows, other.get(name))
+            return value if value.is_empty() else _with_rows(value, rows, other.get(name))
         return value.index_copy(0, rows, other.get(name))
 
     kept = {name: replaced(name, value) for name, value in memory.items()}

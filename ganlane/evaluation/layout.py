@@ -94,7 +94,7 @@ def _signed(value: float, text: str) -> str:
 
 
 def _aligned(headings: Cells, cells: Sequence[Cells], names: int) -> Cells:
-    """Lines of a table: headings, a ruler and the rows; the first ``names`` columns to the left, others to the right."""
+    """Lines of a table: headings, a ruler and the rows; ``names`` columns to the left, the others to the right."""
     widths = [max(len(line[i]) for line in [headings, *cells]) for i in range(len(headings))]
 
     def aligned(line: Cells) -> str:

@@ -21,7 +21,10 @@ from ganlane.errors import UserError
 _MOST = 1000
 _SHARES = Rule(
     lambda shares: (
-        len(shares) > 0 and all(share >= 1 for share in shares.values()) and sum(shares.values()) <= _MOST
+        isinstance(shares, dict)
+        and len(shares) > 0
+        and all(type(share) is int and share >= 1 for share in shares.values())
+        and sum(shares.values()) <= _MOST
     ),
     f"names of traffics with whole numbers of at least 1, not above {_MOST} together",
 )
@@ -47,16 +50,16 @@ class MixedTrafficConfig(TrafficConfig):
     """``traffic=mixed`` (:class:`ganlane.traffic.MixedTraffic`).
 
     ``shares``: by the name of an option, or the import path of a model of one's own, how many of the episodes of a
-    period belong to it; empty means :data:`SHARES` (a default there would be added to what is asked for). ``options``: the keys of the parts, by the same names.
+    period belong to it; null means :data:`SHARES` (names in a default would be added to those asked for). ``options``: the keys of the parts, by the same names.
     """
 
     _target_: str = "ganlane.traffic.MixedTraffic"
-    shares: dict[str, int] = field(default_factory=dict)
+    shares: Any = None
     options: dict[str, TrafficConfig] = field(default_factory=reacting_traffics)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.shares = self.shares or dict(SHARES)
+        self.shares = dict(SHARES) if self.shares is None else self.shares
         check(self, "traffic", shares=_SHARES)
         self.parts()
 
@@ -66,7 +69,8 @@ class MixedTrafficConfig(TrafficConfig):
         Raises:
             UserError: one of them is not known, or plays recordings.
         """
-        for name in self.shares:
+        shares = self.shares or {}
+        for name in shares:
             chosen = self.options.get(name)
             if name in _NOT_MIXED or (chosen is not None and chosen.label() in _NOT_MIXED):
                 what = "plays recordings on roads of its own" if name == "replay" else "is a mixture itself"
@@ -77,11 +81,11 @@ class MixedTrafficConfig(TrafficConfig):
                     f"traffic.shares={name}: no such traffic{did_you_mean(name, self.options)}; choose among {known}, "
                     "or give the import path of a model of your own."
                 )
-        return {name: self.options.get(name) or TrafficConfig(_target_=name) for name in self.shares}
+        return {name: self.options.get(name) or TrafficConfig(_target_=name) for name in shares}
 
     def arguments(self) -> dict[str, Any]:
         """The shares; the parts are made by who makes the traffic."""
-        return {"shares": dict(self.shares), **self.parameters}
+        return {"shares": dict(self.shares or {}), **self.parameters}
 
     def description(self) -> dict[str, Any]:
         """As of every traffic, with the options of those parts alone that have a share."""

@@ -50,7 +50,8 @@ class MixedTrafficConfig(TrafficConfig):
     """``traffic=mixed`` (:class:`ganlane.traffic.MixedTraffic`).
 
     ``shares``: by the name of an option, or the import path of a model of one's own, how many of the episodes of a
-    period belong to it; null means :data:`SHARES` (names in a default would be added to those asked for). ``options``: the keys of the parts, by the same names.
+    period belong to it; null means :data:`SHARES` (a command line would add to names that stand there, and the type is
+    free for the same reason). ``options``: the keys of the parts, by the same names.
     """
 
     _target_: str = "ganlane.traffic.MixedTraffic"
@@ -78,8 +79,8 @@ class MixedTrafficConfig(TrafficConfig):
             if chosen is None and "." not in name:
                 known = ", ".join(self.options)
                 raise UserError(
-                    f"traffic.shares={name}: no such traffic{did_you_mean(name, self.options)}; choose among {known}, "
-                    "or give the import path of a model of your own."
+                    f"traffic.shares={name}: no such traffic{did_you_mean(name, self.options)}; choose among "
+                    f"{known}, or give the import path of a model of your own."
                 )
         return {name: self.options.get(name) or TrafficConfig(_target_=name) for name in shares}
 

@@ -14,12 +14,14 @@ if TYPE_CHECKING:
 
 _FROM_0 = Rule(speed_range().holds, "two numbers [low, high], 0 <= low <= high")
 _POSITIVE = Rule(lambda value: _FROM_0.holds(value) and value[0] > 0, "two numbers [low, high], 0 < low <= high")
-_REACTION = Rule(lambda value: _FROM_0.holds(value) and value[1] <= 3, "two numbers [low, high], 0 <= low <= high <= 3")
+_REACTION = Rule(
+    lambda value: _FROM_0.holds(value) and value[1] <= 3, "two numbers [low, high], 0 <= low <= high <= 3"
+)
 
 
 @dataclass
 class IdmRandomTrafficConfig(TrafficConfig):
-    """``traffic=idm_random`` (:class:`ganlane.traffic.IdmRandomTraffic`): see :class:`ganlane.traffic.RandomDrivers`."""
+    """``traffic=idm_random``: the ranges of :class:`ganlane.traffic.RandomDrivers`."""
 
     _target_: str = "ganlane.traffic.IdmRandomTraffic"
     headway_s: list[float] = field(default_factory=lambda: [0.8, 2.2])

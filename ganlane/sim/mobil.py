@@ -93,9 +93,7 @@ def weigh(there: Prospect, here: Prospect, mobil: AnyMobil) -> Change:
     return Change(incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration)
 
 
-def safe_change(
-    scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
-) -> Tensor:
+def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """Whether a change into ``lane`` [N, K] (float) asks nobody to brake harder than is safe, bool."""
     there = prospect(scene, lane[..., None], idm)
     return weigh(there, there, mobil).safe[..., 0]
@@ -111,9 +109,7 @@ def without_ego(wish: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
 
 
-def one_at_a_time(
-    scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
-) -> Tensor:
+def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """``wish`` (-1, 0, +1 lanes, [N, M]) less those who are in the way of somebody ahead who wants the same lane.
 
     In the way is who is nearer than ``exclusive_m`` (centre to centre), and who would have to brake harder than is
@@ -147,9 +143,7 @@ def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobi
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)
 
 
-def mobil_changes(
-    scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
-) -> Tensor:
+def mobil_changes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """Lane change that each driver starts: as :func:`mobil_wishes`, with one vehicle per gap.
 
     The ego (vehicle 0) decides for itself: here it wishes for nothing, and holds nobody back.

@@ -86,9 +86,7 @@ class Traits(NamedTuple):
     phase_two: Tensor
 
 
-def start_braking(
-    vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m
-) -> Tensor:
+def start_braking(vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m) -> Tensor:
     """Deceleration (m/s2, [N, M]) with which each driver stays behind all those ahead of it in its lane.
 
     Each of them keeps its speed, and who is in between takes its length and ``min_gap_m``. Braking begins after
@@ -110,8 +108,8 @@ class IdmRandomTraffic(IdmMobilTraffic):
     """``traffic=idm_random``: IDM and MOBIL, each driver with parameters of its own for the whole episode.
 
     MOBIL judges what others would have to do by the driver's own parameters, since it knows no others', and without
-    the limit of the brakes. Memory, beside the steering angle: ``traits`` [N, M, 11] (:class:`Traits`) and, if anybody
-    reacts late, ``past`` [N, M, D], the accelerations decided on in the last D steps, m/s2, oldest first.
+    the limit of the brakes. Memory, beside the steering angle: ``traits`` [N, M, 11] (:class:`Traits`) and, if
+    anybody reacts late, ``past`` [N, M, D], the accelerations decided on in the last D steps, m/s2, oldest first.
 
     Args:
         road, stream, steering: as for every rule-driven traffic.
@@ -235,5 +233,3 @@ class IdmRandomTraffic(IdmMobilTraffic):
 def between(u: Tensor, bounds: Range) -> Tensor:
     """From uniform numbers in [0, 1) to ``bounds``."""
     return bounds[0] + u * (bounds[1] - bounds[0])
-
-

@@ -41,19 +41,19 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
 
 
 class Rows(NamedTuple):
-    """The rows of a batch that belong to a part: ``count`` of them, then repetitions that fill up a size."""
+    """The rows of a batch that belong to a part: ``number`` of them, then repetitions that fill up a size."""
 
     picked: Tensor
-    count: int
+    number: int
 
     @property
     def own(self) -> Tensor:
         """The rows without the repetitions."""
-        return self.picked[: self.count]
+        return self.picked[: self.number]
 
 
 class Layout(NamedTuple):
-    """Whose rows are which: part of every row [N], rows by part, and the way from the parts' rows back to the batch."""
+    """Whose rows are which: part of every row [N], rows by part, and the order that brings them back together."""
 
     part: Tensor
     rows: tuple[Rows, ...]
@@ -77,8 +77,8 @@ def _version(tensor: Tensor) -> int | None:
 class MixedTraffic(TrafficModule):
     """``traffic=mixed``: parts and their shares of the episodes.
 
-    Episode ``e`` belongs to the part whose turn is ``e`` modulo the sum of the shares (:func:`interleaved`). Where the
-    batch size is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; in rows that
+    Episode ``e`` belongs to the part whose turn is ``e`` modulo the sum of the shares (:func:`interleaved`). Where
+    the batch size is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; in rows that
     are not its own a part's memory is zero.
 
     A part gets its rows of vehicles, memory and counters, and computes what it would compute alone: bit for bit where
@@ -162,10 +162,11 @@ class MixedTraffic(TrafficModule):
         own_key = episode_key(self.stream, counters[keys.SEED], counters[keys.EPISODE]) if key is None else key
         counters[keys.EPISODE_KEY] = own_key
         layout, none = self.layout(counters[keys.EPISODE]), TensorDict({}, batch_size=tensordict.batch_size)
-        given, moved, kept, compact = [], [], {}, {}
+        given, moved, kept = [], [], {}
+        compact: dict[int, Compact] = {}
         for (name, part), rows in zip(self.named_parts(), layout.rows):
             memory = memories.get(name, none)
-            if rows.count == 0:
+            if rows.number == 0:
                 kept[name] = memory
                 continue
             fields = _picked(vehicles, rows)
@@ -188,7 +189,7 @@ class MixedTraffic(TrafficModule):
         (n, m), dtype = vehicles.x.shape, vehicles.x.dtype
         layout, given, entered, memories = self.layout(episode), [], [], {}
         for (name, part), rows in zip(self.named_parts(), layout.rows):
-            if rows.count == 0:
+            if rows.number == 0:
                 memories[name] = _zeros(part.memory_spec(n, m, dtype), n, vehicles.x.device)
                 continue
             fields = _picked(vehicles, rows)
@@ -198,7 +199,9 @@ class MixedTraffic(TrafficModule):
             given.append(fields)
             entered.append(own)
             memories[name] = Gathered(rows, {}).spread(memory, n, {})
-        return _together(vehicles, given, entered, layout), TensorDict._new_unsafe(memories, batch_size=torch.Size([n]))
+        return _together(vehicles, given, entered, layout), TensorDict._new_unsafe(
+            memories, batch_size=torch.Size([n])
+        )
 
     def init_memory(self, vehicles: Vehicles, who: Tensor, key: Tensor) -> TensorDict:
         """Not to be had: whose an episode is follows from its number (:meth:`enter`)."""
@@ -255,7 +258,7 @@ class Gathered:
         found = self.given.get(id(part))
         if found is None or found.part is not part:
             whole = part.new_zeros((batch, *part.shape[1:]))
-            whole.index_copy_(0, self.rows.own, part[: self.rows.count])
+            whole.index_copy_(0, self.rows.own, part[: self.rows.number])
             found = Compact(whole, _version(whole), self.rows.picked, part)
         compact[id(found.whole)] = found
         return found.whole
@@ -280,7 +283,7 @@ def _picked(vehicles: Vehicles, rows: Rows) -> Vehicles:
 
 def _together(vehicles: Vehicles, given: list[Vehicles], done: list[Vehicles], layout: Layout) -> Vehicles:
     """The parts' rows as one batch; a field that no part has touched is that of ``vehicles``."""
-    counts = [rows.count for rows in layout.rows if rows.count]
+    counts = [rows.number for rows in layout.rows if rows.number]
 
     def field(at: int) -> Tensor:
         if all(after[at] is before[at] for before, after in zip(given, done)):

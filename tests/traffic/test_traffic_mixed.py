@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 import torch
@@ -63,7 +64,7 @@ def test_each_part_has_its_share_of_every_period_and_nobody_waits_long():
     turns = interleaved({"a": 7, "b": 2, "c": 1})
     assert Counter(turns) == {"a": 7, "b": 2, "c": 1}
     places = [place for place, name in enumerate(turns * 2) if name == "b"]
-    assert max(after - before for before, after in zip(places, places[1:])) <= 6
+    assert max(after - before for before, after in pairwise(places)) <= 6
 
 
 @pytest.mark.parametrize("rows", [1, 6, 64])
@@ -154,7 +155,7 @@ def test_graphs_meet_few_numbers_of_rows(monkeypatch):
     generator, sizes = torch.Generator().manual_seed(0), set()
     for _ in range(50):
         rows = traffic.layout(torch.randint(0, 999, (64,), generator=generator)).rows
-        assert sum(each.count for each in rows) == 64
+        assert sum(each.number for each in rows) == 64
         sizes |= {len(each.picked) for each in rows}
     assert len(sizes) <= 8
     assert [len(each.picked) for each in traffic.layout(torch.arange(48)).rows] == [32, 16]
@@ -183,10 +184,15 @@ def test_a_model_of_ones_own_is_mixed_by_its_import_path():
     traffic = make_traffic(config, EnvConfig())
     assert isinstance(traffic, MixedTraffic)
     assert [name for name, _ in traffic.named_parts()] == ["ganlane_traffic_IdmTraffic", "idm_mobil"]
-    assert same_bits(
-        drive(traffic, 4)[-1].exclude(keys.TRAFFIC),
-        drive(MixedTraffic({"a": IdmTraffic(), "b": IdmMobilTraffic()}, {"a": 1, "b": 1}), 4)[-1].exclude(keys.TRAFFIC),
-    ) == []
+    assert (
+        same_bits(
+            drive(traffic, 4)[-1].exclude(keys.TRAFFIC),
+            drive(MixedTraffic({"a": IdmTraffic(), "b": IdmMobilTraffic()}, {"a": 1, "b": 1}), 4)[-1].exclude(
+                keys.TRAFFIC
+            ),
+        )
+        == []
+    )
 
 
 def test_a_description_holds_the_parts_that_have_a_share():

@@ -103,7 +103,9 @@ def test_nobody_brakes_harder_than_it_can():
 
 
 def test_the_first_scene_asks_for_what_is_worked_out_by_hand():
-    scene = vehicles({"x": 100.0, "speed": 10.0}, {"x": 60.0, "speed": 20.0}, {"x": 30.0, "speed": 15.0}, {"x": 0.0, "lane": 1})
+    scene = vehicles(
+        {"x": 100.0, "speed": 10.0}, {"x": 60.0, "speed": 20.0}, {"x": 30.0, "speed": 15.0}, {"x": 0.0, "lane": 1}
+    )
     late = torch.tensor([[0.0, 0.5, 0.0, 0.0]], dtype=torch.float64)
     found = start_braking(scene, Road(), late)[0]
     # 35.5 m less 5 m of reaction; two ahead: 65.5 m less the 6.5 m of the one between.
@@ -139,8 +141,6 @@ def test_a_driver_sways_within_its_lane(lane_width_m, bound):
         v = Vehicles.of(td[keys.VEHICLES])
         aimed = road.centre_of(v.target_lane, v.y.dtype)
         ways.append(torch.where((v.y - aimed).abs() < 0.5 * lane_width_m, v.y - aimed, 0.0)[:, 1:])
-        keeps = (td[keys.VEHICLES, "target_lane"] >= 0).all()
-        assert keeps
     way = torch.stack(ways)
     # Between lane changes; those under way are left out by taking the 90 % quantile.
     assert way.abs().flatten(1).quantile(0.9) <= bound + 0.05

@@ -50,8 +50,8 @@ class MixedTrafficConfig(TrafficConfig):
     """``traffic=mixed`` (:class:`ganlane.traffic.MixedTraffic`).
 
     ``shares``: by the name of an option, or the import path of a model of one's own, how many of the episodes of a
-    period belong to it; null means :data:`SHARES` (a command line would add to names that stand there, and the type is
-    free for the same reason). ``options``: the keys of the parts, by the same names.
+    period belong to it; null means :data:`SHARES` (a command line would add to names that stand there; for the same
+    reason the type is free). ``options``: the keys of the parts, by the same names.
     """
 
     _target_: str = "ganlane.traffic.MixedTraffic"

@@ -78,8 +78,8 @@ class MixedTraffic(TrafficModule):
     """``traffic=mixed``: parts and their shares of the episodes.
 
     Episode ``e`` belongs to the part whose turn is ``e`` modulo the sum of the shares (:func:`interleaved`). Where
-    the batch size is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; in rows that
-    are not its own a part's memory is zero.
+    the batch size is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; in rows
+    that are not its own a part's memory is zero.
 
     A part gets its rows of vehicles, memory and counters, and computes what it would compute alone: bit for bit where
     the model is the same at every batch size, as rule-driven ones are.

@@ -43,7 +43,7 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
 class Rows(NamedTuple):
     """The rows of a batch that belong to a part: ``number`` of them, then repetitions that fill up a size.
 
-    ``source`` [N] tells for every row of the batch which of the part's it is, and ``number`` where it is not the part's.
+    ``source`` [N] tells for every row of the batch which of the part's it is; ``number`` where it is not the part's.
     """
 
     picked: Tensor

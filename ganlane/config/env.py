@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ganlane.sim.ego import EgoParameters
     from ganlane.sim.episode import EpisodeParameters
     from ganlane.sim.idm import IdmParameters
-    from ganlane.sim.lanes import Visibility
     from ganlane.sim.mobil import MobilParameters
     from ganlane.sim.scenes import Scenes
     from ganlane.sim.spawn import SpawnParameters

@@ -11,7 +11,6 @@ from ganlane.errors import UserError
 
 if TYPE_CHECKING:
     from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
-    from ganlane.sim.lanes import Visibility
     from ganlane.sim.road import Road
 
 #: Keys of Table II, which a scene set by hand does not have.

@@ -21,7 +21,7 @@ _REACTION = Rule(
 
 @dataclass
 class IdmRandomTrafficConfig(TrafficConfig):
-    """``traffic=idm_random`` (:class:`ganlane.traffic.IdmRandomTraffic`): see :class:`ganlane.traffic.RandomDrivers`."""
+    """``traffic=idm_random``: the ranges of :class:`ganlane.traffic.RandomDrivers`."""
 
     _target_: str = "ganlane.traffic.IdmRandomTraffic"
     headway_s: list[float] = field(default_factory=lambda: [0.8, 2.2])

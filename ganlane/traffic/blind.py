@@ -20,9 +20,9 @@ class BlindTraffic(TrafficModule):
     """Any traffic model, blind to the ego in a share of the episodes.
 
     In these the model is handed a state in which the ego is not valid: nobody brakes for it, makes room or waits for
-    it. The environment sees it as ever: it hits others, is hit, and observes. Whether an episode is blind follows from
-    (stream, seed, episode) alone. Memory: the model's as ``model``, and ``unseen`` [N, M] bool, true for the ego of a
-    blind episode.
+    it. The environment sees it as ever: it hits others, is hit, and observes. Whether an episode is blind follows
+    from (stream, seed, episode) alone. Memory: the model's as ``model``, and ``unseen`` [N, M] bool, true for the ego
+    of a blind episode.
 
     Args:
         model: the traffic.

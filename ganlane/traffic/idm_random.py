@@ -108,8 +108,8 @@ class IdmRandomTraffic(IdmMobilTraffic):
     """``traffic=idm_random``: IDM and MOBIL, each driver with parameters of its own for the whole episode.
 
     MOBIL judges what others would have to do by the driver's own parameters, since it knows no others', and without
-    the limit of the brakes. Memory, beside the steering angle: ``traits`` [N, M, 11] (:class:`Traits`) and, if anybody
-    reacts late, ``past`` [N, M, D], the accelerations decided on in the last D steps, m/s2, oldest first.
+    the limit of the brakes. Memory, beside the steering angle: ``traits`` [N, M, 11] (:class:`Traits`) and, if
+    anybody reacts late, ``past`` [N, M, D], the accelerations decided on in the last D steps, m/s2, oldest first.
 
     Args:
         road, stream, steering: as for every rule-driven traffic.

@@ -41,19 +41,23 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
 
 
 class Rows(NamedTuple):
-    """The rows of a batch that belong to a part: ``count`` of them, then repetitions that fill up a size."""
+    """The rows of a batch that belong to a part: ``number`` of them, then repetitions that fill up a size.
+
+    ``source`` [N] tells for every row of the batch which of the part's it is; ``number`` where it is not the part's.
+    """
 
     picked: Tensor
-    count: int
+    number: int
+    source: Tensor
 
     @property
     def own(self) -> Tensor:
         """The rows without the repetitions."""
-        return self.picked[: self.count]
+        return self.picked[: self.number]
 
 
 class Layout(NamedTuple):
-    """Whose rows are which: part of every row [N], rows by part, and the way from the parts' rows back to the batch."""
+    """Whose rows are which: part of every row [N], rows by part, and the order that brings them back together."""
 
     part: Tensor
     rows: tuple[Rows, ...]
@@ -77,9 +81,9 @@ def _version(tensor: Tensor) -> int | None:
 class MixedTraffic(TrafficModule):
     """``traffic=mixed``: parts and their shares of the episodes.
 
-    Episode ``e`` belongs to the part whose turn is ``e`` modulo the sum of the shares (:func:`interleaved`). Where the
-    batch size is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; in rows that
-    are not its own a part's memory is zero.
+    Episode ``e`` belongs to the part whose turn is ``e`` modulo the sum of the shares (:func:`interleaved`). Where
+    the batch size is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; in rows
+    that are not its own a part's memory is zero.
 
     A part gets its rows of vehicles, memory and counters, and computes what it would compute alone: bit for bit where
     the model is the same at every batch size, as rule-driven ones are.
@@ -147,12 +151,13 @@ class MixedTraffic(TrafficModule):
         own = (part == index).nonzero()[:, 0]
         count, batch = len(own), len(part)
         usual = batch * list(self.shares.values())[index] / sum(self.shares.values())
+        source = torch.full_like(part, count).index_copy_(0, own, torch.arange(count, device=part.device))
         if not self.compiled or count in (0, usual):
-            return Rows(own, count)
+            return Rows(own, count, source)
         # A graph is made for every number of rows, which takes a minute.
         size = max(8, batch // _SIZES)
         padding = own[:1].expand(-count % size)
-        return Rows(torch.cat((own, padding)), count)
+        return Rows(torch.cat((own, padding)), count, source)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``, each part its rows."""
@@ -162,10 +167,11 @@ class MixedTraffic(TrafficModule):
         own_key = episode_key(self.stream, counters[keys.SEED], counters[keys.EPISODE]) if key is None else key
         counters[keys.EPISODE_KEY] = own_key
         layout, none = self.layout(counters[keys.EPISODE]), TensorDict({}, batch_size=tensordict.batch_size)
-        given, moved, kept, compact = [], [], {}, {}
+        given, moved, kept = [], [], {}
+        compact: dict[int, Compact] = {}
         for (name, part), rows in zip(self.named_parts(), layout.rows):
             memory = memories.get(name, none)
-            if rows.count == 0:
+            if rows.number == 0:
                 kept[name] = memory
                 continue
             fields = _picked(vehicles, rows)
@@ -176,7 +182,7 @@ class MixedTraffic(TrafficModule):
             after = part(_nested(seen, rows))
             given.append(fields)
             moved.append(Vehicles.of(after.get(keys.MOVED)))
-            kept[name] = own.spread(memory_of(after), len(own_key), compact)
+            kept[name] = own.spread(memory_of(after), compact)
         self._compact = compact
         everybody = _together(vehicles, given, moved, layout)
         tensordict.set(keys.MOVED, TensorDict._new_unsafe(everybody.as_dict(), batch_size=tensordict.batch_size))
@@ -188,7 +194,7 @@ class MixedTraffic(TrafficModule):
         (n, m), dtype = vehicles.x.shape, vehicles.x.dtype
         layout, given, entered, memories = self.layout(episode), [], [], {}
         for (name, part), rows in zip(self.named_parts(), layout.rows):
-            if rows.count == 0:
+            if rows.number == 0:
                 memories[name] = _zeros(part.memory_spec(n, m, dtype), n, vehicles.x.device)
                 continue
             fields = _picked(vehicles, rows)
@@ -197,7 +203,7 @@ class MixedTraffic(TrafficModule):
             own, memory = part.enter(fields.with_(visibility=shown), key[rows.picked], episode[rows.picked])
             given.append(fields)
             entered.append(own)
-            memories[name] = Gathered(rows, {}).spread(memory, n, {})
+            memories[name] = Gathered(rows, {}).spread(memory, {})
         return _together(vehicles, given, entered, layout), TensorDict._new_unsafe(
             memories, batch_size=torch.Size([n])
         )
@@ -244,20 +250,19 @@ class Gathered:
         self.given[id(found.part)] = found
         return found.part
 
-    def spread(self, memory: TensorDictBase, batch: int, compact: dict[int, Compact]) -> TensorDictBase:
-        """The part's ``memory`` in a whole ``batch``, zero elsewhere; ``compact`` notes which is which."""
-        named = {name: self._spread(value, batch, compact) for name, value in memory.items()}
-        return TensorDict._new_unsafe(named, batch_size=torch.Size([batch]))
+    def spread(self, memory: TensorDictBase, compact: dict[int, Compact]) -> TensorDictBase:
+        """The part's ``memory`` in the whole batch, zero elsewhere; ``compact`` notes which is which."""
+        named = {name: self._spread(value, compact) for name, value in memory.items()}
+        return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)
 
-    def _spread(
-        self, part: Tensor | TensorDictBase, batch: int, compact: dict[int, Compact]
-    ) -> Tensor | TensorDictBase:
+    def _spread(self, part: Tensor | TensorDictBase, compact: dict[int, Compact]) -> Tensor | TensorDictBase:
         if not isinstance(part, Tensor):
-            return self.spread(part, batch, compact)
+            return self.spread(part, compact)
         found = self.given.get(id(part))
         if found is None or found.part is not part:
-            whole = part.new_zeros((batch, *part.shape[1:]))
-            whole.index_copy_(0, self.rows.own, part[: self.rows.count])
+            # One row of zeros at the end is what all other rows get: a third faster than zeros and then copies.
+            zeros = part.new_zeros((1, *part.shape[1:]))
+            whole = torch.cat((part[: self.rows.number], zeros)).index_select(0, self.rows.source)
             found = Compact(whole, _version(whole), self.rows.picked, part)
         compact[id(found.whole)] = found
         return found.whole
@@ -282,7 +287,7 @@ def _picked(vehicles: Vehicles, rows: Rows) -> Vehicles:
 
 def _together(vehicles: Vehicles, given: list[Vehicles], done: list[Vehicles], layout: Layout) -> Vehicles:
     """The parts' rows as one batch; a field that no part has touched is that of ``vehicles``."""
-    counts = [rows.count for rows in layout.rows if rows.count]
+    counts = [rows.number for rows in layout.rows if rows.number]
 
     def field(at: int) -> Tensor:
         if all(after[at] is before[at] for before, after in zip(given, done)):

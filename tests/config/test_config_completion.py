@@ -34,7 +34,7 @@ TRAFFICS = sorted(path.stem for path in (ROOT / "conf" / "traffic").glob("*.yaml
         ("ganlane nothing traffic=", []),
         ("ganlane doctor ", []),
         ("ganlane train traffic=", [f"traffic={name}" for name in TRAFFICS]),
-        ("ganlane train traffic=idm_", ["traffic=idm_faults", "traffic=idm_mobil"]),
+        ("ganlane train traffic=idm_", ["traffic=idm_faults", "traffic=idm_mobil", "traffic=idm_random"]),
         ("ganlane train env.lane", ["env.lane_width_m=", "env.lanes="]),
         ("ganlane train -m seed=0,1 total_", ["total_decisions="]),
         ("ganlane evaluate episodes", ["episodes="]),

@@ -1,0 +1,200 @@
+"""A mixture of traffics: whose an episode is, and that each part drives as it would alone."""
+
+from __future__ import annotations
+
+import copy
+from collections import Counter
+from itertools import pairwise
+
+import pytest
+import torch
+from reference.worlds import environment, same_bits, step
+
+from ganlane import keys
+from ganlane.build import make_env, make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.config.evaluate import all_traffics
+from ganlane.config.scenarios import CutInEnvConfig
+from ganlane.config.traffic_mixed import MixedTrafficConfig
+from ganlane.config.traffic_replay import ReplayTrafficConfig
+from ganlane.errors import UserError
+from ganlane.sim import Road, Visibility
+from ganlane.traffic import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic, MixedTraffic, TrafficModule
+from ganlane.traffic.mixed import interleaved
+from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
+
+RULES = {"idm": 1, "idm_mobil": 2, "idm_random": 1, "idm_faults": 1}
+
+
+def rules() -> dict[str, TrafficModule]:
+    return {
+        "idm": IdmTraffic(),
+        "idm_mobil": IdmMobilTraffic(),
+        "idm_random": IdmRandomTraffic(),
+        "idm_faults": idm_faults_traffic(),
+    }
+
+
+def drive(traffic: TrafficModule, rows: int, first: int = 0, decisions: int = 12) -> list:
+    env = environment(num_envs=rows, traffic=traffic, dtype=torch.float32)
+    asked = env.reset().select(keys.SEED, keys.EPISODE)
+    asked[keys.EPISODE] = first + torch.arange(rows)
+    td, seen = env.reset(asked), []
+    for _ in range(decisions):
+        td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 5 % 3)
+        seen.append(td)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("shares", "turns"),
+    [
+        ({"a": 1, "b": 1}, "ab"),
+        ({"a": 2, "b": 1}, "aba"),
+        ({"a": 3, "b": 1}, "aaba"),
+        ({"a": 1, "b": 1, "c": 2}, "cabc"),
+        ({"a": 4}, "aaaa"),
+    ],
+)
+def test_the_turns_of_a_period_are_spread(shares, turns):
+    assert "".join(interleaved(shares)) == turns
+
+
+def test_each_part_has_its_share_of_every_period_and_nobody_waits_long():
+    turns = interleaved({"a": 7, "b": 2, "c": 1})
+    assert Counter(turns) == {"a": 7, "b": 2, "c": 1}
+    places = [place for place, name in enumerate(turns * 2) if name == "b"]
+    assert max(after - before for before, after in pairwise(places)) <= 6
+
+
+@pytest.mark.parametrize("rows", [1, 6, 64])
+def test_an_episode_of_a_mixture_is_the_same_bits_in_every_batch(rows):
+    wide, narrow = drive(MixedTraffic(rules(), RULES), 64), drive(MixedTraffic(rules(), RULES), rows, 0)
+    for all_rows, some in zip(wide, narrow):
+        assert same_bits(all_rows[:rows], some) == []
+
+
+@pytest.mark.parametrize("name", sorted(RULES))
+def test_a_part_drives_its_episodes_to_the_bit_as_it_does_alone(name):
+    mixed, alone = drive(MixedTraffic(rules(), RULES), 20), drive(rules()[name], 20)
+    rows = [row for row in range(20) if interleaved(RULES)[row % 5] == name]
+    for one, other in zip(mixed, alone):
+        memory = one[rows][keys.TRAFFIC, name]
+        assert same_bits(one[rows].exclude(keys.TRAFFIC), other[rows].exclude(keys.TRAFFIC)) == []
+        assert same_bits(memory, other[rows][keys.TRAFFIC]) == []
+
+
+def test_where_a_part_has_no_row_its_memory_stays_zero():
+    traffic = MixedTraffic(rules(), RULES)
+    for td in drive(traffic, 7):
+        part = traffic.part_of(td[keys.EPISODE])
+        for number, (name, _) in enumerate(traffic.named_parts()):
+            for leaf in td[keys.TRAFFIC, name].values(include_nested=True, leaves_only=True):
+                assert (leaf[part != number] == 0).all()
+
+
+def test_the_generator_drives_its_rows_as_it_does_alone_to_rounding():
+    parts = {"idm_mobil": IdmMobilTraffic(), "gan": gan_traffic()}
+    mixed, alone = drive(MixedTraffic(parts, {"idm_mobil": 1, "gan": 1}), 8, 0, 3), drive(gan_traffic(), 8, 0, 3)
+    for name in ("x", "y", "speed"):
+        torch.testing.assert_close(
+            mixed[-1][1::2][keys.VEHICLES, name], alone[-1][1::2][keys.VEHICLES, name], atol=2e-3, rtol=1e-4
+        )
+
+
+def test_vehicles_are_seen_as_their_episodes_traffic_has_it():
+    parts = {"idm_mobil": IdmMobilTraffic(), "gan": gan_traffic()}
+    td = environment(num_envs=6, traffic=MixedTraffic(parts, {"idm_mobil": 2, "gan": 1}), dtype=torch.float32).reset()
+    seen = td[keys.VEHICLES, "visibility"]
+    assert (seen[:, 0] == Visibility.BODY).all()
+    others = seen[:, 1:].float().mean(1).tolist()
+    assert others == [2.0, 1.0, 2.0, 2.0, 1.0, 2.0]
+
+
+def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
+    mixture = MixedTrafficConfig(shares={"gan": 1, "idm": 1})
+    scene = CutInEnvConfig()
+    seen = make_env(make_traffic(mixture, scene), scene, num_envs=4).reset()[keys.VEHICLES, "visibility"]
+    assert (seen >= 0).all()
+    mixed = MixedTraffic({"idm": IdmTraffic(), "gan": gan_traffic()}, {"idm": 1, "gan": 1})
+    chain = drive(with_faults(mixed), 4, 0, 2)[-1]
+    assert chain[keys.VEHICLES, "visibility"][:, 1].tolist() == [2, 1, 2, 1]
+
+
+def test_rows_keep_their_part_over_automatic_resets_where_the_batch_is_a_multiple_of_the_period():
+    traffic = MixedTraffic(rules(), RULES)
+    env = environment(num_envs=10, traffic=traffic, goal_m=60.0, dtype=torch.float32)
+    td, first, numbers = env.reset(), None, set()
+    for _ in range(12):
+        td[keys.ACTION] = torch.zeros(10, dtype=torch.int64)
+        _, td = env.step_and_maybe_reset(td)
+        part = traffic.part_of(td[keys.EPISODE])
+        first = part if first is None else first
+        assert torch.equal(part, first)
+        numbers |= set(td[keys.EPISODE].tolist())
+    assert max(numbers) >= 20
+
+
+def test_a_state_written_to_between_two_steps_counts():
+    traffic = MixedTraffic(rules(), RULES)
+    env = environment(num_envs=10, traffic=traffic, dtype=torch.float32)
+    td = step(env, env.reset())
+    fresh = td.clone()
+    for state in (td, fresh):
+        state[keys.TRAFFIC, "idm_mobil", "steering"].mul_(0.0).add_(0.01)
+    other = environment(num_envs=10, traffic=MixedTraffic(rules(), RULES), dtype=torch.float32)
+    assert same_bits(step(env, td), step(other, fresh)) == []
+
+
+def test_graphs_meet_few_numbers_of_rows(monkeypatch):
+    traffic = MixedTraffic({"idm": IdmTraffic(), "idm_mobil": IdmMobilTraffic()}, {"idm": 2, "idm_mobil": 1})
+    for _, part in traffic.named_parts():
+        monkeypatch.setattr(part, "compile_graphs", lambda: None)
+    plain = drive(copy.deepcopy(traffic), 64)
+    traffic.compile_graphs()
+    generator, sizes = torch.Generator().manual_seed(0), set()
+    for _ in range(50):
+        rows = traffic.layout(torch.randint(0, 999, (64,), generator=generator)).rows
+        assert sum(each.number for each in rows) == 64
+        sizes |= {len(each.picked) for each in rows}
+    assert len(sizes) <= 8
+    assert [len(each.picked) for each in traffic.layout(torch.arange(48)).rows] == [32, 16]
+    for one, other in zip(plain, drive(traffic, 64)):
+        assert same_bits(one, other) == []
+
+
+def test_what_cannot_be_mixed_is_refused_in_one_sentence():
+    with pytest.raises(UserError, match="replay: it plays recordings"):
+        MixedTrafficConfig(shares={"replay": 1})
+    with pytest.raises(UserError, match="did you mean 'idm_mobil'"):
+        MixedTrafficConfig(shares={"idm_mobli": 1})
+    for shares in ({}, {"idm": 0}, {"idm": 0.5}, {"idm": 2000}, 3):
+        with pytest.raises(UserError, match="whole numbers of at least 1"):
+            MixedTrafficConfig(shares=shares)
+    with pytest.raises(UserError, match="is a mixture itself"):
+        MixedTrafficConfig(shares={"mixed": 1})
+    with pytest.raises(UserError, match="different roads or streams"):
+        MixedTraffic({"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1})
+    with pytest.raises(UserError, match="no ego anyway"):
+        ReplayTrafficConfig(blind_share=0.5)
+
+
+def test_a_model_of_ones_own_is_mixed_by_its_import_path():
+    config = MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1})
+    traffic = make_traffic(config, EnvConfig())
+    assert isinstance(traffic, MixedTraffic)
+    assert [name for name, _ in traffic.named_parts()] == ["ganlane_traffic_IdmTraffic", "idm_mobil"]
+    assert (
+        same_bits(
+            drive(traffic, 4)[-1].exclude(keys.TRAFFIC),
+            drive(MixedTraffic({"a": IdmTraffic(), "b": IdmMobilTraffic()}, {"a": 1, "b": 1}), 4)[-1].exclude(
+                keys.TRAFFIC
+            ),
+        )
+        == []
+    )
+
+
+def test_a_description_holds_the_parts_that_have_a_share():
+    assert list(MixedTrafficConfig().description()["options"]) == ["idm_mobil", "gan"]
+    assert "blind_share" not in all_traffics()["idm"].description()

@@ -54,6 +54,7 @@ def _offered(env: EnvConfig, stream: int) -> dict[str, Any]:
         "idm": env.idm.parameters(),
         "mobil": env.mobil.parameters(),
         "steering": STEERING,
+        "spawn": env.spawn_parameters(),
     }
 
 

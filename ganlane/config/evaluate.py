@@ -17,6 +17,7 @@ from ganlane.config.traffic import (
     TrafficConfig,
 )
 from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
 
@@ -33,6 +34,8 @@ def all_traffics() -> dict[str, TrafficConfig]:
         "gan_calibrated": GanCalibratedTrafficConfig(),
         "idm_faults": IdmFaultsTrafficConfig(),
         "replay": ReplayTrafficConfig(),
+        "sumo": SumoTrafficConfig(),
+        "highway_env": HighwayEnvTrafficConfig(),
     }
 
 

@@ -36,6 +36,7 @@ from ganlane.config.traffic import (
     IdmTrafficConfig,
 )
 from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
@@ -67,6 +68,8 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "gan_calibrated": GanCalibratedTrafficConfig,
         "idm_faults": IdmFaultsTrafficConfig,
         "replay": ReplayTrafficConfig,
+        "sumo": SumoTrafficConfig,
+        "highway_env": HighwayEnvTrafficConfig,
     },
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},

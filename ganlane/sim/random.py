@@ -51,6 +51,7 @@ class Purpose(IntEnum):
     SENSED_LATERAL = 66
     SENSED_SPEED = 67
     SENSED_DROPOUT = 68
+    FOREIGN_DRIVER = 128  # and the 15 purposes after it: drivers of a foreign simulator, one per parameter
 
 
 def _shift(h: Tensor, bits: int) -> Tensor:

@@ -2,7 +2,8 @@
 
 All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules,
 :mod:`~ganlane.traffic.social_gan` and :mod:`~ganlane.traffic.calibrated_gan` by a generator (what the two share is
-in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays recordings. Overlays
+in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays recordings, and in
+:mod:`~ganlane.traffic.foreign` SUMO and HighwayEnv drive. Overlays
 (:mod:`~ganlane.traffic.lane_change`, :mod:`~ganlane.traffic.acceleration`, and drivers' faults in
 :mod:`~ganlane.traffic.faults` and :mod:`~ganlane.traffic.lane_change_faults`) and the
 :mod:`~ganlane.traffic.guard` stand behind a base model in a :class:`TrafficSequential`;
@@ -13,6 +14,7 @@ in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays reco
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.faults import BrakingFaults, LateReaction, PhantomBraking, ReactionFaults
+from ganlane.traffic.foreign import HighwayEnvTraffic, SumoTraffic
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 from ganlane.traffic.lane_change import (
@@ -42,6 +44,7 @@ __all__ = [
     "GuardParameters",
     "HesitantLaneChange",
     "HesitationFaults",
+    "HighwayEnvTraffic",
     "IdmMobilTraffic",
     "IdmTraffic",
     "LateReaction",
@@ -54,6 +57,7 @@ __all__ = [
     "Recordings",
     "ReplayTraffic",
     "SuddenAccelerations",
+    "SumoTraffic",
     "TrafficModule",
     "TrafficSequential",
 ]

@@ -28,7 +28,7 @@ _FROM_M, _TO_M, _LIMIT_MPS = -10_000.0, 200_000.0, 70.0
 
 
 class HighwayEnvTraffic(TrafficModule):
-    """Others who are driven by HighwayEnv's ``IDMVehicle``: its IDM, its MOBIL, its steering, its explicit Euler step.
+    """Others who are driven by HighwayEnv's ``IDMVehicle``: its IDM, MOBIL and steering, its explicit Euler step.
 
     The parameters are HighwayEnv's own (1.5 s, 3 and -5 m/s2, distances from centre to centre, an egoistic MOBIL
     once a second); desired speeds are Table II's, and the exponent differs from driver to driver as HighwayEnv draws
@@ -86,10 +86,12 @@ class HighwayEnvTraffic(TrafficModule):
         traits = torch.stack((vehicles.desired_speed, exponent, memory["timer"]), dim=-1).double().cpu().numpy()
         size = torch.stack((vehicles.length, vehicles.width), dim=-1).double().cpu().numpy()
         target, valid = vehicles.target_lane.cpu().numpy().copy(), vehicles.valid.cpu().numpy()
+        signals = (vehicles.visibility[:, EGO_INDEX] == int(Visibility.SIGNALLED)).tolist()
         timer = traits[..., 2]
         for row in range(len(fields)):
             present = np.flatnonzero(valid[row])
-            self._highway.drive(present, fields[row], size[row], traits[row], target[row], self.dt)
+            mine = (fields[row], size[row], traits[row], target[row])
+            self._highway.drive(present, *mine, bool(signals[row]), self.dt)
         moving = torch.as_tensor(fields).to(like.device, like.dtype)
         named = dict(zip(_MOVING, moving.unbind(-1)))
         named["acceleration"] = (named["speed"] - vehicles.speed) / self.dt
@@ -105,7 +107,7 @@ class _Highway:
         from highway_env.road.road import Road as TheirRoad
         from highway_env.road.road import RoadNetwork
         from highway_env.vehicle.behavior import IDMVehicle
-        from highway_env.vehicle.kinematics import Vehicle
+        from highway_env.vehicle.controller import ControlledVehicle
 
         class Lane(StraightLane):
             """A straight lane along x; the same numbers as its base class's, without arrays."""
@@ -120,10 +122,12 @@ class _Highway:
             lane.offset = y
             network.add_lane("a", "b", lane)
         self.road = TheirRoad(network, np_random=np.random.RandomState(0))
-        self._ego = Vehicle(self.road, [0.0, 0.0])
-        self._other, self._others = IDMVehicle, [self._ego]
+        # A ControlledVehicle as in HighwayEnv's own environments: the others' MOBIL asks for its target speed.
+        self._driver, self._cars = IDMVehicle, [ControlledVehicle(self.road, [0.0, 0.0])]
 
-    def drive(self, present: Any, fields: Any, size: Any, traits: Any, target: Any, dt: float) -> None:
+    def drive(
+        self, present: Any, fields: Any, size: Any, traits: Any, target: Any, ego_signals: bool, dt: float
+    ) -> None:
         """Move the vehicles ``present`` of one row by ``dt`` seconds, in place.
 
         Args:
@@ -132,24 +136,26 @@ class _Highway:
             size: length, width, [M, 2].
             traits: desired speed, exponent, timer, [M, 3].
             target: lanes, [M] int64.
+            ego_signals: whether the others know the lane that the ego is moving to.
             dt: s.
         """
-        while len(self._others) < len(fields):
-            self._others.append(self._other(self.road, [0.0, 0.0], timer=1.0))
-        self.road.vehicles = [self._others[i] for i in present]
+        while len(self._cars) < len(fields):
+            self._cars.append(self._driver(self.road, [0.0, 0.0], timer=1.0))
+        self.road.vehicles = [self._cars[i] for i in present]
         for i in present:
-            vehicle = self._others[i]
+            vehicle = self._cars[i]
             x, y, vehicle.heading, vehicle.speed = fields[i].tolist()
             vehicle.position = np.array([x, y])
             vehicle.LENGTH, vehicle.WIDTH = size[i].tolist()
             vehicle.on_state_update()
-            if i != EGO_INDEX:
-                vehicle.target_speed, vehicle.DELTA, vehicle.timer = traits[i].tolist()
-                vehicle.target_lane_index = ("a", "b", int(target[i]))
+            vehicle.target_speed, vehicle.DELTA, vehicle.timer = traits[i].tolist()
+            vehicle.target_lane_index = ("a", "b", int(target[i]))
+        if not ego_signals:
+            self._cars[EGO_INDEX].target_lane_index = self._cars[EGO_INDEX].lane_index
         self.road.act()
         for i in present:
             if i != EGO_INDEX:
-                vehicle = self._others[i]
+                vehicle = self._cars[i]
                 vehicle.step(dt)
                 fields[i] = (*vehicle.position, vehicle.heading, max(vehicle.speed, 0.0))
                 traits[i, 2] = vehicle.timer

@@ -146,7 +146,7 @@ class SumoTraffic(TrafficModule):
             return roads, episodes
         if not fresh.all():
             raise UserError(
-                "traffic sumo: asked to drive on an episode whose simulation is gone, since a process has one SUMO and "
+                "traffic sumo: the simulation of this episode is gone, since a process has one SUMO and "
                 "somebody else has used it meanwhile; finish one environment before the next one starts."
             )
         assert isinstance(self.road.lanes, int)
@@ -173,19 +173,18 @@ class SumoTraffic(TrafficModule):
             self._shift(int(row), seen, episodes.outputs)
         if not (follows | waits | shifted).all():
             raise UserError(
-                "traffic sumo: a state that SUMO did not leave itself (loaded, copied or changed); SUMO can only drive "
-                "on from where it is, so start the episode again."
+                "traffic sumo: this state is not the one that SUMO left (it was loaded, copied or changed), and SUMO can "
+                "only drive on from where it is; start the episode again."
             )
         episodes.ended = waits
         return follows | shifted
 
-    def _shift(self, row: int, seen: _Seen, left: _Seen) -> None:
+    def _shift(self, row: int, seen: _Seen, left: _Seen | None) -> None:
         """Follow ``env.recycle``: some of the others are elsewhere along the road."""
         assert self._roads is not None
+        assert left is not None
         for i in np.flatnonzero(seen.x[row, 1:] != left.x[row, 1:]) + 1:
-            name = self._roads.names[row][i - 1]
-            if name:
-                self._roads.move_to(row, name, self._place(seen, row, i), float(seen.length[row, i]))
+            self._roads.replace(row, int(i) - 1, self._place(seen, row, int(i)))
 
     def _place(self, seen: _Seen, row: int, i: int) -> Place:
         lane = round(float(seen.y[row, i]) / float(self.road.lane_width_m))
@@ -197,12 +196,8 @@ class SumoTraffic(TrafficModule):
         roads.clear(row)
         purposes = list(range(Purpose.FOREIGN_DRIVER, Purpose.FOREIGN_DRIVER + _PACE_PHASE + 1))
         u = uniform(key[row : row + 1].cpu(), 0, m, purposes, torch.float64)[0].numpy()
-        there = [i for i in range(1, m) if seen.valid[row, i]]
-        drivers = [_driver(u[i], seen, row, i) for i in there]
-        roads.fill(row, drivers, [self._place(seen, row, i) for i in there])
-        if len(there) < m - 1:
-            names = dict(zip(there, roads.names[row]))
-            roads.names[row] = [names.get(i, "") for i in range(1, m)]
+        drivers = [_driver(u[i], seen, row, i) if seen.valid[row, i] else None for i in range(1, m)]
+        roads.fill(row, drivers, [self._place(seen, row, i) for i in range(1, m)])
         episodes.keys[row] = int(key[row])
         episodes.ended[row] = False
         episodes.desired_speed[row] = seen.desired_speed[row]
@@ -223,7 +218,7 @@ class SumoTraffic(TrafficModule):
         lanes = presence(one, self.road, body, with_target(body, one))
         low, high, x = (field[:, 0].tolist() for field in (lanes.low, lanes.high, one.x))
         for row in np.flatnonzero(driving):
-            driver = _stand_in(seen, row)
+            driver = _stand_in(seen, int(row))
             here = Place(0, float(seen.x[row, EGO_INDEX]), float(seen.speed[row, EGO_INDEX]))
             roads.lead_ego(int(row), range(int(low[row]), int(high[row]) + 1), driver, here, x[row])
 

@@ -71,8 +71,7 @@ class SumoRoads:
             SumoRoads._current.close()
         elif self.libsumo.isLoaded():
             raise UserError(
-                "traffic sumo: libsumo already runs a simulation of somebody else's, and there can be one in a process; "
-                "close that one (libsumo.close()) or start another process."
+                "traffic sumo: libsumo already runs a simulation of somebody else's, and a process has one; close that one (libsumo.close()) or start another process."
             )
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
@@ -83,6 +82,7 @@ class SumoRoads:
         self._serial = 0
         #: Names of the others [row][index]; empty where there is nobody (any more).
         self.names: list[list[str]] = [[] for _ in range(rows)]
+        self._drivers: list[list[SumoDriver | None]] = [[] for _ in range(rows)]
         self._stand_ins: list[dict[int, str]] = [{} for _ in range(rows)]
         self._flat: tuple[list[str], NDArray[np.int64], NDArray[np.int64]] | None = None
 
@@ -104,9 +104,10 @@ class SumoRoads:
                 self.libsumo.vehicle.remove(name)
         self.names[row], self._stand_ins[row], self._flat = [], {}, None
 
-    def fill(self, row: int, drivers: Sequence[SumoDriver], places: Sequence[Place]) -> None:
-        """Put the others of a new episode onto an empty highway."""
-        self.names[row] = [self._add(row, driver, place) for driver, place in zip(drivers, places)]
+    def fill(self, row: int, drivers: Sequence[SumoDriver | None], places: Sequence[Place]) -> None:
+        """Put the others of a new episode onto an empty highway; None: nobody has this index."""
+        self._drivers[row] = list(drivers)
+        self.names[row] = [self._add(row, driver, place) if driver else "" for driver, place in zip(drivers, places)]
         self._flat = None
 
     def _add(self, row: int, driver: SumoDriver, place: Place) -> str:
@@ -123,13 +124,17 @@ class SumoRoads:
         vehicle.setEmergencyDecel(name, driver.emergency_decel)
         vehicle.setApparentDecel(name, driver.decel)
         vehicle.setMinGap(name, driver.min_gap)
-        self.move_to(row, name, place, driver.length)
+        vehicle.moveTo(name, f"{_edge(row)}_{place.lane}", place.x + 0.5 * driver.length + ORIGIN_M)
+        vehicle.setPreviousSpeed(name, place.speed)
         return name
 
-    def move_to(self, row: int, name: str, place: Place, length: float) -> None:
-        """Put a vehicle somewhere else at once, without driving there."""
-        self.libsumo.vehicle.moveTo(name, f"{_edge(row)}_{place.lane}", place.x + 0.5 * length + ORIGIN_M)
-        self.libsumo.vehicle.setPreviousSpeed(name, place.speed)
+    def replace(self, row: int, index: int, place: Place) -> None:
+        """Put one of the others somewhere else: a new vehicle of the same driver. SUMO's own move leaves traces."""
+        driver = self._drivers[row][index]
+        if driver and self.names[row][index]:
+            self.libsumo.vehicle.remove(self.names[row][index])
+            self.names[row][index] = self._add(row, driver, place)
+            self._flat = None
 
     def set_desired_speed(self, name: str, speed: float) -> None:
         """m/s."""
@@ -213,10 +218,11 @@ def _network(rows: int, lanes: int, width: float) -> str:
         )
         inward = " ".join(f"{name}_{k}" for k in range(lanes))
         edges.append(f'<edge id="{name}" from="{name}a" to="{name}b" priority="1">{shapes}</edge>')
-        junctions.append(
-            f'<junction id="{name}a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0"/>'
-            f'<junction id="{name}b" type="dead_end" x="{end}" y="0" incLanes="{inward}" intLanes="" shape="{end},0"/>'
-        )
+        for place, x, lanes_in in (("a", 0.0, ""), ("b", end, inward)):
+            junctions.append(
+                f'<junction id="{name}{place}" type="dead_end" x="{x}" y="0" incLanes="{lanes_in}" intLanes="" '
+                f'shape="{x},0"/>'
+            )
     box = f"0,0,{end},{lanes * width}"
     place = f'<location netOffset="0,0" convBoundary="{box}" origBoundary="{box}" projParameter="!"/>'
     return f'<net version="1.20">{place}{"".join(edges + junctions)}</net>'
@@ -228,7 +234,9 @@ def _routes(rows: int, keep_right: float) -> str:
         '<vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" speedDev="0" maxSpeed="70" '
         f'lcKeepRight="{keep_right}"/>'
     )
-    return "<routes>" + kind + "".join(f'<route id="{_edge(r)}" edges="{_edge(r)}"/>' for r in range(rows)) + "</routes>"
+    return (
+        "<routes>" + kind + "".join(f'<route id="{_edge(r)}" edges="{_edge(r)}"/>' for r in range(rows)) + "</routes>"
+    )
 
 
 def _command(folder: Path, change_s: float) -> list[str]:

@@ -173,8 +173,8 @@ class SumoTraffic(TrafficModule):
             self._shift(int(row), seen, episodes.outputs)
         if not (follows | waits | shifted).all():
             raise UserError(
-                "traffic sumo: this state is not the one that SUMO left (it was loaded, copied or changed), and SUMO can "
-                "only drive on from where it is; start the episode again."
+                "traffic sumo: this state is not the one that SUMO left (it was loaded, copied or changed), and "
+                "SUMO can only drive on from where it is; start the episode again."
             )
         episodes.ended = waits
         return follows | shifted

@@ -71,7 +71,8 @@ class SumoRoads:
             SumoRoads._current.close()
         elif self.libsumo.isLoaded():
             raise UserError(
-                "traffic sumo: libsumo already runs a simulation of somebody else's, and a process has one; close that one (libsumo.close()) or start another process."
+                "traffic sumo: libsumo already runs a simulation that is not ours, and a process has one; close it "
+                "(libsumo.close()) or start another process."
             )
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)

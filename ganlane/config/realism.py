@@ -16,13 +16,15 @@ from ganlane.errors import UserError
 _TAKEN = ("random", "constant_velocity")
 #: The traffic that is the recordings themselves.
 _RECORDED = "replay"
+#: Those that drive around an ego of ours only; a card has none.
+_FOREIGN = ("sumo", "highway_env")
 _QUICK_KM = 5.0
 _QUICK_S = 30.0
 
 
 def drivable() -> dict[str, TrafficConfig]:
-    """The options of the group ``traffic`` that can have a card, by name: all but the recordings themselves."""
-    return {name: traffic for name, traffic in all_traffics().items() if name != _RECORDED}
+    """The options of the group ``traffic`` that can have a card, by name: all that need no ego."""
+    return {name: traffic for name, traffic in all_traffics().items() if name not in (_RECORDED, *_FOREIGN)}
 
 
 @dataclass
@@ -67,6 +69,11 @@ class RealismConfig(RunConfig):
             raise UserError(f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu.")
         if self.traffic.label() == _RECORDED:
             raise UserError("traffic=replay: it is the recordings themselves; choose a traffic that drives.")
+        if self.traffic.label() in _FOREIGN:
+            raise UserError(
+                f"traffic={self.traffic.label()}: a foreign simulator drives around an ego only, and a card has "
+                "none; choose one of our own."
+            )
         if self.data.format != "scenes":
             raise UserError(
                 f"data={self.data.format}: the card reads scenes; run ganlane prepare data={self.data.format} first, "

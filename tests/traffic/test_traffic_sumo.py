@@ -30,7 +30,7 @@ def traffic():
 @pytest.fixture(scope="module")
 def driven(traffic):
     """Twenty egos that keep their lanes, for a minute: vehicles [601, 20, 9]."""
-    vehicles, running, _ = drive(HighwayEnv(traffic, 20), list(range(20)), 60)
+    vehicles, running, state = drive(HighwayEnv(traffic, 20), list(range(20)), 60)
     assert running.all()
     return vehicles, state
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.foreign.packages import require
 
 #: Fields of a vehicle that HighwayEnv moves, in the order in which they are handed over.
 _MOVING = ("x", "y", "heading", "speed")
@@ -49,10 +49,7 @@ class HighwayEnvTraffic(TrafficModule):
 
     def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN) -> None:
         super().__init__(road, stream)
-        if find_spec("highway_env") is None:
-            raise UserError(
-                "traffic highway_env: highway-env is not installed; pip install 'ganlane[bench]' brings it."
-            )
+        require("highway_env", "highway_env", "highway-env", "bench")
         if self.road.ring_m is not None:
             raise UserError(
                 f"traffic highway_env: a ring of {self.road.ring_m:g} m; HighwayEnv's roads here are straight."

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.traffic.foreign.packages import require
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,6 @@ Array = NDArray[np.float64]
 ORIGIN_M, LENGTH_M = 2_000.0, 60_000.0
 #: Speed limit of every lane, m/s. Drivers have a speed factor: their desired speed is a multiple of it.
 LIMIT_MPS = 25.0
-_NOT_INSTALLED = "traffic sumo: {} not installed; pip install 'ganlane[sumo]' brings SUMO."
 
 
 class SumoDriver(NamedTuple):
@@ -195,11 +194,7 @@ def require_libsumo() -> Any:
     Raises:
         UserError: it is not installed.
     """
-    if find_spec("libsumo") is None:
-        raise UserError(_NOT_INSTALLED.format("libsumo is"))
-    import libsumo
-
-    return libsumo
+    return require("libsumo", "sumo", "libsumo", "sumo")
 
 
 def _edge(row: int) -> str:

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ from ganlane import keys
 from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED
 from ganlane.agents.drivers import DRIVERS
+from ganlane.agents.policy import MaskedPolicy
 from ganlane.config.env import EnvConfig
+from ganlane.config.mask import MASKS, MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.targets import call_with, import_target
@@ -32,8 +34,14 @@ from ganlane.paths import CHECKPOINTS
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.steering import STEERING
-from ganlane.traffic import TrafficModule
-from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform, observation_size
+from ganlane.traffic import BlindTraffic, TrafficModule
+from ganlane.transforms import (
+    ActionMaskTransform,
+    ObservationTransform,
+    RewardTransform,
+    SensorTransform,
+    observation_size,
+)
 
 
 def set_threads(threads: int) -> None:
@@ -72,10 +80,13 @@ def make_traffic(traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TR
     )
     if not callable(target) or (inspect.isclass(target) and not issubclass(target, TrafficModule)):
         raise expected
-    made = call_with(target, _offered(env, stream), traffic.arguments(), key)
+    arguments, parts = traffic.arguments(), traffic.parts()
+    if parts:
+        arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
+    made = call_with(target, _offered(env, stream), arguments, key)
     if not isinstance(made, TrafficModule):
         raise expected
-    return made
+    return BlindTraffic(made, traffic.blind_share) if traffic.blind_share else made
 
 
 def make_env(
@@ -87,8 +98,9 @@ def make_env(
     seed: int = 0,
     device: str = "cpu",
     first_episode: int = 0,
+    mask: MaskConfig | None = None,
 ) -> TransformedEnv:
-    """A batched environment with observation and reward; its stream is the traffic's.
+    """A batched environment with observation, reward and, where asked for, action mask; its stream is the traffic's.
 
     Raises:
         UserError: see :class:`ganlane.env.HighwayEnv`.
@@ -110,22 +122,46 @@ def make_env(
         recycle=env.recycle,
     )
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
+    masks = _mask_transforms(mask or MaskConfig(), base, env)
     if env.compile:
         base.compile()
         seen.compile_graphs()
+        for each in masks:
+            each.compile_graphs()
     errors = observation.sensor_parameters()
     sensors = [] if errors is None else [SensorTransform(errors, traffic.stream, env.decision_period_s)]
     pay = RewardTransform(env.decision_period_s, reward.parameters())
-    return TransformedEnv(base, Compose(*sensors, seen, pay))
+    return TransformedEnv(base, Compose(*sensors, seen, *masks, pay))
+
+
+def _mask_transforms(mask: MaskConfig, base: HighwayEnv, env: EnvConfig) -> list[ActionMaskTransform]:
+    """The transform that ``mask`` asks for; none for ``mask=none``."""
+    if mask.form == "none":
+        return []
+    judged_by, abort = env.idm.parameters(), env.ego.abort_lane_change
+    return [ActionMaskTransform(base.road, mask.form, mask.safe_deceleration, judged_by, abort)]
 
 
 @dataclass(frozen=True)
 class Driver:
-    """Somebody who can drive the ego: a policy, and the observation that it reads (None: any)."""
+    """Somebody who can drive the ego.
+
+    Attributes:
+        name: in tables.
+        policy: writes ``action``.
+        observation: that it reads; None: any.
+        mask: behind which it drives; None: that of the command or call, by default none.
+    """
 
     name: str
     policy: TensorDictModuleBase
     observation: ObservationConfig | None = None
+    mask: MaskConfig | None = None
+
+    def behind(self, mask: MaskConfig | None) -> tuple[MaskConfig, TensorDictModuleBase]:
+        """The mask that holds where ``mask`` is the default, and the policy behind it."""
+        chosen = self.mask or mask or MaskConfig()
+        return chosen, self.policy if chosen.form == "none" else MaskedPolicy(self.policy)
 
 
 def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: str = "cpu") -> Driver:
@@ -134,7 +170,8 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     Args:
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent, the path of an agent's file,
             or the import path of a policy of your own (a class or function; it may ask for ``road``, ``stream``,
-            ``idm`` and ``mobil``).
+            ``idm`` and ``mobil``). ``+safe``, ``+legal`` or ``+none`` may follow: the mask behind which it drives, in
+            place of the one that it was trained with.
         env: where it is to drive.
         stream: of its random numbers, if it draws any.
         device: of its network.
@@ -142,6 +179,11 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     Raises:
         UserError: no such driver, or a network of another shape than the environment's observation.
     """
+    plain, plus, form = name.rpartition("+")
+    if plus and form in MASKS:
+        driver = make_driver(plain, env, stream, device)
+        kept = driver.mask if driver.mask is not None and driver.mask.form == form else MaskConfig(form)
+        return replace(driver, name=name, mask=kept)
     if name in DRIVERS:
         policy = call_with(DRIVERS[name], _offered(env, stream), {}, "agents")
         return Driver(name, policy.to(device))
@@ -161,7 +203,20 @@ def _trained(name: str, env: EnvConfig, device: str) -> Driver:
     policy, metadata = load_agent(name, device=device)
     observation = observation_of(metadata)
     load_agent(name, observation_size(observation.form, env.vehicles), device)
-    return Driver(name, policy, observation)
+    return Driver(name, policy, observation, mask_of(metadata))
+
+
+def mask_of(metadata: dict[str, Any]) -> MaskConfig | None:
+    """The mask that an agent was trained with; None for one that was trained without, or before there were any.
+
+    Raises:
+        UserError: the metadata name one that there is not.
+    """
+    try:
+        mask = MaskConfig(**metadata.get("mask", {}))
+    except TypeError as error:
+        raise UserError(f"the agent's metadata name no mask that is known here ({error}); train it again.") from error
+    return None if mask.form == "none" else mask
 
 
 def observation_of(metadata: dict[str, Any]) -> ObservationConfig:

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import polars as pl
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ganlane.build import Driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.evaluation import (
     crashes_by_scene,
     evaluation_rows,
+    paired_rows,
+    paired_table,
     run_episodes,
     text_table,
     write_episodes,
@@ -39,16 +44,18 @@ def compare(
     num_envs: int = 128,
     device: str = "cpu",
     stream: int = Stream.REPORT,
+    mask: MaskConfig | None = None,
 ) -> pl.DataFrame:
     """Run the episodes 0 to ``episodes - 1`` with each driver on each traffic.
 
     Args:
-        drivers: see :func:`ganlane.build.make_driver`; each gets an environment with its own observation.
+        drivers: see :func:`ganlane.build.make_driver`; each drives with its own observation.
         traffics: name to config.
         env, reward: the same for all.
         observation: for drivers that name none; its sensors for all.
         episodes, seed, stream: which episodes.
         num_envs: episodes side by side, at most.
+        mask: for drivers that name none.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
@@ -57,12 +64,18 @@ def compare(
     modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(num_envs, episodes), []
+    made: tuple[tuple[str, ObservationConfig], EnvBase] | None = None
     with _Progress(len(pairs) * episodes) as progress:
         for traffic, driver in pairs:
             seen = (observation or ObservationConfig()).read_by(driver.observation)
-            made = make_env(modules[traffic], env, seen, reward, rows, seed, device)
+            shield, policy = driver.behind(mask)
+            make = partial(make_env, modules[traffic], env, seen, reward, seed=seed, device=device, mask=shield)
+            if made is None or made[0] != (traffic, seen, shield):
+                # Drivers that see the same share an environment, which is compiled once then.
+                made = (traffic, seen, shield), make(rows)
+            smaller = None if env.compile else make
             report = progress.start(f"{driver.name} on {traffic}")
-            table = run_episodes(made, driver.policy, range(episodes), seed, report)
+            table = run_episodes(made[1], policy, range(episodes), seed, report, smaller)
             named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             tables.append(_with_scenes(named, modules[traffic], seed))
     return pl.concat(tables, how="diagonal")
@@ -106,6 +119,8 @@ def compare_as_told(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.Dat
         config.seed,
         config.num_envs,
         config.device,
+        Stream[config.stream.upper()],
+        config.mask,
     )
 
 
@@ -118,7 +133,8 @@ def publish(
 ) -> str:
     """Print the table of a comparison, write its episodes and ``results.json``; the line that names the latter.
 
-    Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
+    With two drivers or more a second table, and ``paired`` in the record, say by how much the first one is ahead of
+    each of the others on the same episodes (:func:`ganlane.evaluation.paired_rows`). Where a traffic replays recorded scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
 
     Args:
         table: what :func:`compare` returned.
@@ -126,11 +142,14 @@ def publish(
         config, seeds: of the run, for the record.
         numbers: what the record holds beside ``rows``.
     """
-    rows = evaluation_rows(table)
+    rows, paired = evaluation_rows(table), paired_rows(table)
     print(text_table(rows))
+    if paired:
+        print(f"\n{paired_table(paired)}")
     write_episodes(folder, table)
     recorded = recorded_crashes(table)
-    known = {"rows": rows, **({"crashes_by_scene": recorded} if recorded else {}), **(numbers or {})}
+    scenes = {"crashes_by_scene": recorded} if recorded else {}
+    known = {"rows": rows, "paired": paired, **scenes, **(numbers or {})}
     return f"results: {write_results(folder, known, config, seeds)}"
 
 

@@ -26,7 +26,7 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
     set_threads(config.threads)
     drivers = [make_driver(name, config.env, device=config.device) for name in config.agents]
     table = compare_as_told(drivers, config)
-    seeds = {"stream": "report", "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
     return publish(table, folder, asdict(config), seeds)
 
 

@@ -18,6 +18,7 @@ N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI un
 ``road.lane_width_m``                      [N, 1]      the same, m
 ``events.*``                               [N, 1]      what the last decision led to
 ``action``                                 [N] i64     0 keep, 1 left, 2 right
+``action_mask``                            [N, 3] b    which of them are allowed, where there is a mask
 =========================================  ==========  ==================================================
 """
 
@@ -41,6 +42,10 @@ ACTION: Final = "action"
 #: What a policy that tells thinks its action worth, [N] or [N, 1]; named as in TorchRL.
 CHOSEN_VALUE: Final = "chosen_action_value"
 OBSERVATION: Final = "observation"
+#: Which actions are allowed, [N, 3] bool, where the environment has a mask; named as in TorchRL.
+ACTION_MASK: Final = "action_mask"
+#: Whether even keeping the lane asks somebody to brake harder than is safe, [N, 1] bool (mask ``safe``).
+NO_SAFE_ACTION: Final = "no_safe_action"
 REWARD: Final = "reward"
 
 #: Float fields of ``vehicles``.
@@ -58,9 +63,10 @@ TERMINAL_EVENTS: Final = ("goal", "hard_crash", "out_of_road")
 TRUNCATING_EVENTS: Final = ("timeout", "scene_end")
 #: Number of soft-crash onsets in the decision, int64.
 SOFT_CRASH: Final = "soft_crash"
-#: The same behind the ego: reported, not penalised.
+#: The same behind the ego: reported, and penalised by ``reward=considerate`` alone.
 SOFT_CRASH_BEHIND: Final = "soft_crash_behind"
 
+#: Terms of the paper's reward; one that charges for ``soft_crash_behind`` has a further one of that name.
 REWARD_TERM_NAMES: Final = ("speed", "lane_change", "out_of_road", "hard_crash", "soft_crash", "goal")
 
 KEEP: Final = 0

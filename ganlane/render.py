@@ -53,9 +53,10 @@ def _record(config: RenderConfig, agent: str, number: int) -> Trajectory:
     driver = make_driver(agent, config.env, device=config.device)
     traffic = make_traffic(config.traffic, config.env, Stream.REPORT)
     seen = config.observation.read_by(driver.observation)
-    env = make_env(traffic, config.env, seen, config.reward, device=config.device)
+    mask, policy = driver.behind(config.mask)
+    env = make_env(traffic, config.env, seen, config.reward, device=config.device, mask=mask)
     end_s = config.film.end_s if config.film.end_s is not None else float("inf")
-    episode = record_episode(env, driver.policy, config.seed, number, driver.name, label, end_s)
+    episode = record_episode(env, policy, config.seed, number, driver.name, label, end_s)
     which = f"{driver.name} on {label}, seed {config.seed}, episode {number}"
     print(f"{which}: {episode.outcome or 'cut off'} after {episode.time_s[-1]:.1f} s")
     return episode

@@ -61,6 +61,21 @@ def test_the_record_holds_crashes_by_scene_for_replayed_traffic(table, tmp_path,
         assert sum(scene["distance_km"] for scene in row["scenes"]) == pytest.approx(own["distance_m"].sum() / 1000)
 
 
+def test_the_first_driver_is_held_against_the_other_in_print_and_in_the_record(table, tmp_path, capsys):
+    publish(table, tmp_path, {}, {})
+    paired = json.loads((tmp_path / "results.json").read_text())["paired"]
+    assert [(row["agent"], row["over"], row["traffic"], row["episodes"]) for row in paired] == [
+        ("keep_lane", "random_legal", "idm", EPISODES),
+        ("keep_lane", "random_legal", "replay", EPISODES),
+    ]
+    means = table.group_by("agent", "traffic").agg(pl.col("reward").mean())
+    for row in paired:
+        of = {r["agent"]: r["reward"] for r in means.filter(pl.col("traffic") == row["traffic"]).to_dicts()}
+        assert row["lead"] == pytest.approx(of["keep_lane"] - of["random_legal"])
+        assert row["lead_ci"][0] <= row["lead"] <= row["lead_ci"][1]
+    assert capsys.readouterr().out.count("keep_lane over random_legal") == 2
+
+
 def test_other_traffics_have_no_scenes(table, tmp_path, capsys):
     others = table.filter(pl.col("traffic") == "idm").drop("scene")
     assert recorded_crashes(others) == []

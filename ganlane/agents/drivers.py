@@ -19,13 +19,19 @@ from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
+from ganlane.transforms.mask import on_road_actions
 
 
 class Driver(TensorDictModuleBase):
-    """A rule-based policy: reads the raw state, writes ``action`` [N] int64 through :meth:`act`."""
+    """A rule-based policy: reads the raw state, writes ``action`` [N] int64 through :meth:`act`.
+
+    One of your own that remembers something per row in the module itself sets ``rows_must_stay = True``: an
+    evaluation then never moves a running episode to another row, or into a smaller batch.
+    """
 
     in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
+    rows_must_stay = False
 
     def __init__(self, road: Road, stream: int = Stream.TRAIN) -> None:
         super().__init__()
@@ -44,7 +50,7 @@ def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
     """Which of the three actions stay on the road, bool [N, 3]: keeping the lane always does."""
     target = tensordict.get(keys.VEHICLES).get("target_lane")[:, EGO_INDEX]
     lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
-    return torch.stack((target >= 0, target < lanes - 1, target > 0), dim=1)
+    return on_road_actions(target, lanes)
 
 
 class RandomDriver(Driver):

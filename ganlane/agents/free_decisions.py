@@ -114,7 +114,9 @@ def transitions(pending: Pending, complete: Tensor, after: TensorDictBase) -> Te
     place, row = complete[..., 0].nonzero(as_tuple=True)
     if len(row) == 0:
         return None
+    mask = after.get(keys.ACTION_MASK, None)
     led_to = {
+        **({} if mask is None else {keys.ACTION_MASK: mask[row]}),
         "observation": after.get("observation")[row],
         "reward": pending.reward[place, row],
         "terminated": after.get("terminated")[row],

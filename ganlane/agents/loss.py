@@ -16,8 +16,10 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
+from ganlane import keys
 from ganlane.agents.config import RainbowConfig
 from ganlane.agents.network import QNetwork, Weights
+from ganlane.agents.policy import allowed_values
 from ganlane.agents.projection import outside_support, pick, project
 
 
@@ -69,7 +71,8 @@ class LeanDistributionalLoss(_TargetNetwork, DistributionalDQNLoss):
         """Cross-entropy per transition.
 
         Reads ``observation`` [B, D], ``action`` [B], ``steps_to_next_obs`` [B, 1] and ``next``'s ``observation``,
-        ``reward`` and ``terminated`` [B, 1]; writes ``td_error`` [B, 1]. Returns ``loss`` [B] and, 0-dim,
+        ``reward`` and ``terminated`` [B, 1]; where ``next`` has ``action_mask`` [B, A], the best next action is one
+        that it allows. Writes ``td_error`` [B, 1]. Returns ``loss`` [B] and, 0-dim,
         ``clamped_fraction`` (mass of the targets outside the support) and ``mean_q`` (of the best next action).
         """
         weights = self.network.weights()
@@ -89,7 +92,8 @@ class LeanDistributionalLoss(_TargetNetwork, DistributionalDQNLoss):
         following, support = batch.get(("next", "observation")), self.network.support
         target_logits = self.target_network.logits(following)
         choosing = self.network.logits(following, weights) if self.double else target_logits
-        best, action = self.network.expected(choosing).max(-1)
+        values = allowed_values(self.network.expected(choosing), batch.get(("next", keys.ACTION_MASK), None))
+        best, action = values.max(-1)
         probabilities = pick(target_logits, action).softmax(-1)
         discount = self.gamma ** batch.get("steps_to_next_obs")
         alive = 1.0 - batch.get(("next", "terminated")).to(support.dtype)
@@ -130,7 +134,8 @@ class LeanDQNLoss(_TargetNetwork, DQNLoss):
         """Bellman targets [B] and the mean value of the best next action."""
         following = batch.get(("next", "observation"))
         target_values = self.target_network(following)
-        best, action = (self.network(following) if self.double_dqn else target_values).max(-1)
+        values = self.network(following) if self.double_dqn else target_values
+        best, action = allowed_values(values, batch.get(("next", keys.ACTION_MASK), None)).max(-1)
         value = target_values.gather(-1, action[:, None])
         alive = 1.0 - batch.get(("next", "terminated")).to(value.dtype)
         discount = self.discount ** batch.get("steps_to_next_obs")

@@ -11,9 +11,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from ganlane import keys
+
 
 class Step(NamedTuple):
-    """One decision of N environments; ``following`` is the observation after it, before any reset."""
+    """One decision of N environments; ``following`` is the observation after it, before any reset.
+
+    ``following_mask`` [N, A] bool says which actions are allowed there, where the environment has a mask.
+    """
 
     observation: Tensor
     action: Tensor
@@ -21,6 +26,7 @@ class Step(NamedTuple):
     following: Tensor
     terminated: Tensor
     done: Tensor
+    following_mask: Tensor | None = None
 
 
 class NStepWindow:
@@ -44,7 +50,7 @@ class NStepWindow:
 
         Returns:
             ``observation``, ``action``, ``steps_to_next_obs`` [N, 1] (the exponent of the discount), and ``next``'s
-            ``observation``, ``reward`` (the n-step return) and ``terminated``.
+            ``observation``, ``reward`` (the n-step return), ``terminated``, and ``action_mask`` where there is one.
         """
         self.steps.append(_copy(step))
         if len(self.steps) < self.n:
@@ -66,15 +72,19 @@ def combine(steps: list[Step], gamma: float) -> TensorDict:
     """The transition of the oldest of ``steps``, cut at the first end (see :meth:`NStepWindow.push`)."""
     first = steps[0]
     reward, following, terminated = first.reward, first.following, first.terminated
+    mask = first.following_mask
     length = torch.ones_like(reward)
     running = ~first.done
     for power, step in enumerate(steps[1:], start=1):
         reward = reward + running * (gamma**power * step.reward)
         following = torch.where(running, step.following, following)
+        if mask is not None and step.following_mask is not None:
+            mask = torch.where(running, step.following_mask, mask)
         terminated = torch.where(running, step.terminated, terminated)
         length = length + running
         running = running & ~step.done
-    after = TensorDict({"observation": following, "reward": reward, "terminated": terminated}, reward.shape[:1])
+    led_to = {"observation": following, "reward": reward, "terminated": terminated}
+    after = TensorDict(led_to if mask is None else {**led_to, keys.ACTION_MASK: mask}, reward.shape[:1])
     content = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length, "next": after}
     return TensorDict(content, reward.shape[:1])
 
@@ -82,6 +92,7 @@ def combine(steps: list[Step], gamma: float) -> TensorDict:
 def _copy(step: TensorDictBase) -> Step:
     """The tensors of a step, copied: the environment may write into its own afterwards."""
     after = step.get("next")
+    mask = after.get(keys.ACTION_MASK, None)
     return Step(
         step.get("observation").clone(),
         step.get("action").clone(),
@@ -89,4 +100,5 @@ def _copy(step: TensorDictBase) -> Step:
         after.get("observation").clone(),
         after.get("terminated").clone(),
         after.get("done").clone(),
+        None if mask is None else mask.clone(),
     )

@@ -13,16 +13,58 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from ganlane import keys
 from ganlane.agents.network import QNetwork
 from ganlane.agents.noise import redraw_noise
+from ganlane.errors import UserError
 
 #: Gives the legal actions, [N, A] bool, of what the environment wrote.
 LegalActions = Callable[[TensorDictBase], Tensor]
 
 
+def allowed_values(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Action values [*, A] with minus infinity where ``mask`` [*, A] forbids; as they are without a mask."""
+    return values if mask is None else values.masked_fill(~mask, -torch.inf)
+
+
+class MaskedPolicy(TensorDictModuleBase):
+    """Any policy behind the environment's ``action_mask``: an action that is not allowed becomes 'keep the lane'.
+
+    A policy that chooses among the allowed actions itself, as this package's agents do, is not changed by it.
+
+    Args:
+        policy: writes ``action`` [N] int64.
+
+    Raises:
+        UserError: the environment has no mask.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        super().__init__()
+        self.policy = policy
+        self.in_keys = [*policy.in_keys, *([] if keys.ACTION_MASK in policy.in_keys else [keys.ACTION_MASK])]
+        self.out_keys = list(policy.out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        mask = tensordict.get(keys.ACTION_MASK, None)
+        if mask is None:
+            raise UserError(
+                "this driver chooses among allowed actions, but the environment has no action_mask; make it with "
+                "mask='safe' or 'legal'."
+            )
+        action = self.policy(tensordict).get(keys.ACTION)
+        allowed = mask.gather(1, action[:, None])[:, 0]
+        return tensordict.set(keys.ACTION, torch.where(allowed, action, keys.KEEP))
+
+
 class GreedyPolicy(TensorDictModuleBase):
-    """Writes the best ``action`` [N] int64 for ``observation`` [N, D]; never any noise, whatever the context says."""
+    """Writes the best ``action`` [N] int64 for ``observation`` [N, D]; never any noise, whatever the context says.
+
+    Where the environment writes ``action_mask`` [N, A], it is the best of the allowed actions.
+    """
 
     in_keys = [keys.OBSERVATION]  # noqa: RUF012
     out_keys = [keys.ACTION]  # noqa: RUF012
+    #: Nothing is held per row, so an evaluation may move running episodes to other rows.
+    rows_must_stay = False
 
     def __init__(self, network: QNetwork) -> None:
         super().__init__()
@@ -33,6 +75,7 @@ class GreedyPolicy(TensorDictModuleBase):
         """Write ``action``."""
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
+        values = allowed_values(values, tensordict.get(keys.ACTION_MASK, None))
         return tensordict.set(keys.ACTION, values.argmax(-1))
 
 
@@ -40,7 +83,8 @@ class ExploringPolicy(TensorDictModuleBase):
     """The policy that collects: network noise drawn anew at every step, or random legal actions.
 
     Under ``set_exploration_type`` of DETERMINISTIC, MODE or MEAN it does not explore; otherwise it does, so that
-    collecting outside any context (where TorchRL's noisy layers are silent) is not greedy by accident.
+    collecting outside any context (where TorchRL's noisy layers are silent) is not greedy by accident. Where the
+    environment writes ``action_mask``, all actions are among the allowed ones, and ``legal`` is not asked.
 
     Args:
         network: its noise is redrawn in place, in one draw for all environments of the batch.
@@ -65,9 +109,12 @@ class ExploringPolicy(TensorDictModuleBase):
             redraw_noise(self.network, self.generator)
         with set_exploration_type(ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
-        action = values.argmax(-1)
+        mask = tensordict.get(keys.ACTION_MASK, None)
+        action = allowed_values(values, mask).argmax(-1)
         if explore and self.epsilon > 0.0:
-            action = self._mix(action, torch.ones_like(values) if self.legal is None else self.legal(tensordict))
+            if mask is None:
+                mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
+            action = self._mix(action, mask)
         chosen = values.gather(-1, action[..., None])
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 

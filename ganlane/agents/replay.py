@@ -19,6 +19,8 @@ TRANSITION_KEYS = (
     ("next", "reward"),
     ("next", "terminated"),
 )
+#: What it has besides where the environment has a mask.
+MASK_KEY: tuple[str, ...] = ("next", "action_mask")
 
 
 def make_replay(
@@ -49,7 +51,9 @@ def annealed(start: float, end: float, done: int, total: int) -> float:
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """The transitions in use (tensors by dotted key), the place of the next one, the sampler: plain data."""
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
-    tensors = {".".join(_path(key)): rows.get(key) for key in TRANSITION_KEYS} if len(buffer) else {}
+    masked = rows.get(MASK_KEY, None) is not None
+    stored = (*TRANSITION_KEYS, MASK_KEY) if masked else TRANSITION_KEYS
+    tensors = {".".join(_path(key)): rows.get(key) for key in stored} if len(buffer) else {}
     if len(buffer) < buffer.storage.max_size:  # a view would be saved with all of the storage behind it
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     state = {"rows": tensors, "cursor": buffer.writer._cursor, "sampler": buffer.sampler.state_dict()}

@@ -17,7 +17,7 @@ from ganlane.compare import compare_as_told
 from ganlane.config.evaluate import EvaluateConfig, all_traffics
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
-from ganlane.evaluation import evaluation_rows, write_episodes, write_results
+from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import plain
 
 #: A driver's name, a loaded driver, or a policy of your own (named by its class).
@@ -34,6 +34,7 @@ def evaluate(
     env: Option = "highway",
     observation: Option = "lane_view_overlap",
     reward: Option = "paper",
+    mask: Option = "none",
     device: str = "cpu",
     per_episode: bool = False,
     folder: str | Path | None = None,
@@ -58,7 +59,7 @@ def evaluate(
         seed: of the episodes.
         num_envs: episodes driven side by side; the numbers do not depend on it.
         env, reward: the same for all; ``overrides`` are keys of the environment.
-        observation: for policies that name none.
+        observation, mask: for policies that name none.
         device: ``cpu`` or ``cuda``.
         per_episode: one row per episode instead (:func:`ganlane.evaluation.run_episodes`).
         folder: write ``results.json`` and ``episodes.parquet`` there, as the command does.
@@ -71,7 +72,7 @@ def evaluate(
         UserError: an unknown name, a wrong value, or a policy that does not fit.
     """
     named, given = [_name(agent) for agent in agents], _traffics(traffics)
-    parts: dict[str, Option | None] = {"env": env, "observation": observation, "reward": reward}
+    parts: dict[str, Option | None] = {"env": env, "observation": observation, "reward": reward, "mask": mask}
     told = {"episodes": episodes, "seed": seed, "num_envs": num_envs, "device": device}
     lists = {"agents": named, "traffics": list(given), "traffic_options": {**all_traffics(), **given}}
     config = command_config(EvaluateConfig, parts, {**overrides, **told, **lists})
@@ -122,6 +123,6 @@ def _traffics(traffics: Sequence[Option] | Mapping[str, Option]) -> dict[str, Tr
 def _keep(folder: Path, table: pl.DataFrame, rows: list[dict[str, Any]], config: EvaluateConfig) -> None:
     """The files of the command."""
     folder.mkdir(parents=True, exist_ok=True)
-    seeds = {"stream": "report", "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
     write_episodes(folder, table)
-    write_results(folder, {"rows": rows}, asdict(config), seeds)
+    write_results(folder, {"rows": rows, "paired": paired_rows(table)}, asdict(config), seeds)

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 from omegaconf import OmegaConf
 
 from ganlane.config.checks import did_you_mean
+from ganlane.config.mask import MASKS
 from ganlane.config.messages import CONFIG_ERRORS, sentence
 from ganlane.config.observation import FORMS
 from ganlane.config.store import SCHEMAS
@@ -24,6 +25,7 @@ DEFAULTS = {
     "env": "highway",
     "traffic": "idm_mobil",
     "observation": "lane_view_overlap",
+    "mask": "none",
     "reward": "paper",
     "agent": "rainbow",
     "init": "none",
@@ -69,14 +71,14 @@ def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
     """Dataclass of an option and the values that its name stands for."""
     if group == "traffic" and inspect.isclass(name):
         return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
-    known = FORMS if group == "observation" else tuple(SCHEMAS[group])
+    known = {"observation": FORMS, "mask": MASKS}.get(group) or tuple(SCHEMAS[group])
     if group == "traffic" and isinstance(name, str) and "." in name:
         return TrafficConfig, {"_target_": name}
     if name not in known:
         hint = did_you_mean(str(name), known)
         raise UserError(f"{group}={name}: no such option{hint}; choose one of {', '.join(known)}.")
-    if group == "observation":
-        return SCHEMAS[group]["observation"], {"form": name}
+    if group in ("observation", "mask"):
+        return SCHEMAS[group][group], {"form": name}
     return SCHEMAS[group][name], {}
 
 

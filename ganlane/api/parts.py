@@ -26,6 +26,7 @@ def make_env(
     env: Option = "highway",
     observation: Option = "lane_view_overlap",
     reward: Option = "paper",
+    mask: Option = "none",
     transforms: Sequence[Transform] = (),
     seed: int = 0,
     stream: str = "train",
@@ -49,7 +50,9 @@ def make_env(
         env: an option of the group ``env``: ``highway``, ``dense``, or a scenario such as ``cut_in``.
         observation: ``table3``, ``table3_progress``, ``lane_view``, ``lane_view_drift``, ``lane_view_overlap``,
             ``table3_lane_view``, ``fixed_order``, or a mapping.
-        reward: ``paper``, or a mapping of what differs from it, ``{"hard_crash": -200}``.
+        reward: ``paper``, ``considerate``, or a mapping of what differs from it, ``{"hard_crash": -200}``.
+        mask: ``none``, ``legal`` or ``safe`` (writes ``action_mask`` [N, 3] bool), or a mapping such as
+            ``{"name": "safe", "safe_deceleration": 3.0}``.
         transforms: your own, after observation and reward.
         seed: base of the random numbers.
         stream: family of the episodes: ``train``, ``select`` or ``report`` (that of ``evaluate``).
@@ -63,7 +66,9 @@ def make_env(
     check_pay(config, pay)
     run = RunConfig(seed=whole("seed", seed), device=device)
     module = build.make_traffic(option("traffic", traffic), config, stream_of(stream))
-    made = build.make_env(module, config, seen, pay, rows_of(num_envs), run.seed, run.device)
+    made = build.make_env(
+        module, config, seen, pay, rows_of(num_envs), run.seed, run.device, mask=option("mask", mask)
+    )
     for transform in transforms:
         made.append_transform(transform)
     return made
@@ -72,12 +77,12 @@ def make_env(
 def load_agent(
     name: str, *, env: Option = "highway", stream: str = "report", device: str = "cpu", **overrides: Any
 ) -> Driver:
-    """Somebody who can drive the ego: ``.policy`` and the ``.observation`` that it reads (None: the raw state).
+    """Somebody who can drive the ego: ``.policy``, its ``.observation`` (None: the raw state) and its ``.mask``.
 
     ::
 
         agent = load_agent("agent_idm")
-        env = make_env(traffic="gan", num_envs=64, observation=agent.observation)
+        env = make_env(traffic="gan", num_envs=64, observation=agent.observation, mask=agent.mask)
         rollout = env.rollout(100, agent.policy)
 
     On the command line: ``ganlane evaluate 'agents=[agent_idm]'``.

@@ -33,6 +33,7 @@ def train(
     env: Option = "highway",
     observation: Option = "lane_view_overlap",
     reward: Option = "paper",
+    mask: Option = "none",
     num_envs: int = 128,
     logger: Option = "csv",
     evaluation: Mapping[str, Any] | None = None,
@@ -53,7 +54,7 @@ def train(
         ganlane train traffic=gan init=idm_ckpt total_decisions=3000000 env.lanes=4 evaluation.episodes=1000
 
     Args:
-        traffic, env, observation, reward: as in :func:`ganlane.api.make_env`.
+        traffic, env, observation, reward, mask: as in :func:`ganlane.api.make_env`.
         init: ``idm_ckpt`` (the agent that ships), ``none``, or ``{"name": "idm_ckpt", "path": FILE}``; ``support``
             and ``optimizer`` are further keys (docs/training.md, 'Transfer').
         total_decisions: of all environments together.
@@ -77,7 +78,8 @@ def train(
     if resume and folder is None:
         raise UserError("resume=True: which run? give its folder, for instance folder='outputs/train/RUN'.")
     parts: dict[str, Option] = {"traffic": traffic, "init": init, "agent": agent, "env": env}
-    parts |= {"observation": observation, "reward": reward, "logger": logger, "collector": {"num_envs": num_envs}}
+    parts |= {"observation": observation, "reward": reward, "mask": mask, "logger": logger}
+    parts |= {"collector": {"num_envs": num_envs}}
     told: dict[str, Any] = {"total_decisions": total_decisions, "seed": seed}
     told |= {"evaluation": _with_traffic(evaluation), "pretrain": _with_traffic(pretrain)}
     config = command_config(TrainConfig, parts, {**overrides, **told, "resume": str(folder) if resume else None})

@@ -37,6 +37,11 @@ def below(high: float) -> Rule:
     return Rule(lambda value: _finite(value) and value < high, f"a number below {_shown(high)}")
 
 
+def at_most(high: float) -> Rule:
+    """Finite and not above ``high``."""
+    return Rule(lambda value: _finite(value) and value <= high, f"at most {_shown(high)}")
+
+
 def between(low: float, high: float) -> Rule:
     """From ``low`` to ``high``, both included."""
     return Rule(

@@ -100,6 +100,10 @@ class EnvConfig:
     ego_desired_speed_mps: float = 25.0
     length_m: float = 4.5
     width_m: float = 2.5
+    truck_share: float = 0.0
+    truck_length_m: float = 12.0
+    truck_width_m: float = 2.5
+    truck_desired_speed_mps: list[float] = field(default_factory=lambda: [22.0, 25.0])
     decision_period_s: float = 1.0
     goal_m: float = 5000.0
     timeout_s: float = 1000.0
@@ -122,25 +126,31 @@ class EnvConfig:
             ego_desired_speed_mps=above(0),
             length_m=above(0),
             width_m=above(0),
+            truck_share=between(0, 1),
+            truck_length_m=above(0),
+            truck_width_m=above(0),
             decision_period_s=above(0),
             goal_m=above(0),
             timeout_s=above(0),
             **dict.fromkeys(("front_speed_mps", "rear_speed_mps", "ego_speed_mps"), speed_range()),
-            desired_speed_mps=speed_range(),
+            **dict.fromkeys(("desired_speed_mps", "truck_desired_speed_mps"), speed_range()),
         )
         self._check_together()
 
     def _check_together(self) -> None:
-        if self.desired_speed_mps[0] <= 0:
-            raise UserError(
-                f"env.desired_speed_mps={self.desired_speed_mps}: expected speeds above 0; a driver that wants to "
-                "stand still is no driver."
-            )
-        if self.lane_width_m <= self.width_m:
-            raise UserError(
-                f"env.lane_width_m={self.lane_width_m:g}: expected more than env.width_m={self.width_m:g}, or "
-                "vehicles in neighbouring lanes touch; widen the lanes."
-            )
+        for name in ("desired_speed_mps", "truck_desired_speed_mps"):
+            speeds = getattr(self, name)
+            if speeds[0] <= 0:
+                raise UserError(
+                    f"env.{name}={speeds}: expected speeds above 0; a driver that wants to stand still is no driver."
+                )
+        for name in ("width_m", "truck_width_m") if self.truck_share > 0 else ("width_m",):
+            width = getattr(self, name)
+            if self.lane_width_m <= width:
+                raise UserError(
+                    f"env.lane_width_m={self.lane_width_m:g}: expected more than env.{name}={width:g}, or vehicles "
+                    "in neighbouring lanes touch; widen the lanes."
+                )
         if self.timeout_s < self.decision_period_s:
             raise UserError(
                 f"env.timeout_s={self.timeout_s:g}: expected at least env.decision_period_s="
@@ -153,7 +163,7 @@ class EnvConfig:
         """Refuse first scenes that do not fit on the road, or from which nobody could drive on."""
         self.spawn_parameters().check(self.vehicles, self.lanes, self.idm.parameters())
 
-    def scenes(self, others_visibility: Visibility | None = None) -> Scenes | None:
+    def scenes(self, others_visibility: int | None = None) -> Scenes | None:
         """Where an episode's vehicles start: None for Table II; ``others_visibility`` is the traffic's."""
         return None
 

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.config.checks import Rule, at_least, between, check, did_you_mean
+from ganlane.config.checks import Rule, at_least, between, check, did_you_mean, one_of
 from ganlane.config.env import EnvConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
-from ganlane.config.traffic import (
-    GanCalibratedTrafficConfig,
-    GanTrafficConfig,
-    IdmMobilTrafficConfig,
-    IdmTrafficConfig,
-    TrafficConfig,
-)
-from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic import TrafficConfig
 from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
+from ganlane.config.traffic_mixed import MixedTrafficConfig, reacting_traffics
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
 
+#: Families of episodes that can be driven for a table: to choose on, to report on.
+STREAMS = ("report", "select")
 #: A list of names without repetitions.
 NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
 
@@ -28,11 +25,8 @@ NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a 
 def all_traffics() -> dict[str, TrafficConfig]:
     """The options of the group ``traffic``, by name."""
     return {
-        "idm": IdmTrafficConfig(),
-        "idm_mobil": IdmMobilTrafficConfig(),
-        "gan": GanTrafficConfig(),
-        "gan_calibrated": GanCalibratedTrafficConfig(),
-        "idm_faults": IdmFaultsTrafficConfig(),
+        **reacting_traffics(),
+        "mixed": MixedTrafficConfig(),
         "replay": ReplayTrafficConfig(),
         "sumo": SumoTrafficConfig(),
         "highway_env": HighwayEnvTrafficConfig(),
@@ -47,8 +41,10 @@ class EvaluateConfig(RunConfig):
     traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
     episodes: int = 100
     num_envs: int = 128
+    stream: str = "report"
     env: EnvConfig = field(default_factory=EnvConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
+    mask: MaskConfig = field(default_factory=MaskConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     traffic_options: dict[str, TrafficConfig] = field(default_factory=all_traffics)
@@ -56,6 +52,7 @@ class EvaluateConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self, "", agents=NAMES, traffics=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+        check(self, "", stream=one_of(STREAMS))
         check_pay(self.env, self.reward)
         self.chosen_traffics()
 

@@ -18,13 +18,16 @@ _TAKEN = ("random", "constant_velocity")
 _RECORDED = "replay"
 #: Those that drive around an ego of ours only; a card has none.
 _FOREIGN = ("sumo", "highway_env")
+#: No traffic of its own: its parts have cards.
+_MIXED = "mixed"
 _QUICK_KM = 5.0
 _QUICK_S = 30.0
 
 
 def drivable() -> dict[str, TrafficConfig]:
-    """The options of the group ``traffic`` that can have a card, by name: all that need no ego."""
-    return {name: traffic for name, traffic in all_traffics().items() if name not in (_RECORDED, *_FOREIGN)}
+    """The options of the group ``traffic`` that can have a card, by name: neither recordings nor mixtures, no ego."""
+    without = (_RECORDED, _MIXED, *_FOREIGN)
+    return {name: traffic for name, traffic in all_traffics().items() if name not in without}
 
 
 @dataclass
@@ -74,6 +77,8 @@ class RealismConfig(RunConfig):
                 f"traffic={self.traffic.label()}: a foreign simulator drives around an ego only, and a card has "
                 "none; choose one of our own."
             )
+        if self.traffic.label() == _MIXED:
+            raise UserError("traffic=mixed: a card is of one traffic; make one of each of its parts.")
         if self.data.format != "scenes":
             raise UserError(
                 f"data={self.data.format}: the card reads scenes; run ganlane prepare data={self.data.format} first, "

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ganlane.config.checks import Rule, above, at_least, between, check, every, optional, text
 from ganlane.config.env import EnvConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
@@ -84,6 +85,7 @@ class RenderConfig(RunConfig):
     env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
+    mask: MaskConfig = field(default_factory=MaskConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     film: FilmConfig = field(default_factory=FilmConfig)

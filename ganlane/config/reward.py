@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import below, check, number
+from ganlane.config.checks import at_most, below, check, number
 from ganlane.config.plain import plain_copy
 from ganlane.errors import UserError
 
@@ -26,16 +26,25 @@ class RewardConfig:
     hard_crash: float = -100.0
     soft_crash: float = -10.0
     goal: float = 100.0
+    soft_crash_behind: float = 0.0
 
     def __post_init__(self) -> None:
         terms = ("lane_change", "out_of_road", "hard_crash", "soft_crash", "goal", "base_speed_mps")
-        check(self, "reward", low_acceleration=below(0), **dict.fromkeys(terms, number()))
+        limits = {"low_acceleration": below(0), "soft_crash_behind": at_most(0)}
+        check(self, "reward", **limits, **dict.fromkeys(terms, number()))
 
     def parameters(self) -> RewardParameters:
         """As the transform takes it."""
         from ganlane.transforms import RewardParameters
 
         return plain_copy(self, RewardParameters)
+
+
+@dataclass
+class ConsiderateRewardConfig(RewardConfig):
+    """``reward=considerate``: the paper's, and an onset of danger behind the ego costs what one ahead of it does."""
+
+    soft_crash_behind: float = -10.0
 
 
 def check_pay(env: EnvConfig, reward: RewardConfig) -> None:

@@ -24,6 +24,10 @@ TABLE_II_KEYS = (
     "desired_speed_mps",
     "length_m",
     "width_m",
+    "truck_share",
+    "truck_length_m",
+    "truck_width_m",
+    "truck_desired_speed_mps",
 )
 
 
@@ -72,17 +76,17 @@ class SceneEnvConfig(EnvConfig):
     def _check_start(self) -> None:
         self.fixed_scene().check(self._road(), self.idm.parameters())
 
-    def scenes(self, others_visibility: Visibility | None = None) -> FixedScene:
+    def scenes(self, others_visibility: int | None = None) -> FixedScene:
         """The scene as the environment takes it, see :meth:`EnvConfig.scenes`."""
         return self.fixed_scene(others_visibility)
 
-    def fixed_scene(self, others_visibility: Visibility | None = None) -> FixedScene:
+    def fixed_scene(self, others_visibility: int | None = None) -> FixedScene:
         """The scene; ``others_visibility`` is the traffic's."""
         from ganlane.sim.fixed_scene import FixedScene
 
         return FixedScene(self.rows(), self._road(), name=self.name(), **self._scene_options(others_visibility))
 
-    def _scene_options(self, others_visibility: Visibility | None) -> dict[str, Any]:
+    def _scene_options(self, others_visibility: int | None) -> dict[str, Any]:
         from ganlane.sim.lanes import Visibility
 
         return {

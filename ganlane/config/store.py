@@ -17,11 +17,12 @@ from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorConfig
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.prepare import PrepareConfig
 from ganlane.config.realism import RealismConfig
 from ganlane.config.render import RenderConfig
-from ganlane.config.reward import RewardConfig
+from ganlane.config.reward import ConsiderateRewardConfig, RewardConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -37,6 +38,8 @@ from ganlane.config.traffic import (
 )
 from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
 from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
+from ganlane.config.traffic_mixed import MixedTrafficConfig
+from ganlane.config.traffic_random import IdmRandomTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
@@ -67,6 +70,8 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "gan": GanTrafficConfig,
         "gan_calibrated": GanCalibratedTrafficConfig,
         "idm_faults": IdmFaultsTrafficConfig,
+        "idm_random": IdmRandomTrafficConfig,
+        "mixed": MixedTrafficConfig,
         "replay": ReplayTrafficConfig,
         "sumo": SumoTrafficConfig,
         "highway_env": HighwayEnvTrafficConfig,
@@ -74,7 +79,8 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
     "observation": {"observation": ObservationConfig},
-    "reward": {"paper": RewardConfig},
+    "mask": {"mask": MaskConfig},
+    "reward": {"paper": RewardConfig, "considerate": ConsiderateRewardConfig},
     "collector": {"single": CollectorConfig, "multi": MultiCollectorConfig, "ray": RayCollectorConfig},
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},

@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from ganlane.config.checks import Rule, at_least, between, check, optional
@@ -30,18 +30,24 @@ NAMES = {
     "ganlane.traffic.ReplayTraffic": "replay",
     "ganlane.traffic.SumoTraffic": "sumo",
     "ganlane.traffic.HighwayEnvTraffic": "highway_env",
+    "ganlane.traffic.IdmRandomTraffic": "idm_random",
+    "ganlane.traffic.MixedTraffic": "mixed",
 }
 
 
 @dataclass
 class TrafficConfig:
-    """What every traffic option has: a target, and free parameters for it."""
+    """What every traffic option has: a target, free parameters for it, and how often the others are blind to the ego.
+
+    ``blind_share`` is the share of the episodes in which they do not see it (:class:`ganlane.traffic.BlindTraffic`).
+    """
 
     _target_: str = "ganlane.traffic.IdmTraffic"
     parameters: dict[str, Any] = field(default_factory=dict)
+    blind_share: float = 0.0
 
     def __post_init__(self) -> None:
-        check(self, "traffic", _target_=_IMPORT_PATH)
+        check(self, "traffic", _target_=_IMPORT_PATH, blind_share=between(0, 1))
 
     def label(self) -> str:
         """Name in tables: the option's, or the target's of a model of your own."""
@@ -52,6 +58,17 @@ class TrafficConfig:
         shared = {known.name for known in fields(TrafficConfig)}
         own = {known.name: getattr(self, known.name) for known in fields(self) if known.name not in shared}
         return {**own, **self.parameters}
+
+    def parts(self) -> dict[str, TrafficConfig]:
+        """Traffics that the target is made of, by name; it is given the models made of them as ``parts``."""
+        return {}
+
+    def description(self) -> dict[str, Any]:
+        """Plain data by which a run is recognised; what has no effect, and older runs do not hold, is left out."""
+        described = asdict(self)
+        if not self.blind_share:
+            del described["blind_share"]
+        return described
 
 
 @dataclass

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ganlane.config.checks import at_least, check
 from ganlane.config.traffic import TrafficConfig
+from ganlane.errors import UserError
 
 
 @dataclass
@@ -19,3 +20,8 @@ class ReplayTrafficConfig(TrafficConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check(self, "traffic", least_s=at_least(0.1))
+        if self.blind_share:
+            raise UserError(
+                f"traffic.blind_share={self.blind_share:g} with replayed traffic: recorded vehicles see no ego "
+                "anyway; leave it out."
+            )

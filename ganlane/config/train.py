@@ -11,6 +11,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import NAMES
 from ganlane.config.init import InitConfig
 from ganlane.config.logger import LoggerConfig
+from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
@@ -63,6 +64,7 @@ class TrainConfig(RunConfig):
     init: InitConfig = field(default_factory=InitConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
+    mask: MaskConfig = field(default_factory=MaskConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)

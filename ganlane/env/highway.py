@@ -20,7 +20,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.sim.ego import EgoParameters
 from ganlane.sim.episode import EpisodeParameters
 from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.random import absorb, episode_key
+from ganlane.sim.random import episode_key
 from ganlane.sim.recycle import out_of_range
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.scenes import RandomScenes, Scenes
@@ -51,8 +51,9 @@ class HighwayEnv(EnvBase):
             (:mod:`ganlane.sim.recycle`), so that the road never empties.
 
     An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with ``seed`` and
-    ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. :attr:`recorder`, if set, is called
-    after every physics step.
+    ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With a mask the masked rows go on to
+    their episode plus N, or to ``next_episode`` [N] in ``reset(td, next_episode=...)``, on the seed in ``td``.
+    :attr:`recorder`, if set, is called after every physics step.
 
     Raises:
         UserError: the vehicles do not fit on the road or could not brake in time, the decision period is not a
@@ -153,8 +154,10 @@ class HighwayEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self._seed = 0 if seed is None else int(seed)
 
-    def _episodes(self, tensordict: TensorDictBase | None) -> tuple[Tensor, Tensor]:
-        """Seed and episode [N] of every row after this reset."""
+    def _episodes(
+        self, tensordict: TensorDictBase | None, next_episode: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Seed and episode [N] of every row after this reset; ``next_episode`` [N] counts in masked rows only."""
         n = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
@@ -165,14 +168,17 @@ class HighwayEnv(EnvBase):
         else:
             seed = torch.full((n,), self._seed, dtype=torch.int64, device=self.device)
             return seed, self.first_episode + torch.arange(n, device=self.device)
-        return seed, last if mask is None else torch.where(mask.reshape(n), last + n, last)
+        if mask is None:
+            return seed, last
+        return seed, torch.where(mask.reshape(n), last + n if next_episode is None else next_episode, last)
 
-    def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None, next_episode: Tensor | None = None, **kwargs: object
+    ) -> TensorDictBase:
         """All rows at the start of their episodes; EnvBase keeps those of the rows that were not asked for."""
-        seed, episode = self.last_episodes = self._episodes(tensordict)
+        seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
         key = episode_key(self.stream, seed, episode)
-        vehicles = self.scenes(key, self.dtype).with_finite_padding()
-        memory = self.traffic.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
+        vehicles, memory = self.traffic.enter(self.scenes(key, self.dtype).with_finite_padding(), key, episode)
         zero = torch.zeros(self.batch_size, dtype=self.dtype, device=self.device)
         rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
         rest |= {name: zero[:, None].bool() for name in DONE_FLAGS}

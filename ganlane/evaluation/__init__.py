@@ -5,7 +5,8 @@ The path of a number: :func:`run_episodes` drives the episodes 0 to E - 1 and gi
 bootstrap intervals (:mod:`~ganlane.evaluation.statistics`), exact intervals for crashes
 (:mod:`~ganlane.evaluation.counts`) and the normalised score (:mod:`~ganlane.evaluation.score`);
 on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resamples whole scenes;
-:func:`text_table` and :func:`markdown_table` print it; :func:`write_results` and :func:`write_episodes` keep it.
+:func:`paired_rows` holds the first driver against the others on the same episodes;
+:func:`text_table`, :func:`markdown_table` and :func:`paired_table` print them; :func:`write_results` and :func:`write_episodes` keep it.
 Which crashes nobody could have avoided, :func:`beam_search` tells, which looks for a way through an episode on the
 simulator itself (:mod:`~ganlane.evaluation.crash_floor`).
 Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them against recorded driving.
@@ -17,7 +18,8 @@ from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene
 from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_per_1000_km
 from ganlane.evaluation.crash_floor import Way, floor_rows, search_left, ways_of_drivers
 from ganlane.evaluation.episodes import run_episodes
-from ganlane.evaluation.layout import markdown_table, text_table
+from ganlane.evaluation.layout import markdown_table, paired_table, text_table
+from ganlane.evaluation.paired import paired_rows
 from ganlane.evaluation.provenance import code_version, machine
 from ganlane.evaluation.results import results_record, write_episodes, write_results
 from ganlane.evaluation.rides import Ride, drive, replay
@@ -53,6 +55,8 @@ __all__ = [
     "mean_interval",
     "normalized_percent",
     "paired_difference",
+    "paired_rows",
+    "paired_table",
     "poisson_interval",
     "probability_of_improvement",
     "rate_per_1000_km",

@@ -1,8 +1,12 @@
-"""Running given episodes with a policy, and one row of facts about each of them."""
+"""Running given episodes with a policy, and one row of facts about each of them.
+
+The rows of the batch drive side by side. A row whose episode has ended takes the next one that has not been driven
+yet, so none waits for the slowest. Once all have been handed out, the last ones move to smaller batches.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import polars as pl
 import torch
@@ -10,16 +14,21 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.evaluation.tally import EpisodeTally
 
-#: Told after every look at the rows: (episodes finished, episodes in all).
+#: Called after every look at the rows with (episodes finished, episodes in all).
 Progress = Callable[[int, int], None]
-#: Decisions between two looks at whether all rows have finished; each look waits for the device once.
+#: Makes the same environment with another number of rows.
+MakeEnv = Callable[[int], EnvBase]
+#: Decisions between two looks at which rows have ended. A look waits for the device and a reset costs about a tenth
+#: of a decision; a row that has ended waits 3.5 decisions on average, of more than 200 in an episode.
 CHECK_EVERY = 8
+#: A batch of at most so many rows is not made smaller: fewer are hardly faster.
+SMALL_BATCH = 16
 #: The reason of an episode that something outside the environment ended (a user's own transform).
 OTHER = "other"
 
@@ -30,18 +39,25 @@ def run_episodes(
     episodes: Sequence[int],
     seed: int,
     on_progress: Progress | None = None,
+    make_smaller: MakeEnv | None = None,
 ) -> pl.DataFrame:
-    """Drive exactly ``episodes`` of ``seed``; one row per episode, in the order given.
+    """Drive exactly ``episodes`` of ``seed``, each to its own end; one row per episode, in the order given.
 
-    They run in chunks of the environment's batch size; a row that finishes first is ignored until the chunk
-    is done, so long episodes are not under-represented. The policy acts deterministically, without gradients.
+    Which episodes are counted does not depend on how long any of them takes, so short ones are not favoured.
+    Rule-driven traffic gives the same numbers in any batch bit for bit, generated traffic up to rounding. The policy
+    acts deterministically, without gradients.
 
     Args:
-        env: batched environment, batch size ``[N]``, whose ``reset`` takes ``seed`` and ``episode``.
+        env: batched environment, batch size ``[N]``, whose ``reset`` takes ``seed`` and ``episode`` in the
+            tensordict, and as an argument ``next_episode`` [N], which the rows of a ``_reset`` mask start
+            (:class:`ganlane.env.HighwayEnv` and what is built around it).
         policy: writes ``action``; reads the observation or the raw state.
         episodes: episode numbers, for instance ``range(1000)``.
         seed: the seed of all of them.
         on_progress: called now and then with (episodes finished, episodes in all).
+        make_smaller: makes ``env`` with fewer rows; the last episodes move there when at most half of the rows are
+            still driving. Not used where the traffic or the policy holds something per row: traffic has
+            ``rows_must_stay`` then, and a policy counts as such unless it has ``rows_must_stay = False``.
 
     Returns:
         Columns ``episode, seed, reason`` (``goal``, ``hard_crash``, ``out_of_road``, ``timeout``,
@@ -51,35 +67,17 @@ def run_episodes(
         ``lane_changes``.
 
     Raises:
-        UserError: no episodes are asked for, or the environment is not batched in one dimension.
+        UserError: no episodes are asked for, the environment is not batched in one dimension, or its reset ignores
+            ``next_episode``.
     """
     if len(episodes) == 0:
         raise UserError("episodes: none were asked for; expected at least one, give for instance episodes=100.")
     if len(env.batch_size) != 1:
         shape = list(env.batch_size)
         raise UserError(f"env: batch size {shape} was found, expected [N]; build the environment with N rows.")
-    frames = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for start, chunk in _chunks(episodes, env.batch_size[0]):
-            report = _progress_of_chunk(on_progress, start, len(episodes))
-            frames.append(_run_chunk(env, policy, chunk, seed, report))
-    return pl.concat(frames)
-
-
-def _chunks(episodes: Sequence[int], size: int) -> Iterator[tuple[int, list[int]]]:
-    """(position, numbers) of each run of at most ``size`` episodes."""
-    for start in range(0, len(episodes), size):
-        yield start, list(episodes[start : start + size])
-
-
-def _progress_of_chunk(on_progress: Progress | None, before: int, total: int) -> Callable[[int], None]:
-    """A function that reports a chunk's finished episodes on top of those finished ``before`` it."""
-
-    def report(finished: int) -> None:
-        if on_progress is not None:
-            on_progress(before + finished, total)
-
-    return report
+        measures = _Evaluation(env, policy, list(episodes), seed, make_smaller).run(on_progress)
+    return _episode_rows(measures, list(episodes), seed)
 
 
 def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
@@ -90,25 +88,101 @@ def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
     return TensorDict({keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode}, [rows], device=env.device)
 
 
-def _run_chunk(
-    env: EnvBase, policy: TensorDictModuleBase, numbers: list[int], seed: int, report: Callable[[int], None]
-) -> pl.DataFrame:
-    """Run at most N episodes to their ends."""
-    state: TensorDictBase = env.reset(start_of(env, numbers, seed))
-    tally = EpisodeTally(torch.arange(env.batch_size[0], device=env.device) < len(numbers))
-    driving = len(numbers)
-    while driving > 0:
-        for _ in range(CHECK_EVERY):
-            stepped, state = env.step_and_maybe_reset(policy(state))
-            tally.add(stepped["next"])
-        driving = int(tally.driving.sum())
-        report(len(numbers) - driving)
-    return _episode_rows(tally.measures(), numbers, seed)
+class _Evaluation:
+    """Episodes on their way through the rows of an environment; arguments as :func:`run_episodes` has them.
+
+    Attributes:
+        place: [N] int64, where in the list of episodes the one of a row stands; the list's length in spare rows.
+        handed_out: episodes that have been started.
+        finished: places and counts of those that have ended.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase,
+        numbers: list[int],
+        seed: int,
+        make_smaller: MakeEnv | None,
+    ) -> None:
+        rows, self.total = env.batch_size[0], len(numbers)
+        rows_stay = getattr(getattr(env, "traffic", None), "rows_must_stay", False)
+        self.env, self.policy = env, policy
+        self.make_smaller = None if rows_stay or getattr(policy, "rows_must_stay", True) else make_smaller
+        # What holds something per row outside the tensordict might not stand being driven on after an end.
+        self.check_every = 1 if rows_stay else CHECK_EVERY
+        self.numbers = torch.tensor(numbers, dtype=torch.int64, device=env.device)
+        self.place = torch.arange(rows, device=env.device).clamp_max(self.total)
+        self.handed_out = min(rows, self.total)
+        self.finished: list[tuple[Tensor, dict[str, Tensor]]] = []
+        self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
+        self.tally = EpisodeTally(self.place < self.total)
+
+    def run(self, on_progress: Progress | None) -> dict[str, Tensor]:
+        """Drive all episodes to their ends; the counts by name, each [E], in the order of the episodes."""
+        done = 0
+        while done < self.total:
+            for _ in range(self.check_every):
+                after = self.env.step(self.policy(self.state))
+                self.tally.add(after["next"])
+                self.state = step_mdp(after)
+            self._collect()
+            done = sum(len(places) for places, _ in self.finished)
+            if on_progress is not None:
+                on_progress(done, self.total)
+            if done < self.total:
+                self._go_on()
+        order = torch.cat([places for places, _ in self.finished]).argsort()
+        names = self.finished[0][1]
+        return {name: torch.cat([counts[name] for _, counts in self.finished])[order] for name in names}
+
+    def _collect(self) -> None:
+        """Put aside the counts of the episodes that have ended; their rows are spare then."""
+        ended = ((self.place < self.total) & ~self.tally.driving).nonzero()[:, 0]
+        if len(ended) > 0:
+            self.finished.append((self.place[ended].cpu(), self.tally.measures(ended)))
+            self.place[ended] = self.total
+
+    def _go_on(self) -> None:
+        """Give spare rows the next episodes; without any, start the last ones again or leave such rows out."""
+        driving = self.tally.driving.nonzero()[:, 0]
+        rows = self.env.batch_size[0]
+        wide = rows > SMALL_BATCH and 2 * len(driving) <= rows
+        if wide and self.handed_out == self.total and self.make_smaller is not None:
+            self._shrink(self.make_smaller(len(driving)), driving)
+            return
+        spare = (~self.tally.driving).nonzero()[:, 0]
+        new = spare[: self.total - self.handed_out]
+        self.place[new] = torch.arange(self.handed_out, self.handed_out + len(new), device=self.place.device)
+        self.handed_out += len(new)
+        self._reset(new)
+        self.tally.begin(new)
+
+    def _reset(self, new: Tensor) -> None:
+        """Start the episodes of the rows ``new``; spare rows that have ended start theirs again, for nothing."""
+        mask = self.state["done"] & (self.place == self.total)[:, None]
+        mask[new] = True
+        if not bool(mask.any()):
+            return
+        wanted = torch.where(
+            self.place < self.total, self.numbers[self.place.clamp_max(self.total - 1)], self.state[keys.EPISODE]
+        )
+        self.state = self.env.reset(self.state.set("_reset", mask), next_episode=wanted)
+        if not torch.equal(self.state[keys.EPISODE], wanted):
+            raise UserError(
+                "env: its reset did not start the episodes that it was given; take next_episode [N] in _reset and "
+                "start it in the rows of the _reset mask, as ganlane.env.HighwayEnv does."
+            )
+
+    def _shrink(self, smaller: EnvBase, rows: Tensor) -> None:
+        """Go on with ``rows`` alone, in an environment of as many."""
+        self.env, self.state, self.place = smaller, self.state[rows], self.place[rows]
+        self.tally.keep(rows)
 
 
 def _episode_rows(measures: dict[str, Tensor], numbers: list[int], seed: int) -> pl.DataFrame:
-    """The rows of a chunk from its tally (see :func:`run_episodes` for the columns)."""
-    counts = {name: value[: len(numbers)].numpy() for name, value in measures.items()}
+    """The rows of the episodes ``numbers`` from their counts (see :func:`run_episodes` for the columns)."""
+    counts = {name: value.numpy() for name, value in measures.items()}
     terms = [name for name in counts if name.startswith("reward_")]
     integer = pl.Int64
     frame = pl.DataFrame({"episode": numbers, **counts})

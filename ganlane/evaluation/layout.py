@@ -75,14 +75,33 @@ def _notes(rows: Sequence[Row]) -> list[str]:
 def text_table(rows: Sequence[Row]) -> str:
     """The rows as aligned columns for a terminal, with a line for each reason why a score is missing."""
     headings, cells = _grid(rows)
+    return "\n".join([*_aligned(headings, cells, _NAMES), *_notes(rows)])
+
+
+def paired_table(rows: Sequence[Row]) -> str:
+    """The rows of :func:`ganlane.evaluation.paired_rows` as aligned columns for a terminal."""
+    lead = _number("lead", 1)
+    cells = [
+        [f"{row['agent']} over {row['over']}", row["traffic"], _signed(row["lead"], lead(row)), row["verdict"]]
+        for row in rows
+    ]
+    return "\n".join(_aligned(["paired lead", "traffic", "reward [95 %]", "verdict"], cells, names=2))
+
+
+def _signed(value: float, text: str) -> str:
+    """``text`` of a difference, with a plus where it is one."""
+    return text if value < 0.0 else f"+{text}"
+
+
+def _aligned(headings: Cells, cells: Sequence[Cells], names: int) -> Cells:
+    """Lines of a table: headings, a ruler and the rows; the first ``names`` columns to the left, others to the right."""
     widths = [max(len(line[i]) for line in [headings, *cells]) for i in range(len(headings))]
 
     def aligned(line: Cells) -> str:
-        fitted = [cell.ljust(w) if i < _NAMES else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths))]
+        fitted = [cell.ljust(w) if i < names else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths))]
         return "  ".join(fitted).rstrip()
 
-    ruler = "  ".join("-" * width for width in widths)
-    return "\n".join([aligned(headings), ruler, *(aligned(line) for line in cells), *_notes(rows)])
+    return [aligned(headings), "  ".join("-" * width for width in widths), *(aligned(line) for line in cells)]
 
 
 def markdown_table(rows: Sequence[Row]) -> str:

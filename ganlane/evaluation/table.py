@@ -10,13 +10,13 @@ import polars as pl
 
 from ganlane import keys
 from ganlane.evaluation.counts import clopper_pearson, rate_per_1000_km
+from ganlane.evaluation.paired import paired_lead, paired_rewards
 from ganlane.evaluation.score import NormalizedScore, no_score, normalized_percent
-from ganlane.evaluation.statistics import mean_interval, paired_difference
+from ganlane.evaluation.statistics import mean_interval
 
 #: The two drivers that give the normalised score its scale.
 SCALE_TOP = "mobil"
 SCALE_BOTTOM = "random_legal"
-_EPISODE = ["seed", "episode"]
 
 Row = dict[str, Any]
 
@@ -31,9 +31,11 @@ def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
     Returns:
         Per pair ``agent, traffic, episodes``; the counts ``goal, hard_crash, out_of_road, timeout,
         scene_end`` (how episodes ended) and ``soft_crash`` (episodes with at least one),
-        ``soft_crash_onsets``, ``soft_crash_behind_onsets``; ``mean_reward`` and ``reward_sd``;
+        ``soft_crash_onsets``, ``soft_crash_behind_onsets`` and the latter's mean ``soft_crash_behind_per_episode``;
+        ``mean_reward`` and ``reward_sd``;
         ``mean_speed_mps`` (distance over time of all episodes together); ``lane_changes_per_km``;
-        ``distance_km``; ``hard_crash_share``; ``crashes_per_1000_km`` (hard crashes);
+        ``distance_km``; ``hard_crash_share`` and ``out_of_road_share`` of the episodes (exact intervals);
+        ``crashes_per_1000_km`` (hard crashes);
         ``minus_mobil`` (paired difference of the mean reward to MOBIL's on the same episodes);
         ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with ``_ci``
         holds the 95 % interval of its namesake as ``[low, high]``, or None.
@@ -63,15 +65,21 @@ def _outcomes(pair: pl.DataFrame) -> Row:
         "scene_end": ended["scene_end"],
         "soft_crash_onsets": int(pair["soft_crash"].sum()),
         "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
+        **_mean_fields("soft_crash_behind_per_episode", pair["soft_crash_behind"].to_numpy()),
     }
+
+
+def _mean_fields(key: str, values: npt.ArrayLike) -> Row:
+    """Mean of one value per episode, with its bootstrap interval."""
+    mean = mean_interval(values)
+    return {key: mean.value, f"{key}_ci": mean.interval}
 
 
 def _returns(pair: pl.DataFrame) -> Row:
     """Mean return with its interval, and the returns' standard deviation as the paper gives it."""
     returns = pair["reward"].to_numpy()
-    mean = mean_interval(returns)
     spread = float(np.std(returns, ddof=1)) if len(returns) > 1 else None
-    return {"mean_reward": mean.value, "mean_reward_ci": mean.interval, "reward_sd": spread}
+    return {**_mean_fields("mean_reward", returns), "reward_sd": spread}
 
 
 def _driving(pair: pl.DataFrame) -> Row:
@@ -79,6 +87,7 @@ def _driving(pair: pl.DataFrame) -> Row:
     distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
     crashes = int((pair["reason"] == "hard_crash").sum())
     share, rate = clopper_pearson(crashes, pair.height), rate_per_1000_km(crashes, distance_m)
+    off_road = clopper_pearson(int((pair["reason"] == "out_of_road").sum()), pair.height)
     changes = int(pair["lane_changes"].sum())
     return {
         "mean_speed_mps": distance_m / duration_s if duration_s > 0 else None,
@@ -86,6 +95,8 @@ def _driving(pair: pl.DataFrame) -> Row:
         "distance_km": distance_m / 1000.0,
         "hard_crash_share": share.value,
         "hard_crash_share_ci": share.interval,
+        "out_of_road_share": off_road.value,
+        "out_of_road_share_ci": off_road.interval,
         "crashes_per_1000_km": None if rate is None else rate.value,
         "crashes_per_1000_km_ci": None if rate is None else rate.interval,
     }
@@ -96,16 +107,8 @@ def _lead(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
     if pair["agent"][0] == SCALE_TOP or mobil.height == 0:
         return {"minus_mobil": None, "minus_mobil_ci": None}
-    both = pair.select([*_EPISODE, "reward"]).join(_named(mobil, SCALE_TOP), on=_EPISODE).sort(_EPISODE)
-    if both.height < 2:
-        return {"minus_mobil": None, "minus_mobil_ci": None}
-    lead = paired_difference(_column(both, "reward"), _column(both, SCALE_TOP))
-    return {"minus_mobil": lead.value, "minus_mobil_ci": lead.interval}
-
-
-def _named(driver: pl.DataFrame, name: str) -> pl.DataFrame:
-    """Episodes and rewards of ``driver``, the rewards under its ``name``."""
-    return driver.select([*_EPISODE, pl.col("reward").alias(name)])
+    lead, _ = paired_lead(pair, mobil)
+    return {"minus_mobil": lead.value if lead else None, "minus_mobil_ci": lead.interval if lead else None}
 
 
 def _score_fields(score: NormalizedScore) -> Row:
@@ -119,19 +122,13 @@ def _score_fields(score: NormalizedScore) -> Row:
 
 def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
     """The normalised score of one agent, from the episodes that it shares with the two drivers of the scale."""
-    returns = [pair.select([*_EPISODE, "reward"])]
+    drivers = [pair]
     for name in (SCALE_TOP, SCALE_BOTTOM):
         driver = same_traffic.filter(pl.col("agent") == name)
         if driver.height == 0:
             return no_score(f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing")
-        returns.append(_named(driver, name))
-    paired = returns[0].join(returns[1], on=_EPISODE).join(returns[2], on=_EPISODE).sort(_EPISODE)
-    if paired.height < 2:
+        drivers.append(driver)
+    agent, mobil, random_legal = paired_rewards(*drivers)
+    if len(agent) < 2:
         return no_score("fewer than two episodes are shared by the drivers")
-    agent, mobil, random_legal = (_column(paired, name) for name in ("reward", SCALE_TOP, SCALE_BOTTOM))
     return normalized_percent(agent, mobil, random_legal)
-
-
-def _column(frame: pl.DataFrame, name: str) -> npt.NDArray[np.float64]:
-    """A column as float64."""
-    return frame[name].cast(pl.Float64).to_numpy()

@@ -38,12 +38,12 @@ def last_measures(after: TensorDictBase) -> dict[str, Tensor]:
 
 
 class EpisodeTally:
-    """Sums and last values of N rows, of each until its first end; what a row does later is ignored.
+    """Sums and last values of N rows, of each until its first end; what a row does until it begins anew is ignored.
 
-    Nothing here reads a tensor back to the host, so the loop around it never waits for the device.
+    :meth:`add` reads nothing back to the host, so it never waits for the device.
 
     Args:
-        driving: [N] bool, the rows that count (a padded chunk has rows that do not).
+        driving: [N] bool, the rows that count from the start.
     """
 
     def __init__(self, driving: Tensor):
@@ -62,6 +62,18 @@ class EpisodeTally:
             self._last[name] = value.clone() if before is None else torch.where(driving, value, before)
         self.driving = driving & ~after["done"].squeeze(-1)
 
-    def measures(self) -> dict[str, Tensor]:
-        """All counts by name, each [N], on the CPU."""
-        return {name: value.cpu() for name, value in (self._sums | self._last).items()}
+    def measures(self, rows: Tensor) -> dict[str, Tensor]:
+        """All counts of ``rows`` [K] (int64) by name, each [K], on the CPU."""
+        return {name: value[rows].cpu() for name, value in (self._sums | self._last).items()}
+
+    def begin(self, rows: Tensor) -> None:
+        """Count from 0 again in ``rows`` (int64), in which other episodes start."""
+        self.driving[rows] = True
+        for value in self._sums.values():
+            value[rows] = 0.0
+
+    def keep(self, rows: Tensor) -> None:
+        """Go on with ``rows`` [K] (int64) alone, in that order."""
+        self.driving = self.driving[rows]
+        self._sums = {name: value[rows] for name, value in self._sums.items()}
+        self._last = {name: value[rows] for name, value in self._last.items()}

@@ -28,7 +28,8 @@ def observation_space(env: TransformedEnv) -> Box:
     """Bounds of the observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
     size = env.observation_spec[keys.OBSERVATION].shape[-1]
     form = next((each.form for each in env.transform if isinstance(each, ObservationTransform)), "table3")
-    low, high = np.full(size, -1.0, np.float32), np.full(size, largest_number(form), np.float32)
+    largest = largest_number(form, env.base_env.scenes.longest_m)
+    low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
@@ -88,6 +89,15 @@ class Rows:
         found = (self.now() if state is None else state).get(keys.OBSERVATION)
         return np.clip(found.cpu().numpy(), self.space.low, self.space.high)
 
+    def allowed(self) -> npt.NDArray[np.bool_]:
+        """Which actions are allowed now, [N, 3]; a copy."""
+        return _array(self._mask(self.now()))
+
+    def _mask(self, state: TensorDictBase) -> Tensor:
+        """The environment's mask, bool [N, 3]; without one, the actions that stay on the road."""
+        mask = state.get(keys.ACTION_MASK, None)
+        return legal_actions(state, road_in(state, self.env.base_env.road)) if mask is None else mask
+
     def info(self, state: TensorDictBase | None = None) -> dict[str, Any]:
         """What is known beside the observation, by name, arrays [N] (the mask [N, 3]); copies.
 
@@ -105,11 +115,10 @@ class Rows:
             "lane": road.lane_of(vehicles.get("y"))[:, EGO_INDEX].long(),
             "decisions": ego.get("decisions"),
             "lane_changes": ego.get("lane_changes"),
-            "action_mask": legal_actions(at, road).to(torch.int8),
+            "action_mask": self._mask(at).to(torch.int8),
             **{name: events.get(name)[:, 0] for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)},
         }
-        terms = at.get(keys.REWARD_TERMS)
-        paid = {name: _array(terms.get(name)[:, 0]) for name in keys.REWARD_TERM_NAMES}
+        paid = {name: _array(term[:, 0]) for name, term in at.get(keys.REWARD_TERMS).items()}
         return {**{name: _array(value) for name, value in found.items()}, keys.REWARD_TERMS: paid}
 
 

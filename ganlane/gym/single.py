@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 from torchrl.envs import Transform, TransformedEnv
 
 from ganlane.api.options import Option, option
@@ -24,7 +25,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     """``gymnasium.make("ganlane/Highway-v0", ...)``.
 
     Args:
-        traffic, observation, reward, env, transforms, stream, device, overrides: as in
+        traffic, observation, reward, mask, env, transforms, stream, device, overrides: as in
             :func:`ganlane.api.make_env`.
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random, as gymnasium
             has it.
@@ -46,6 +47,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         traffic: Option = "idm_mobil",
         observation: Option = "lane_view_overlap",
         reward: Option = "paper",
+        mask: Option = "none",
         seed: int | None = None,
         env: Option = "highway",
         transforms: Sequence[Transform] = (),
@@ -59,6 +61,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
             env=env,
             observation=observation,
             reward=reward,
+            mask=mask,
             transforms=transforms,
             stream=stream,
             device=device,
@@ -107,6 +110,10 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         if self._view is not None:
             self._view.decided(after, reward)
         return self._rows.observation(after)[0], reward, terminated, truncated, row_of(self._rows.info(after), 0)
+
+    def action_masks(self) -> npt.NDArray[np.bool_]:
+        """Which actions are allowed now, bool [3]; named as sb3-contrib's MaskablePPO asks for it."""
+        return self._rows.allowed()[0]
 
     def render(self) -> Any:
         """The picture [height, width, 3] uint8 of the last moment with ``rgb_array``; ``human`` draws by itself."""

@@ -35,7 +35,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
 
     Args:
         num_envs: N, highways side by side.
-        traffic, observation, reward, env, transforms, stream, device, overrides: as in
+        traffic, observation, reward, mask, env, transforms, stream, device, overrides: as in
             :func:`ganlane.api.make_env`.
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random.
         render_mode: None or ``rgb_array``.
@@ -58,6 +58,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         traffic: Option = "idm_mobil",
         observation: Option = "lane_view_overlap",
         reward: Option = "paper",
+        mask: Option = "none",
         seed: int | None = None,
         env: Option = "highway",
         transforms: Sequence[Transform] = (),
@@ -76,6 +77,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
             env=env,
             observation=observation,
             reward=reward,
+            mask=mask,
             transforms=transforms,
             stream=stream,
             device=device,
@@ -142,6 +144,10 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
             info |= {"final_obs": _where(ended, final), "_final_obs": ended.copy()}
             info |= {"final_info": self._rows.info(after), "_final_info": ended.copy()}
         return self._rows.observation(), reward.astype(np.float64), terminated, truncated, info
+
+    def action_masks(self) -> Flags:
+        """Which actions are allowed now, bool [N, 3]."""
+        return self._rows.allowed()
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture [height, width, 3] uint8 of every row, without trails."""

@@ -93,7 +93,7 @@ def check_finished(config: TrainConfig, phase: Phase) -> None:
             f"pretrain.total_decisions={asked}: this phase is over, after {done} decisions; resume with what the run "
             "was started with."
         )
-    if flat(training["traffic"]) != flat(asdict(phase.traffic)):
+    if flat(training["traffic"]) != flat(phase.traffic.description()):
         raise UserError("traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same.")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 import polars as pl
@@ -20,10 +21,13 @@ def make_selection(config: TrainConfig, phase: Phase) -> Callable[[GreedyPolicy]
     """Drives the greedy policy through episodes of the stream that is kept for choosing among checkpoints."""
     traffic = make_traffic(phase.traffic, config.env, Stream.SELECT)
     rows = min(config.selection_episodes, config.evaluation.num_envs)
-    env = make_env(traffic, config.env, config.observation, config.reward, rows, config.seed, config.device)
+    parts = (traffic, config.env, config.observation, config.reward)
+    make = partial(make_env, *parts, seed=config.seed, device=config.device, mask=config.mask)
+    env, smaller = make(rows), None if config.env.compile else make
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
-        return figures(run_episodes(env, policy, range(config.selection_episodes), config.seed))
+        table = run_episodes(env, policy, range(config.selection_episodes), config.seed, make_smaller=smaller)
+        return figures(table)
 
     return evaluate
 

@@ -36,7 +36,17 @@ def training_env(
 ) -> EnvBase:
     """``rows`` environments of the training stream; row i begins with episode ``first_episode + i``."""
     traffic = make_traffic(phase.traffic, config.env, Stream.TRAIN)
-    return make_env(traffic, config.env, config.observation, config.reward, rows, config.seed, device, first_episode)
+    return make_env(
+        traffic,
+        config.env,
+        config.observation,
+        config.reward,
+        rows,
+        config.seed,
+        device,
+        first_episode,
+        config.mask,
+    )
 
 
 def worker_env(config: TrainConfig, phase: Phase, rows: int, first_episode: int) -> EnvBase:

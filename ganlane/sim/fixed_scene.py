@@ -89,6 +89,11 @@ class FixedScene:
         """M, the ego included."""
         return len(self.rows)
 
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest vehicle, m."""
+        return max(row.length_m for row in self.rows)
+
     def check(self, road: Road, idm: IdmParameters) -> None:
         """Raise :class:`UserError` where ``road`` is another than the scene's, or somebody cannot brake in time."""
         mine, other = ((r.lanes, r.lane_width_m) for r in (self.road, road))

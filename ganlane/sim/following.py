@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ganlane.sim.idm import TABLE_V, IdmParameters, idm_acceleration
+from ganlane.sim.idm import TABLE_V, AnyIdm, idm_acceleration
 from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import Neighbour, Scene, leader
 
@@ -12,7 +12,7 @@ from ganlane.sim.neighbours import Neighbour, Scene, leader
 def acceleration_behind(
     scene: Scene,
     ahead: Neighbour,
-    parameters: IdmParameters = TABLE_V,
+    parameters: AnyIdm = TABLE_V,
     headway_s: Tensor | float | None = None,
 ) -> Tensor:
     """IDM acceleration of each observer behind ``ahead`` ([N, K], or [N, K, L] in L lanes), m/s2, of that shape."""
@@ -21,11 +21,12 @@ def acceleration_behind(
     if ahead.gap.ndim == 3:
         speed, desired = speed[..., None], desired[..., None]
         headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
+        parameters = parameters.per_lane()
     return idm_acceleration(speed, desired, ahead.gap, ahead.speed, parameters, headway_s)
 
 
 def following_acceleration(
-    scene: Scene, parameters: IdmParameters = TABLE_V, headway_s: Tensor | float | None = None
+    scene: Scene, parameters: AnyIdm = TABLE_V, headway_s: Tensor | float | None = None
 ) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K].
 

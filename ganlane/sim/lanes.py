@@ -21,6 +21,8 @@ from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 
 ENTRY_M = 0.1
+#: Stands in a first scene for a :class:`Visibility` that differs from episode to episode: the traffic knows which.
+VISIBILITY_OF_EPISODE = -1
 #: A lane change is complete, and the next one possible, within this distance of the target lane's centre.
 ARRIVED_M = 0.3
 

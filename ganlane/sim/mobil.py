@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.sim.following import acceleration_behind
-from ganlane.sim.idm import TABLE_V, IdmParameters, idm_acceleration
+from ganlane.sim.idm import TABLE_V, AnyIdm, idm_acceleration
 from ganlane.sim.lanes import settled
 from ganlane.sim.neighbours import FREE_GAP_M, Follower, Neighbour, Scene, follower, leader
 from ganlane.sim.road import Road
@@ -28,6 +28,17 @@ class MobilParameters:
     exclusive_m: float = 60.0
 
 
+class DriverMobil(NamedTuple):
+    """MOBIL with a politeness of its own for every driver: tensors [N, M, 1] in the place of Table IV's numbers."""
+
+    threshold: float
+    politeness_rear: Tensor
+    politeness_side: Tensor
+    safe_deceleration: float
+    exclusive_m: float
+
+
+AnyMobil: TypeAlias = MobilParameters | DriverMobil
 TABLE_IV = MobilParameters()
 
 
@@ -59,29 +70,30 @@ def _gap_over(behind: Follower, ahead: Neighbour, length: Tensor) -> Tensor:
     return torch.where(ahead.gap < FREE_GAP_M, behind.gap + length + ahead.gap, FREE_GAP_M)
 
 
-def prospect(scene: Scene, lanes: Tensor, idm: IdmParameters) -> Prospect:
-    """The :class:`Prospect` of each observer in ``lanes`` [N, K, L] (float)."""
+def prospect(scene: Scene, lanes: Tensor, idm: AnyIdm) -> Prospect:
+    """The :class:`Prospect` of each observer in ``lanes`` [N, K, L] (float).
+
+    Where drivers have parameters of their own, each takes the others to drive by its own.
+    """
     ahead, behind = leader(scene, lanes), follower(scene, lanes)
     speed, length = (number[..., None] for number in (scene.observers.speed, scene.observers.length))
-    with_it = idm_acceleration(behind.speed, behind.desired_speed, behind.gap, speed, idm)
+    with_it = idm_acceleration(behind.speed, behind.desired_speed, behind.gap, speed, idm.per_lane())
     leader_speed = torch.where(ahead.gap >= FREE_GAP_M, behind.speed, ahead.speed)
     gap = _gap_over(behind, ahead, length)
-    without = idm_acceleration(behind.speed, behind.desired_speed, gap, leader_speed, idm)
+    without = idm_acceleration(behind.speed, behind.desired_speed, gap, leader_speed, idm.per_lane())
     nobody = ~behind.exists
     own = acceleration_behind(scene, ahead, idm)
     return Prospect(own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0))
 
 
-def weigh(there: Prospect, here: Prospect, mobil: MobilParameters) -> Change:
+def weigh(there: Prospect, here: Prospect, mobil: AnyMobil) -> Change:
     """MOBIL's criteria for a change from ``here`` [N, K, 1] to ``there`` [N, K, L]."""
     burden, relief = there.with_it - there.without, here.without - here.with_it
     incentive = there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
     return Change(incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration)
 
 
-def safe_change(
-    scene: Scene, lane: Tensor, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
-) -> Tensor:
+def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """Whether a change into ``lane`` [N, K] (float) asks nobody to brake harder than is safe, bool."""
     there = prospect(scene, lane[..., None], idm)
     return weigh(there, there, mobil).safe[..., 0]
@@ -97,9 +109,7 @@ def without_ego(wish: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
 
 
-def one_at_a_time(
-    scene: Scene, wish: Tensor, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
-) -> Tensor:
+def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """``wish`` (-1, 0, +1 lanes, [N, M]) less those who are in the way of somebody ahead who wants the same lane.
 
     In the way is who is nearer than ``exclusive_m`` (centre to centre), and who would have to brake harder than is
@@ -109,12 +119,12 @@ def one_at_a_time(
     target = vehicles.target_lane + wish
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
     speed, desired = vehicles.speed[:, :, None], vehicles.desired_speed[:, :, None]
-    demand = idm_acceleration(speed, desired, scene.ahead, vehicles.speed[:, None, :], idm)
+    demand = idm_acceleration(speed, desired, scene.ahead, vehicles.speed[:, None, :], idm.per_lane())
     near = (scene.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
     return torch.where((same & near & (scene.order > 0)).any(-1), 0, wish)
 
 
-def mobil_wishes(scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV) -> Tensor:
+def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """Lane change that each driver wishes for: -1 right, 0 none, +1 left, int64 [N, K].
 
     A driver in the middle of a change wishes for none. Where both sides pay, the better one is taken, the left
@@ -133,9 +143,7 @@ def mobil_wishes(scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: 
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)
 
 
-def mobil_changes(
-    scene: Scene, road: Road, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
-) -> Tensor:
+def mobil_changes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """Lane change that each driver starts: as :func:`mobil_wishes`, with one vehicle per gap.
 
     The ego (vehicle 0) decides for itself: here it wishes for nothing, and holds nobody back.

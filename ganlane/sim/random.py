@@ -51,6 +51,9 @@ class Purpose(IntEnum):
     SENSED_LATERAL = 66
     SENSED_SPEED = 67
     SENSED_DROPOUT = 68
+    BLIND_EPISODE = 69
+    DRIVER = 70  # and the 15 purposes after it: what is each driver's own (traffic=idm_random)
+    SPAWN_TRUCK = 90
     FOREIGN_DRIVER = 128  # and the 15 purposes after it: drivers of a foreign simulator, one per parameter
 
 

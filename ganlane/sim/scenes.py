@@ -30,6 +30,11 @@ class Scenes(Protocol):
         """M, the ego included."""
         ...
 
+    @property
+    def longest_m(self) -> float:
+        """No vehicle of any episode, the ego included, is longer, m."""
+        ...
+
     def check(self, road: Road, idm: IdmParameters) -> None:
         """Raise :class:`UserError` where the scene does not suit the road, or nobody could drive on from it."""
         ...
@@ -61,19 +66,26 @@ class RandomScenes:
         self.parameters.check(self.vehicles, road.lanes, idm)
         self._check_room(road.lane_width_m, road.ring_m)
 
+    @property
+    def longest_m(self) -> float:
+        """No vehicle of any episode is longer, m."""
+        return self.parameters.longest_m
+
     def _check_room(self, lane_width_m: float, ring_m: float | None) -> None:
         """Side by side, and where a ring closes: the last vehicle is the first one's leader."""
         p = self.parameters
-        if lane_width_m <= p.width_m:
+        if lane_width_m <= p.widest_m:
+            wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
             raise UserError(
-                f"env.lane_width_m={lane_width_m:g}: expected more than env.width_m={p.width_m:g}, or vehicles in "
+                f"env.lane_width_m={lane_width_m:g}: expected more than env.{wide}={p.widest_m:g}, or vehicles in "
                 "neighbouring lanes touch; widen the lanes."
             )
-        if ring_m is not None and p.spread_m + p.min_spacing_m > ring_m:
+        if ring_m is not None and p.spread_m + p.spacing_m > ring_m:
+            more = f" ({p.spacing_m:g} with lorries)" if p.spacing_m > p.min_spacing_m else ""
             raise UserError(
                 f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and env.min_spacing_m="
-                f"{p.min_spacing_m:g} together, or the first vehicles stand upon the last; lengthen the ring or "
-                "lower env.spread_m."
+                f"{p.min_spacing_m:g}{more} together, or the first vehicles stand upon the last; lengthen the ring "
+                "or lower env.spread_m."
             )
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:

@@ -3,7 +3,9 @@
 All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules,
 :mod:`~ganlane.traffic.social_gan` and :mod:`~ganlane.traffic.calibrated_gan` by a generator (what the two share is
 in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays recordings, and in
-:mod:`~ganlane.traffic.foreign` SUMO and HighwayEnv drive. Overlays
+:mod:`~ganlane.traffic.foreign` SUMO and HighwayEnv drive. Drivers of :mod:`~ganlane.traffic.idm_random` differ from
+each other, :mod:`~ganlane.traffic.mixed` gives every episode to one of several models, and
+:mod:`~ganlane.traffic.blind` hides the ego from any of them. Overlays
 (:mod:`~ganlane.traffic.lane_change`, :mod:`~ganlane.traffic.acceleration`, and drivers' faults in
 :mod:`~ganlane.traffic.faults` and :mod:`~ganlane.traffic.lane_change_faults`) and the
 :mod:`~ganlane.traffic.guard` stand behind a base model in a :class:`TrafficSequential`;
@@ -13,10 +15,12 @@ in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays reco
 
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.blind import BlindTraffic
 from ganlane.traffic.faults import BrakingFaults, LateReaction, PhantomBraking, ReactionFaults
 from ganlane.traffic.foreign import HighwayEnvTraffic, SumoTraffic
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
+from ganlane.traffic.idm_random import IdmRandomTraffic, RandomDrivers
 from ganlane.traffic.lane_change import (
     CalibratedChanges,
     CalibratedLaneChange,
@@ -29,6 +33,7 @@ from ganlane.traffic.lane_change_faults import (
     HesitantLaneChange,
     HesitationFaults,
 )
+from ganlane.traffic.mixed import MixedTraffic
 from ganlane.traffic.recordings import Recordings
 from ganlane.traffic.replay import RecordedScenes, ReplayTraffic
 from ganlane.traffic.sequential import Overlay, TrafficSequential
@@ -37,6 +42,7 @@ __all__ = [
     "AbortFaults",
     "AbortedLaneChange",
     "AccelerationOverlay",
+    "BlindTraffic",
     "BrakingFaults",
     "CalibratedChanges",
     "CalibratedLaneChange",
@@ -46,12 +52,15 @@ __all__ = [
     "HesitationFaults",
     "HighwayEnvTraffic",
     "IdmMobilTraffic",
+    "IdmRandomTraffic",
     "IdmTraffic",
     "LateReaction",
     "LiteralChanges",
     "LiteralLaneChange",
+    "MixedTraffic",
     "Overlay",
     "PhantomBraking",
+    "RandomDrivers",
     "ReactionFaults",
     "RecordedScenes",
     "Recordings",

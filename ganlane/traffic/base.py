@@ -13,7 +13,7 @@ from ganlane import keys
 from ganlane.compiling import compiled
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.lanes import Visibility
-from ganlane.sim.random import Stream, episode_key
+from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.vehicles import Vehicles
@@ -58,10 +58,14 @@ class TrafficModule(TensorDictModuleBase):
     in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
 
-    #: How the vehicles of this model show their lane changes to others.
-    visibility: Visibility = Visibility.SIGNALLED
+    #: How the vehicles of this model show their lane changes to others; where that differs from episode to episode
+    #: ``VISIBILITY_OF_EPISODE``, which :meth:`enter` replaces.
+    visibility: int = Visibility.SIGNALLED
     #: Whether lanes and lane width differ from row to row (:meth:`road_of`).
     own_roads: bool = False
+    #: Whether a running episode has to keep its row of the batch, since the module holds something per row outside
+    #: ``traffic`` (a foreign simulator). New episodes then show by their (seed, episode) with step 0.
+    rows_must_stay: bool = False
     #: Per-vehicle memory; empty for a model without any.
     memory_fields: MemoryFields = {}  # noqa: RUF012
 
@@ -130,6 +134,19 @@ class TrafficModule(TensorDictModuleBase):
         The environment keeps the old memory of the others, so a module may fill all entries.
         """
         return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])
+
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+        """The start of the episodes with ``key`` [N]: the vehicles as this traffic has them, and its memory.
+
+        Here the vehicles stay as they are and :meth:`init_memory` fills the memory. A traffic that changes what a
+        scene leaves to it (who is seen how, how fast a driver wants to go) overrides this method.
+
+        Args:
+            vehicles: the first scene, fields [N, M].
+            key: the episodes' keys [N] int64.
+            episode: their numbers [N] int64.
+        """
+        return vehicles, self.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""

@@ -20,7 +20,7 @@ from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.recordings import Recordings
 
-_X = VEHICLE_FLOATS.index("x")
+_X, _LENGTH = VEHICLE_FLOATS.index("x"), VEHICLE_FLOATS.index("length")
 
 
 class ReplayTraffic(TrafficModule):
@@ -63,6 +63,11 @@ class ReplayTraffic(TrafficModule):
         for name, value in vars(recorded).items():
             if isinstance(value, Tensor):
                 self.register_buffer(f"_{name}", value, persistent=False)
+
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest recorded vehicle, m."""
+        return float(self._samples[:, _LENGTH].max())
 
     def start_of(self, key: Tensor) -> Tensor:
         """Number of the start, [N] int64, of the episodes with ``key`` [N]."""
@@ -136,6 +141,11 @@ class RecordedScenes:
     vehicles: int = 9
     ego_visibility: int = Visibility.BODY
     ego_desired_speed_mps: float = 25.0
+
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest vehicle that was recorded, m."""
+        return self.traffic.longest_m
 
     def check(self, road: Road, idm: IdmParameters) -> None:
         """Anything that was recorded will do."""

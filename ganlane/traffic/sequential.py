@@ -55,6 +55,7 @@ class TrafficSequential(TrafficModule):
         super().__init__(base.road, base.stream)
         self.parts = nn.ModuleDict(parts)
         self.visibility = base.visibility
+        self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
 
     def named_parts(self) -> list[tuple[str, TrafficModule]]:
         """Names and parts, in order."""
@@ -80,6 +81,13 @@ class TrafficSequential(TrafficModule):
         """The parts' memories, by name."""
         memories = {name: part.init_memory(vehicles, who, key) for name, part in self.named_parts()}
         return TensorDict(memories, batch_size=[vehicles.x.shape[0]])
+
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+        """The vehicles as the parts have them, one after the other, and the parts' memories by name."""
+        memories = {}
+        for name, part in self.named_parts():
+            vehicles, memories[name] = part.enter(vehicles, key, episode)
+        return vehicles, TensorDict(memories, batch_size=[vehicles.x.shape[0]])
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """The parts' specs, by name."""

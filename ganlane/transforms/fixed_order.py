@@ -38,7 +38,7 @@ def fixed_order(others: Others, distance: Tensor, lanes: int | Tensor) -> Others
     place = torch.where(place < count, place, count)
     fields = (
         torch.full((len(place), count + 1), empty, dtype=field.dtype, device=field.device).scatter(1, place, field)
-        for field, empty in zip(others, (1.0, 0.0, 0.0, False, 0.0))
+        for field, empty in zip(others, (1.0, 0.0, 0.0, False, 0.0, 0.0))
     )
     return Others(*(field[:, :count] for field in fields))
 

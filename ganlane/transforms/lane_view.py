@@ -1,4 +1,4 @@
-"""The lane view: Table III's numbers, reordered and summarised by lane. No new information.
+"""The lane view: Table III's numbers, reordered and summarised by lane, and the lengths of the vehicles.
 
 For the left, the own and the right lane the nearest vehicle ahead and behind: gap, ``exp(-gap / 15 m)`` and
 relative speed. A small network reads advantages of a lane change from it that it does not find in the list of
@@ -12,13 +12,10 @@ from torch import Tensor
 
 from ganlane.transforms.table3 import ObservationScale, Others
 
-#: Scale of the nearness feature, m, and the length taken off the distance between centres, m.
+#: Scale of the nearness feature, m.
 NEARNESS_M = 15.0
 #: Overlap along the road that adds 1 to the nearness, m: drivers beside brake so hard that one metre decides.
 OVERLAP_M = 1.0
-CAR_LENGTH_M = 4.5
-#: The nearness of somebody exactly beside the ego, where overlap counts.
-LARGEST_NEARNESS = 1.0 + CAR_LENGTH_M / OVERLAP_M
 LANE_VIEW_SIZE = 18
 DRIFT_SIZE = 6
 
@@ -28,6 +25,11 @@ _SIDES = (1.0, 1.0, 0.0, 0.0, -1.0, -1.0)
 _WAYS = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
 #: Stands for a distance, or a speed, of nobody.
 _NOBODY = 1e9
+
+
+def largest_nearness(longest_m: float) -> float:
+    """The nearness of somebody exactly beside the ego, where overlap counts and no body is above ``longest_m``."""
+    return 1.0 + longest_m / OVERLAP_M
 
 
 def lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
@@ -41,9 +43,10 @@ def lane_view(
 ) -> Tensor:
     """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) for nobody.
 
-    The gap is over the range of sight; somebody beside the ego counts as behind. With ``drift`` [N, 24]: a fourth
-    number tells where in its lane that vehicle is (:attr:`Others.drift`), by which a lane change shows before its
-    middle; this is information that Table III does not have. With ``overlap`` the gap goes below 0 where the two
+    The gap, over the range of sight, is from bumper to bumper by the lengths of the two (:attr:`Others.bumpers_m`);
+    the nearest is who has the nearest centre, and somebody beside the ego counts as behind. With ``drift`` [N, 24]: a
+    fourth number tells where in its lane that vehicle is (:attr:`Others.drift`), by which a lane change shows before
+    its middle; this is information that Table III does not have. With ``overlap`` the gap goes below 0 where the two
     bodies overlap along the road, and the nearness above 1, by 1 per metre; without, all of them look alike, from
     bumper to bumper to side by side.
     """
@@ -60,7 +63,8 @@ def lane_view(
         value = torch.add(field[:, None, :], farther, alpha=_NOBODY).amin(-1, keepdim=True)
         return torch.where(found, value, 0.0)
 
-    gap_m = (nearest * scale.range_m - CAR_LENGTH_M).clamp_min(-CAR_LENGTH_M if overlap else 0.0)
+    gap_m = nearest * scale.range_m + of_the_nearest(-others.bumpers_m)  # of two as near the longer one counts
+    gap_m = gap_m if overlap else gap_m.clamp_min(0.0)
     gap = torch.where(found, gap_m / scale.range_m, 1.0)
     overlap_m = (-gap_m).clamp_min(0.0)
     nearness = torch.where(found, torch.exp(-gap_m.clamp_min(0.0) / NEARNESS_M) + overlap_m / OVERLAP_M, 0.0)

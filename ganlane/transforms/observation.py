@@ -16,7 +16,7 @@ from ganlane.errors import UserError
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.transforms.fixed_order import fixed_order, places
-from ganlane.transforms.lane_view import DRIFT_SIZE, LANE_VIEW_SIZE, LARGEST_NEARNESS, lane_view
+from ganlane.transforms.lane_view import DRIFT_SIZE, LANE_VIEW_SIZE, lane_view, largest_nearness
 from ganlane.transforms.sensors import perceived
 from ganlane.transforms.table3 import (
     ObservationScale,
@@ -60,9 +60,13 @@ def observation_size(name: str, vehicles: int) -> int:
     return 3 + listed + form.viewed * LANE_VIEW_SIZE + form.drift * DRIFT_SIZE + form.progress * 2
 
 
-def largest_number(name: str) -> float:
-    """What no number of observation ``name`` exceeds, but the first (speed over desired speed, without a bound)."""
-    return LARGEST_NEARNESS if OBSERVATIONS[name].overlap else 1.0
+def largest_number(name: str, longest_m: float = 4.5) -> float:
+    """What no number of observation ``name`` exceeds, but the first (speed over desired speed, without a bound).
+
+    ``longest_m`` is the length of the longest vehicle, m (:attr:`ganlane.sim.scenes.Scenes.longest_m`): with
+    ``lane_view_overlap`` the nearness counts metres of overlap.
+    """
+    return largest_nearness(longest_m) if OBSERVATIONS[name].overlap else 1.0
 
 
 class ObservationTransform(Transform):

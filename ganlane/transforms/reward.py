@@ -20,6 +20,9 @@ class RewardParameters:
 
     ``literal_low_acceleration``: where the ego brakes hard, the paper's text negates the speed reward, which
     below 15 m/s pays for crawling. By default its absolute value is negated.
+
+    ``soft_crash_behind`` is not in the paper: what an onset of somebody dangerously close *behind* the ego costs
+    (:func:`ganlane.sim.ego.look_around`). At 0, the paper's reward, the term is not there.
     """
 
     base_speed_mps: float = 15.0
@@ -30,6 +33,12 @@ class RewardParameters:
     hard_crash: float = -100.0
     soft_crash: float = -10.0
     goal: float = 100.0
+    soft_crash_behind: float = 0.0
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """The terms in the order in which they are added up."""
+        return keys.REWARD_TERM_NAMES + ((keys.SOFT_CRASH_BEHIND,) if self.soft_crash_behind else ())
 
 
 SECTION_V_C = RewardParameters()
@@ -49,7 +58,7 @@ class RewardTransform(Transform):
 
     Args:
         decision_period_s: terms that accrue with time are multiplied by it over 1 s.
-        parameters: the numbers of section V.C.
+        parameters: the numbers of section V.C. With its ``soft_crash_behind`` there is a term of that name, too.
     """
 
     def __init__(self, decision_period_s: float = 1.0, parameters: RewardParameters | None = None) -> None:
@@ -63,7 +72,7 @@ class RewardTransform(Transform):
         ego, events = tensordict.get(keys.EGO), tensordict.get(keys.EVENTS)
         speed, desired = (vehicles.get(name)[:, EGO_INDEX, None] for name in ("speed", "desired_speed"))
         dtype = speed.dtype
-        return {
+        terms = {
             "speed": self.period * speed_reward(speed, desired, ego.get("mean_acceleration")[:, None], p),
             "lane_change": p.lane_change * ego.get("started_change")[:, None].to(dtype),
             "out_of_road": p.out_of_road * events.get("out_of_road").to(dtype),
@@ -71,6 +80,9 @@ class RewardTransform(Transform):
             "soft_crash": p.soft_crash * events.get(keys.SOFT_CRASH).to(dtype),
             "goal": p.goal * events.get("goal").to(dtype),
         }
+        if p.soft_crash_behind:
+            terms[keys.SOFT_CRASH_BEHIND] = p.soft_crash_behind * events.get(keys.SOFT_CRASH_BEHIND).to(dtype)
+        return terms
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.terms(next_tensordict)
@@ -84,7 +96,7 @@ class RewardTransform(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
-        terms = {name: zero for name in keys.REWARD_TERM_NAMES}
+        terms = {name: zero for name in self.parameters.term_names}
         batch = tensordict_reset.batch_size
         return tensordict_reset.set(keys.REWARD_TERMS, TensorDict._new_unsafe(terms, batch_size=batch))
 
@@ -95,6 +107,6 @@ class RewardTransform(Transform):
         shape = observation_spec.shape
         term = Unbounded(shape=(*shape, 1), dtype=dtype, device=device)
         observation_spec[keys.REWARD_TERMS] = Composite(
-            {name: term.clone() for name in keys.REWARD_TERM_NAMES}, shape=shape
+            {name: term.clone() for name in self.parameters.term_names}, shape=shape
         ).to(device)
         return observation_spec

@@ -24,7 +24,8 @@ class Others(NamedTuple):
     """The other vehicles as the ego sees them, each [N, M - 1], normalised and clipped to [-1, 1].
 
     Relative position, relative speed, lane difference (to the left is positive), whether there is one; and, which
-    Table III does not have, where in its lane it is: 0 in the middle, 1 on the line to the left, -1 to the right.
+    Table III does not have, where in its lane it is: 0 in the middle, 1 on the line to the left, -1 to the right; and
+    how much of the distance to it lies within the two bodies, half of the ego's length plus half of its own, m.
     """
 
     position: Tensor
@@ -32,6 +33,7 @@ class Others(NamedTuple):
     lane: Tensor
     valid: Tensor
     drift: Tensor
+    bumpers_m: Tensor
 
 
 def own_state(vehicles: Vehicles, road: Road) -> Tensor:
@@ -58,6 +60,7 @@ def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> O
         torch.where(there, lane, 0.0),
         there,
         torch.where(there, drift_of(others.y, road), 0.0),
+        torch.where(there, 0.5 * ego.length + 0.5 * others.length, 0.0),
     )
 
 

@@ -181,3 +181,24 @@ def test_the_target_network_is_torchrls_target_parameters():
     pointers = {value.data_ptr() for value in loss.target_network.parameters()}
     theirs = {value.data_ptr() for value in loss.target_value_network_params.values(True, True)}
     assert pointers <= theirs
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("distributional", [True, False])
+def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
+    """Where one next action alone is allowed, the target is that of a network to which it is the best."""
+    kind, options = (LeanDistributionalLoss, {}) if distributional else (LeanDQNLoss, {"distributional": False})
+    loss = unlike_target(kind(network(noisy=False, dueling=False, **options), gamma=0.97, double=double))
+    data = batch()
+    only = torch.randint(0, 3, (64,), generator=torch.Generator().manual_seed(1))
+    data["next", "action_mask"] = torch.nn.functional.one_hot(only, 3).bool()
+    masked = loss(data.clone())["loss"]
+    choosing = loss.network if double else loss.target_network
+    best = choosing.values(data["next", "observation"]).argmax(-1)
+    agree = best == only
+    unmasked = loss(data.exclude(("next", "action_mask")).clone())["loss"]
+    assert 5 < int(agree.sum()) < 59
+    torch.testing.assert_close(masked[agree], unmasked[agree], atol=1e-6, rtol=1e-6)
+    ended = data["next", "terminated"][:, 0]
+    torch.testing.assert_close(masked[ended], unmasked[ended], atol=1e-6, rtol=1e-6)
+    assert bool((masked[~agree & ~ended] != unmasked[~agree & ~ended]).all())

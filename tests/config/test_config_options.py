@@ -26,6 +26,7 @@ from ganlane.config.generator import (
     PaperGeneratorConfig,
     WeightOptions,
 )
+from ganlane.config.mask import MASKS
 from ganlane.config.observation import FORMS, LISTS, ObservationConfig, SensorsConfig
 from ganlane.config.plain import plain_copy
 from ganlane.config.reward import RewardConfig
@@ -49,6 +50,8 @@ from ganlane.generator import (
     shipped_generator,
 )
 from ganlane.paths import conf_folder
+from ganlane.phases.description import describe
+from ganlane.phases.phase import phases_of
 from ganlane.sim import IdmParameters, MobilParameters, SpawnParameters
 from ganlane.sim.ego import EgoParameters
 from ganlane.traffic import AbortFaults, BrakingFaults, HesitationFaults, ReactionFaults
@@ -88,7 +91,7 @@ def test_yaml_and_dataclass_hold_the_same_values(group, option):
     if needed:
         assert value == type(value)(scene=value.scene)
         return
-    expected = type(value)(form=option) if group == "observation" else type(value)()
+    expected = type(value)(form=option) if group in ("observation", "mask") else type(value)()
     assert value == expected
 
 
@@ -107,8 +110,8 @@ def test_no_schema_is_without_its_yaml():
     register()
     for group, options in SCHEMAS.items():
         names = {path.stem for path in (conf_folder() / group).glob("*.yaml")}
-        if group == "observation":
-            assert names == set(FORMS)
+        if group in ("observation", "mask"):
+            assert names == set({"observation": FORMS, "mask": MASKS}[group])
         else:
             assert set(options) <= names, group
         assert {name + SUFFIX for name in options} <= {
@@ -193,6 +196,21 @@ def test_sensors_are_perfect_unless_an_error_is_asked_for(form):
     assert config_of("train", f"observation={form}").observation.sensors is None
     late = check("train", [f"observation={form}", "observation.sensors.delay_s=2"]).config.observation
     assert late == ObservationConfig(form, sensors=SensorsConfig(delay_s=2.0))
+
+
+def test_considerate_is_the_paper_and_a_price_for_danger_behind():
+    paper, considerate = (config_of("train", f"reward={name}").reward for name in ("paper", "considerate"))
+    assert dataclasses.asdict(considerate) == {**dataclasses.asdict(paper), "soft_crash_behind": -10.0}
+    assert considerate.soft_crash_behind == considerate.soft_crash
+    milder = config_of("evaluate", "reward.soft_crash_behind=-5").reward
+    assert milder.parameters() == RewardParameters(soft_crash_behind=-5.0)
+    with pytest.raises(UserError, match=r"reward\.soft_crash_behind=3: expected at most 0"):
+        check("train", ["reward=considerate", "reward.soft_crash_behind=3"])
+
+
+def test_the_reward_stands_in_the_agents_metadata():
+    config = config_of("train", "reward=considerate")
+    assert describe(config, phases_of(config, Path("run"))[-1])["reward"]["soft_crash_behind"] == -10.0
 
 
 def test_dqn_switches_every_component_off():

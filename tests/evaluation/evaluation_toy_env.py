@@ -30,7 +30,7 @@ def _nested(n: int, names: list[str], shape: tuple[int, ...], dtype: torch.dtype
 
 
 class ToyEnv(EnvBase):
-    """N rows; an automatic reset goes on with episode + N."""
+    """N rows; an automatic reset goes on with episode + N, or with the ``next_episode`` that is asked for."""
 
     def __init__(self, n: int):
         super().__init__(batch_size=[n])
@@ -50,13 +50,16 @@ class ToyEnv(EnvBase):
     def _set_seed(self, seed):
         return seed
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, next_episode: torch.Tensor | None = None, **kwargs
+    ) -> TensorDictBase:
         self.reset_calls += 1
         fresh = self.observation_spec.zero()
         if tensordict is not None and keys.SEED in tensordict:
             again = "_reset" in tensordict
+            following = tensordict[keys.EPISODE] + self.batch_size[0] if next_episode is None else next_episode
             fresh[keys.SEED] = tensordict[keys.SEED].clone()
-            fresh[keys.EPISODE] = tensordict[keys.EPISODE] + (self.batch_size[0] if again else 0)
+            fresh[keys.EPISODE] = following if again else tensordict[keys.EPISODE].clone()
         return fresh.update(self.full_done_spec.zero())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -48,6 +48,8 @@ def test_ends_are_counted_once_and_soft_crashes_by_episode(rows):
     assert row["soft_crash"] == 1
     assert row["soft_crash_onsets"] == 3
     assert row["soft_crash_behind_onsets"] == 4
+    assert row["soft_crash_behind_per_episode"] == 1.0
+    assert row["soft_crash_behind_per_episode_ci"] == [1.0, 1.0]
 
 
 def test_rates_relate_to_the_distance_of_all_episodes(rows):
@@ -59,6 +61,8 @@ def test_rates_relate_to_the_distance_of_all_episodes(rows):
     assert row["crashes_per_1000_km_ci"] == pytest.approx([0.0253 * 50, 5.572 * 50], abs=0.1)
     assert row["hard_crash_share"] == pytest.approx(0.25)
     assert row["hard_crash_share_ci"] == pytest.approx([0.0063, 0.8059], abs=1e-3)
+    assert row["out_of_road_share"] == pytest.approx(0.25)
+    assert row["out_of_road_share_ci"] == pytest.approx([0.0063, 0.8059], abs=1e-3)
 
 
 def test_the_score_runs_from_random_to_mobil(rows):

@@ -4,21 +4,24 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
 from ganlane.agents.drivers import RandomDriver
 from ganlane.env import HighwayEnv
-from ganlane.traffic import IdmMobilTraffic
+from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
+from ganlane.traffic import IdmMobilTraffic, IdmTraffic
 from ganlane.transforms import RewardParameters, RewardTransform
 from ganlane.transforms.reward import speed_reward
 
 
-def outcome(speed=20.0, mean_acceleration=0.0, started=False, soft=0, **events):
+def outcome(speed=20.0, mean_acceleration=0.0, started=False, soft=0, behind=0, **events):
     """The state after a decision of one ego with a desired speed of 25 m/s."""
     flags = {name: torch.tensor([[events.get(name, False)]]) for name in keys.END_EVENTS}
     vehicles = {"speed": torch.tensor([[speed, 0.0]]), "desired_speed": torch.tensor([[25.0, 20.0]])}
     ego = {"mean_acceleration": torch.tensor([mean_acceleration]), "started_change": torch.tensor([started])}
-    content = {"vehicles": vehicles, "ego": ego, "events": {**flags, "soft_crash": torch.tensor([[soft]])}}
+    onsets = {"soft_crash": torch.tensor([[soft]]), "soft_crash_behind": torch.tensor([[behind]])}
+    content = {"vehicles": vehicles, "ego": ego, "events": {**flags, **onsets}}
     return TensorDict({k: TensorDict(v, [1]) for k, v in content.items()}, [1])
 
 
@@ -81,3 +84,60 @@ def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset():
         ended += int(done.sum())
         assert all((state[keys.REWARD_TERMS, name][done] == 0).all() for name in keys.REWARD_TERM_NAMES)
     assert ended > 0
+
+
+CONSIDERATE = RewardParameters(soft_crash_behind=-10.0)
+
+
+def test_the_paper_charges_nothing_for_danger_behind_and_has_no_such_term():
+    assert list(terms(behind=3)) == list(keys.REWARD_TERM_NAMES)
+    assert terms(behind=3) == terms()
+
+
+def test_considerate_charges_per_onset_behind_and_is_the_paper_otherwise():
+    paid = terms(CONSIDERATE, behind=2, soft=1, started=True)
+    assert paid.pop("soft_crash_behind") == -20.0
+    assert paid == terms(soft=1, started=True)
+    assert terms(CONSIDERATE)["soft_crash_behind"] == 0.0
+
+
+def changes_left(behind_m, behind_mps, parameters=None, decisions=4):
+    """The rewards of an ego at 15 m/s that goes left at once, ``behind_m`` in front of a faster driver there."""
+    scene = FixedScene((SceneVehicle(0.0, 0, 15.0), SceneVehicle(-behind_m, 1, behind_mps, behind_mps)))
+    env = TransformedEnv(HighwayEnv(IdmTraffic(), scenes=scene), RewardTransform(1.0, parameters))
+    state, rewards = env.reset(), []
+    for number in range(decisions):
+        action = keys.LEFT if number == 0 else keys.KEEP
+        after = env.step(state.set("action", torch.full((1,), action)))["next"]
+        rewards.append(after.select("reward", keys.REWARD_TERMS, keys.EVENTS))
+        state = after.exclude("reward")
+    return torch.stack(rewards)
+
+
+def test_who_cuts_in_before_a_fast_driver_pays_and_who_leaves_room_does_not():
+    """The other, 15.5 m behind the rear bumper, closes in at 10 m/s: it is 1.55 s away, and nearer at every step."""
+    cut_in = changes_left(20.0, 25.0, CONSIDERATE)
+    onsets = cut_in[keys.EVENTS, "soft_crash_behind"]
+    assert onsets.sum() >= 1
+    assert torch.equal(cut_in[keys.REWARD_TERMS, "soft_crash_behind"], -10.0 * onsets)
+    assert not cut_in[keys.EVENTS, "hard_crash"].any()
+    room = changes_left(90.0, 25.0, CONSIDERATE)
+    assert (room[keys.REWARD_TERMS, "soft_crash_behind"] == 0).all()
+
+
+def test_the_papers_reward_is_bit_for_bit_what_it_is_without_the_term():
+    paper, considerate = changes_left(20.0, 25.0), changes_left(20.0, 25.0, CONSIDERATE)
+    assert set(paper[keys.REWARD_TERMS].keys()) == set(keys.REWARD_TERM_NAMES)
+    for name in keys.REWARD_TERM_NAMES:
+        assert torch.equal(paper[keys.REWARD_TERMS, name], considerate[keys.REWARD_TERMS, name])
+    total = torch.zeros_like(paper["reward"])
+    for name in keys.REWARD_TERM_NAMES:
+        total = total + paper[keys.REWARD_TERMS, name]
+    assert torch.equal(paper["reward"], total)
+    assert torch.equal(considerate["reward"], total + considerate[keys.REWARD_TERMS, "soft_crash_behind"])
+
+
+def test_the_specs_hold_with_the_further_term():
+    env = TransformedEnv(HighwayEnv(IdmTraffic(), num_envs=3), RewardTransform(1.0, CONSIDERATE))
+    check_env_specs(env, seed=0)
+    assert (env.reset()[keys.REWARD_TERMS, "soft_crash_behind"] == 0).all()

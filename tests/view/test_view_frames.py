@@ -41,6 +41,17 @@ def test_the_ego_stays_at_its_column_and_others_stand_at_their_distance():
         assert ego[1] - other[1] == pytest.approx(4.0 * 1.5 * 1280 / 160, abs=2)
 
 
+@pytest.mark.parametrize("length_m", [4.5, 12.0])
+def test_a_lorry_is_drawn_at_its_length(length_m):
+    trajectory = straight([0, 30], [1, 2])
+    length = trajectory.length.copy()
+    length[:, 1] = length_m
+    picture = road_of(FramePainter(replace(trajectory, length=length), drawing=BARE).draw(0))
+    columns = np.nonzero(np.abs(picture.astype(int) - style.speed_tint(20.0)).max(axis=-1) <= 6)[1]
+    # 8 pixels a metre, less the dark edge of the body.
+    assert columns.max() - columns.min() == pytest.approx(0.93 * 8 * length_m, abs=3)
+
+
 def test_the_road_moves_past_the_ego():
     painter = FramePainter(straight([0], [1]), drawing=BARE)
     first, second = painter.draw(0), painter.draw(1)

@@ -101,12 +101,23 @@ def spawned(traffic: TrafficModule, parameters: LongRunParameters, key: Tensor) 
     return vehicles.with_(valid=vehicles.valid & (index > 0))
 
 
+def _counters(parameters: LongRunParameters, first: int, rows: int) -> dict[str, Tensor]:
+    """Seed and episode [N] of ``rows`` episodes from number ``first`` on."""
+    return {keys.SEED: torch.full((rows,), parameters.seed), keys.EPISODE: first + torch.arange(rows)}
+
+
+def sizes(traffic: TrafficModule, parameters: LongRunParameters, first: int, rows: int) -> tuple[np.ndarray, ...]:
+    """Length and width [N, M] in m of those whom :func:`drive_spawned` drives."""
+    state = spawned(traffic, parameters, episode_key(traffic.stream, *_counters(parameters, first, rows).values()))
+    return state.length[:, 1:].numpy(), state.width[:, 1:].numpy()
+
+
 def drive_spawned(
     traffic: TrafficModule, parameters: LongRunParameters, first: int, rows: int, events: EventCounter
 ) -> Course:
     """One batch of ``rows`` episodes from number ``first`` on, from spawned starts; ``events`` counts."""
-    counters = {keys.SEED: torch.full((rows,), parameters.seed), keys.EPISODE: first + torch.arange(rows)}
-    key = episode_key(traffic.stream, counters[keys.SEED], counters[keys.EPISODE])
+    counters = _counters(parameters, first, rows)
+    key = episode_key(traffic.stream, *counters.values())
     state = spawned(traffic, parameters, key)
     memory = traffic.init_memory(state, torch.ones_like(state.valid), absorb(key, 0))
     course, start = [_snapshot(state)], state.x

@@ -10,7 +10,7 @@ import polars as pl
 
 from ganlane.evaluation.realism.counters import EventCounter
 from ganlane.evaluation.realism.driving import Report, driven_of
-from ganlane.evaluation.realism.long import LongRunParameters, drive_spawned
+from ganlane.evaluation.realism.long import LongRunParameters, drive_spawned, sizes
 from ganlane.evaluation.realism.quantities import measure
 from ganlane.evaluation.realism.recordings import Recording, frame_of
 from ganlane.evaluation.realism.reference import SHIPPED_REFERENCE, Reference, rate
@@ -58,13 +58,12 @@ def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows
     """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` seconds, as recordings are measured."""
     traffic = make(road)
     course = drive_spawned(traffic, parameters, 0, rows, EventCounter(road))
-    shape, body = course.x[:, 0].shape, parameters.spawn
+    shape, (length, width) = course.x[:, 0].shape, sizes(traffic, parameters, 0, rows)
     nothing, everywhere = np.zeros(shape), np.ones(shape, dtype=bool)
-    length, width = np.full(shape[1], body.length_m), np.full(shape[1], body.width_m)
     frames = []
     for row in range(rows):
         name, lanes, lane_width = f"spawned-{row}", int(road.lanes), float(road.lane_width_m)
         states = (nothing, nothing, nothing, everywhere)
-        made = Recording(name, name, lanes, lane_width, *states, length, width, everywhere[0])
+        made = Recording(name, name, lanes, lane_width, *states, length[row], width[row], everywhere[0])
         frames.append(frame_of(made, course.x[:, row], course.y[:, row], everywhere, name))
     return pl.concat(frames)

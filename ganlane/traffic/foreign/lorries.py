@@ -42,6 +42,11 @@ class LorryScenes:
         """M, the ego included."""
         return self.cars.vehicles
 
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest vehicle that there may be, m."""
+        return max(self.cars.longest_m, self.length_m) if self.share > 0 else self.cars.longest_m
+
     def check(self, road: Road, idm: IdmParameters) -> None:
         """As :meth:`RandomScenes.check`."""
         self.cars.check(road, idm)

@@ -18,7 +18,7 @@ from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.lanes import Visibility, body_lanes, presence, with_target
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
-from ganlane.sim.scenes import RandomScenes
+from ganlane.sim.scenes import RandomScenes, Scenes
 from ganlane.sim.spawn import TABLE_II, SpawnParameters
 from ganlane.sim.steering import STEERING, SteeringParameters
 from ganlane.sim.vehicles import Vehicles
@@ -68,7 +68,7 @@ class SumoTraffic(TrafficModule):
     Args:
         road, stream, idm, steering: as for every traffic module; idm and steering are the ego's.
         spawn: Table II, for the first scenes.
-        truck_share: of the others, 0 to 1.
+        truck_share: of the others, 0 to 1, where ``spawn`` has none.
         truck_length_m: length of a lorry.
         lane_change_s: how long a lane change takes.
         keep_right: LC2013's ``lcKeepRight``.
@@ -113,9 +113,11 @@ class SumoTraffic(TrafficModule):
 
     def scenes(
         self, vehicles: int, ego_visibility: int = Visibility.BODY, ego_desired_speed_mps: float = 25.0
-    ) -> LorryScenes:
-        """Table II with lorries."""
+    ) -> Scenes:
+        """Table II with lorries: so many as the environment says (``env.truck_share``), or else ``truck_share``."""
         cars = RandomScenes(self.road, vehicles, self.spawn, ego_visibility, self.visibility)
+        if self.spawn.truck_share > 0:
+            return cars
         return LorryScenes(cars, self.truck_share, self.truck_length_m)
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
@@ -220,7 +222,8 @@ class SumoTraffic(TrafficModule):
         for row in np.flatnonzero(driving):
             driver = _stand_in(seen, int(row))
             here = Place(0, float(seen.x[row, EGO_INDEX]), float(seen.speed[row, EGO_INDEX]))
-            roads.lead_ego(int(row), range(int(low[row]), int(high[row]) + 1), driver, here, x[row])
+            there = range(int(low[row]), int(high[row]) + 1) if seen.valid[row, EGO_INDEX] else range(0)
+            roads.lead_ego(int(row), there, driver, here, x[row])
 
     def _wander(
         self, roads: SumoRoads, episodes: _Episodes, driving: NDArray[np.bool_], step: NDArray[np.int64]

@@ -1,0 +1,151 @@
+"""Action masks: which of the ego's three actions are allowed at each decision.
+
+A mask is a safety layer between a driver and the road (action masking, Krasowski et al. 2020; shielding, Alshiekh
+et al. 2018): it is computed from rules, never learnt, and the same for every driver. ``legal`` removes commands that
+have no meaning (off the road, or while a lane change is under way). ``safe`` also removes lane changes that violate
+MOBIL's safety criterion (Kesting et al. 2007): after the change neither the new follower nor the ego itself would
+have to brake harder than ``safe_deceleration`` by IDM. Keeping the lane is always allowed.
+
+The mask sees what the ego perceives: with sensor errors it can be wrong. It holds at the instant of the command; a
+lane change that has begun runs to its end (or, with ``abort_lane_change``, can be turned back if that is safe).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec
+from torchrl.data.tensor_specs import Binary
+from torchrl.envs import Transform
+
+from ganlane import keys
+from ganlane.compiling import compiled
+from ganlane.errors import UserError
+from ganlane.keys import EGO_INDEX
+from ganlane.sim.ego import ego_scene
+from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.mobil import prospect
+from ganlane.sim.road import Road, road_in
+from ganlane.sim.vehicles import Vehicles
+from ganlane.transforms.sensors import perceived
+
+MASKS: Final = ("none", "legal", "safe")
+ACTIONS: Final = 3
+
+
+def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
+    """Which actions stay on the road, bool [N, 3], for an ego whose target lane is ``target_lane`` [N].
+
+    ``lanes`` is one number or one for every row, [N].
+    """
+    return torch.stack((target_lane >= 0, target_lane < lanes - 1, target_lane > 0), dim=1)
+
+
+def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
+    """Which actions mean something, bool [N, 3], while a lane change in ``change_direction`` (-1, 0, 1; [N]) lasts.
+
+    During a lane change commands are ignored; with ``abort`` the opposite command turns back.
+    """
+    free = change_direction == 0
+    left, right = (free | (change_direction == (-1 if turn > 0 else 1)) if abort else free for turn in (1, -1))
+    return torch.stack((torch.ones_like(free), left, right), dim=1)
+
+
+def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
+    """The hardest braking that each action asks for by IDM, as an acceleration in m/s2, [N, 3] (keep, left, right).
+
+    It is the smaller of the ego's own acceleration in that lane and its follower's there. A lane that does not exist
+    has no vehicles; :func:`on_road_actions` excludes it.
+    """
+    scene = ego_scene(vehicles, road)
+    lane = scene.observers.target_lane.to(vehicles.x.dtype)
+    there = prospect(scene, torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1), idm)
+    return torch.minimum(there.own, there.with_it)[:, 0]
+
+
+class ActionMaskTransform(Transform):
+    """Write ``action_mask`` [N, 3] bool: which actions are allowed; TorchRL's key and meaning.
+
+    Stands after a :class:`~ganlane.transforms.SensorTransform`, so that the mask sees what the ego perceives. Append
+    TorchRL's own ``ActionMask()`` to restrict the action spec, and with it ``env.rand_action``.
+
+    With ``form="safe"`` it also writes ``no_safe_action`` [N, 1] bool: no lane change is allowed, and keeping the
+    lane asks the ego or its follower to brake harder than is safe. The ego then keeps its lane and brakes.
+
+    Args:
+        road: the environment's.
+        form: ``legal`` or ``safe``.
+        safe_deceleration: m/s2, above 0; MOBIL's ``b_safe`` (Table IV: 4).
+        idm: by which braking is judged (Table V).
+        abort: whether the ego may turn back during a lane change (``env.ego.abort_lane_change``).
+
+    Raises:
+        UserError: an unknown form, or a deceleration that is not above 0.
+    """
+
+    def __init__(
+        self,
+        road: Road,
+        form: str = "safe",
+        safe_deceleration: float = 4.0,
+        idm: IdmParameters = TABLE_V,
+        abort: bool = False,
+    ) -> None:
+        if form not in MASKS[1:]:
+            raise UserError(f"mask.form={form!r}: expected one of {', '.join(MASKS[1:])}; choose one of them.")
+        if safe_deceleration <= 0:
+            raise UserError(f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2.")
+        out_keys = [keys.ACTION_MASK, *([keys.NO_SAFE_ACTION] if form == "safe" else [])]
+        super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
+        self.road, self.form, self.idm, self.abort = road, form, idm, abort
+        self.safe_deceleration = safe_deceleration
+
+    def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
+        """The mask [N, 3], and whether no action is safe [N].
+
+        Args:
+            vehicles: as the ego perceives them.
+            direction: of its lane change under way, [N].
+            road: where it drives.
+        """
+        lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
+        legal = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes) & obeyed_actions(direction, self.abort)
+        if self.form == "legal":
+            return legal, torch.zeros_like(legal[:, 0])
+        safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
+        none = ~(safe & legal).any(1)
+        keep, changes = torch.ones_like(safe[:, :1]), legal[:, 1:] & safe[:, 1:]
+        return torch.cat((keep, changes), dim=1), none
+
+    def compile_graphs(self) -> None:
+        """Make one graph of the mask (``env.compile=true``)."""
+        self.allowed = compiled(self.allowed)  # type: ignore[method-assign]
+
+    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
+        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+        direction = tensordict.get(keys.EGO).get("change_direction")
+        mask, none = self.allowed(perceived(tensordict, vehicles), direction, road_in(tensordict, self.road))
+        tensordict.set(keys.ACTION_MASK, mask)
+        return tensordict.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form == "safe" else tensordict
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._write(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._write(tensordict_reset)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action_mask`` into any TensorDict that holds the raw state."""
+        return self._write(tensordict)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the mask to the spec."""
+        assert isinstance(observation_spec, Composite)
+        device, (rows, *_) = observation_spec.device, observation_spec.shape
+        sizes = {keys.ACTION_MASK: ACTIONS, keys.NO_SAFE_ACTION: 1}
+        for name in self.out_keys:
+            observation_spec[name] = Binary(shape=(rows, sizes[name]), dtype=torch.bool, device=device)
+        return observation_spec

@@ -1,0 +1,92 @@
+"""Traffic with lorries in it does not run into itself, nor into an ego that keeps its lane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ganlane import keys
+from ganlane.agents.drivers import KeepLaneDriver
+from ganlane.build import make_env, make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import GanCalibratedTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.evaluation.realism.long import LongRunParameters
+from ganlane.evaluation.realism.spawned_scenes import spawned_frame
+from ganlane.generator.anchored import extra_inputs
+from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
+from ganlane.traffic import IdmTraffic
+
+LORRIES = {"truck_share": 0.4}
+
+
+def drive(traffic, rows: int, decisions: int, **env) -> tuple[float, float, int, int]:
+    """Vehicle-km, those of lorries, steps in which two bodies overlap, and hard crashes, with a keep-lane ego."""
+    config = EnvConfig(**LORRIES, **env)
+    made = make_env(make_traffic(traffic, config), config, num_envs=rows)
+    km = lorries = 0.0
+    overlaps = crashes = 0
+
+    def record(vehicles: Vehicles, running: torch.Tensor) -> None:
+        nonlocal km, lorries, overlaps
+        driven = vehicles.speed * (vehicles.valid & running[:, None]) * keys.PHYSICS_STEP_S / 1000.0
+        km += driven.sum().item()
+        lorries += driven[vehicles.length == 12.0].sum().item()
+        overlaps += int(pair_overlaps(vehicles)[running].sum()) // 2
+
+    made.base_env.recorder = record
+    state, driver = made.reset(), KeepLaneDriver(made.base_env.road)
+    with torch.no_grad():
+        for _ in range(decisions):
+            step, state = made.step_and_maybe_reset(driver(state))
+            crashes += int(step["next", keys.EVENTS, "hard_crash"].sum())
+    return km, lorries, overlaps, crashes
+
+
+@pytest.mark.parametrize(
+    ("traffic", "rows", "most_s"),
+    [(IdmTrafficConfig(), 32, 40), (IdmMobilTrafficConfig(), 32, 40), (GanCalibratedTrafficConfig(), 8, 40)],
+    ids=["idm", "idm_mobil", "gan_calibrated"],
+)
+@pytest.mark.parametrize("recycle", [False, True], ids=["", "recycle"])
+def test_nobody_overlaps_a_lorry(traffic, rows, most_s, recycle):
+    km, lorries, overlaps, crashes = drive(traffic, rows, most_s, recycle=recycle)
+    assert km > 0.5 * rows * 9 * 0.015 * most_s
+    assert lorries == pytest.approx(km * 0.4 * 8 / 9, rel=0.3)
+    assert (overlaps, crashes) == (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("traffic", "rows", "seconds", "least_km"),
+    [
+        (IdmTrafficConfig(), 64, 150, 1760),
+        (IdmMobilTrafficConfig(), 64, 150, 1800),
+        (GanCalibratedTrafficConfig(), 48, 100, 840),
+    ],
+    ids=["idm", "idm_mobil", "gan_calibrated"],
+)
+def test_nobody_overlaps_a_lorry_on_a_road_that_stays_full(traffic, rows, seconds, least_km):
+    km, _, overlaps, crashes = drive(traffic, rows, seconds, recycle=True)
+    assert km > least_km
+    assert (overlaps, crashes) == (0, 0)
+
+
+def test_the_generator_is_told_the_gap_behind_the_lorry():
+    """Centres 30 m apart, 21.75 m free; the input is gap / (gap + 20)."""
+    zero = torch.zeros(1, 2)
+    scene = Vehicles(
+        x=torch.tensor([[0.0, 30.0]]), y=zero, heading=zero, speed=zero + 20, acceleration=zero,
+        length=torch.tensor([[4.5, 12.0]]), width=zero + 2.5, desired_speed=zero + 25, target_lane=zero.long(),
+        visibility=zero.long(), valid=zero == 0,
+    )  # fmt: skip
+    seen = extra_inputs(perceive(scene, Road()), zero, zero)
+    assert seen[0, 0, 1].item() == pytest.approx(21.75 / 41.75)
+
+
+def test_the_realism_card_measures_spawned_lorries_by_their_own_length():
+    parameters = LongRunParameters(9, most_s=2.0, spawn=SpawnParameters(truck_share=0.5))
+    frame = spawned_frame(IdmTraffic, Road(), parameters, rows=4)
+    lengths = frame.group_by("scene", "vehicle").first()["length"].to_numpy()
+    assert set(lengths) == {4.5, 12.0}
+    assert 0.2 < np.mean(lengths == 12.0) < 0.8

@@ -1,0 +1,275 @@
+"""The action mask: what is allowed, for whom, and that policies, replay and losses respect it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reference.worlds import environment, vehicles
+from tensordict import TensorDict
+from torchrl.envs import ActionMask, Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+import ganlane
+from ganlane import keys
+from ganlane.agents.drivers import RandomDriver
+from ganlane.agents.n_step import NStepWindow
+from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, MaskedPolicy
+from ganlane.build import make_driver
+from ganlane.config.env import EnvConfig
+from ganlane.config.mask import MASKS as OFFERED
+from ganlane.config.mask import MaskConfig
+from ganlane.errors import UserError
+from ganlane.sim.idm import TABLE_V
+from ganlane.sim.road import Road
+from ganlane.transforms import MASKS, ActionMaskTransform
+from ganlane.transforms.mask import braking_demand, obeyed_actions, on_road_actions
+
+KEEP_ONLY, ALL = [True, False, False], [True, True, True]
+
+
+def allowed(*cars, form="safe", direction=0, lanes=3, abort=False, limit=4.0):
+    """The mask of the first of ``cars``, and whether no action is safe."""
+    transform = ActionMaskTransform(Road(lanes=lanes), form, limit, abort=abort)
+    mask, none = transform.allowed(vehicles(*cars), torch.tensor([direction]), Road(lanes=lanes))
+    return mask[0].tolist(), bool(none[0])
+
+
+def idm(speed, desired, gap, leader_speed):
+    """IDM by hand (Table V), m/s2."""
+    t = TABLE_V
+    root = 2.0 * (t.max_acceleration * t.comfortable_deceleration) ** 0.5
+    wanted = t.min_gap_m + max(0.0, speed * t.headway_s + speed * (speed - leader_speed) / root)
+    return max(t.min_acceleration, t.max_acceleration * (1.0 - (speed / desired) ** 4 - (wanted / gap) ** 2))
+
+
+# --- what is allowed
+
+
+@pytest.mark.parametrize(("lane", "expected"), [(0, [True, True, False]), (1, ALL), (2, [True, False, True])])
+def test_commands_off_the_road_are_never_allowed(lane, expected):
+    assert allowed({"x": 0.0, "lane": lane}, {"x": 500.0, "lane": 0}, form="legal")[0] == expected
+    assert on_road_actions(torch.tensor([lane]), 3)[0].tolist() == expected
+
+
+def test_on_one_lane_only_keeping_is_allowed():
+    assert allowed({"x": 0.0, "lane": 0}, {"x": 50.0, "lane": 0}, lanes=1)[0] == KEEP_ONLY
+
+
+def test_every_row_has_the_lanes_of_its_own_road():
+    mask = on_road_actions(torch.tensor([1, 1]), torch.tensor([2, 3]))
+    assert mask.tolist() == [[True, False, True], ALL]
+
+
+@pytest.mark.parametrize("form", ["legal", "safe"])
+def test_during_a_lane_change_nothing_but_keeping_is_allowed(form):
+    assert allowed({"x": 0.0, "lane": 1}, {"x": 500.0, "lane": 0}, form=form, direction=1)[0] == KEEP_ONLY
+
+
+def test_who_may_turn_back_may_give_the_opposite_command_alone():
+    assert obeyed_actions(torch.tensor([0, 1, -1]), abort=True).tolist() == [
+        ALL,
+        [True, False, True],
+        [True, True, False],
+    ]
+
+
+def test_turning_back_must_be_safe_too():
+    """On its way from lane 0 to lane 1; somebody fast has come up in lane 0 meanwhile."""
+    ego = {"x": 0.0, "y": 3.0, "target_lane": 1, "speed": 15.0}
+    back = {"abort": True, "direction": 1}
+    assert allowed(ego, {"x": -200.0, "lane": 0}, **back)[0] == [True, False, True]
+    assert allowed(ego, {"x": -15.0, "lane": 0, "speed": 30.0}, **back)[0] == KEEP_ONLY
+
+
+def test_a_change_is_allowed_up_to_the_braking_that_it_asks_of_the_new_follower():
+    """The follower's deceleration is worked out by hand; a limit a little above it allows, a little below forbids."""
+    ego, follower = {"x": 0.0, "lane": 0, "speed": 15.0}, {"x": -60.0, "lane": 1, "speed": 24.0}
+    braking = -idm(24.0, 25.0, 60.0 - 4.5, 15.0)
+    assert 4.0 < braking < 20.0
+    assert allowed(ego, follower, limit=braking + 1e-6)[0] == [True, True, False]
+    assert allowed(ego, follower, limit=braking - 1e-6)[0] == KEEP_ONLY
+
+
+def test_a_change_is_allowed_up_to_the_braking_that_it_asks_of_the_ego():
+    ego, leader = {"x": 0.0, "lane": 1, "speed": 25.0}, {"x": 65.0, "lane": 2, "speed": 15.0}
+    braking = -idm(25.0, 25.0, 65.0 - 4.5, 15.0)
+    assert allowed(ego, leader, limit=braking + 1e-6)[0] == ALL
+    assert allowed(ego, leader, limit=braking - 1e-6)[0] == [True, False, True]
+
+
+def test_nobody_changes_into_a_vehicle_alongside():
+    assert allowed({"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0})[0] == KEEP_ONLY
+
+
+def test_a_lorry_reaches_farther_than_a_car():
+    ego, behind = {"x": 0.0, "lane": 0, "speed": 20.0}, {"x": -13.0, "lane": 1, "speed": 16.0}
+    assert allowed(ego, behind)[0] == [True, True, False]
+    assert allowed(ego, {**behind, "length": 25.0})[0] == KEEP_ONLY
+
+
+def test_a_vehicle_that_is_not_there_forbids_nothing():
+    assert allowed({"x": 0.0, "lane": 1}, {"x": 0.0, "lane": 2, "valid": False})[0] == ALL
+
+
+def test_keeping_the_lane_is_allowed_when_nothing_is_safe_and_that_is_reported():
+    """A standing car ahead, cars alongside: no change is possible, and braking harder than 4 m/s2 is all there is."""
+    boxed_in = [{"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0}]
+    assert allowed(*boxed_in, {"x": 25.0, "lane": 1, "speed": 0.0}) == (KEEP_ONLY, True)
+    assert allowed(*boxed_in, {"x": 500.0, "lane": 1}) == (KEEP_ONLY, False)
+
+
+def test_the_demand_is_the_smaller_of_egos_and_followers_acceleration():
+    row = vehicles({"x": 0.0, "lane": 0, "speed": 20.0}, {"x": -40.0, "lane": 1}, {"x": 60.0, "lane": 1})
+    ahead, behind = idm(20.0, 25.0, 55.5, 20.0), idm(20.0, 25.0, 35.5, 20.0)
+    torch.testing.assert_close(braking_demand(row, Road())[0, 1].item(), min(ahead, behind), rtol=1e-9, atol=1e-9)
+
+
+# --- in the environment
+
+
+def masked(form="safe", **options):
+    base = environment(**options)
+    return TransformedEnv(base, Compose(ActionMaskTransform(base.road, form)))
+
+
+def test_the_specs_hold_and_torchrls_own_action_mask_draws_from_it():
+    env = masked(num_envs=4)
+    check_env_specs(env)
+    env.append_transform(ActionMask())
+    state = env.reset()
+    for _ in range(20):
+        state = env.rand_action(state)
+        assert bool(state[keys.ACTION_MASK].gather(1, state[keys.ACTION][:, None]).all())
+        state = env.step_mdp(env.step(state))
+
+
+def test_a_random_driver_behind_the_legal_mask_never_leaves_the_road():
+    env = masked("legal", num_envs=16, stream=2)
+    policy = MaskedPolicy(RandomDriver(env.base_env.road, 2))
+    rollout = env.rollout(60, policy, break_when_any_done=False)
+    assert not bool(rollout["next", "events", "out_of_road"].any())
+    bare = environment(num_envs=16, stream=2).rollout(60, RandomDriver(Road(), 2), break_when_any_done=False)
+    assert bool(bare["next", "events", "out_of_road"].any())
+
+
+def test_no_follower_brakes_harder_than_the_limit_in_the_step_after_an_allowed_change():
+    """Measured in rule-driven traffic, where everybody drives by the IDM that the mask judges by."""
+    env = masked(num_envs=32, stream=2)
+    state, hardest = env.reset(), []
+    policy = MaskedPolicy(RandomDriver(env.base_env.road, 2))
+    for _ in range(40):
+        before = state
+        state = env.step(policy(state))["next"]
+        started = state["ego", "started_change"]
+        accelerations = before["vehicles"], state["vehicles", "acceleration"][:, 1:]
+        hardest.append(torch.where(started, accelerations[1].amin(1), 0.0).amin())
+        state = env.step_mdp(TensorDict({"next": state}, state.batch_size))
+        if bool(state["done"].any()):
+            state = env.reset(state.set("_reset", state["done"]))
+    assert -6.0 < float(torch.stack(hardest).amin()) < 0.0
+
+
+def test_the_mask_sees_what_the_ego_perceives_and_not_the_truth():
+    """Sensors that never see anybody: every change looks safe."""
+    blind = {"name": "lane_view_overlap", "sensors": {"dropout": 1.0}}
+    env = ganlane.make_env("idm_mobil", 64, mask="safe", observation=blind, spread_m=60, min_spacing_m=18)
+    seeing = ganlane.make_env("idm_mobil", 64, mask="safe", spread_m=60, min_spacing_m=18)
+    legal = ganlane.make_env("idm_mobil", 64, mask="legal", spread_m=60, min_spacing_m=18)
+    assert torch.equal(env.reset()["action_mask"], legal.reset()["action_mask"])
+    assert not torch.equal(seeing.reset()["action_mask"], legal.reset()["action_mask"])
+
+
+@pytest.mark.parametrize("size", [{"vehicles": 4, "lanes": 2}, {"vehicles": 20, "lanes": 5, "spread_m": 300}])
+def test_any_number_of_vehicles_and_lanes_has_a_mask(size):
+    env = ganlane.make_env("idm_mobil", 3, mask="safe", **size)
+    assert env.rollout(5, break_when_any_done=False)["next", "action_mask"].shape == (3, 5, 3)
+
+
+# --- who obeys it
+
+
+class Values(torch.nn.Module):
+    """A 'network' that likes right best, then left."""
+
+    def values(self, observation):
+        return torch.tensor([[0.0, 1.0, 2.0]]).expand(observation.shape[0], 3)
+
+
+@pytest.mark.parametrize(("mask", "chosen"), [(ALL, 2), ([True, True, False], 1), (KEEP_ONLY, 0)])
+def test_a_greedy_agent_takes_the_best_of_the_allowed_actions(mask, chosen):
+    state = TensorDict({"observation": torch.zeros(1, 4), "action_mask": torch.tensor([mask])}, [1])
+    assert GreedyPolicy(Values())(state)["action"].tolist() == [chosen]
+
+
+def test_exploration_draws_allowed_actions_alone():
+    policy = ExploringPolicy(Values(), torch.Generator().manual_seed(0), legal=lambda state: 1 / 0)
+    policy.epsilon = 1.0
+    rows = 300
+    mask = torch.tensor([[True, True, False]]).expand(rows, 3)
+    drawn = policy(TensorDict({"observation": torch.zeros(rows, 4), "action_mask": mask}, [rows]))["action"]
+    assert set(drawn.tolist()) == {0, 1}
+
+
+def test_any_other_driver_keeps_its_lane_where_its_action_is_not_allowed():
+    env = masked("legal", num_envs=1, lanes=1)
+    rollout = env.rollout(5, MaskedPolicy(RandomDriver(Road(lanes=1), 2)))
+    assert rollout["action"].tolist() == [[0] * 5]
+
+
+def test_a_masked_driver_in_an_environment_without_a_mask_is_refused():
+    with pytest.raises(UserError, match="no action_mask"):
+        MaskedPolicy(RandomDriver(Road(), 2))(environment().reset())
+
+
+def test_the_next_state_brings_its_mask_to_the_transition_it_ends():
+    """n = 2; row 0 ends after the first step, so its mask is that step's."""
+    window, masks = NStepWindow(2, 0.9), [torch.tensor([KEEP_ONLY, ALL]), torch.tensor([ALL, [True, False, True]])]
+    made = None
+    for number, mask in enumerate(masks):
+        after = {
+            "observation": torch.zeros(2, 1),
+            "reward": torch.zeros(2, 1),
+            "terminated": torch.zeros(2, 1, dtype=torch.bool),
+            "done": torch.tensor([[number == 0], [False]]),
+            "action_mask": mask,
+        }
+        step = {"observation": torch.zeros(2, 1), "action": torch.zeros(2, dtype=torch.int64), "next": after}
+        made = window.push(TensorDict(step, [2]))
+    assert made["next", "action_mask"].tolist() == [KEEP_ONLY, [True, False, True]]
+
+
+# --- names on the command line
+
+
+def test_the_masks_of_the_command_line_are_those_of_the_transform():
+    assert OFFERED == MASKS
+
+
+def test_a_suffix_puts_any_driver_behind_a_mask():
+    driver = make_driver("mobil_egoistic+safe", EnvConfig())
+    assert (driver.name, driver.mask) == ("mobil_egoistic+safe", MaskConfig("safe"))
+    mask, policy = driver.behind(None)
+    assert mask.form == "safe"
+    assert isinstance(policy, MaskedPolicy)
+
+
+def test_the_suffix_none_takes_the_mask_away():
+    driver = replace(make_driver("mobil", EnvConfig()), mask=MaskConfig("safe"))
+    assert driver.behind(None)[0].form == "safe"
+    assert make_driver("mobil+none", EnvConfig()).behind(MaskConfig("safe"))[0].form == "none"
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: ActionMaskTransform(Road(), "soft"), "expected one of legal, safe"),
+        (lambda: ActionMaskTransform(Road(), "safe", 0.0), "above 0"),
+        (lambda: ganlane.make_env("idm", mask="save"), "did you mean"),
+        (lambda: ganlane.make_env("idm", mask={"name": "safe", "safe_deceleration": -1}), "safe_deceleration"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(make, expected):
+    with pytest.raises(UserError, match=expected):
+        make()

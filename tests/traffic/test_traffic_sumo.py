@@ -13,6 +13,7 @@ from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
+from ganlane.evaluation import run_episodes
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import Visibility, body_lanes
 from ganlane.sim.road import Road
@@ -263,3 +264,12 @@ def test_a_copy_starts_a_simulation_of_its_own(traffic):
 def test_a_ring_is_refused():
     with pytest.raises(UserError, match="ring of 500 m"):
         SumoTraffic(Road(ring_m=500.0))
+
+
+def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(traffic):
+    keep = DRIVERS["keep_lane"](Road())
+    tables = [
+        run_episodes(HighwayEnv(traffic, rows, episode=EpisodeParameters(goal_m=600.0)), keep, range(6), 0)
+        for rows in (6, 2)
+    ]
+    assert tables[0].equals(tables[1])

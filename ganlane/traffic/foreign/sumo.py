@@ -79,6 +79,8 @@ class SumoTraffic(TrafficModule):
     """
 
     visibility = Visibility.SIGNALLED
+    #: Each row has a highway of its own in SUMO.
+    rows_must_stay = True
     memory_fields = {"steering": ((), None)}  # noqa: RUF012
 
     def __init__(

@@ -62,6 +62,7 @@ def _offered(env: EnvConfig, stream: int) -> dict[str, Any]:
         "idm": env.idm.parameters(),
         "mobil": env.mobil.parameters(),
         "steering": STEERING,
+        "spawn": env.spawn_parameters(),
     }
 
 

@@ -64,7 +64,7 @@ def compare(
     modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(num_envs, episodes), []
-    made: tuple[tuple[str, ObservationConfig], EnvBase] | None = None
+    made: tuple[tuple[str, ObservationConfig, MaskConfig], EnvBase] | None = None
     with _Progress(len(pairs) * episodes) as progress:
         for traffic, driver in pairs:
             seen = (observation or ObservationConfig()).read_by(driver.observation)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ganlane import __version__
+from ganlane._version import __version__
 from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
 from ganlane.agents.policy import GreedyPolicy
 from ganlane.agents.rainbow import Rainbow

@@ -39,6 +39,7 @@ class MaskedPolicy(TensorDictModuleBase):
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
         self.policy = policy
+        self.rows_must_stay = getattr(policy, "rows_must_stay", True)
         self.in_keys = [*policy.in_keys, *([] if keys.ACTION_MASK in policy.in_keys else [keys.ACTION_MASK])]
         self.out_keys = list(policy.out_keys)
 

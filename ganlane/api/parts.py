@@ -44,8 +44,8 @@ def make_env(
 
     Args:
         traffic: an option of the group ``traffic`` (``idm``, ``idm_mobil``, ``gan``, ``gan_calibrated``,
-            ``idm_faults``, ``idm_random``, ``mixed``, ``replay``), the import path or the class of a model of your
-            own, or a mapping such as ``{"name": "gan", "noise_scale": 0.5}``.
+            ``idm_faults``, ``idm_random``, ``mixed``, ``replay``, ``sumo``, ``highway_env``), the import path or the
+            class of a model of your own, or a mapping such as ``{"name": "gan", "noise_scale": 0.5}``.
         num_envs: N, environments side by side.
         env: an option of the group ``env``: ``highway``, ``dense``, or a scenario such as ``cut_in``.
         observation: ``table3``, ``table3_progress``, ``lane_view``, ``lane_view_drift``, ``lane_view_overlap``,

@@ -11,6 +11,7 @@ from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
+from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
 from ganlane.config.traffic_mixed import MixedTrafficConfig, reacting_traffics
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
@@ -23,7 +24,13 @@ NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a 
 
 def all_traffics() -> dict[str, TrafficConfig]:
     """The options of the group ``traffic``, by name."""
-    return {**reacting_traffics(), "mixed": MixedTrafficConfig(), "replay": ReplayTrafficConfig()}
+    return {
+        **reacting_traffics(),
+        "mixed": MixedTrafficConfig(),
+        "replay": ReplayTrafficConfig(),
+        "sumo": SumoTrafficConfig(),
+        "highway_env": HighwayEnvTrafficConfig(),
+    }
 
 
 @dataclass

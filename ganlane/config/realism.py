@@ -16,6 +16,8 @@ from ganlane.errors import UserError
 _TAKEN = ("random", "constant_velocity")
 #: The traffic that is the recordings themselves.
 _RECORDED = "replay"
+#: Those that drive around an ego of ours only; a card has none.
+_FOREIGN = ("sumo", "highway_env")
 #: No traffic of its own: its parts have cards.
 _MIXED = "mixed"
 _QUICK_KM = 5.0
@@ -23,8 +25,9 @@ _QUICK_S = 30.0
 
 
 def drivable() -> dict[str, TrafficConfig]:
-    """The options of the group ``traffic`` that can have a card, by name: not the recordings, and no mixture."""
-    return {name: traffic for name, traffic in all_traffics().items() if name not in (_RECORDED, _MIXED)}
+    """The options of the group ``traffic`` that can have a card, by name: neither recordings nor mixtures, no ego."""
+    without = (_RECORDED, _MIXED, *_FOREIGN)
+    return {name: traffic for name, traffic in all_traffics().items() if name not in without}
 
 
 @dataclass
@@ -69,6 +72,11 @@ class RealismConfig(RunConfig):
             raise UserError(f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu.")
         if self.traffic.label() == _RECORDED:
             raise UserError("traffic=replay: it is the recordings themselves; choose a traffic that drives.")
+        if self.traffic.label() in _FOREIGN:
+            raise UserError(
+                f"traffic={self.traffic.label()}: a foreign simulator drives around an ego only, and a card has "
+                "none; choose one of our own."
+            )
         if self.traffic.label() == _MIXED:
             raise UserError("traffic=mixed: a card is of one traffic; make one of each of its parts.")
         if self.data.format != "scenes":

@@ -37,6 +37,7 @@ from ganlane.config.traffic import (
     IdmTrafficConfig,
 )
 from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
+from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
 from ganlane.config.traffic_mixed import MixedTrafficConfig
 from ganlane.config.traffic_random import IdmRandomTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
@@ -72,6 +73,8 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "idm_random": IdmRandomTrafficConfig,
         "mixed": MixedTrafficConfig,
         "replay": ReplayTrafficConfig,
+        "sumo": SumoTrafficConfig,
+        "highway_env": HighwayEnvTrafficConfig,
     },
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},

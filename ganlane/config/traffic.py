@@ -1,7 +1,7 @@
 """``traffic=...``: who drives the other vehicles.
 
 ``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function that makes one. It is called with those of
-``road, stream, idm, mobil, steering`` that its signature asks for, with the option's further keys, and with
+``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys, and with
 ``parameters``. A model of your own needs no more than its import path::
 
     python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
@@ -28,6 +28,8 @@ NAMES = {
     "ganlane.traffic.presets.gan_calibrated_traffic": "gan_calibrated",
     "ganlane.traffic.presets.idm_faults_traffic": "idm_faults",
     "ganlane.traffic.ReplayTraffic": "replay",
+    "ganlane.traffic.SumoTraffic": "sumo",
+    "ganlane.traffic.HighwayEnvTraffic": "highway_env",
     "ganlane.traffic.IdmRandomTraffic": "idm_random",
     "ganlane.traffic.MixedTraffic": "mixed",
 }

@@ -2,9 +2,10 @@
 
 All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules,
 :mod:`~ganlane.traffic.social_gan` and :mod:`~ganlane.traffic.calibrated_gan` by a generator (what the two share is
-in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays recordings. Drivers
-of :mod:`~ganlane.traffic.idm_random` differ from each other, :mod:`~ganlane.traffic.mixed` gives every episode to one
-of several models, and :mod:`~ganlane.traffic.blind` hides the ego from any of them. Overlays
+in :mod:`~ganlane.traffic.generated`); :mod:`~ganlane.traffic.replay` plays recordings, and in
+:mod:`~ganlane.traffic.foreign` SUMO and HighwayEnv drive. Drivers of :mod:`~ganlane.traffic.idm_random` differ from
+each other, :mod:`~ganlane.traffic.mixed` gives every episode to one of several models, and
+:mod:`~ganlane.traffic.blind` hides the ego from any of them. Overlays
 (:mod:`~ganlane.traffic.lane_change`, :mod:`~ganlane.traffic.acceleration`, and drivers' faults in
 :mod:`~ganlane.traffic.faults` and :mod:`~ganlane.traffic.lane_change_faults`) and the
 :mod:`~ganlane.traffic.guard` stand behind a base model in a :class:`TrafficSequential`;
@@ -16,6 +17,7 @@ from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAcceleration
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.blind import BlindTraffic
 from ganlane.traffic.faults import BrakingFaults, LateReaction, PhantomBraking, ReactionFaults
+from ganlane.traffic.foreign import HighwayEnvTraffic, SumoTraffic
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 from ganlane.traffic.idm_random import IdmRandomTraffic, RandomDrivers
@@ -48,6 +50,7 @@ __all__ = [
     "GuardParameters",
     "HesitantLaneChange",
     "HesitationFaults",
+    "HighwayEnvTraffic",
     "IdmMobilTraffic",
     "IdmRandomTraffic",
     "IdmTraffic",
@@ -63,6 +66,7 @@ __all__ = [
     "Recordings",
     "ReplayTraffic",
     "SuddenAccelerations",
+    "SumoTraffic",
     "TrafficModule",
     "TrafficSequential",
 ]

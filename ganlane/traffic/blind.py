@@ -42,7 +42,7 @@ class BlindTraffic(TrafficModule):
             )
         super().__init__(model.road, model.stream)
         self.model, self.blind_share = model, blind_share
-        self.visibility = model.visibility
+        self.visibility, self.rows_must_stay = model.visibility, model.rows_must_stay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``, as the model does that sees the ego in some episodes only."""

@@ -123,6 +123,7 @@ class MixedTraffic(TrafficModule):
         numbers = {name: number for number, name in enumerate(self.shares)}
         turns = torch.tensor([numbers[name] for name in interleaved(self.shares)])
         self.register_buffer("turns", turns, persistent=False)
+        self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
         self.compiled = False
         self._layout: Layout | None = None
         self._compact: dict[int, Compact] = {}

@@ -1,0 +1,159 @@
+"""``traffic=highway_env``: the others are HighwayEnv's, the ego is ours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ganlane.errors import UserError
+from ganlane.keys import EGO_INDEX
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.random import Purpose, Stream, uniform
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.foreign.packages import require
+
+#: Fields of a vehicle that HighwayEnv moves, in the order in which they are handed over.
+_MOVING = ("x", "y", "heading", "speed")
+#: Column of :attr:`ganlane.sim.random.Purpose.FOREIGN_DRIVER`, after those of SUMO's drivers.
+_EXPONENT = 8
+#: HighwayEnv's own bounds for the exponent of a driver's free acceleration (``IDMVehicle.DELTA_RANGE``).
+_EXPONENTS = (3.5, 4.5)
+#: From where to where HighwayEnv's lanes go, m, and their speed limit, m/s, which is out of everybody's way.
+_FROM_M, _TO_M, _LIMIT_MPS = -10_000.0, 200_000.0, 70.0
+
+
+class HighwayEnvTraffic(TrafficModule):
+    """Others who are driven by HighwayEnv's ``IDMVehicle``: its IDM, MOBIL and steering, its explicit Euler step.
+
+    The parameters are HighwayEnv's own (1.5 s, 3 and -5 m/s2, distances from centre to centre, an egoistic MOBIL
+    once a second); desired speeds are Table II's, and the exponent differs from driver to driver as HighwayEnv draws
+    it. Its vehicles do not react to crashes here. One whose speed would fall below 0 stands still.
+
+    What HighwayEnv knows of a vehicle is in ``vehicles`` and in this module's memory (the time since its driver last
+    thought of a lane change, s), and is written into HighwayEnv's objects in every step. So this traffic is a
+    function of the state like the others: an episode is the same in any batch and can be saved and branched. It is
+    slow: a Python loop over rows and vehicles.
+
+    Raises:
+        UserError: highway-env is not installed, or the road is a ring.
+    """
+
+    #: As HighwayEnv's drivers see each other: in a lane from 1 m beyond its edge on.
+    visibility = Visibility.BODY
+    memory_fields = {"timer": ((), None)}  # noqa: RUF012
+
+    def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN) -> None:
+        super().__init__(road, stream)
+        require("highway_env", "highway_env", "highway-env", "bench")
+        if self.road.ring_m is not None:
+            raise UserError(
+                f"traffic highway_env: a ring of {self.road.ring_m:g} m; HighwayEnv's roads here are straight."
+            )
+        assert isinstance(self.road.lanes, int)
+        self._highway = _Highway(self.road.lanes, float(self.road.lane_width_m))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without HighwayEnv's objects, whose class is made at run time."""
+        return {**self.__dict__, "_highway": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """With new ones."""
+        super().__setstate__(state)
+        assert isinstance(self.road.lanes, int)
+        self._highway = _Highway(self.road.lanes, float(self.road.lane_width_m))
+
+    def compile_graphs(self) -> None:
+        """Nothing here is a graph."""
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+        """As HighwayEnv staggers its drivers: by where they start."""
+        return {"timer": torch.remainder((vehicles.x + vehicles.y) * torch.pi, 1.0)}
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """Row by row: write HighwayEnv's objects, let it act and step, read them."""
+        m, like = vehicles.x.shape[1], vehicles.x
+        fields = torch.stack([getattr(vehicles, name) for name in _MOVING], dim=-1).double().cpu().numpy()
+        low, high = _EXPONENTS
+        exponent = low + (high - low) * uniform(key, 0, m, [Purpose.FOREIGN_DRIVER + _EXPONENT], like.dtype)[..., 0]
+        traits = torch.stack((vehicles.desired_speed, exponent, memory["timer"]), dim=-1).double().cpu().numpy()
+        size = torch.stack((vehicles.length, vehicles.width), dim=-1).double().cpu().numpy()
+        target, valid = vehicles.target_lane.cpu().numpy().copy(), vehicles.valid.cpu().numpy()
+        signals = (vehicles.visibility[:, EGO_INDEX] == int(Visibility.SIGNALLED)).tolist()
+        timer = traits[..., 2]
+        for row in range(len(fields)):
+            present = np.flatnonzero(valid[row])
+            mine = (fields[row], size[row], traits[row], target[row])
+            self._highway.drive(present, *mine, bool(signals[row]), self.dt)
+        moving = torch.as_tensor(fields).to(like.device, like.dtype)
+        named = dict(zip(_MOVING, moving.unbind(-1)))
+        named["acceleration"] = (named["speed"] - vehicles.speed) / self.dt
+        moved = vehicles.with_(**named, target_lane=torch.as_tensor(target).to(like.device))
+        return moved.with_first(vehicles.at(EGO_INDEX)), {"timer": torch.as_tensor(timer).to(like.device, like.dtype)}
+
+
+class _Highway:
+    """One road of HighwayEnv with objects that are filled with one row after another."""
+
+    def __init__(self, lanes: int, lane_width_m: float) -> None:
+        from highway_env.road.lane import StraightLane
+        from highway_env.road.road import Road as TheirRoad
+        from highway_env.road.road import RoadNetwork
+        from highway_env.vehicle.behavior import IDMVehicle
+        from highway_env.vehicle.controller import ControlledVehicle
+
+        class Lane(StraightLane):
+            """A straight lane along x; the same numbers as its base class's, without arrays."""
+
+            def local_coordinates(self, position: Any) -> tuple[float, float]:
+                return float(position[0]) - _FROM_M, float(position[1]) - self.offset
+
+        network = RoadNetwork()
+        for k in range(lanes):
+            y = k * lane_width_m
+            lane = Lane([_FROM_M, y], [_TO_M, y], width=lane_width_m, speed_limit=_LIMIT_MPS)
+            lane.offset = y
+            network.add_lane("a", "b", lane)
+        self.road = TheirRoad(network, np_random=np.random.RandomState(0))
+        # A ControlledVehicle as in HighwayEnv's own environments: the others' MOBIL asks for its target speed.
+        self._driver, self._cars = IDMVehicle, [ControlledVehicle(self.road, [0.0, 0.0])]
+
+    def drive(
+        self, present: Any, fields: Any, size: Any, traits: Any, target: Any, ego_signals: bool, dt: float
+    ) -> None:
+        """Move the vehicles ``present`` of one row by ``dt`` seconds, in place.
+
+        Args:
+            present: their indices.
+            fields: x, y, heading, speed, [M, 4] float64.
+            size: length, width, [M, 2].
+            traits: desired speed, exponent, timer, [M, 3].
+            target: lanes, [M] int64.
+            ego_signals: whether the others know the lane that the ego is moving to.
+            dt: s.
+        """
+        while len(self._cars) < len(fields):
+            self._cars.append(self._driver(self.road, [0.0, 0.0], timer=1.0))
+        self.road.vehicles = [self._cars[i] for i in present]
+        for i in present:
+            vehicle = self._cars[i]
+            x, y, vehicle.heading, vehicle.speed = fields[i].tolist()
+            vehicle.position = np.array([x, y])
+            vehicle.LENGTH, vehicle.WIDTH = size[i].tolist()
+            vehicle.on_state_update()
+            vehicle.target_speed, vehicle.DELTA, vehicle.timer = traits[i].tolist()
+            vehicle.target_lane_index = ("a", "b", int(target[i]))
+        if not ego_signals:
+            self._cars[EGO_INDEX].target_lane_index = self._cars[EGO_INDEX].lane_index
+        self.road.act()
+        for i in present:
+            if i != EGO_INDEX:
+                vehicle = self._cars[i]
+                vehicle.step(dt)
+                fields[i] = (*vehicle.position, vehicle.heading, max(vehicle.speed, 0.0))
+                traits[i, 2] = vehicle.timer
+                target[i] = vehicle.target_lane_index[2]

@@ -1,0 +1,188 @@
+"""HighwayEnv's drivers around our ego."""
+
+import pickle
+
+import pytest
+import torch
+
+pytest.importorskip("highway_env", reason="HighwayEnv is not installed: pip install 'ganlane[bench]'")
+
+from reference.foreign import drive, start, turns
+
+from ganlane import keys
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic import HighwayEnvTraffic
+
+KEEP = torch.zeros(1, dtype=torch.int64)
+
+
+@pytest.fixture(scope="module")
+def traffic():
+    return HighwayEnvTraffic()
+
+
+@pytest.fixture(scope="module")
+def driven(traffic):
+    """Six egos that keep their lanes, for 40 s: vehicles [401, 6, 9]."""
+    vehicles, running, state = drive(HighwayEnv(traffic, 6), list(range(6)), 40)
+    assert running.all()
+    return vehicles, state
+
+
+def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(driven):
+    vehicles, state = driven
+    assert not state[keys.EVENTS]["hard_crash"].any()
+    assert not pair_overlaps(Vehicles(*(field.flatten(0, 1) for field in vehicles))).any()
+
+
+def test_a_step_is_that_of_highway_envs_own_road(traffic):
+    """The same scene on a road built and stepped the way HighwayEnv's environments do it."""
+    import numpy as np
+    from highway_env.road.road import Road as TheirRoad
+    from highway_env.road.road import RoadNetwork
+    from highway_env.vehicle.behavior import IDMVehicle
+    from highway_env.vehicle.controller import ControlledVehicle
+
+    env = HighwayEnv(traffic, 1, dtype=torch.float64)
+    state = start(env, [2])
+    before = Vehicles.of(state[keys.VEHICLES])
+    seen = []
+    env.recorder = lambda vehicles, running: seen.append(vehicles)
+    env.step(state.set(keys.ACTION, KEEP))
+
+    road = TheirRoad(RoadNetwork.straight_road_network(3, start=-1000.0, length=9000.0, speed_limit=70.0))
+    for i in range(9):
+        place = [before.x[0, i].item(), before.y[0, i].item()]
+        rest = {"speed": before.speed[0, i].item(), "target_speed": before.desired_speed[0, i].item()}
+        if i == 0:
+            vehicle = ControlledVehicle(road, place, **rest)
+        else:
+            vehicle = IDMVehicle(road, place, timer=state[keys.TRAFFIC, "timer"][0, i].item(), **rest)
+            vehicle.LENGTH, vehicle.WIDTH = 4.5, 2.5
+        road.vehicles.append(vehicle)
+    for count, after in enumerate(seen[:8]):
+        road.vehicles[0].position = np.array([before.x[0, 0].item(), before.y[0, 0].item()])
+        road.vehicles[0].heading, road.vehicles[0].speed = before.heading[0, 0].item(), before.speed[0, 0].item()
+        for vehicle in road.vehicles[1:]:
+            vehicle.DELTA = traffic_exponent(traffic, road.vehicles.index(vehicle))
+        road.act()
+        for vehicle in road.vehicles[1:]:
+            vehicle.step(0.1)
+        theirs = torch.tensor([[*vehicle.position, vehicle.heading, vehicle.speed] for vehicle in road.vehicles[1:]])
+        ours = torch.stack((after.x, after.y, after.heading, after.speed), dim=-1)[0, 1:]
+        torch.testing.assert_close(ours.float(), theirs.float(), rtol=1e-6, atol=1e-4, msg=f"step {count}")
+        before = after
+
+
+def traffic_exponent(traffic, index):
+    """The exponent of a driver of episode 2, in HighwayEnv's range."""
+    from ganlane.sim.random import Purpose, episode_key, uniform
+
+    key = episode_key(traffic.stream, torch.tensor([0]), torch.tensor([2]))
+    return 3.5 + uniform(key, 0, 9, [Purpose.FOREIGN_DRIVER + 8], torch.float64)[0, index, 0].item()
+
+
+def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
+    vehicles, _ = driven
+    dx, dy = (field[1:] - field[:-1] for field in (vehicles.x, vehicles.y))
+    # Explicit Euler: a step is driven at its first speed, in the direction of the wheels.
+    driven_m = torch.hypot(dx, dy)[..., 1:]
+    assert (driven_m - 0.1 * vehicles.speed[:-1, :, 1:]).abs().max() < 1e-3
+    assert dy[..., 1:].abs().max() < 0.8, "HighwayEnv changes lanes at up to 7 m/s"
+    assert vehicles.acceleration[..., 1:].abs().max() < 6.01
+    assert (vehicles.speed >= 0.0).all()
+
+
+def test_a_target_lane_is_where_a_change_ends(driven):
+    vehicles, _ = driven
+    y, target = vehicles.y[..., 1:], vehicles.target_lane[..., 1:]
+    assert (target[1:] != target[:-1]).any(), "nobody changed lanes"
+    # Within 6 s of a new target the vehicle is there, or has thought again.
+    begins = target[1:-60] != target[:-61]
+    said, came = target[1:-60][begins], (y[61:][begins] / 4.0).round().long()
+    assert (said == came).float().mean() > 0.8
+
+
+def test_an_episode_is_the_same_alone_and_beside_others(traffic):
+    episodes = [1, 3]
+    together, running, _ = drive(HighwayEnv(traffic, 2), episodes, 12, turns)
+    for row, episode in enumerate(episodes):
+        alone, _, _ = drive(HighwayEnv(HighwayEnvTraffic(), 1), [episode], 12, turns)
+        count = int(running[:, row].sum())
+        for one, other in zip(alone, together):
+            assert torch.equal(one[: count + 1, 0], other[: count + 1, row])
+
+
+def test_a_state_can_be_branched(traffic):
+    env = HighwayEnv(traffic, 1)
+    state = env.step(start(env, [0]).set(keys.ACTION, KEEP))["next"].clone()
+    first, second = (env.step(state.clone().set(keys.ACTION, KEEP))["next"] for _ in range(2))
+    for one, other in zip(Vehicles.of(first[keys.VEHICLES]), Vehicles.of(second[keys.VEHICLES])):
+        assert torch.equal(one, other)
+
+
+def two(x_ego, ego_visibility=Visibility.BODY):
+    """A fast driver in lane 0 at x = 0 behind a slow one, and an ego in lane 1 that is beside or behind it."""
+    x = torch.tensor([[x_ego, 0.0, 30.0]])
+    lane = torch.tensor([[1, 0, 0]])
+    zero = torch.zeros_like(x)
+    return Vehicles(
+        x=x, y=lane * 4.0, heading=zero, speed=torch.tensor([[20.0, 20.0, 10.0]]), acceleration=zero,
+        length=zero + 4.5, width=zero + 2.5, desired_speed=torch.tensor([[20.0, 25.0, 10.0]]), target_lane=lane,
+        visibility=torch.full_like(lane, int(ego_visibility)), valid=torch.ones_like(lane, dtype=torch.bool),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("x_ego", "changes"), [(-60.0, True), (0.0, False), (-8.0, False)])
+def test_a_driver_changes_lanes_before_an_ego_that_is_far_behind_and_not_before_one_that_is_near(x_ego, changes):
+    traffic = HighwayEnvTraffic(Road(2))
+    vehicles = two(x_ego)
+    memory = {"timer": torch.full_like(vehicles.x, 2.0)}
+    key = torch.zeros(1, dtype=torch.int64)
+    moved, _ = traffic.move(vehicles, memory, key, key)
+    assert bool(moved.target_lane[0, 1] == 1) is changes
+
+
+def test_a_follower_brakes_for_an_ego_that_stands_in_its_lane(traffic):
+    vehicles = two(20.0)
+    in_front = vehicles.with_(
+        y=torch.tensor([[0.9, 0.0, 0.0]]),
+        speed=torch.tensor([[5.0, 20.0, 20.0]]),
+        x=torch.tensor([[30.0, 0.0, 300.0]]),
+    )
+    beside = in_front.with_(y=torch.tensor([[4.0, 0.0, 0.0]]))
+    memory = {"timer": torch.zeros_like(vehicles.x)}
+    key = torch.zeros(1, dtype=torch.int64)
+    assert traffic.move(in_front, memory, key, key)[0].acceleration[0, 1] < -5.0
+    # Seen from 1 m beyond the edge of the lane on, as HighwayEnv has it: y = 0.9 would do by our rule, too.
+    assert traffic.move(beside, memory, key, key)[0].acceleration[0, 1] > 0.0
+
+
+def test_who_is_not_valid_is_nobodys_leader(traffic):
+    vehicles = two(500.0)
+    gone = vehicles.with_(valid=torch.tensor([[True, True, False]]))
+    memory = {"timer": torch.zeros_like(vehicles.x)}
+    key = torch.zeros(1, dtype=torch.int64)
+    assert traffic.move(vehicles, memory, key, key)[0].acceleration[0, 1] < -3.0
+    moved = traffic.move(gone, memory, key, key)[0]
+    assert moved.acceleration[0, 1] > 0.0
+    assert moved.x[0, 2] == 30.0
+    assert not moved.valid[0, 2]
+
+
+def test_a_copy_drives_on(traffic):
+    copy = pickle.loads(pickle.dumps(traffic))
+    key = torch.zeros(1, dtype=torch.int64)
+    memory = {"timer": torch.zeros(1, 3)}
+    for one, other in zip(*(made.move(two(-60.0), dict(memory), key, key)[0] for made in (traffic, copy))):
+        assert torch.equal(one, other)
+
+
+def test_a_ring_is_refused():
+    with pytest.raises(UserError, match="ring of 500 m"):
+        HighwayEnvTraffic(Road(ring_m=500.0))

@@ -1,0 +1,275 @@
+"""SUMO's drivers around our ego."""
+
+import pickle
+
+import pytest
+import torch
+
+pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
+
+from reference.foreign import drive, start, turns
+
+from ganlane import keys
+from ganlane.agents.drivers import DRIVERS
+from ganlane.env import EpisodeParameters, HighwayEnv
+from ganlane.errors import UserError
+from ganlane.evaluation import run_episodes
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.lanes import Visibility, body_lanes
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic import IdmTraffic, SumoTraffic
+
+LEFT, RIGHT = 1, 2
+
+
+@pytest.fixture(scope="module")
+def traffic():
+    return SumoTraffic()
+
+
+@pytest.fixture(scope="module")
+def driven(traffic):
+    """Twenty egos that keep their lanes, for a minute: vehicles [601, 20, 9]."""
+    vehicles, running, state = drive(HighwayEnv(traffic, 20), list(range(20)), 60)
+    assert running.all()
+    return vehicles, state
+
+
+def car(x, lane, speed, desired=20.0, length=4.5):
+    return {"x": x, "lane": lane, "speed": speed, "desired_speed": desired, "length": length}
+
+
+def scene_of(*cars, width=2.5, lane_width=4.0):
+    """A scene [1, M] set by hand; the first car is the ego."""
+    number = {name: torch.tensor([[float(one[name]) for one in cars]]) for name in cars[0]}
+    lane, zero = number["lane"].long(), torch.zeros_like(number["x"])
+    return Vehicles(
+        x=number["x"], y=lane * lane_width, heading=zero, speed=number["speed"], acceleration=zero,
+        length=number["length"], width=zero + width, desired_speed=number["desired_speed"], target_lane=lane,
+        visibility=torch.full_like(lane, int(Visibility.BODY)), valid=torch.ones_like(lane, dtype=torch.bool),
+    )  # fmt: skip
+
+
+class Scene:
+    """Always the same first scene."""
+
+    def __init__(self, scene):
+        self.scene, self.vehicles = scene, scene.x.shape[1]
+
+    def check(self, road, idm):
+        pass
+
+    def __call__(self, key, dtype):
+        return Vehicles(*(field.expand(len(key), -1).clone() for field in self.scene))
+
+
+def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(driven):
+    vehicles, state = driven
+    assert not state[keys.EVENTS]["hard_crash"].any()
+    flat = Vehicles(*(field.flatten(0, 1) for field in vehicles))
+    assert not pair_overlaps(flat).any()
+
+
+def test_the_goal_is_reached_without_a_crash(traffic):
+    env = HighwayEnv(traffic, 20, episode=EpisodeParameters(goal_m=1500.0))
+    state, goals = start(env, list(range(100, 120))), 0
+    for _ in range(150):
+        state[keys.ACTION] = torch.zeros(20, dtype=torch.int64)
+        stepped, state = env.step_and_maybe_reset(state)
+        assert not stepped["next", keys.EVENTS, "hard_crash"].any()
+        goals += int(stepped["next", keys.EVENTS, "goal"].sum())
+    # The rows that arrive go on with new episodes beside those that are still driving.
+    assert goals >= 20
+
+
+def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
+    vehicles, _ = driven
+    dx, dy = (field[1:] - field[:-1] for field in (vehicles.x, vehicles.y))
+    mean = 0.5 * (vehicles.speed[1:] + vehicles.speed[:-1])
+    # A car that comes to a stand within a step stops at once: 0.6 m/s at most, which it then has not driven.
+    assert (dx - 0.1 * mean)[..., 1:].abs().max() < 0.03
+    assert dy[..., 1:].abs().max() < 0.11, "4 m in 4 s"
+    acceleration = (vehicles.speed[1:] - vehicles.speed[:-1]) / 0.1
+    torch.testing.assert_close(vehicles.acceleration[1:, :, 1:], acceleration[..., 1:], rtol=0.0, atol=1e-3)
+    assert vehicles.acceleration.amin() > -9.1
+    assert vehicles.heading.abs().max() <= 0.2
+
+
+def test_a_target_lane_is_where_a_change_ends_or_turns_back_from(driven):
+    vehicles, _ = driven
+    y, target = vehicles.y[..., 1:], vehicles.target_lane[..., 1:]
+    centre = 4.0 * target
+    moving = (y - centre).abs() > 1e-3
+    assert moving.any(), "nobody changed lanes"
+    assert ((y - centre).abs() < 4.01).all()
+    # 4 s later a change is over; it has ended where it was said to go unless the driver has thought again meanwhile.
+    begins = moving[1:-40] & ~moving[:-41]
+    said, came = target[1:-40][begins], (y[41:][begins] / 4.0).round().long()
+    assert (said == came).float().mean() > 0.9
+    assert (target[1:-40][begins] != target[:-41][begins]).all()
+
+
+def test_the_others_signal_and_are_all_there(driven):
+    vehicles, _ = driven
+    assert vehicles.valid.all()
+    assert (vehicles.visibility[..., 1:] == int(Visibility.SIGNALLED)).all()
+
+
+def test_some_are_lorries_who_keep_their_length(driven):
+    vehicles, _ = driven
+    share = (vehicles.length[0, :, 1:] == 12.0).float().mean()
+    assert 0.05 < share < 0.3
+    assert (vehicles.length == vehicles.length[0]).all()
+
+
+def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(traffic):
+    episodes = [1, 3, 4, 6]
+    env = HighwayEnv(traffic, 4)
+    # In the middle of this the same roads have to be cleared, vehicles on their way across lanes among them.
+    drive(env, [11, 12, 13, 14], 17, turns)
+    together, running, _ = drive(env, episodes, 40, turns)
+    for row, episode in enumerate(episodes):
+        alone, ran, _ = drive(HighwayEnv(traffic, 1), [episode], 40, turns)
+        count = int(running[:, row].sum())
+        assert count == int(ran[:, 0].sum())
+        assert count > 0
+        for one, other in zip(alone, together):
+            assert torch.equal(one[: count + 1, 0], other[: count + 1, row])
+
+
+def test_stand_ins_are_where_the_ego_is(traffic):
+    env = HighwayEnv(traffic, 1)
+    wrong, lanes_seen = [], set()
+
+    def compare(vehicles, running):
+        x = float(vehicles.x[0, 0] + 0.5 * vehicles.length[0, 0])
+        stand_ins = traffic._roads.stand_ins(0)
+        lanes_seen.add(tuple(sorted(stand_ins)))
+        wrong.extend(abs(place - x) for place in stand_ins.values())
+        y = float(vehicles.y[0, 0])
+        assert round(y / 4.0) in stand_ins
+
+    state = start(env, [3])
+    env.recorder = compare
+    lane = int(state[keys.VEHICLES, "target_lane"][0, 0])
+    there, back = (LEFT, RIGHT) if lane < 2 else (RIGHT, LEFT)
+    for action in (0, there, 0, 0, 0, 0, 0, back, 0, 0, 0, 0, 0):
+        state[keys.ACTION] = torch.tensor([action])
+        state = env.step(state)["next"]
+    assert max(wrong) < 2e-3, "float32 and one step of the ego's car following"
+    # Half way it is in both lanes, before and afterwards in one.
+    assert {len(lanes) for lanes in lanes_seen} == {1, 2}
+
+
+def follower_of(traffic, lane_of_ego, action):
+    """Speeds of a fast driver 30 m behind a slow ego's place in lane 1, over 6 s."""
+    # Somebody slow ahead keeps the ego slow, far enough away for the driver behind not to mind.
+    scene = scene_of(car(0.0, lane_of_ego, 12.0, 12.0), car(-32.0, 1, 20.0, 20.0), car(2000.0, 2, 20.0))
+    vehicles, running, _ = drive(
+        HighwayEnv(traffic, 1, scenes=Scene(scene)), [0], 6, lambda decision, _: action if decision == 0 else 0
+    )
+    assert running.all()
+    return vehicles
+
+
+def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
+    keeps = SumoTraffic(speed_wander=0.0)
+    free = follower_of(keeps, 0, 0)
+    cut_off = follower_of(keeps, 0, LEFT)
+    assert free.speed[:, 0, 1].amin() > 19.0
+    ego = Vehicles(*(field[:, 0, :1] for field in cut_off))
+    enters = int((body_lanes(ego, Road()).high[:, 0] > 0).nonzero()[0])
+    # The stand-in comes in at the start of the step at whose end the ego's body does.
+    assert torch.equal(free.speed[:enters, 0, 1], cut_off.speed[:enters, 0, 1])
+    assert cut_off.speed[enters, 0, 1] < 20.0
+    assert cut_off.speed[:, 0, 1].amin() < 17.0 or cut_off.y[-1, 0, 1] > 6.0
+
+
+def test_the_ego_is_followed_when_it_brakes_to_a_stand():
+    # A parked lorry ahead of the ego; the driver behind has nowhere to go on a road of one lane.
+    one_lane = SumoTraffic(Road(1), speed_wander=0.0)
+    scene = scene_of(car(0.0, 0, 15.0), car(-25.0, 0, 15.0), car(120.0, 0, 0.0, 0.1, 12.0))
+    vehicles, running, _ = drive(HighwayEnv(one_lane, 1, scenes=Scene(scene)), [0], 40)
+    assert running.all()
+    assert vehicles.speed[-1, 0, 0] < 0.5
+    gap = vehicles.x[-1, 0, 0] - vehicles.x[-1, 0, 1] - 4.5
+    assert 0.5 < gap < 8.0
+
+
+def test_our_driver_does_here_what_it_does_in_our_own_traffic(traffic):
+    """The same scene written into another environment: the same command, and the ego's first step is the same."""
+    ours = HighwayEnv(IdmTraffic(), 20)
+    mobil = DRIVERS["mobil"](Road())
+    env = HighwayEnv(traffic, 20)
+    state, changes = mobil(start(env, list(range(20)))), 0
+    for _ in range(40):
+        copy = start(ours, list(range(20)))
+        for key in (keys.VEHICLES, keys.EGO, keys.STEP):
+            copy[key] = state[key].clone()
+        copy = mobil(copy)
+        assert torch.equal(copy[keys.ACTION], state[keys.ACTION])
+        changes += int((copy[keys.ACTION] != 0).sum())
+        egos = []
+        for one, at in ((env, state), (ours, copy)):
+            seen = []
+            one.recorder = lambda vehicles, running, seen=seen: seen.append(vehicles.at(0))
+            _, after = one.step_and_maybe_reset(at)
+            egos.append(seen[0])
+            if one is env:
+                state = mobil(after)
+        for here, there in zip(*egos):
+            assert torch.equal(here, there)
+    assert changes > 5
+
+
+def test_vehicles_that_return_in_front_of_the_ego_are_followed(traffic):
+    env = HighwayEnv(traffic, 8, recycle=True)
+    vehicles, running, _ = drive(env, list(range(8)), 60)
+    away = (vehicles.x[1:] - vehicles.x[:-1] - 0.1 * vehicles.speed[1:])[..., 1:].abs() > 100.0
+    assert away.any()
+    assert running.all(), "somebody crashed"
+    assert ((vehicles.x - vehicles.x[..., :1]).abs() < 500.0).all()
+
+
+def test_a_state_that_sumo_did_not_leave_is_refused(traffic):
+    env = HighwayEnv(traffic, 1)
+    state = start(env, [0])
+    state[keys.ACTION] = torch.zeros(1, dtype=torch.int64)
+    first = env.step(state)["next"].clone()
+    first[keys.ACTION] = torch.zeros(1, dtype=torch.int64)
+    second = env.step(first.clone())["next"].clone()
+    env.step(second.set(keys.ACTION, torch.zeros(1, dtype=torch.int64)))
+    with pytest.raises(UserError, match="not the one that SUMO left"):
+        env.step(first)
+
+
+def test_two_environments_cannot_take_turns_but_may_follow_each_other():
+    one, other = HighwayEnv(SumoTraffic(), 1), HighwayEnv(SumoTraffic(), 1)
+    keep = torch.zeros(1, dtype=torch.int64)
+    first = one.step(start(one, [0]).set(keys.ACTION, keep))["next"]
+    other.step(start(other, [0]).set(keys.ACTION, keep))
+    with pytest.raises(UserError, match="a process has one SUMO"):
+        one.step(first.set(keys.ACTION, keep))
+    one.step(start(one, [0]).set(keys.ACTION, keep))
+
+
+def test_a_copy_starts_a_simulation_of_its_own(traffic):
+    drive(HighwayEnv(traffic, 1), [0], 1)
+    copy = pickle.loads(pickle.dumps(traffic))
+    _, running, _ = drive(HighwayEnv(copy, 1), [0], 2)
+    assert running.all()
+
+
+def test_a_ring_is_refused():
+    with pytest.raises(UserError, match="ring of 500 m"):
+        SumoTraffic(Road(ring_m=500.0))
+
+
+def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(traffic):
+    keep = DRIVERS["keep_lane"](Road())
+    tables = [
+        run_episodes(HighwayEnv(traffic, rows, episode=EpisodeParameters(goal_m=600.0)), keep, range(6), 0)
+        for rows in (6, 2)
+    ]
+    assert tables[0].equals(tables[1])

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from typing import Any
 
 from ganlane.config.train import TrainConfig
 from ganlane.evaluation import code_version
 from ganlane.phases.phase import Phase
+from ganlane.training.run import DEFAULTS
 
 
 def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     """What a resumed run must share with the one that was stopped."""
+    parts = {"env": config.env, "reward": config.reward, "collector": config.collector}
     return {
+        # Of a run that was begun before there was an option, the default of the option is known.
+        DEFAULTS: {
+            f"{name}.{key}": value for name, part in parts.items() for key, value in defaults_of(part).items()
+        },
         "env": asdict(config.env),
         "traffic": phase.traffic.description(),
         "observation": asdict(config.observation),
@@ -23,6 +29,18 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "collector": {name: value for name, value in asdict(config.collector).items() if name != "address"},
         "seed": config.seed,
     }
+
+
+def defaults_of(config: Any) -> dict[str, Any]:
+    """The defaults of a dataclass's fields by dotted name; nested dataclasses by their own fields."""
+    found: dict[str, Any] = {}
+    for known in fields(config):
+        default = known.default if known.default_factory is MISSING else known.default_factory()
+        if is_dataclass(default):
+            found |= {f"{known.name}.{name}": value for name, value in defaults_of(default).items()}
+        elif default is not MISSING:
+            found[known.name] = list(default) if isinstance(default, tuple) else default
+    return found
 
 
 def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from ganlane.training.checkpoints import load_checkpoint
 from ganlane.training.collectors import Source, source_of
 from ganlane.training.meter import Meter
 
+#: Key of an identity for the defaults of its options.
+DEFAULTS = "defaults"
 #: What the checkpoint of a run holds.
 PARTS = {"agent", "window", "carrier", "meter", "counters", "identity"}
 
@@ -24,11 +26,13 @@ class Run:
 
     ``source`` gives the steps of the environments; ``owed`` counts the decisions not yet paid for by an update;
     ``best`` is the best evaluation so far. ``identity`` is plain data that a resumed run must share: environment,
-    traffic, reward, seed.
+    traffic, reward, seed; under :data:`DEFAULTS`, which is not saved, the defaults of its options by dotted name.
     """
 
     def __init__(self, env: EnvBase | Source, agent: Rainbow, identity: Mapping[str, Any] | None = None) -> None:
         self.source, self.agent, self.identity = source_of(env), agent, dict(identity or {})
+        #: Of options that the identity of an older run does not name.
+        self.defaults = self.identity.pop(DEFAULTS, {})
         self.environments = self.source.environments
         self.window = agent.window()
         self.meter = Meter(self.environments, agent.network.config.actions, agent.config.gamma, agent.device)
@@ -76,7 +80,9 @@ class Run:
         state = load_checkpoint(path, self.agent.device)
         if not isinstance(state, dict) or not state.keys() >= PARTS:
             raise UserError(f"resume={path}: parts of the run are missing in it; give another checkpoint.")
-        refuse_another_run(path, state["identity"], self.identity)
+        refuse_another_run(
+            path, {**self.defaults, **flat(state["identity"])}, {**self.defaults, **flat(self.identity)}
+        )
         exact = state["window"] is not None
         try:
             self.source.load_state_dict(state["carrier"], exact)

@@ -13,7 +13,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.mask import MaskConfig
 from ganlane.errors import UserError
 from ganlane.phases import AGENT_FILE, phases_of, run_phase
-from ganlane.training.checkpoints import LAST, load_checkpoint
+from ganlane.training.checkpoints import LAST, load_checkpoint, save_checkpoint
 
 OPTIONS = [*entry_tiny.TINY, "logger.progress=false", "traffic=idm_mobil"]
 SAFE = "mask=safe"
@@ -73,3 +73,16 @@ def test_a_run_is_not_resumed_behind_another_mask(masked, other):
 def test_runs_without_a_mask_have_the_identity_that_they_always_had(tmp_path):
     """Those of versions that knew no masks can be resumed."""
     assert "mask" not in load_checkpoint(run(tmp_path) / LAST)["identity"]
+
+
+@pytest.mark.parametrize(("now", "refused"), [([], False), (["env.truck_share=0.5"], True)])
+def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(now, refused, tmp_path):
+    half = run(tmp_path, "total_decisions=160")
+    state = load_checkpoint(half / LAST)
+    del state["identity"]["env"]["truck_share"]
+    save_checkpoint(half / LAST, state)
+    if refused:
+        with pytest.raises(UserError, match="truck_share"):
+            run(half, *now, resume=half / LAST)
+    else:
+        assert run(half, *now, resume=half / LAST)

@@ -423,3 +423,28 @@ def test_stable_baselines3_trains_on_it_unchanged():
     assert model.num_timesteps == 200
     assert len(model.ep_info_buffer) > 0
     assert any(not torch.equal(old, new) for old, new in zip(before, model.q_net.parameters()))
+
+
+def test_the_safe_mask_is_in_the_info_and_behind_maskable_ppos_method():
+    env = gymnasium.make("ganlane/Highway-v0", mask="safe", traffic="idm_mobil")
+    _, info = env.reset(seed=0)
+    forbidden = 0
+    for _ in range(15):
+        mask = env.unwrapped.action_masks()
+        assert mask.dtype == np.bool_
+        assert mask[0]
+        np.testing.assert_array_equal(mask, info["action_mask"].astype(bool))
+        forbidden += int((~mask).sum())
+        _, _, terminated, truncated, info = env.step(int(env.action_space.sample(info["action_mask"])))
+        assert not (terminated and info["out_of_road"])
+        if terminated or truncated:
+            break
+    assert forbidden > 0
+
+
+def test_a_batch_has_a_mask_for_every_row():
+    envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=5, mask="legal")
+    _, info = envs.reset(seed=0)
+    mask = envs.unwrapped.action_masks()
+    assert mask.shape == (5, 3)
+    np.testing.assert_array_equal(mask, info["action_mask"].astype(bool))

@@ -17,10 +17,16 @@ GRAPHS_PER_FUNCTION = 64
 COMPILERS = ("c++", "g++", "clang++", "cl")
 
 
+def has_compiler() -> bool:
+    """Whether torch would find a C++ compiler: the one that ``CXX`` names, or one of :data:`COMPILERS`."""
+    named = os.environ.get("CXX")
+    return any(shutil.which(name) for name in ((named,) if named else COMPILERS))
+
+
 def check_compiler() -> None:
     """Raise :class:`UserError` where torch would find no C++ compiler."""
-    named = os.environ.get("CXX")
-    if not any(shutil.which(name) for name in ((named,) if named else COMPILERS)):
+    if not has_compiler():
+        named = os.environ.get("CXX")
         looked = f"CXX={named}" if named else ", ".join(COMPILERS)
         raise UserError(
             f"compile=true needs a C++ compiler, and there is none (looked for {looked}); install one "

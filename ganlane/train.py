@@ -36,12 +36,13 @@ def train(config: TrainConfig, folder: Path) -> str:
         make_traffic(traffic, config.env)
     others = [make_driver(name, config.env, device=config.device) for name in config.evaluation.agents]
     outcome: dict[str, dict[str, float]] = {}
+    training = config.compiled()
     for phase in phases_of(config, folder):
         if phase.name == "pretrain" and (phase.folder / AGENT_FILE).is_file():
             check_finished(config, phase)
             outcome[phase.name] = length_of(phase.folder / AGENT_FILE)
             continue
-        result = run_phase(config, phase, checkpoint_of(phase, config.resume))
+        result = run_phase(training, phase, checkpoint_of(phase, config.resume))
         if result.stopped_by is not None:
             print(f"saved; go on with: ganlane train resume={folder}", file=sys.stderr)
             raise Stopped(result.stopped_by)

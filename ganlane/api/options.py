@@ -27,7 +27,7 @@ DEFAULTS = {
     "observation": "lane_view_overlap",
     "mask": "none",
     "reward": "paper",
-    "agent": "rainbow",
+    "agent": "transfer",
     "init": "none",
     "collector": "single",
     "logger": "csv",

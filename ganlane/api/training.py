@@ -27,14 +27,14 @@ def train(
     traffic: Option = "gan",
     init: Option = "idm_ckpt",
     *,
-    total_decisions: int = 100_000,
+    total_decisions: int = 600_000,
     seed: int = 0,
-    agent: Option = "rainbow",
+    agent: Option = "transfer",
     env: Option = "highway",
     observation: Option = "lane_view_overlap",
     reward: Option = "paper",
-    mask: Option = "none",
-    num_envs: int = 128,
+    mask: Option = "safe",
+    num_envs: int = 512,
     logger: Option = "csv",
     evaluation: Mapping[str, Any] | None = None,
     pretrain: Mapping[str, Any] | None = None,
@@ -59,7 +59,7 @@ def train(
             and ``optimizer`` are further keys (docs/training.md, 'Transfer').
         total_decisions: of all environments together.
         seed: of everything.
-        agent: ``rainbow``, ``dqn``, or a mapping such as ``{"gamma": 0.99}``.
+        agent: ``transfer``, ``rainbow`` (to train from nothing), ``dqn``, or a mapping such as ``{"gamma": 0.99}``.
         num_envs: environments side by side.
         logger: ``csv``, ``tensorboard``, or a mapping such as ``{"progress": False}``.
         evaluation: keys of the final evaluation: ``agents, episodes, num_envs, traffic``.

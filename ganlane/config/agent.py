@@ -91,6 +91,18 @@ class AgentConfig:
 
 
 @dataclass
+class TransferAgentConfig(AgentConfig):
+    """``agent=transfer``: Rainbow for going on from a trained agent in minutes.
+
+    Twice the updates per decision, a falling learning rate and little exploration: what was known is to be kept.
+    """
+
+    decisions_per_update: int = 32
+    learning_rate_end: float | None = 2.5e-5
+    epsilon: float = 0.02
+
+
+@dataclass
 class DqnConfig(AgentConfig):
     """``agent=dqn``: plain DQN (Mnih et al. 2015), every component of Rainbow switched off."""
 

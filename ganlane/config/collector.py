@@ -11,7 +11,7 @@ from ganlane.config.checks import at_least, between, check, optional, text
 class CollectorConfig:
     """``collector=single``: one process steps ``num_envs`` environments side by side."""
 
-    num_envs: int = 128
+    num_envs: int = 512
 
     def __post_init__(self) -> None:
         check(self, "collector", num_envs=between(1, 65536))

@@ -5,14 +5,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
-from ganlane.config.folders import OVERRIDES
+from ganlane.config.folders import CONFIG, OVERRIDES
 from ganlane.config.overrides import parse, quoted, without_repetitions
 from ganlane.errors import UserError
 
 _RUNS = Path("outputs")
+#: Keys whose defaults are others than in version 0.1.0.
+CHANGED_SINCE_0_1 = ("total_decisions", "collector.num_envs", "evaluation.episodes")
 
 
 def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list[str]:
@@ -35,8 +38,23 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
     if run is None:
         print(f"resume=auto: no unfinished run below {_RUNS / command}; a new one is started.", file=sys.stderr)
         return without_repetitions([*overrides, "resume=null"])
-    stored = _stored(run / OVERRIDES)
+    stored = [*_defaults_of_then(run), *_stored(run / OVERRIDES)]
     return without_repetitions([*stored, *overrides, f"resume={quoted(run)}", f"hydra.run.dir={quoted(run)}"])
+
+
+def _defaults_of_then(run: Path) -> list[str]:
+    """What a run of version 0.1.0 had where its command line said nothing and the defaults have changed since.
+
+    Its config.yaml is recognised by knowing no masks; the numbers are taken from there.
+    """
+    try:
+        config: Any = OmegaConf.load(run / CONFIG)
+        if "mask" in config:
+            return []
+        kept = {key: OmegaConf.select(config, key) for key in CHANGED_SINCE_0_1}
+    except Exception:  # missing, no YAML, no text; what is wrong with the run, its checkpoint will tell
+        return []
+    return ["mask=none", "agent=rainbow", "compile=false", *(f"{key}={quoted(value)}" for key, value in kept.items())]
 
 
 def _stored(path: Path) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from ganlane.config.agent import AgentConfig, DqnConfig
+from ganlane.config.agent import AgentConfig, DqnConfig, TransferAgentConfig
 from ganlane.config.bench import BenchConfig
 from ganlane.config.collector import CollectorConfig, MultiCollectorConfig, RayCollectorConfig
 from ganlane.config.data import DataConfig, HighdDataConfig, NgsimDataConfig
@@ -77,7 +77,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "highway_env": HighwayEnvTrafficConfig,
     },
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
-    "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
+    "agent": {"rainbow": AgentConfig, "transfer": TransferAgentConfig, "dqn": DqnConfig},
     "observation": {"observation": ObservationConfig},
     "mask": {"mask": MaskConfig},
     "reward": {"paper": RewardConfig, "considerate": ConsiderateRewardConfig},

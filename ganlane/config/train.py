@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ganlane.config.agent import AgentConfig, check_agent
-from ganlane.config.checks import at_least, between, check
+from ganlane.config.checks import at_least, between, check, one_of
 from ganlane.config.collector import CollectorConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import NAMES
@@ -17,6 +17,11 @@ from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+
+
+COMPILE = ("auto", "true", "false")
+#: Compiling takes one to two minutes, which a training of so many decisions gets back.
+WORTH_COMPILING = 300_000
 
 
 @dataclass
@@ -39,9 +44,9 @@ class PretrainConfig:
 class FinalEvaluationConfig:
     """``evaluation``: the trained agent beside others, on the same episodes, when training is over."""
 
-    agents: list[str] = field(default_factory=lambda: ["mobil", "agent_idm", "keep_lane", "random_legal"])
+    agents: list[str] = field(default_factory=lambda: ["mobil", "agent_idm", "random_legal"])
     traffic: TrafficConfig | None = None
-    episodes: int = 100
+    episodes: int = 500
     num_envs: int = 512
 
     def __post_init__(self) -> None:
@@ -50,9 +55,14 @@ class FinalEvaluationConfig:
 
 @dataclass
 class TrainConfig(RunConfig):
-    """Everything that ``ganlane train`` can be told."""
+    """Everything that ``ganlane train`` can be told.
 
-    total_decisions: int = 100_000
+    ``compile``: whether the training is compiled (the final evaluation is, with ``env.compile=true`` alone). ``auto``:
+    where there is a C++ compiler and the training is long enough to gain by it (:data:`WORTH_COMPILING`).
+    """
+
+    total_decisions: int = 600_000
+    compile: str = "auto"
     log_every: int = 10_000
     evaluate_every: int = 0
     selection_episodes: int = 64
@@ -78,6 +88,7 @@ class TrainConfig(RunConfig):
             self,
             "",
             total_decisions=at_least(1),
+            compile=one_of(COMPILE),
             log_every=at_least(1),
             evaluate_every=at_least(0),
             selection_episodes=at_least(1),
@@ -85,6 +96,15 @@ class TrainConfig(RunConfig):
         )
         check_pay(self.env, self.reward)
         check_agent(self.agent, self.observation, self.env)
+
+    def compiled(self) -> TrainConfig:
+        """The same with ``env.compile`` as ``compile`` says."""
+        from ganlane.compiling import has_compiler
+
+        worth = self.total_decisions >= WORTH_COMPILING and has_compiler()
+        if self.env.compile or self.compile == "false" or (self.compile == "auto" and not worth):
+            return self
+        return replace(self, env=replace(self.env, compile=True))
 
     def all_traffic(self) -> list[TrafficConfig]:
         """Every traffic that this run drives in."""

@@ -18,7 +18,6 @@ from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 
-
 COMPILE = ("auto", "true", "false")
 #: Compiling takes one to two minutes, which a training of so many decisions gets back.
 WORTH_COMPILING = 300_000
@@ -57,7 +56,7 @@ class FinalEvaluationConfig:
 class TrainConfig(RunConfig):
     """Everything that ``ganlane train`` can be told.
 
-    ``compile``: whether the training is compiled (the final evaluation is, with ``env.compile=true`` alone). ``auto``:
+    ``compile``: whether the training is compiled (the final evaluation is with ``env.compile=true`` alone). ``auto``:
     where there is a C++ compiler and the training is long enough to gain by it (:data:`WORTH_COMPILING`).
     """
 

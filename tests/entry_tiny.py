@@ -4,6 +4,7 @@ TINY = [
     "env.goal_m=40",
     "traffic=idm",
     "init=none",
+    "agent=rainbow",
     "observation=table3_progress",
     "total_decisions=320",
     "log_every=160",

@@ -19,11 +19,11 @@ from ganlane.files import load_weights, save_weights
 from ganlane.paths import CHECKPOINTS
 
 #: Agents that come with the package; others are given by their path.
-SHIPPED = ("agent_idm", "agent_gan")
+SHIPPED = ("agent_general", "agent_idm", "agent_gan")
 
 
 def agent_file(name: str | Path) -> Path:
-    """The file of a shipped agent (``agent_idm``, ``agent_gan``; ``@0`` may follow) or of a path.
+    """The file of a shipped agent (:data:`SHIPPED`; ``@0`` may follow) or of a path.
 
     Raises:
         UserError: neither a shipped agent nor a file.

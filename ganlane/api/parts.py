@@ -75,7 +75,12 @@ def make_env(
 
 
 def load_agent(
-    name: str, *, env: Option = "highway", stream: str = "report", device: str = "cpu", **overrides: Any
+    name: str = "agent_general",
+    *,
+    env: Option = "highway",
+    stream: str = "report",
+    device: str = "cpu",
+    **overrides: Any,
 ) -> Driver:
     """Somebody who can drive the ego: ``.policy``, its ``.observation`` (None: the raw state) and its ``.mask``.
 

@@ -77,7 +77,7 @@ class RenderConfig(RunConfig):
     ``agents`` and ``episodes`` take the place of ``driver`` and ``episode`` where there are several.
     """
 
-    driver: str = "mobil"
+    driver: str = "agent_general"
     episode: int = 0
     agents: list[str] | None = None
     episodes: list[int] | None = None

@@ -17,6 +17,8 @@ from ganlane.training.meter import Meter
 
 #: Key of an identity for the defaults of its options.
 DEFAULTS = "defaults"
+#: Of an identity, how the run is computed: may change when it goes on, which is bit-exact only where it does not.
+COMPUTED_BY = ("env.compile",)
 #: What the checkpoint of a run holds.
 PARTS = {"agent", "window", "carrier", "meter", "counters", "identity"}
 
@@ -107,7 +109,7 @@ def refuse_another_run(path: str | Path, saved: Mapping[str, Any], asked: Mappin
     """Raise :class:`UserError` where the run that was saved is not the one that is asked for."""
     theirs, ours = flat(saved), flat(asked)
     for name in (*ours, *theirs):
-        if theirs.get(name) != ours.get(name):
+        if name not in COMPUTED_BY and theirs.get(name) != ours.get(name):
             raise UserError(
                 f"resume={path}: {name}={ours.get(name)}, but the run was started with {theirs.get(name)}; "
                 "go on with that, or start a new run."

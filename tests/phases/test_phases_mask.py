@@ -55,7 +55,7 @@ def test_the_mask_of_the_next_state_is_kept_with_every_transition(masked):
 
 
 def test_it_learns_something_else_without_the_mask(masked, tmp_path):
-    assert not equal(masked, run(tmp_path))
+    assert not equal(masked, run(tmp_path, "mask=none"))
 
 
 def test_a_masked_run_stopped_and_resumed_ends_with_the_same_bits(masked, tmp_path):
@@ -72,7 +72,7 @@ def test_a_run_is_not_resumed_behind_another_mask(masked, other):
 
 def test_runs_without_a_mask_have_the_identity_that_they_always_had(tmp_path):
     """Those of versions that knew no masks can be resumed."""
-    assert "mask" not in load_checkpoint(run(tmp_path) / LAST)["identity"]
+    assert "mask" not in load_checkpoint(run(tmp_path, "mask=none") / LAST)["identity"]
 
 
 @pytest.mark.parametrize(("now", "refused"), [([], False), (["env.truck_share=0.5"], True)])

@@ -43,7 +43,7 @@ def test_a_truncated_or_foreign_file_is_refused(saved, tmp_path):
 
 
 def test_an_unknown_agent_is_refused_with_the_names_there_are():
-    with pytest.raises(UserError, match="agents that ship are agent_gan, agent_idm"):
+    with pytest.raises(UserError, match="agents that ship are agent_gan, agent_general, agent_idm"):
         load_agent("agent_xyz")
 
 

@@ -1,15 +1,18 @@
-"""Fetching a large file over HTTP: it goes on where it broke off, and stands in place only when it is whole.
+"""Downloads of large files over HTTP that resume after an interruption, and progress in bytes.
 
-Bytes go to ``.NAME.part`` beside the file, and what the server said of its version to ``.NAME.part.json``. A broken
-connection is taken up again with HTTP's Range, guarded by If-Range, so that two versions of a file are never joined;
-so is a part that an earlier run left. A server that ignores Range sends everything, and the part begins anew. What
-the disk refuses is no fault of the network: it is told at once.
+Bytes are written to ``.NAME.part`` next to the file, and the server's version of it to ``.NAME.part.json``. After a
+broken connection, or an earlier run that was interrupted, the download resumes with HTTP's Range, guarded by
+If-Range, so that two versions of a file are never joined. If the server ignores Range, the download starts again.
+Errors of the disk are not retried. The file gets its name only when it is complete.
 """
 
 from __future__ import annotations
 
 import hashlib
 import http.client
+import json
+import os
+import sys
 import time
 import urllib.error
 import urllib.parse
@@ -18,21 +21,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Final
 
-from ganlane.data.part_files import forget, named, note_version, size_of, version_of
-from ganlane.data.source import OnProgress
-from ganlane.errors import UserError
+from tqdm import tqdm
 
-_PIECE: Final = 2**18
+from ganlane.data.tables import OnProgress
+from ganlane.errors import UserError
+from ganlane.files import write_json
+
+_PIECE_BYTES: Final = 2**18
+#: Seconds between two progress lines where there is no terminal.
+LINE_EVERY_S: Final = 10.0
 
 
 @dataclass(frozen=True)
 class DownloadParameters:
-    """Patience with a server.
+    """How long to wait for a server.
 
     Attributes:
-        timeout_s: without a byte for so long, the connection counts as broken.
+        timeout_s: without a byte for this long, the connection counts as broken.
         attempts: connections without any progress before giving up.
         wait_s: before the second attempt; doubled each time.
     """
@@ -46,15 +54,39 @@ class _Broken(Exception):
     """The connection ended before the file did."""
 
 
-@contextmanager
-def _connection() -> Iterator[None]:
-    """What fails in here is the network; an OSError from elsewhere is the disk's."""
-    try:
-        yield
-    except urllib.error.HTTPError:
-        raise
-    except (OSError, http.client.HTTPException) as error:
-        raise _Broken(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
+class _Part:
+    """The incomplete file next to ``path``, and a note of its version.
+
+    Attributes:
+        file: ``.NAME.part``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.file = path.with_name(f".{path.name}.part")
+        self._note = path.with_name(f".{path.name}.part.json")
+
+    @property
+    def size(self) -> int:
+        """Bytes received so far."""
+        return self.file.stat().st_size if self.file.is_file() else 0
+
+    @property
+    def version(self) -> str | None:
+        """The server's identifier of the version; None where the download cannot be resumed."""
+        try:
+            version = json.loads(self._note.read_text())["version"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return version if isinstance(version, str) and not version.startswith("W/") else None
+
+    @version.setter
+    def version(self, version: str | None) -> None:
+        write_json(self._note, {"version": version})
+
+    def remove(self) -> None:
+        """Remove the incomplete file and its note."""
+        self.file.unlink(missing_ok=True)
+        self._note.unlink(missing_ok=True)
 
 
 def download(
@@ -64,59 +96,59 @@ def download(
     on_progress: OnProgress | None = None,
     parameters: DownloadParameters | None = None,
 ) -> Path:
-    """Fetch ``url`` to ``path``; a file that is there already is kept.
+    """Download ``url`` to ``path``; a file that exists already is kept.
 
     Args:
         url: http or https.
-        path: where to put it.
-        sha256: checksum in hexadecimal digits; a file that does not have it is not left in place.
+        path: the file to write.
+        sha256: checksum in hexadecimal digits; a file with another checksum is removed.
         on_progress: called after every piece.
-        parameters: patience.
+        parameters: timeouts and attempts.
 
     Raises:
-        UserError: no http address, the server refuses or cannot be reached, or the checksum differs.
-        OSError: the disk refuses; it names ``path``. What came is kept for the next time.
+        UserError: not an http address, the server refuses or cannot be reached, or the checksum differs.
+        OSError: the disk's error; it names ``path``. Received bytes are kept for the next run.
     """
     path, parameters = Path(path), parameters or DownloadParameters()
     if urllib.parse.urlsplit(url).scheme not in ("http", "https"):
         raise UserError(f"{url}: not an address of a file; expected http:// or https://.")
     if path.is_file():
-        _refuse_other(path, sha256, "remove it, or correct data.sha256")
+        _check_sha256(path, sha256, "remove it, or correct data.sha256")
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    with named(path, nameless=True):
+    part = _Part(path)
+    with name_in_errors(path, nameless=True):
         _fetch(url, part, on_progress, parameters)
     try:
-        _refuse_other(part, sha256, "it was removed; download again, or correct data.sha256")
+        _check_sha256(part.file, sha256, "it was removed; download again, or correct data.sha256")
     except UserError:
-        forget(part)
+        part.remove()
         raise
-    part.replace(path)
-    forget(part)
+    part.file.replace(path)
+    part.remove()
     return path
 
 
-def _fetch(url: str, part: Path, on_progress: OnProgress | None, parameters: DownloadParameters) -> None:
-    """Connect until the file is whole; give up after so many connections that bring nothing."""
+def _fetch(url: str, part: _Part, on_progress: OnProgress | None, parameters: DownloadParameters) -> None:
+    """Connect until the file is complete; give up after several connections in a row that bring nothing."""
     failures, wait = 0, parameters.wait_s
     while True:
-        before = size_of(part)
+        before = part.size
         try:
             _connect(url, part, on_progress, parameters.timeout_s)
             return
         except urllib.error.HTTPError as error:
             if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and before:
-                forget(part)  # The part is longer than the file: from another version.
+                part.remove()  # It is longer than the file, so it is of another version.
             elif error.code < 500:
                 raise UserError(f"{url}: the server says {error.code} {error.reason}; check data.url.") from error
             reason = f"{error.code} {error.reason}"
         except _Broken as error:
             reason = str(error)
-        failures = 0 if size_of(part) > before else failures + 1
+        failures = 0 if part.size > before else failures + 1
         if failures >= parameters.attempts:
             raise UserError(
-                f"{url}: cannot be fetched, {size_of(part)} bytes came ({reason}); check the network and run the "
+                f"{url}: cannot be fetched, {part.size} bytes came ({reason}); check the network and run the "
                 "command again, it goes on from there."
             )
         if failures:
@@ -124,61 +156,60 @@ def _fetch(url: str, part: Path, on_progress: OnProgress | None, parameters: Dow
             wait *= 2.0
 
 
-def _connect(url: str, part: Path, on_progress: OnProgress | None, timeout_s: float) -> None:
+def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: float) -> None:
     """One connection: the rest of the file, or all of it."""
-    have, version = size_of(part), version_of(part)
+    received, version = part.size, part.version
     request = urllib.request.Request(url, headers={"User-Agent": "ganlane", "Accept-Encoding": "identity"})
-    if have and version:
-        request.add_header("Range", f"bytes={have}-")
+    if received and version:
+        request.add_header("Range", f"bytes={received}-")
         request.add_header("If-Range", version)
-    with _connection():
+    with _network():
         answer = urllib.request.urlopen(request, timeout=timeout_s)
     with answer:
-        goes_on = answer.status == http.HTTPStatus.PARTIAL_CONTENT
-        if goes_on and _range_start(answer) != have:
-            forget(part)
+        resumes = answer.status == http.HTTPStatus.PARTIAL_CONTENT
+        if resumes and _range_start(answer) != received:
+            part.remove()
             raise _Broken("the server sent another part than the one asked for")
-        have = have if goes_on else 0
+        received = received if resumes else 0
         length = answer.headers.get("Content-Length")
-        total = None if length is None else have + int(length)
-        if not goes_on:
-            note_version(part, answer.headers.get("ETag") or answer.headers.get("Last-Modified"))
-        _receive(answer, part, have, total, on_progress)
+        total = None if length is None else received + int(length)
+        if not resumes:
+            part.version = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
+        with part.file.open("ab" if received else "wb") as file:
+            while piece := _read(answer):
+                file.write(piece)
+                received += len(piece)
+                if on_progress is not None:
+                    on_progress(received, total)
+    if total is not None and received < total:
+        raise _Broken(f"{received} of {total} bytes came")
 
 
-def _receive(
-    answer: http.client.HTTPResponse, part: Path, have: int, total: int | None, on_progress: OnProgress | None
-) -> None:
-    """Add what comes to the part."""
-    with part.open("ab" if have else "wb") as file:
-        for piece in _pieces(answer):
-            file.write(piece)
-            have += len(piece)
-            if on_progress is not None:
-                on_progress(have, total)
-    if total is not None and have < total:
-        raise _Broken(f"{have} of {total} bytes came")
+def _read(answer: http.client.HTTPResponse) -> bytes:
+    with _network():
+        return answer.read1(_PIECE_BYTES)
 
 
-def _pieces(answer: http.client.HTTPResponse) -> Iterator[bytes]:
-    """What comes, as it comes."""
-    while True:
-        with _connection():
-            piece = answer.read1(_PIECE)
-        if not piece:
-            return
-        yield piece
+@contextmanager
+def _network() -> Iterator[None]:
+    """Errors in this context are the network's; an OSError elsewhere is the disk's."""
+    try:
+        yield
+    except urllib.error.HTTPError:
+        raise
+    except (OSError, http.client.HTTPException) as error:
+        raise _Broken(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
 
 
 def _range_start(answer: http.client.HTTPResponse) -> int | None:
-    """Where the answer begins, by its Content-Range: ``bytes 100-199/200``."""
+    """First byte of the answer, by its Content-Range: ``bytes 100-199/200``."""
     _, _, place = (answer.headers.get("Content-Range") or "").partition("bytes ")
     start = place.partition("-")[0]
     return int(start) if start.isdigit() else None
 
 
-def _refuse_other(path: Path, sha256: str | None, advice: str) -> None:
-    """Compare with the checksum, where one is given."""
+def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
+    """Compare with the checksum, if one is given."""
     if sha256 is None:
         return
     with path.open("rb") as file:
@@ -187,3 +218,77 @@ def _refuse_other(path: Path, sha256: str | None, advice: str) -> None:
             digest.update(piece)
     if digest.hexdigest() != sha256.lower():
         raise UserError(f"{path}: its SHA-256 is {digest.hexdigest()}, expected {sha256.lower()}; {advice}.")
+
+
+@contextmanager
+def name_in_errors(path: Path, nameless: bool = False) -> Iterator[None]:
+    """Make the file system's errors name ``path``, which the user gave, instead of the temporary ``.NAME....``.
+
+    Args:
+        path: the file or folder being made.
+        nameless: errors without a file name, as those of a write, name ``path`` too.
+
+    Raises:
+        OSError: as it came, with its ``errno``.
+    """
+    try:
+        yield
+    except OSError as error:
+        known = path if nameless and error.filename is None else _final_path(error.filename, path)
+        if known is None or error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(known)) from error
+
+
+def _final_path(temporary: str | None, path: Path) -> Path | None:
+    """``path``, or a file in it, for the name of its temporary counterpart; None for any other file."""
+    if not isinstance(temporary, str):
+        return None
+    place, full = Path(os.path.abspath(path)).parent, Path(os.path.abspath(temporary))
+    if not full.is_relative_to(place) or full == place:
+        return None
+    hidden, *inside = full.relative_to(place).parts
+    return path.joinpath(*inside) if hidden.startswith(f".{path.name}.") else None
+
+
+class ByteProgress:
+    """Context that shows bytes done, rate and time left: a bar on a terminal, elsewhere a line every 10 s.
+
+    Args:
+        what: the first word, ``download`` or ``read``.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._bar: tqdm | None = None
+        self._begun = time.monotonic()
+        self._last_line = self._begun
+        self._first: int | None = None
+
+    def __call__(self, done: int, total: int | None) -> None:
+        """Called with the bytes done so far and the total, None where that is unknown."""
+        self._first = done if self._first is None else self._first
+        if sys.stderr.isatty():
+            self._bar = self._bar or tqdm(
+                total=total, initial=done, desc=self._what, unit="B", unit_scale=True, file=sys.stderr
+            )
+            self._bar.update(done - self._bar.n)
+        elif time.monotonic() - self._last_line >= LINE_EVERY_S:
+            self._last_line = time.monotonic()
+            print(self.line(done, total), file=sys.stderr, flush=True)
+
+    def line(self, done: int, total: int | None) -> str:
+        """``read: 120 of 1200 MB, 40.0 MB/s, 27 s left``."""
+        rate = (done - (self._first or 0)) / max(time.monotonic() - self._begun, 1e-3)
+        share = f"{done / 1e6:.0f} MB" if total is None else f"{done / 1e6:.0f} of {total / 1e6:.0f} MB"
+        left = f", {(total - done) / rate:.0f} s left" if total is not None and rate > 0.0 else ""
+        return f"{self._what}: {share}, {rate / 1e6:.1f} MB/s{left}"
+
+    def __enter__(self) -> ByteProgress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.close()

@@ -1,4 +1,4 @@
-"""Where the recordings lie."""
+"""Where the recordings are on this machine."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Final
 
 from ganlane.errors import UserError
 
-#: Environment variable that names the folder of the recordings.
+#: Environment variable with the folder of the recordings.
 VARIABLE: Final = "GANLANE_DATA"
 SCENES: Final = Path("ngsim") / "us101_scenes.csv"
 _FOLDER = Path("shared") / "data"
 
 
 def data_folder() -> Path | None:
-    """Folder of the recordings: ``GANLANE_DATA``, else ``../shared/data`` beside the checkout or the current folder.
+    """Folder of the recordings: ``GANLANE_DATA``, else ``../shared/data`` next to the checkout or the current folder.
 
     Returns:
-        The folder, or None when the variable is unset and no such folder is there.
+        The folder, or None when the variable is unset and no such folder exists.
 
     Raises:
-        UserError: ``GANLANE_DATA`` names a folder that is not there.
+        UserError: the folder in ``GANLANE_DATA`` does not exist.
     """
     named = os.environ.get(VARIABLE)
     if named:
@@ -31,15 +31,15 @@ def data_folder() -> Path | None:
             )
         return Path(named)
     checkout = Path(__file__).resolve().parents[2]
-    beside = (checkout.parent / _FOLDER, Path.cwd().parent / _FOLDER)
-    return next((folder for folder in beside if folder.is_dir()), None)
+    candidates = (checkout.parent / _FOLDER, Path.cwd().parent / _FOLDER)
+    return next((folder for folder in candidates if folder.is_dir()), None)
 
 
 def default_scenes() -> Path:
-    """Path of the US-101 scene CSV in :func:`data_folder`, or straight in the folder that ``GANLANE_DATA`` names.
+    """Path of the US-101 scene CSV: ``ngsim/us101_scenes.csv`` in :func:`data_folder`, or the file directly in it.
 
     Raises:
-        UserError: it is not there; the message says what to do.
+        UserError: it does not exist; the message says what to do.
     """
     folder = data_folder()
     candidates = [] if folder is None else [folder / SCENES, folder / SCENES.name]

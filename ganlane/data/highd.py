@@ -1,33 +1,39 @@
 """highD recordings (Krajewski et al. 2018): three files each, 25 Hz, two directions of travel, into the schema.
 
-Each direction becomes a scene of its own, seen as its drivers see it: ``x`` forward, ``y`` to the left, lane 0
-rightmost. highD's pictures have ``y`` downwards and call the length of a vehicle its ``width``; ``x, y`` are the
-upper left corner of its box, from which half a box leads to the centre. Vehicles of the upper lanes (direction 1)
-drive to the left in the picture, those of the lower lanes (direction 2) to the right. Positions and speeds are
-interpolated linearly to 10 Hz; a sample's lane is that of the nearest recorded one. Positions are not smoothed.
+Each direction becomes a scene of its own, in its drivers' view: ``x`` forward, ``y`` to the left, lane 0 rightmost.
+highD's images have ``y`` downwards and call the length of a vehicle its ``width``; ``x, y`` are the upper left
+corner of its bounding box. Vehicles of the upper lanes (direction 1) drive to the left in the image, those of the
+lower lanes (direction 2) to the right. Positions and speeds are interpolated linearly to 10 Hz; the lane is that of
+the nearest recorded frame. Positions are not smoothed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import polars as pl
 
-from ganlane.data.blocks import BLOCK_BYTES, LINE, read_blocks
-from ganlane.data.highd_directions import Direction, as_driven, both_directions
-from ganlane.data.highd_meta import UPPER, HighdMeta, highd_meta
-from ganlane.data.layout import csv_table
-from ganlane.data.resampling import resampling
-from ganlane.data.schema import SCHEMA, sort, validate
-from ganlane.data.source import RowCount, Scene, number_tracks
-from ganlane.data.tables import convert, refuse
+from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, number_tracks, sort, validate
+from ganlane.data.tables import (
+    BLOCK_BYTES,
+    FIRST_LINE,
+    LINE,
+    convert,
+    csv_table,
+    raise_where,
+    read_blocks,
+    read_table,
+)
+from ganlane.data.tracks import Flags, Floats, Integers
 from ganlane.errors import UserError
 
 _TRACKS: Final = "_tracks.csv"
-#: Columns of ``XX_tracks.csv`` that are used.
+#: Columns of ``XX_tracks.csv`` that are read.
 COLUMNS: Final = {
     "frame": pl.Int64,
     "id": pl.Int64,
@@ -38,51 +44,106 @@ COLUMNS: Final = {
     "xvelocity": pl.Float64,
     "laneid": pl.Int64,
 }
+#: ``drivingDirection`` of the upper lanes, driven to the left in the image, and of the lower lanes.
+UPPER: Final = 1
+LOWER: Final = 2
+
+
+@dataclass(frozen=True)
+class _Direction:
+    """One direction of travel.
+
+    Attributes:
+        number: :data:`UPPER` or :data:`LOWER`.
+        lane_ids: highD's numbers of its lanes, from the rightmost.
+        right_edge: ``y`` of the road's right edge in the image, m.
+        lane_width: m.
+    """
+
+    number: int
+    lane_ids: tuple[int, ...]
+    right_edge: float
+    lane_width: float
 
 
 def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
     """Two scenes, ``highd-XX-upper`` and ``highd-XX-lower``, for each recording.
 
     Args:
-        path: an ``XX_tracks.csv``, beside which ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv`` stand, or a folder
-            of such.
+        path: an ``XX_tracks.csv`` in the same folder as ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``, or a
+            folder of recordings.
         count: rows read and dropped are added to it.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
-    count = count if count is not None else RowCount()
-    for tracks in _recordings(Path(path)):
-        meta = highd_meta(tracks, _TRACKS)
-        rows = _rows(tracks, meta, count)
-        for direction in both_directions(meta):
-            scene = _scene(rows, direction, meta, tracks, count)
+    path, count = Path(path), count if count is not None else RowCount()
+    if path.is_dir():
+        recordings = sorted(path.glob(f"*{_TRACKS}"))
+        if not recordings:
+            raise UserError(f"{path}: no XX{_TRACKS} in this folder; give highD's data folder or one such file.")
+    elif not path.name.endswith(_TRACKS):
+        raise UserError(f"{path}: expected highD's XX{_TRACKS} or a folder of recordings.")
+    else:
+        recordings = [path]
+    for tracks in recordings:
+        stem = tracks.name.removesuffix(_TRACKS)
+        rate_hz, directions = _read_recording_meta(tracks.with_name(f"{stem}_recordingMeta.csv"))
+        direction_of = _read_tracks_meta(tracks.with_name(f"{stem}_tracksMeta.csv"))
+        rows = _read_rows(tracks, direction_of, count)
+        for direction in directions:
+            name = f"highd-{stem}-{'upper' if direction.number == UPPER else 'lower'}"
+            scene = _scene(rows, direction, rate_hz, name, tracks, count)
             if scene is not None:
                 yield scene
 
 
-def read_highd(path: str | Path) -> pl.DataFrame:
-    """One recording, or a folder of them, in the schema, sorted (see :func:`highd_scenes`)."""
-    return pl.concat([scene.frame for scene in highd_scenes(path)])
+def _read_recording_meta(path: Path) -> tuple[float, tuple[_Direction, _Direction]]:
+    """Frame rate in Hz, and both directions. Lane ids grow downwards; the id between the directions is unused."""
+    columns = {"frameRate": pl.Float64, "upperLaneMarkings": pl.String, "lowerLaneMarkings": pl.String}
+    row = read_table(path, columns).row(0, named=True)
+    if row["frameRate"] < 10.0:
+        raise UserError(f"{path}, line 2, column frameRate: {row['frameRate']}, expected 10 Hz or more.")
+    upper, lower = (_markings(row[name], path, name) for name in ("upperLaneMarkings", "lowerLaneMarkings"))
+    n_upper, n_lower = len(upper) - 1, len(lower) - 1
+    first_lower = n_upper + 3
+    return row["frameRate"], (
+        _Direction(UPPER, tuple(range(2, 2 + n_upper)), upper[0], (upper[-1] - upper[0]) / n_upper),
+        _Direction(
+            LOWER,
+            tuple(range(first_lower, first_lower + n_lower))[::-1],
+            lower[-1],
+            (lower[-1] - lower[0]) / n_lower,
+        ),
+    )
 
 
-def _recordings(path: Path) -> list[Path]:
-    """The tracks files that ``path`` means."""
-    if path.is_dir():
-        found = sorted(path.glob(f"*{_TRACKS}"))
-        if not found:
-            raise UserError(f"{path}: no XX{_TRACKS} in this folder; give highD's data folder or one such file.")
-        return found
-    if not path.name.endswith(_TRACKS):
-        raise UserError(f"{path}: expected highD's XX{_TRACKS} or a folder of recordings.")
-    return [path]
+def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
+    """``y`` of the lane markings in the image, m: ``8.51;12.59;16.43`` as numbers."""
+    try:
+        found = tuple(float(part) for part in text.split(";") if part.strip())
+    except ValueError:
+        found = ()
+    if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
+        raise UserError(
+            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; expected two or more growing numbers parted by ;"
+        )
+    return found
 
 
-def _rows(path: Path, meta: HighdMeta, count: RowCount) -> pl.DataFrame:
-    """Rows of the tracks file, sorted by vehicle and frame, with each vehicle's direction."""
-    table = csv_table(path, COLUMNS)
+def _read_tracks_meta(path: Path) -> dict[int, int]:
+    """Vehicle to :data:`UPPER` or :data:`LOWER`."""
+    table = read_table(path, {"id": pl.Int64, "drivingDirection": pl.Int64})
+    direction = table["drivingDirection"]
+    what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
+    raise_where(~direction.is_in([UPPER, LOWER]), direction, path, what)
+    return dict(table.iter_rows())
+
+
+def _read_rows(path: Path, direction_of: dict[int, int], count: RowCount) -> pl.DataFrame:
+    """Rows of the tracks file, sorted by vehicle and frame, with each vehicle's ``direction``."""
     blocks = []
-    for text in read_blocks(table, list(COLUMNS), BLOCK_BYTES):
+    for text in read_blocks(csv_table(path, COLUMNS), list(COLUMNS), BLOCK_BYTES):
         lines = text[LINE]
         typed = [convert(text[name], kind, path, lines) for name, kind in COLUMNS.items()]
         blocks.append(pl.DataFrame([*typed, lines]))
@@ -90,45 +151,107 @@ def _rows(path: Path, meta: HighdMeta, count: RowCount) -> pl.DataFrame:
         raise UserError(f"{path}: a header but no rows; copy or unpack the recording again.")
     rows = pl.concat(blocks)
     count.read += rows.height
+    lines = rows[LINE]
     for name in ("width", "height"):
-        refuse(rows[name] <= 0.0, rows[name], path, "is not above 0", rows[LINE])
-    _refuse_disorder(rows, path)
-    directions = rows["id"].replace_strict(meta.directions, default=None, return_dtype=pl.Int64)
-    refuse(directions.is_null(), rows["id"], path, "is not in the tracksMeta file", rows[LINE])
+        raise_where(rows[name] <= 0.0, rows[name], path, "is not above 0", lines)
+    step = rows.select(pl.col("frame").diff().over("id")).to_series()
+    what = "is not after the last frame of its vehicle; frames must grow"
+    raise_where(step <= 0, rows["frame"], path, what, lines)
+    directions = rows["id"].replace_strict(direction_of, default=None, return_dtype=pl.Int64)
+    raise_where(directions.is_null(), rows["id"], path, "is not in the tracksMeta file", lines)
     return rows.with_columns(directions.alias("direction")).sort("id", "frame")
 
 
-def _refuse_disorder(rows: pl.DataFrame, path: Path) -> None:
-    """A vehicle's frames grow in the order of the file."""
-    step = rows.select(pl.col("frame").diff().over("id")).to_series()
-    what = "is not after the last frame of its vehicle; frames must grow"
-    refuse((step <= 0).fill_null(False), rows["frame"], path, what, rows[LINE])
-
-
-def _scene(rows: pl.DataFrame, direction: Direction, meta: HighdMeta, path: Path, count: RowCount) -> Scene | None:
-    """One direction in the schema; None where nobody drives that way."""
-    rows = rows.filter((pl.col("direction") == UPPER) == direction.upper)
+def _scene(
+    rows: pl.DataFrame, direction: _Direction, rate_hz: float, name: str, path: Path, count: RowCount
+) -> Scene | None:
+    """One direction in the schema; None where nobody drives in it."""
+    rows = rows.filter(pl.col("direction") == direction.number)
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
     count.drop("off the lanes of its direction", int((~on_road).sum()))
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
-    name = f"highd-{path.name.removesuffix(_TRACKS)}-{'upper' if direction.upper else 'lower'}"
-    recorded = as_driven(rows, direction, name)
-    numbered = number_tracks(recorded, str(path))
-    frame = _at_ten_hertz(numbered, meta.rate_hz)
+    frame = _to_ten_hertz(number_tracks(_in_driving_direction(rows, direction, name), str(path)), rate_hz)
     if frame.is_empty():
         return None
     return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
 
 
-def _at_ten_hertz(rows: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
-    """The tracks every 0.1 s."""
-    begins = (rows["vehicle"].diff() != 0).fill_null(True).to_numpy()
-    new = resampling(np.asarray(begins), rows["frame"].to_numpy(), rate_hz)
-    kept = {name: new.linear(rows[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
-    whole = {name: rows[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
-    lanes = new.nearest(rows["lane"].to_numpy())
-    return pl.DataFrame({**whole, "frame": new.frame, **kept, "lane": lanes}, schema_overrides=SCHEMA).select(
-        SCHEMA.names()
+def _in_driving_direction(rows: pl.DataFrame, direction: _Direction, name: str) -> pl.DataFrame:
+    """The schema's coordinates and lanes, at the recorded frame rate."""
+    forward = -1.0 if direction.number == UPPER else 1.0
+    along = forward * (pl.col("x") + 0.5 * pl.col("width"))
+    # Upper lanes: left is down in the image, where y grows; lower lanes: left is up.
+    left = -forward * (pl.col("y") + 0.5 * pl.col("height") - direction.right_edge)
+    numbers = {lane_id: lane for lane, lane_id in enumerate(direction.lane_ids)}
+    return rows.select(
+        pl.lit(name).alias("scene"),
+        pl.col("id").alias("vehicle"),
+        "frame",
+        x=along - along.min(),
+        y=left - 0.5 * direction.lane_width,
+        speed=forward * pl.col("xvelocity"),
+        lane=pl.col("laneid").replace_strict(numbers, return_dtype=pl.Int64),
+        length="width",
+        width="height",
     )
+
+
+def _to_ten_hertz(rows: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
+    """The tracks with a frame every 0.1 s."""
+    begins = (rows["vehicle"].diff() != 0).fill_null(True).to_numpy()
+    new = resample(begins, rows["frame"].to_numpy(), rate_hz)
+    columns = {name: rows[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
+    columns["frame"] = new.frame
+    columns |= {name: new.linear(rows[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
+    columns["lane"] = new.nearest(rows["lane"].to_numpy())
+    return pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """Positions of R new samples among the old ones.
+
+    Attributes:
+        frame: [R] new frame numbers, 0.1 s each; frame 0 is the old frame 0.
+        before, after: [R] indices of the old samples before and after it (equal at the end of a track).
+        share: [R] position between the two, 0 to below 1.
+    """
+
+    frame: Integers
+    before: Integers
+    after: Integers
+    share: Floats
+
+    def linear(self, values: Floats) -> Floats:
+        """[R] values, interpolated linearly."""
+        return values[self.before] + self.share * (values[self.after] - values[self.before])
+
+    def nearest(self, values: Integers) -> Integers:
+        """[R] values of the nearest old sample; of two the earlier."""
+        return values[np.where(self.share > 0.5, self.after, self.before)]
+
+
+def resample(begins: Flags, frame: Integers, rate_hz: float) -> Resampling:
+    """Samples every 0.1 s within each track, none beyond its ends.
+
+    Args:
+        begins: [S] true at the first sample of each track; within a track frames grow by one.
+        frame: [S] frame numbers at ``rate_hz``.
+        rate_hz: frame rate of the old samples.
+    """
+    starts = np.flatnonzero(begins)
+    ends = np.append(starts[1:], len(frame)) - 1
+    per_step = rate_hz * FRAME_S
+    # A small tolerance, so that a new frame at the time of an old one is kept in spite of rounding.
+    first = np.ceil(frame[starts] / per_step - 1e-9).astype(np.int64)
+    last = np.floor(frame[ends] / per_step + 1e-9).astype(np.int64)
+    samples = np.maximum(last - first + 1, 0)
+    track = np.repeat(np.arange(len(starts)), samples)
+    offset = np.arange(len(track)) - np.repeat(np.cumsum(samples) - samples, samples)
+    new = first[track] + offset
+    place = new * per_step - frame[starts][track]
+    whole = np.floor(place + 1e-9)
+    before = starts[track] + whole.astype(np.int64)
+    return Resampling(new, before, np.minimum(before + 1, ends[track]), np.clip(place - whole, 0.0, 1.0))

@@ -1,15 +1,15 @@
-"""One lane-change detector for recordings and simulations, and equation 11's times.
+"""Lane changes in recordings and simulations, and their durations (equation 11).
 
-**What counts.** The nearest lane changes between two samples, and it was the old one for the 0.5 s before and is
-the new one for the 0.5 s after, without a break. A vehicle that flickers across the boundary has not changed.
+**What counts.** The nearest lane changes between two samples, and it is the old one during the 0.5 s before and the
+new one during the 0.5 s after, without interruption. A vehicle that only touches the boundary has not changed lanes.
 
-**How long it takes** (equation 11, after Thiemann et al. 2008, in our reading). Going back from the instant of
-the crossing, the change starts at the first sample at which the vehicle is within 0.3 m of the old lane's centre
-or moves towards the new lane at less than 0.1 m/s; ``tau_s`` is the time in between. ``tau_e`` runs on from the
-crossing to the first sample within 0.3 m of the new lane's centre or slower than 0.1 m/s. The lateral speed is
-taken over 1 s, centred, since recorded positions jitter. The offset alone would not do: a fitted road is good to
-some decimetres, and drivers follow lanes beside the centre. A side on which the track ends first is censored:
-its time is a lower bound.
+**Duration** (equation 11, after Thiemann et al. 2008, in our reading). Going back from the crossing, the change
+starts at the first sample at which the vehicle is within 0.3 m of the old lane's centre or moves towards the new
+lane at less than 0.1 m/s; ``tau_s`` is the time in between. ``tau_e`` is the time from the crossing to the first
+sample within 0.3 m of the new lane's centre or slower than 0.1 m/s. The lateral speed is the mean over 1 s,
+centred, since recorded positions are noisy. The offset alone is not enough: a fitted road is accurate to a few
+decimetres, and drivers keep an offset from the centre. Where the track ends first, the change is censored on that
+side: its time is a lower bound.
 """
 
 from __future__ import annotations
@@ -18,21 +18,20 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import polars as pl
 from numpy.typing import ArrayLike
 
 from ganlane.data.schema import FRAME_S
-from ganlane.data.tracks import Flags, Floats, Integers, Tracks, tracks_of_arrays, tracks_of_frame
+from ganlane.data.tracks import Flags, Floats, Integers, Tracks, tracks_of_arrays
 
-#: Both lanes must hold this long, s.
+#: Minimum time in the old lane before the change, and in the new lane after it, s.
 HOLD_S: Final = 0.5
-#: Within this of the lane's centre, m, the change has not begun or is over.
+#: Offset from the lane's centre below which the change has not begun or is over, m.
 CENTRED_M: Final = 0.3
-#: Slower than this towards the new lane, m/s, likewise.
+#: Lateral speed towards the new lane below which the change has not begun or is over, m/s.
 STILL_MPS: Final = 0.1
-#: Half the time over which the lateral speed is taken, s.
+#: Half the window of the mean lateral speed, s.
 SPEED_HALF_WINDOW_S: Final = 0.5
-#: How far from the crossing the start and the end are looked for, s.
+#: Longest search for start and end, before and after the crossing, s.
 SEARCH_S: Final = 20.0
 
 
@@ -43,9 +42,9 @@ class LaneChanges:
     Attributes:
         sample: [C] index of the last sample in the old lane.
         old_lane, new_lane: [C]; 0 is the rightmost.
-        tau_s, tau_e: [C] times from the start to the crossing and from there to the end, s (equation 11).
+        tau_s, tau_e: [C] times from the start to the crossing and from the crossing to the end, s (equation 11).
         start_censored, end_censored: [C] the track begins or ends first; the time is a lower bound.
-        lateral_speed: [C] mean over the change (its visible part, where censored), m/s, positive.
+        lateral_speed: [C] mean over the change (over its recorded part, where censored), m/s, positive.
     """
 
     sample: Integers
@@ -72,24 +71,19 @@ class LaneChanges:
 
 
 def find_lane_changes(tracks: Tracks) -> LaneChanges:
-    """All lane changes of ``tracks``; see the module's text for what counts and how it is timed."""
+    """All lane changes of ``tracks``; the module's docstring defines what counts and how it is timed."""
     lane = tracks.lane
     sample = _crossings(lane, tracks)
     old, new = lane[sample], lane[sample + 1]
     side = np.sign(new - old)
     boundary = (old + 0.5 * side) * tracks.lane_width[sample]
     part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
-    start, starts = _settled(tracks, sample, side, old, -1)
-    end, ends = _settled(tracks, sample + 1, side, new, 1)
+    start, start_seen = _find_end(tracks, sample, side, old, -1)
+    end, end_seen = _find_end(tracks, sample + 1, side, new, 1)
     tau_s = (sample - start + part) * tracks.step_s
     tau_e = (end - sample - part) * tracks.step_s
     moved = side * (tracks.y[end] - tracks.y[start])
-    return LaneChanges(sample, old, new, tau_s, tau_e, ~starts, ~ends, moved / (tau_s + tau_e))
-
-
-def lane_changes_of_frame(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> LaneChanges:
-    """Lane changes of a frame in the schema, sorted; ``sample`` is the row."""
-    return find_lane_changes(tracks_of_frame(frame, lane_widths))
+    return LaneChanges(sample, old, new, tau_s, tau_e, ~start_seen, ~end_seen, moved / (tau_s + tau_e))
 
 
 def lane_changes_of_arrays(
@@ -109,25 +103,25 @@ def lane_changes_of_arrays(
 
 
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:
-    """Last samples in an old lane that was held long enough, before a new one that is."""
+    """[C] last samples in an old lane, where both the old and the new lane are kept long enough."""
     index = np.arange(len(lane))
     fresh = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
     starts = np.flatnonzero(fresh)
     lengths = np.diff(starts, append=len(lane))
-    held = lengths >= round(HOLD_S / tracks.step_s)
+    long_enough = lengths >= round(HOLD_S / tracks.step_s)
     run = np.cumsum(fresh) - 1
     changes = fresh & ~tracks.begins & (index > 0)
     after = np.flatnonzero(changes)
-    return after[held[run[after]] & held[run[after - 1]]] - 1
+    return after[long_enough[run[after]] & long_enough[run[after - 1]]] - 1
 
 
-def _settled(
+def _find_end(
     tracks: Tracks, sample: Integers, side: Integers, lane: Integers, direction: int
 ) -> tuple[Integers, Flags]:
-    """First samples, going ``direction`` in time, at which the vehicle is centred or has stopped moving aside.
+    """Start (``direction`` -1) or end (1) of lane changes: first sample that is centred or without lateral movement.
 
     Returns:
-        [C] the samples, or the track's last ones that way; and [C] whether it settled before the track's end.
+        [C] the samples, or the first or last samples of their tracks; and [C] whether the end lies within the track.
     """
     reach = round(SEARCH_S / tracks.step_s)
     limit = (tracks.first if direction < 0 else tracks.last)[sample]
@@ -143,7 +137,7 @@ def _settled(
 
 
 def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
-    """Mean lateral speed over 1 s about the samples ``at``, m/s; over what there is of it at a track's ends."""
+    """Mean lateral speed over 1 s, centred at the samples ``at``, m/s; the window is shorter at a track's ends."""
     half = round(SPEED_HALF_WINDOW_S / tracks.step_s)
     before = np.maximum(at - half, tracks.first[at])
     after = np.minimum(at + half, tracks.last[at])

@@ -1,4 +1,4 @@
-"""How wide the lanes of a recording are, told by positions and lane numbers alone."""
+"""Lane widths of a recording, estimated from lateral positions and lane numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ganlane.errors import UserError
 
-#: 12 feet, the standard lane of a US freeway: taken where a recording shows one lane only.
+#: 12 feet, the standard lane of a US freeway: used where a recording has one lane only.
 STANDARD_LANE_WIDTH_M: Final = 3.66
 #: A lane counts for the first fit when it has this many rows (0.5 s of one vehicle or more).
 _FEWEST_ROWS = 5
@@ -30,23 +30,26 @@ def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
 
 
 def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
-    """Number of lanes of every scene of a frame in the schema (its highest lane and one)."""
+    """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
     counts = frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1)
     return {str(scene): int(lanes) for scene, lanes in counts.iter_rows()}
 
 
 def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> float:
-    """Width in metres at which 'the lane whose centre is nearest' agrees best with the lane numbers.
+    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number.
 
     Args:
         y: [R] lateral positions, m, with 0 at the centre of lane 0 and growing with the lane number.
         lane: [R] lane numbers.
         scene: name for messages.
 
-    The first guess is the median slope between the median positions of each two lanes (Theil and Sen), which
-    outlying vehicles do not move. It stands if, of the widths within 10 % of it, it puts as many rows into
-    their own lane as any other; else the middle of the best range is taken. Lane changes make that range
-    narrow, since a vehicle's number changes just where it crosses the boundary.
+    The first estimate is the median slope between the median positions of each pair of lanes (Theil and Sen), which
+    is robust to outliers. It is kept if no other width within 10 % of it puts more rows into their recorded lane;
+    otherwise the result is the middle of the best range. Lane changes make that range narrow, since a vehicle's lane
+    number changes just where it crosses the boundary.
+
+    Raises:
+        UserError: the estimate is below 2 m or above 6 m.
     """
     guess = _median_spacing(y, lane)
     if guess is None:
@@ -61,12 +64,13 @@ def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "sc
 
 
 def lane_grid(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> tuple[float, float]:
-    """Lane width, and where the centre of lane 0 lies, where its position is not known beforehand.
+    """Lane width and position of lane 0's centre, both m, where that position is unknown.
 
-    The centre is the median of what each lane's median position says of it; the width is :func:`lane_width`'s.
+    Each lane's median position gives an estimate of the centre; their median is returned. The width is
+    :func:`lane_width`'s.
 
     Args:
-        y: [R] lateral positions, m, growing with the lane number, from anywhere.
+        y: [R] lateral positions, m, growing with the lane number, from any origin.
         lane: [R] lane numbers.
         scene: name for messages.
     """
@@ -80,7 +84,7 @@ def lane_grid(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "sce
 
 
 def _best_range(y: NDArray[np.float64], lane: NDArray[np.int64], guess: float) -> tuple[float, float]:
-    """Widths within 10 % of the guess that most rows agree with: the range nearest to the guess, if several."""
+    """Widths within 10 % of the guess that most rows agree with; of several ranges, the nearest to the guess."""
     # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no upper end.
     begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5))
     end = np.where(lane == 0, np.inf, y / np.where(lane == 0, 1.0, lane - 0.5))

@@ -1,33 +1,113 @@
-"""NGSIM recordings: raw text files and the portal's CSV, in feet, into the schema.
+"""NGSIM recordings: raw text files and the data portal's CSV, in feet, converted into the schema.
 
 Feet become metres; the front centre becomes the centre of the body; lanes, which NGSIM counts from the left, are
-counted from the right, and ``y``, there from the left edge to the right, is measured from the rightmost lane's
-centre to the left. Rows on ramps (lanes beyond ``lanes``) are left out: a ramp is no lane beside the others. US-101's
-auxiliary lane (6) stays, as the rightmost. A car's track ends where a frame is missing or a ramp begins.
+counted from the right, and ``y``, in NGSIM positive to the right from the left edge, is positive to the left from
+the rightmost lane's centre. Rows on ramps (lanes beyond ``lanes``) are dropped, since a ramp is not parallel to the
+lanes. US-101's auxiliary lane (6) is kept, as the rightmost. A car's track ends where a frame is missing or a ramp
+begins.
+
+Vehicle and frame numbers start again in every recording period, so a number alone does not identify a vehicle.
+Within a period ``global_time - 100 ms * frame_id``, the time of frame 0, is the same for every row. Rows are stored
+on disk by the minute of that time, block by block; adjacent minutes are one period. So memory holds one block, then
+one period, never the file, and tracks that extend over several blocks are not cut.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import polars as pl
 
-from ganlane.data.blocks import LINE
 from ganlane.data.lane_widths import lane_grid
-from ganlane.data.ngsim_checks import refuse_disorder, refuse_units
-from ganlane.data.ngsim_periods import Period, sort_into_periods
-from ganlane.data.ngsim_rows import COLUMNS, NgsimParameters, ngsim_rows, ngsim_table
-from ganlane.data.schema import SCHEMA, sort
-from ganlane.data.source import OnProgress, RowCount, Scene, number_tracks
+from ganlane.data.schema import SCHEMA, RowCount, Scene, number_tracks, sort
+from ganlane.data.tables import (
+    BLOCK_BYTES,
+    LINE,
+    OnProgress,
+    TextTable,
+    convert,
+    csv_table,
+    first_line,
+    raise_where,
+    read_blocks,
+)
 from ganlane.errors import UserError
 
 FOOT_M: Final = 0.3048
-#: Rows that tell how wide the lanes are and where they lie.
+FRAME_MS: Final = 100
+MINUTE_MS: Final = 60_000
+#: The 18 columns of the raw text files, which have no header.
+RAW_NAMES: Final = (
+    *("vehicle_id", "frame_id", "total_frames", "global_time", "local_x", "local_y", "global_x", "global_y"),
+    *("v_length", "v_width", "v_class", "v_vel", "v_acc", "lane_id", "preceding", "following"),
+    *("space_headway", "time_headway"),
+)
+#: Columns that are read; ``location`` too, where it exists.
+COLUMNS: Final = {
+    "vehicle_id": pl.Int64,
+    "frame_id": pl.Int64,
+    "global_time": pl.Int64,
+    "local_x": pl.Float64,
+    "local_y": pl.Float64,
+    "v_length": pl.Float64,
+    "v_width": pl.Float64,
+    "v_vel": pl.Float64,
+    "lane_id": pl.Int64,
+}
+LOCATION: Final = "location"
+#: Locations in the portal's file: motorways, and streets with intersections.
+MOTORWAYS: Final = ("us-101", "i-80")
+STREETS: Final = ("lankershim", "peachtree")
+#: A file has about six periods; a damaged column of times or frames makes hundreds.
+MAX_PERIODS: Final = 500
+#: Minimum rows of a period in a file with several periods: a vehicle for 5 s.
+MIN_ROWS: Final = 50
+#: Maximum number of rows from which lane width and position are estimated.
 ROWS_FOR_LANES: Final = 500_000
+#: Medians of vehicle lengths that can be feet: 15 is usual, 4.5 would be metres, 450 centimetres.
+LENGTHS_FT: Final = (8.0, 40.0)
+#: Distance covered divided by speed times time. Recordings give 1.00; km/h give 0.91, miles per hour 1.47.
+PACE: Final = (0.94, 1.06)
+#: The pace is measured on tracks of at least 2 s at 10 ft/s or more.
+_PACE_FRAMES, _PACE_FT_S = 20, 10.0
+
+
+@dataclass(frozen=True)
+class NgsimParameters:
+    """Which rows of an NGSIM file are read.
+
+    Attributes:
+        locations: locations to keep, where the file names them.
+        lanes: number of lanes kept, counted from the left; on US-101 and I-80 lanes 1 to 6 are the main lanes (and
+            US-101's auxiliary lane), higher numbers are ramps.
+        block_bytes: bytes read at once.
+    """
+
+    locations: tuple[str, ...] = MOTORWAYS
+    lanes: int = 6
+    block_bytes: int = BLOCK_BYTES
+
+
+@dataclass(frozen=True)
+class _Period:
+    """Rows of one location and recording period, in the files where they are stored."""
+
+    location: str
+    number: int
+    parts: tuple[Path, ...]
+
+    @property
+    def name(self) -> str:
+        """``us-101-1`` for the first period of US-101."""
+        return f"{self.location}-{self.number}"
+
+    def read(self) -> pl.DataFrame:
+        """All its rows, not sorted."""
+        return pl.concat([pl.read_ipc(part) for part in self.parts])
 
 
 def ngsim_scenes(
@@ -41,78 +121,223 @@ def ngsim_scenes(
 
     Args:
         path: a raw text file (18 columns, no header) or a CSV with NGSIM's column names, in any case and order; with
-            a column ``location`` several places may stand in it.
-        parameters: what to take of it.
+            a column ``location`` it may hold several locations.
+        parameters: which rows to read.
         count: rows read and dropped are added to it.
-        scratch: folder for the rows that are put aside; by default a temporary one. It is emptied in the end.
+        scratch: folder for temporary files, which are removed at the end; by default the system's.
         on_progress: called with the bytes read.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
-    parameters, count = parameters or NgsimParameters(), count if count is not None else RowCount()
-    table = ngsim_table(path)
+    path, parameters = Path(path), parameters or NgsimParameters()
+    count = count if count is not None else RowCount()
+    table = _layout(path)
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
-        periods = sort_into_periods(ngsim_rows(table, parameters, count, on_progress), Path(folder), str(path))
+        periods = _store_by_period(_read_rows(table, parameters, count, on_progress), Path(folder), str(path))
         if not periods:
             places = ", ".join(parameters.locations)
             raise UserError(f"{path}: no rows of {places}; check data.locations.")
         for period in periods:
-            scene = _scene(period, str(path), parameters.lanes, count)
+            scene = _scene(period, path, parameters.lanes, count)
             if scene is not None:
                 yield scene
 
 
-def read_ngsim(path: str | Path, parameters: NgsimParameters | None = None) -> pl.DataFrame:
-    """A whole NGSIM file in the schema, sorted; for files that fit into memory (see :func:`ngsim_scenes`)."""
-    return pl.concat([scene.frame for scene in ngsim_scenes(path, parameters)])
+def _layout(path: Path) -> TextTable:
+    """Raw text if the first line begins with a number and has no comma, else a CSV with a header."""
+    first = first_line(path)
+    fields = first.split()
+    if "," in first or not _is_number(fields[0]):
+        return csv_table(path, COLUMNS)
+    if len(fields) != len(RAW_NAMES):
+        raise UserError(
+            f"{path}, line 1: {len(fields)} columns; expected the {len(RAW_NAMES)} of NGSIM's text files, or a "
+            "header line."
+        )
+    return TextTable(path, RAW_NAMES, has_header=False, blanks=True)
 
 
-def _scene(period: Period, source: str, lanes: int, count: RowCount) -> Scene | None:
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_rows(
+    table: TextTable, parameters: NgsimParameters, count: RowCount, on_progress: OnProgress | None
+) -> Iterator[pl.DataFrame]:
+    """Blocks with :data:`COLUMNS`, ``location`` and ``line``, in feet, in the order of the file."""
+    path, has_location = table.path, LOCATION in table.names
+    wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
+    last_row: pl.DataFrame | None = None
+    for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
+        count.read += text.height
+        if has_location:
+            text = _keep_locations(text, path, parameters.locations, count)
+        else:
+            text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
+        lines = text[LINE]
+        columns = {name: convert(text[name], kind, path, lines, thousands=True) for name, kind in COLUMNS.items()}
+        for name in ("v_length", "v_width"):
+            raise_where(columns[name] <= 0.0, columns[name], path, "is not above 0", lines)
+        raise_where(columns["v_vel"] < 0.0, columns["v_vel"], path, "is below 0", lines)
+        rows = pl.DataFrame([*columns.values(), text[LOCATION], lines])
+        if table.blanks:
+            _check_raw_order(rows if last_row is None else pl.concat((last_row, rows)), path)
+            last_row = rows.tail(1)
+        yield rows
+
+
+def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount) -> pl.DataFrame:
+    """Rows of the wanted locations; rows of others are dropped and counted."""
+    found = convert(text[LOCATION], pl.String, path, text[LINE]).str.to_lowercase()
+    known = sorted({*MOTORWAYS, *STREETS, *locations})
+    what = f"is no known place, expected {', '.join(known)}, or name it in data.locations"
+    raise_where(~found.is_in(known), found, path, what, text[LINE])
+    kept = found.is_in(list(locations))
+    for location, rows in found.filter(~kept).value_counts().iter_rows():
+        count.drop(f"location {location}", rows)
+    return text.with_columns(found).filter(kept)
+
+
+def _check_raw_order(rows: pl.DataFrame, path: Path) -> None:
+    """In the raw files the rows of a vehicle are in the order of time."""
+    same_vehicle = pl.col("vehicle_id").diff() == 0
+    # In concatenated files the same vehicle number may follow itself, in another period.
+    same_period = pl.col("global_time").diff().abs() < MINUTE_MS
+    backwards = rows.select(same_vehicle & same_period & (pl.col("frame_id").diff() < 0)).to_series()
+    what = "is before the last frame of its vehicle; frames must grow"
+    raise_where(backwards, rows["frame_id"], path, what, rows[LINE])
+
+
+def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) -> list[_Period]:
+    """Store the rows of all blocks under ``folder`` and return the periods, by location and time.
+
+    Raises:
+        UserError: ``global_time`` and ``frame_id`` contradict each other; the message names line and column.
+    """
+    parts: dict[tuple[str, int], list[Path]] = {}
+    start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // MINUTE_MS
+    for number, block in enumerate(blocks):
+        for (location, minute), rows in block.group_by(LOCATION, start.alias("minute"), maintain_order=True):
+            part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
+            rows.drop(LOCATION).write_ipc(part, compression="lz4")
+            parts.setdefault((str(location), int(minute)), []).append(part)  # type: ignore[call-overload]
+        if len(parts) > MAX_PERIODS:
+            raise UserError(
+                f"{source}, columns global_time and frame_id: they hold {len(parts)} recording periods or more; "
+                "expected global_time in milliseconds and frame_id in steps of 100 ms."
+            )
+    periods: list[_Period] = []
+    previous: tuple[str, int] | None = None
+    for location, minute in sorted(parts):
+        files = tuple(parts[location, minute])
+        if previous == (location, minute - 1):
+            periods[-1] = _Period(location, periods[-1].number, periods[-1].parts + files)
+        else:
+            same_place = sum(period.location == location for period in periods)
+            periods.append(_Period(location, same_place + 1, files))
+        previous = (location, minute)
+    for period in periods:
+        has_others = sum(other.location == period.location for other in periods) > 1
+        if has_others and len(period.parts) == 1:
+            _check_size(period, source)
+    return periods
+
+
+def _check_size(period: _Period, source: str) -> None:
+    """A few rows that make a period of their own have a wrong time or frame."""
+    rows = period.read()
+    if rows.height < MIN_ROWS:
+        first = rows.sort(LINE).row(0, named=True)
+        raise UserError(
+            f"{source}, line {first[LINE]}, columns frame_id and global_time: frame {first['frame_id']} at "
+            f"{first['global_time']} ms fits no recording period of {period.location} ({rows.height} rows alone); "
+            "mend or remove the row."
+        )
+
+
+def _scene(period: _Period, path: Path, lanes: int, count: RowCount) -> Scene | None:
     """One period in the schema; None where none of its rows is on a lane."""
-    rows = _without_repetitions(period.read(), count)
-    refuse_disorder(rows, Path(source))
-    refuse_units(rows, f"{source}, {period.name}")
-    on_road = rows["lane_id"].is_between(1, lanes)
+    source = f"{path}, {period.name}"
+    rows = _drop_duplicates(period.read(), count)
+    _check_order(rows, path)
+    _check_units(rows, source)
     count.drop("lane below 1", int((rows["lane_id"] < 1).sum()))
     count.drop("ramp", int((rows["lane_id"] > lanes).sum()))
-    rows = rows.filter(on_road)
+    rows = rows.filter(rows["lane_id"].is_between(1, lanes))
     if rows.is_empty():
         return None
-    metric, width = _turned_round(rows, f"{source}, {period.name}")
-    frame = metric.select(
+    from_left = rows["lane_id"].to_numpy() - 1
+    right_m = FOOT_M * rows["local_x"].to_numpy()
+    # Every n-th row is enough to estimate the lanes, and bounds the memory.
+    part = slice(None, None, -(-len(right_m) // ROWS_FOR_LANES))
+    width, first_centre = lane_grid(right_m[part], from_left[part], source)
+    last = int(from_left.max())
+    frame = rows.select(
         pl.lit(period.name).alias("scene"),
         pl.col("vehicle_id").alias("vehicle"),
         pl.col("frame_id").alias("frame"),
         x=FOOT_M * (pl.col("local_y") - 0.5 * pl.col("v_length")),
-        y="y",
+        y=pl.Series(last * width - (right_m - first_centre)),
         speed=FOOT_M * pl.col("v_vel"),
-        lane="lane",
+        lane=pl.Series(last - from_left),
         length=FOOT_M * pl.col("v_length"),
         width=FOOT_M * pl.col("v_width"),
     )
-    return Scene(period.name, sort(number_tracks(frame, source)).select(SCHEMA.names()), width)
+    return Scene(period.name, sort(number_tracks(frame, str(path))).select(SCHEMA.names()), width)
 
 
-def _without_repetitions(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
-    """Rows by vehicle and time; of rows of one vehicle at one time the first in the file stays."""
+def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
+    """Rows by vehicle and time; of several rows of one vehicle at one time the first in the file is kept."""
     rows = rows.sort("vehicle_id", "global_time", LINE)
     again = (pl.col("vehicle_id").diff() == 0) & (pl.col("global_time").diff() == 0)
     values = [name for name in COLUMNS if name not in ("vehicle_id", "global_time")]
-    same = pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in values)
-    told = rows.select(again.fill_null(False).alias("again"), same.fill_null(False).alias("same"))
-    count.drop("duplicate", int((told["again"] & told["same"]).sum()))
-    count.drop("same vehicle and time, other values", int((told["again"] & ~told["same"]).sum()))
-    return rows.filter(~told["again"])
+    equal = pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in values)
+    flags = rows.select(again=again.fill_null(False), equal=equal.fill_null(False))
+    count.drop("duplicate", int((flags["again"] & flags["equal"]).sum()))
+    count.drop("same vehicle and time, other values", int((flags["again"] & ~flags["equal"]).sum()))
+    return rows.filter(~flags["again"])
 
 
-def _turned_round(rows: pl.DataFrame, source: str) -> tuple[pl.DataFrame, float]:
-    """Lanes from the right and ``y`` in metres to the left of the rightmost lane's centre; and the lane width."""
-    from_left = rows["lane_id"].to_numpy() - 1
-    right_m = FOOT_M * rows["local_x"].to_numpy()
-    # Every so many rows tell as much of the lanes, in bounded memory.
-    told = slice(None, None, -(-len(right_m) // ROWS_FOR_LANES))
-    width, first_centre = lane_grid(right_m[told], from_left[told], source)
-    last = int(from_left.max())
-    y = last * width - (right_m - first_centre)
-    return rows.with_columns(y=np.asarray(y), lane=pl.Series(last - from_left)), width
+def _check_order(rows: pl.DataFrame, path: Path) -> None:
+    """Frames must grow with time, and be 100 ms apart."""
+    same_vehicle, frames = pl.col("vehicle_id").diff() == 0, pl.col("frame_id").diff()
+    flags = rows.select(
+        backwards=same_vehicle & (frames <= 0),
+        apart=same_vehicle & (pl.col("global_time").diff() != FRAME_MS * frames),
+    )
+    what = "does not grow with global_time within its vehicle"
+    raise_where(flags["backwards"], rows["frame_id"], path, what, rows[LINE])
+    raise_where(flags["apart"], rows["global_time"], path, "is not 100 ms a frame after the row before", rows[LINE])
+
+
+def _check_units(rows: pl.DataFrame, source: str) -> None:
+    """Lengths, positions or speeds that cannot be in feet and seconds."""
+    line = int(rows[LINE].min())  # type: ignore[arg-type]
+    length = float(rows["v_length"].median())  # type: ignore[arg-type]
+    if not LENGTHS_FT[0] <= length <= LENGTHS_FT[1]:
+        guess = "they look like metres" if length < LENGTHS_FT[0] else "they look like centimetres or inches"
+        raise UserError(
+            f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected feet, about 15; "
+            f"{guess}, convert all columns to feet."
+        )
+    distance = pl.col("local_y").last() - pl.col("local_y").first()
+    seconds = (pl.col("global_time").last() - pl.col("global_time").first()) / 1000.0
+    speed = pl.col("v_vel").mean()
+    per_vehicle = rows.group_by("vehicle_id", maintain_order=True).agg(
+        pace=distance / (seconds * speed), rows=pl.len(), speed=speed
+    )
+    moving = per_vehicle.filter((pl.col("rows") >= _PACE_FRAMES) & (pl.col("speed") >= _PACE_FT_S))
+    if moving.is_empty():
+        return
+    pace = float(moving["pace"].median())  # type: ignore[arg-type]
+    if not PACE[0] <= pace <= PACE[1]:
+        raise UserError(
+            f"{source}, from line {line}, columns local_y and v_vel: vehicles cover {pace:.2f} times the distance "
+            "that their speed makes; expected feet and feet per second (0.91 would be km/h, 1.47 miles per hour, "
+            "3.28 m/s), convert v_vel."
+        )

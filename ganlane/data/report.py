@@ -1,15 +1,13 @@
-"""What was prepared, as text: a few lines for the terminal, and a page of Markdown."""
+"""Reports of ``ganlane prepare``: a few lines for the terminal, and a page of Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from ganlane.data.distributions import Distribution
-from ganlane.data.preparation import Preparation
-from ganlane.data.scene_summary import SceneSummary
+from ganlane.data.prepare import Preparation, SceneSummary
 
-#: A page lists no more scenes than this one by one.
+#: Maximum number of scenes in the table.
 MOST_SCENES: Final = 60
 _QUANTITIES: Final = {
     "speed": "speed, m/s",
@@ -23,7 +21,7 @@ _SHOWN_LEVELS: Final = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def short_report(prepared: Preparation) -> str:
-    """Rows, amount of driving, lane-change rates and durations in a few lines."""
+    """Rows, exposure, lane-change rates and durations in a few lines."""
     exposure = prepared.statistics.exposure
     return "\n".join(
         [
@@ -37,7 +35,7 @@ def short_report(prepared: Preparation) -> str:
 
 
 def long_report(prepared: Preparation, source: str, figure: str) -> str:
-    """The page: ``source`` is what was read, ``figure`` the name of the sheet of figures beside it."""
+    """A page of Markdown about the recordings ``source``, with the image ``figure``."""
     parts = [
         f"# Recordings: {source}",
         "## Rows\n\n" + _bullets(_row_lines(prepared)),
@@ -83,10 +81,10 @@ def _lane_change_lines(prepared: Preparation) -> list[str]:
 
 def _acceleration_lines(prepared: Preparation) -> list[str]:
     statistics = prepared.statistics
-    shares = {name: statistics.strong_share(name) for name in ("acceleration_raw", "acceleration_smoothed")}
-    words = {"acceleration_raw": "as recorded", "acceleration_smoothed": "over 1 s"}
-    told = [f"{100.0 * share:.1f} % {words[name]}" for name, share in shares.items() if share is not None]
-    return [f"accelerations beyond 3 m/s2: {', '.join(told)}"] if told else []
+    titles = {"acceleration_raw": "as recorded", "acceleration_smoothed": "over 1 s"}
+    shares = {title: statistics.strong_share(name) for name, title in titles.items()}
+    parts = [f"{100.0 * share:.1f} % {title}" for title, share in shares.items() if share is not None]
+    return [f"accelerations beyond 3 m/s2: {', '.join(parts)}"] if parts else []
 
 
 def _bullets(lines: Iterable[str]) -> str:
@@ -118,11 +116,10 @@ def _scene_table(scenes: Sequence[SceneSummary]) -> str:
 
 def _distribution_table(prepared: Preparation) -> str:
     head = ["quantity", "samples", "mean", "sd", *(f"{100 * level:g} %" for level in _SHOWN_LEVELS)]
-    described = {name: prepared.statistics.describe(name) for name in _QUANTITIES}
-    return _table(head, [_distribution_row(_QUANTITIES[name], each) for name, each in described.items()])
-
-
-def _distribution_row(name: str, found: Distribution) -> list[str]:
-    quantiles = [found.quantile(level) if found.count else None for level in _SHOWN_LEVELS]
-    shown = ["" if value is None else f"{value:.2f}" for value in (found.mean, found.sd, *quantiles)]
-    return [name, f"{found.count:,}", *shown]
+    rows = []
+    for name, title in _QUANTITIES.items():
+        found = prepared.statistics.describe(name)
+        quantiles = [found.quantile(level) if found.count else None for level in _SHOWN_LEVELS]
+        numbers = ["" if value is None else f"{value:.2f}" for value in (found.mean, found.sd, *quantiles)]
+        rows.append([title, f"{found.count:,}", *numbers])
+    return _table(head, rows)

@@ -1,7 +1,12 @@
-"""Scene CSV: recordings that are straightened already, in metres, with lanes counted from the left."""
+"""Scene CSV and Parquet: recordings that are already straightened and in metres.
+
+Scene CSV counts lanes from the left. Parquet holds the schema itself: ``ganlane prepare`` writes it, and every
+command reads it.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -9,13 +14,12 @@ from typing import Final
 import polars as pl
 
 from ganlane.data.lane_widths import lane_width, scene_lane_widths
-from ganlane.data.prepared import is_prepared, note_scene, prepared_files, read_prepared
-from ganlane.data.schema import SCHEMA, sort, validate
-from ganlane.data.source import RowCount, Scene
-from ganlane.data.tables import FIRST_LINE, read_table
+from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
+from ganlane.data.tables import raise_where, read_table, reason
 from ganlane.errors import UserError
+from ganlane.files import atomic_path
 
-#: Columns of the file; ``y`` is 0 at the centre of lane 1, which is the leftmost, and grows to the left.
+#: Columns of a scene CSV; ``y`` is 0 at the centre of lane 1, which is the leftmost, and positive to the left.
 COLUMNS: Final = {
     "scene": pl.String,
     "vehicle": pl.Int64,
@@ -27,13 +31,14 @@ COLUMNS: Final = {
     "length": pl.Float64,
     "width": pl.Float64,
 }
+_ENDING: Final = ".parquet"
 
 
 def read_scenes(path: str | Path) -> pl.DataFrame:
     """Read a scene CSV, or what ``ganlane prepare`` wrote, into the schema, sorted by scene, vehicle and frame.
 
-    Lanes are turned round (the highest number of a scene, its rightmost lane, becomes 0), and ``y`` is moved so
-    that it is 0 at the centre of that lane. Positions are the file's own: nothing is smoothed.
+    Lanes of a CSV are renumbered from the right (the highest number of a scene, its rightmost lane, becomes 0), and
+    ``y`` is shifted so that it is 0 at the centre of that lane. Positions are not smoothed.
 
     Args:
         path: CSV with the columns ``scene, vehicle, frame, x, y, v, lane, length, width`` (others are ignored);
@@ -41,38 +46,92 @@ def read_scenes(path: str | Path) -> pl.DataFrame:
             of them.
 
     Raises:
-        UserError: a missing or damaged file; the message names file, line and column.
+        UserError: a missing or damaged file, or a scene that is in two files; the message names file, line and
+            column.
     """
-    if is_prepared(path):
-        return read_prepared(path)
-    table = read_table(path, COLUMNS).rename({"v": "speed"})
-    below = table["lane"] < 1
-    if below.any():
-        row = int(below.arg_max() or 0)
-        raise UserError(
-            f"{path}, line {row + FIRST_LINE}, column lane: {table['lane'][row]} is below 1, the leftmost lane."
-        )
-    rows = validate(table, str(path))
-    turned = [_turn_round(scene, f"{path}, scene {name}") for (name,), scene in rows.group_by("scene")]
-    return sort(pl.concat(turned))
+    path, file_of = Path(path), dict[str, Path]()
+    if not _is_parquet(path):
+        return _read_csv(path)
+    frames = []
+    for file in _parquet_files(path):
+        frames.append(_read_parquet(file))
+        for scene in frames[-1]["scene"].unique():
+            _check_one_file(scene, file, file_of)
+    return sort(pl.concat(frames))
 
 
 def scene_csv_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
-    """The scenes of :func:`read_scenes` one by one; ``count`` gets the rows read. Each file is read at once."""
-    seen: dict[str, Path] = {}
-    for file in prepared_files(path) if is_prepared(path) else [Path(path)]:
+    """The scenes of :func:`read_scenes` one by one, in memory for one file; ``count`` gets the rows read."""
+    path, file_of = Path(path), dict[str, Path]()
+    for file in _parquet_files(path) if _is_parquet(path) else [path]:
         frame = read_scenes(file)
         if count is not None:
             count.read += frame.height
         widths = scene_lane_widths(frame)
         for (name,), rows in frame.group_by("scene", maintain_order=True):
-            note_scene(str(name), file, seen)
+            _check_one_file(str(name), file, file_of)
             yield Scene(str(name), rows, widths[str(name)])
 
 
-def _turn_round(scene: pl.DataFrame, source: str) -> pl.DataFrame:
-    """One scene with lanes counted from the right and ``y`` measured from the rightmost lane's centre."""
-    from_left = scene["lane"].to_numpy() - 1
-    width = lane_width(-scene["y"].to_numpy(), from_left, source)
-    last = int(from_left.max())
-    return scene.with_columns(y=pl.col("y") + last * width, lane=last + 1 - pl.col("lane")).select(SCHEMA.names())
+def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
+    """Write a frame in the schema as Parquet, atomically."""
+    with atomic_path(path) as part:
+        frame.write_parquet(part, compression="zstd")
+
+
+def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
+    """Cut each recording into scenes of at most ``seconds``, so that some of them can be held out.
+
+    ``us-101-1`` becomes ``us-101-1-000``, ``us-101-1-001`` and so on; frame numbers do not change. Tracks are cut
+    too, and so may be a lane change.
+    """
+    frames = max(1, round(seconds / FRAME_S))
+    first = pl.col("frame").min().over("scene")
+    number = ((pl.col("frame") - first) // frames).cast(pl.String).str.zfill(3)
+    return sort(frame.with_columns(scene=pl.col("scene") + "-" + number))
+
+
+def parquet_name(scene: str) -> str:
+    """Name of a scene's Parquet file: letters, digits, dots and dashes."""
+    return re.sub(r"[^\w.-]+", "_", scene).lstrip(".") + _ENDING
+
+
+def _read_csv(path: Path) -> pl.DataFrame:
+    table = read_table(path, COLUMNS).rename({"v": "speed"})
+    raise_where(table["lane"] < 1, table["lane"], path, "is below 1, the leftmost lane")
+    rows = validate(table, str(path))
+    scenes = []
+    for (name,), scene in rows.group_by("scene"):
+        from_left = scene["lane"].to_numpy() - 1
+        width = lane_width(-scene["y"].to_numpy(), from_left, f"{path}, scene {name}")
+        last = int(from_left.max())
+        scenes.append(scene.with_columns(y=pl.col("y") + last * width, lane=last + 1 - pl.col("lane")))
+    return sort(pl.concat(scenes).select(SCHEMA.names()))
+
+
+def _is_parquet(path: Path) -> bool:
+    """Whether ``path`` means Parquet: a file of that ending, or a folder."""
+    return path.is_dir() or path.suffix == _ENDING
+
+
+def _parquet_files(path: Path) -> list[Path]:
+    files = sorted(path.glob(f"*{_ENDING}")) if path.is_dir() else [path]
+    if not files:
+        raise UserError(f"{path}: no such file as *{_ENDING} in this folder; give what ganlane prepare wrote.")
+    return files
+
+
+def _read_parquet(path: Path) -> pl.DataFrame:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder.")
+    try:
+        frame = pl.read_parquet(path)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise UserError(f"{path}: not a readable Parquet file ({reason(error)}); prepare it again.") from error
+    return validate(frame, str(path), first_line=None)
+
+
+def _check_one_file(scene: str, file: Path, file_of: dict[str, Path]) -> None:
+    """Note the ``file`` of a ``scene``; a scene must not be in two files."""
+    if file_of.setdefault(scene, file) != file:
+        raise UserError(f"{file}: scene {scene} is in {file_of[scene]} too; remove one of them.")

@@ -1,7 +1,7 @@
 """Synthetic recordings: small, deterministic, free to share; for tests and for runs on a machine without data.
 
-They look like a motorway from afar and are not a model of anybody's driving: vehicles start in slots along the
-road that nobody shares, keep about one speed, and some change lanes along half a cosine. Nobody overlaps.
+They are not a driver model: vehicles start in slots of their own along the road, keep about one speed, and some
+change lanes along half a cosine. No two vehicles overlap.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from ganlane.files import atomic_path
 
 @dataclass(frozen=True)
 class SyntheticTraffic:
-    """What the recordings look like.
+    """Parameters of the recordings.
 
     Speeds follow ``speed_mps`` plus a sine of up to ``speed_swing_mps`` and a period of 6 to 10 s; with the
-    default slots no two vehicles can meet. A change takes 3 to 5 s and ends inside the recording.
+    default slots no two vehicles can collide. A lane change takes 3 to 5 s and ends within the recording.
     """
 
     scenes: int = 2
@@ -49,7 +49,7 @@ def write_scene_csv(
 ) -> None:
     """Write a frame in the schema as the scene CSV that :func:`ganlane.data.read_scenes` reads.
 
-    Lanes are counted from the left, and ``y`` is 0 at the centre of the leftmost; heading follows from the path.
+    Lanes are counted from the left, and ``y`` is 0 at the centre of the leftmost; the heading is that of the path.
     """
     leftmost = pl.col("lane").max().over("scene")
     ahead, aside = (pl.col(name).diff().over("scene", "vehicle") for name in ("x", "y"))
@@ -70,7 +70,7 @@ def write_scene_csv(
 
 
 def _scene(traffic: SyntheticTraffic, number: int, random: np.random.Generator) -> pl.DataFrame:
-    """One scene; every vehicle is there in every frame."""
+    """One scene; every vehicle is present in every frame."""
     n, frames = traffic.vehicles, round(traffic.seconds / FRAME_S)
     time = np.arange(frames) * FRAME_S
     home = random.permutation(np.arange(n) % traffic.lanes)
@@ -91,7 +91,7 @@ def _scene(traffic: SyntheticTraffic, number: int, random: np.random.Generator) 
 
 
 def _along(traffic: SyntheticTraffic, time: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and speeds along the road, each [vehicles, frames]: a slot each, and a sine about one speed."""
+    """Positions and speeds along the road, each [vehicles, frames]: one slot each, and a sine around one speed."""
     n = traffic.vehicles
     swing = random.uniform(0.3, 1.0, (n, 1)) * traffic.speed_swing_mps
     omega = 2.0 * math.pi / random.uniform(6.0, 10.0, (n, 1))
@@ -102,7 +102,7 @@ def _along(traffic: SyntheticTraffic, time: np.ndarray, random: np.random.Genera
 
 
 def _across(traffic: SyntheticTraffic, time: np.ndarray, home: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Offsets from the first lane's centre, [vehicles, frames]: a slow wander, and for some a change of lane."""
+    """Offsets from the first lane's centre, [vehicles, frames]: a slow wander, and for some a lane change."""
     n, end = traffic.vehicles, time[-1]
     wander = traffic.wander_m * np.sin(random.uniform(0.3, 0.8, (n, 1)) * time + random.uniform(0.0, 6.28, (n, 1)))
     side = np.where(home == 0, 1, np.where(home == traffic.lanes - 1, -1, random.choice([-1, 1], n)))

@@ -1,8 +1,14 @@
-"""Reading a comma-separated table of numbers, with every fault traced to its line and column."""
+"""Text tables as typed columns, with every error traced to its line and column.
+
+:func:`read_table` reads a small CSV file at once. :func:`read_blocks` reads a file of any size block by block, as
+text that :func:`convert` turns into numbers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -10,16 +16,39 @@ import polars as pl
 
 from ganlane.errors import UserError
 
-#: The header is line 1, so the first row of numbers is line 2.
-FIRST_LINE = 2
-#: ``1,118,846,980,200``: commas that part thousands, as against those of a decimal comma.
+#: Line of the first row of data below a header, which is line 1.
+FIRST_LINE: Final = 2
+#: Bytes read at once: about 300,000 rows of NGSIM, which take a few times as much memory.
+BLOCK_BYTES: Final = 32 * 2**20
+#: Column that holds each row's line number in the file.
+LINE: Final = "line"
+#: ``1,118,846,980,200``: commas that separate thousands, unlike a decimal comma.
 _THOUSANDS: Final = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"
 
 Kind = pl.DataType | type[pl.DataType]
+#: Called with the bytes done so far and the total, None where the total is unknown.
+OnProgress = Callable[[int, int | None], None]
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Layout of a text table.
+
+    Attributes:
+        path: the file.
+        names: names of the columns, in lower case, in order.
+        has_header: whether line 1 holds the names.
+        blanks: whether runs of blanks separate the columns, instead of a comma.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    has_header: bool = True
+    blanks: bool = False
 
 
 def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
-    """Read the named ``columns`` of a CSV file with a header, in file order; other columns are left out.
+    """Read the named ``columns`` of a CSV file with a header, in file order; other columns are ignored.
 
     Args:
         path: the file.
@@ -31,19 +60,56 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
             number expected; the message names file, line and column.
     """
     path = Path(path)
-    text = _read_text(path)
-    refuse_missing(columns, text.columns, path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give the path of a CSV file.")
+    try:
+        text = pl.read_csv(path, infer_schema=False)
+    except pl.exceptions.NoDataError as error:
+        raise UserError(f"{path}: the file is empty; a CSV file with a header was expected.") from error
+    except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not a readable CSV table ({reason(error)}).") from error
+    _check_columns(columns, text.columns, path)
     if text.is_empty():
         raise UserError(f"{path}: a header but no rows; give a file with at least one row of data.")
     return text.select(convert(text[name], kind, path) for name, kind in columns.items())
 
 
-def refuse_missing(wanted: Mapping[str, Kind], found: list[str], path: Path) -> None:
-    """Name the columns that are not there.
+def csv_table(path: str | Path, wanted: Mapping[str, Kind]) -> TextTable:
+    """Layout of a CSV file according to its header line; names are compared in lower case.
 
     Raises:
-        UserError: one of ``wanted`` is not among ``found``.
+        UserError: no such file, an empty one, or one without a ``wanted`` column.
     """
+    path = Path(path)
+    names = tuple(name.strip().lower() for name in next(csv.reader([first_line(path)]), []))
+    _check_columns(wanted, names, path)
+    return TextTable(path, names)
+
+
+def first_line(path: Path) -> str:
+    """The first line of a text file, without a byte order mark.
+
+    Raises:
+        UserError: no such file, an empty file, or not text.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give the path of a text table.")
+    with path.open("rb") as file:
+        raw = file.readline(2**16)
+    if not raw.strip():
+        raise UserError(f"{path}: the file is empty; a table of text was expected.")
+    try:
+        return raw.decode("utf-8-sig").strip()
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}, line 1: not text ({error.reason}); give an unpacked text or CSV file.") from error
+
+
+def reason(error: Exception) -> str:
+    """The first line of a library's error message, to be quoted inside one of ours."""
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
+
+
+def _check_columns(wanted: Mapping[str, Kind], found: Sequence[str], path: Path) -> None:
     missing = [name for name in wanted if name not in found]
     if missing:
         raise UserError(
@@ -51,68 +117,169 @@ def refuse_missing(wanted: Mapping[str, Kind], found: list[str], path: Path) -> 
         )
 
 
-def _read_text(path: Path) -> pl.DataFrame:
-    """The whole table as text."""
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; give the path of a CSV file.")
-    try:
-        return pl.read_csv(path, infer_schema=False)
-    except pl.exceptions.NoDataError as error:
-        raise UserError(f"{path}: the file is empty; a CSV file with a header was expected.") from error
-    except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not a readable CSV table ({_first_line(error)}).") from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
-
-
 def convert(
     text: pl.Series, kind: Kind, path: Path, lines: pl.Series | None = None, thousands: bool = False
 ) -> pl.Series:
-    """One column of text as ``kind``.
+    """Convert one column of text to ``kind``.
 
     Args:
         text: the column.
         kind: ``String``, ``Int64`` or ``Float64``.
         path: for messages.
-        lines: the line of each row, for messages; by default they follow a header.
-        thousands: whether commas may part thousands.
+        lines: the line of each row, for messages; by default the rows follow a header.
+        thousands: whether commas may separate thousands.
 
     Raises:
         UserError: a field is empty or not what was expected; the first one is named by file, line and column.
     """
     text = text.str.strip_chars()
-    refuse(text.is_null() | (text == ""), text, path, "is empty; the row is incomplete", lines)
+    raise_where(text.is_null() | (text == ""), text, path, "is empty; the row is incomplete", lines)
     if kind == pl.String:
         return text
-    plain = _without_thousands(text) if thousands else text
+    plain = text
+    if thousands:
+        field = pl.col(text.name)
+        # Any other comma stays, so that the field is reported as no number.
+        without = pl.when(field.str.contains(_THOUSANDS)).then(field.str.replace_all(",", "", literal=True))
+        plain = text.to_frame().select(without.otherwise(field)).to_series()
     numbers = plain.cast(pl.Float64, strict=False)
-    if numbers.null_count():
-        refuse(numbers.is_null(), text, path, "is not a number", lines)
-    refuse(~numbers.is_finite(), text, path, "is not a finite number", lines)
+    raise_where(numbers.is_null(), text, path, "is not a number", lines)
+    raise_where(~numbers.is_finite(), text, path, "is not a finite number", lines)
     if kind == pl.Int64:
-        refuse(numbers != numbers.round(), text, path, "is not a whole number", lines)
+        raise_where(numbers != numbers.round(), text, path, "is not a whole number", lines)
     return numbers.cast(kind)
 
 
-def _without_thousands(text: pl.Series) -> pl.Series:
-    """Without commas where they part thousands; elsewhere they stay, and make no number."""
-    grouped = pl.col("field").str.contains(_THOUSANDS)
-    plain = pl.when(grouped).then(pl.col("field").str.replace_all(",", "", literal=True)).otherwise("field")
-    return pl.DataFrame({"field": text}).select(plain.alias(text.name))[text.name]
-
-
-def refuse(bad: pl.Series, values: pl.Series, path: Path, what: str, lines: pl.Series | None = None) -> None:
-    """Report the first row that is ``bad``, if any.
+def raise_where(bad: pl.Series, values: pl.Series, path: Path, what: str, lines: pl.Series | None = None) -> None:
+    """Raise an error for the first row that is ``bad``, if there is one; null is not bad.
 
     Raises:
         UserError: naming file, line, column and value.
     """
-    row = bad.arg_max() if bad.any() else None
+    row = bad.fill_null(False).arg_max() if bad.any() else None
     if row is None:
         return
     value = values[row]
     field = "the field" if value in (None, "") else repr(value)
     line = row + FIRST_LINE if lines is None else lines[row]
     raise UserError(f"{path}, line {line}, column {values.name}: {field} {what}; mend or remove the row.")
+
+
+def read_blocks(
+    table: TextTable, wanted: Sequence[str], block_bytes: int = BLOCK_BYTES, on_progress: OnProgress | None = None
+) -> Iterator[pl.DataFrame]:
+    """The ``wanted`` columns as text, and ``line``, block by block; rows in the order of the file.
+
+    Args:
+        table: the layout.
+        wanted: names of columns.
+        block_bytes: bytes read at once.
+        on_progress: called with the bytes read.
+
+    Raises:
+        UserError: a row with too many or too few fields or with bytes that are not text, an empty line, or a last
+            row that is cut off; the message names file and line.
+    """
+    number = FIRST_LINE if table.has_header else 1
+    done, total = 0, table.path.stat().st_size
+    for block, has_no_end in _whole_lines(table, block_bytes):
+        # A last line without a line break is a row only if it has all its fields.
+        if has_no_end and (found := len(_fields(table, block))) < len(table.names):
+            raise UserError(
+                f"{table.path}, line {number}, column {table.names[max(found - 1, 0)]}: the file breaks off here, "
+                f"{found} of {len(table.names)} columns into the row; copy or download it again."
+            )
+        rows = block.count(b"\n") + (not block.endswith(b"\n"))
+        yield _parse(table, block, wanted, number, rows)
+        number += rows
+        done += len(block)
+        if on_progress is not None:
+            on_progress(done, total)
+
+
+def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bool]]:
+    """Blocks of whole lines; true for a last line without a line break. Empty lines at the end are left out."""
+    with table.path.open("rb") as file:
+        if table.has_header:
+            file.readline()
+        rest = b""
+        while read := file.read(block_bytes):
+            together = rest + read
+            # The last non-empty line is held back: it may be the file's last.
+            cut = together.rstrip().rfind(b"\n") + 1
+            if cut:
+                yield together[:cut], False
+            rest = together[cut:]
+        if rest.strip():
+            yield rest.rstrip(), not rest.endswith(b"\n")
+
+
+def _fields(table: TextTable, line: bytes) -> list[str]:
+    text = line.decode("utf-8", errors="replace")
+    return text.split() if table.blanks else next(csv.reader([text]), [])
+
+
+def _parse(table: TextTable, block: bytes, wanted: Sequence[str], number: int, rows: int) -> pl.DataFrame:
+    """One block of ``rows`` lines, the first of which is line ``number``."""
+    separator = b" " if table.blanks else b","
+    if table.blanks:
+        block = _single_blanks(block)
+    # Columns are named by their position while parsing, since a file may use a name twice.
+    columns = [b"c%d" % k for k in range(len(table.names))]
+    places = {f"c{table.names.index(name)}": name for name in wanted}
+    # The parser does not check columns that it skips, so extra fields are found by counting separators.
+    has_quotes = b'"' in block
+    if not has_quotes and block.count(separator) != rows * (len(columns) - 1):
+        _raise_at_bad_line(table, block, number)
+    try:
+        frame = pl.read_csv(
+            separator.join(columns) + b"\n" + block,
+            separator=separator.decode(),
+            infer_schema=False,
+            columns=None if has_quotes else list(places),
+        )
+    except (pl.exceptions.PolarsError, UnicodeDecodeError) as error:
+        _raise_at_bad_line(table, block, number)
+        raise UserError(f"{table.path}, from line {number}: not a readable table ({error}).") from error
+    if frame.height != rows:
+        _raise_at_bad_line(table, block, number)
+        raise UserError(f"{table.path}, from line {number}: a row stretches over several lines.")
+    frame = frame.select(pl.col(place).alias(name) for place, name in places.items())
+    return frame.with_columns(pl.int_range(number, number + rows, dtype=pl.Int64).alias(LINE))
+
+
+def _single_blanks(block: bytes) -> bytes:
+    """One blank between the fields of each line, none at its ends."""
+    block = block.replace(b"\r\n", b"\n").replace(b"\t", b" ")
+    while b"  " in block:
+        block = block.replace(b"  ", b" ")
+    return block.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
+
+
+def _raise_at_bad_line(table: TextTable, block: bytes, number: int) -> None:
+    """Look for the first line that does not fit the table."""
+    expected = len(table.names)
+    for line, raw in enumerate(block.removesuffix(b"\n").split(b"\n"), number):
+        place = f"{table.path}, line {line}"
+        if not raw.strip():
+            raise UserError(f"{place}: the line is empty; remove it.")
+        if not _is_text(raw):
+            raise UserError(f"{place}: the line is not text; copy or download the file again.")
+        if raw.count(b'"') % 2:
+            raise UserError(f"{place}: a quotation mark without its counterpart; mend or remove the row.")
+        found = len(_fields(table, raw))
+        if found > expected:
+            raise UserError(f"{place}: {found} fields, expected {expected}; mend or remove the row.")
+        if found < expected:
+            column = table.names[found - 1]
+            raise UserError(
+                f"{place}, column {column}: the row ends after {found} of {expected} fields; mend or remove it."
+            )
+
+
+def _is_text(raw: bytes) -> bool:
+    try:
+        raw.decode()
+    except UnicodeDecodeError:
+        return False
+    return True

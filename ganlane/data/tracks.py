@@ -1,7 +1,7 @@
-"""Many tracks in one flat array: the form in which recordings and simulations are measured alike.
+"""Tracks as flat arrays: the common form in which recordings and simulations are measured.
 
-Samples of a track follow each other 0.1 s apart; where a vehicle is missing for a sample, its track ends and
-another begins. Everything here is vectorised over all samples of all tracks.
+The samples of a track are consecutive, 0.1 s apart; where a vehicle is missing for a sample, its track ends and
+another begins. Everything is vectorised over all samples of all tracks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Tracks:
-    """R samples of any number of tracks, one track after the other.
+    """R samples of any number of tracks, track by track.
 
     Attributes:
         y: [R] lateral position, m; lane k's centre is at ``k * lane_width``.
@@ -38,7 +38,7 @@ class Tracks:
 
     @property
     def lane(self) -> Integers:
-        """[R] the lane whose centre is nearest."""
+        """[R] lane whose centre is nearest."""
         return np.rint(self.y / self.lane_width).astype(np.int64)
 
     @property
@@ -84,12 +84,12 @@ def tracks_of_arrays(
         y: [T, K] lateral positions, m, of K vehicles at T samples.
         lane_width: m.
         valid: [T, K] false where there is no vehicle; all true by default.
-        begins: [T, K] true where another vehicle takes the column over (a reset, a recycled vehicle); the first
-            valid sample after a gap counts as one anyway.
+        begins: [T, K] true where the column continues with another vehicle (a reset, a recycled vehicle); the first
+            valid sample after a gap always begins a track.
         step_s: time between samples.
 
     Returns:
-        The tracks, and [R, 2] the (time, column) that each sample has in the arrays.
+        The tracks, and [R, 2] the (time, column) of each sample in the arrays.
     """
     columns = np.asarray(y, dtype=np.float64).T
     there = np.ones(columns.shape, bool) if valid is None else np.asarray(valid, bool).T

@@ -1,11 +1,11 @@
 """The simulator as pure functions on tensors (sections IV and V of the paper); no TorchRL in here.
 
-A scene is a record of [N, M] tensors (:class:`Vehicles`: N environments, M vehicles). From it follow, in this
-order, what each driver sees (:func:`perceive`, :mod:`~ganlane.sim.lanes`, :mod:`~ganlane.sim.neighbours`), how
-hard it accelerates (:mod:`~ganlane.sim.idm`, :mod:`~ganlane.sim.following`), whether it changes lanes
-(:mod:`~ganlane.sim.mobil`), how it turns the wheel (:mod:`~ganlane.sim.steering`), where the car goes
-(:mod:`~ganlane.sim.bicycle`) and whether it hits something (:mod:`~ganlane.sim.collisions`).
-:mod:`~ganlane.sim.spawn` makes the first scene of an episode, :mod:`~ganlane.sim.episode` says when one ends,
+A scene is a record of [N, M] tensors (:class:`Vehicles`: N environments, M vehicles). From it are computed, in this
+order: what each driver sees (:func:`perceive`, :mod:`~ganlane.sim.lanes`, :mod:`~ganlane.sim.neighbours`), its
+acceleration (:mod:`~ganlane.sim.idm`, :mod:`~ganlane.sim.following`), its lane
+changes (:mod:`~ganlane.sim.mobil`), its steering (:mod:`~ganlane.sim.steering`), its motion
+(:mod:`~ganlane.sim.bicycle`) and collisions (:mod:`~ganlane.sim.collisions`).
+:mod:`~ganlane.sim.spawn` makes the initial scene of an episode, :mod:`~ganlane.sim.episode` defines its end,
 :mod:`~ganlane.sim.recycle` keeps the road populated and :mod:`~ganlane.sim.random` makes every random number.
 """
 

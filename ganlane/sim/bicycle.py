@@ -12,7 +12,7 @@ WHEELBASE_M = 2.7
 
 
 class Pose(NamedTuple):
-    """Where a vehicle is and how fast: x, y (m), heading (rad), speed (m/s), acceleration realised (m/s2)."""
+    """Position x, y (m), heading (rad), speed (m/s) and realised acceleration (m/s2) of a vehicle."""
 
     x: Tensor
     y: Tensor
@@ -32,8 +32,8 @@ def advance(
     """One step of ``dt`` seconds.
 
     The distance is the mean of old and new speed times ``dt`` (exact for constant acceleration), so it never
-    exceeds ``max(v_old, v_new) dt``; a vehicle that brakes to a stop stays there. The mean heading of the step
-    gives the direction, so a constant steering angle drives a circle to second order.
+    exceeds ``max(v_old, v_new) dt``; a vehicle that brakes to a stop does not roll back. The direction is the mean
+    heading of the step, so a constant steering angle gives a circle, accurate to second order.
     """
     new_speed = (speed + acceleration * dt).clamp_min(0.0)
     distance = 0.5 * (speed + new_speed) * dt

@@ -1,4 +1,4 @@
-"""Can a follower brake in time? The question that tells a hard scene from a hopeless one."""
+"""Can an IDM follower avoid a leader that brakes at the limit?"""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import SMALLEST_GAP_M, TABLE_V, IdmParameters, idm_acceleration
 
-#: Long enough for every meeting that may end badly: a stop from 60 m/s at 1 m/s2, s.
+#: Simulated time, s: enough for a stop from 60 m/s at 1 m/s2.
 HORIZON_S = 60.0
 
 
 def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
-    """Constant deceleration (m/s2, >= 0) that keeps a follower off a leader of constant speed; infinite without gap.
+    """Constant deceleration (m/s2, >= 0) to avoid a leader at constant speed; infinite for a gap of 0 or less.
 
     Args:
         speed, leader_speed: m/s.
@@ -29,11 +29,11 @@ def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Ten
 def smallest_gap(
     gap: Tensor, speed: Tensor, leader_speed: Tensor, desired_speed: float, idm: IdmParameters = TABLE_V
 ) -> Tensor:
-    """Smallest gap (m) to a leader that brakes at once, as hard as anybody can, to a stand; negative: a crash.
+    """Smallest gap (m) to a leader that brakes at ``idm.min_acceleration`` to a stop from now on; negative: a crash.
 
-    Two vehicles, IDM, steps of 0.1 s. Of all leaders that brake no harder than ``idm.min_acceleration`` this is the
-    worst: any other is always ahead of it and no slower, so a driver that survives this one survives a queue, in
-    which everybody's leader may have to brake for its own.
+    Two vehicles, IDM, steps of 0.1 s. This leader is the worst of all that brake no harder than
+    ``idm.min_acceleration``: any other is always ahead of it and no slower. So a driver that avoids this one also
+    avoids crashes in a queue, where each leader may have to brake for its own.
 
     Args:
         gap, speed, leader_speed: at the start; m and m/s, broadcast.
@@ -60,7 +60,7 @@ def _survives(gap: Tensor, speed: Tensor, leader: float, desired_speed: float, i
 def can_brake(
     gap_m: float, speed_mps: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
 ) -> bool:
-    """Whether a follower at ``speed_mps`` stays off the worst leader, with 0.1 m to spare for rounding."""
+    """Whether a follower at ``speed_mps`` avoids the leader of :func:`smallest_gap`, with 0.1 m for rounding."""
     gap, speed = (torch.tensor([value], dtype=torch.float64) for value in (gap_m, speed_mps))
     return bool(_survives(gap, speed, leader_speed_mps, desired_speed_mps, idm)[0])
 
@@ -68,7 +68,7 @@ def can_brake(
 def least_gap(
     speed_mps: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
 ) -> float:
-    """Smallest gap (m, in steps of 0.1 m) with which :func:`can_brake` holds for this and every larger gap."""
+    """Smallest gap (m, in steps of 0.1 m) for which :func:`can_brake` is true at this and every larger gap."""
     stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
     gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
     speed = torch.full_like(gaps, speed_mps)
@@ -79,7 +79,7 @@ def least_gap(
 def highest_speed(
     gap_m: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
 ) -> float:
-    """Highest speed (m/s, in steps of 0.1 m/s) with which :func:`can_brake` holds for this and every lower speed."""
+    """Highest speed (m/s, in steps of 0.1 m/s) for which :func:`can_brake` is true at this and every lower speed."""
     speeds = torch.arange(0, 1000).double() * 0.1
     crashes = ~_survives(torch.full_like(speeds, gap_m), speeds, leader_speed_mps, desired_speed_mps, idm)
     return 0.1 * max(0, int(crashes.nonzero().min()) - 1) if bool(crashes.any()) else float(speeds[-1])

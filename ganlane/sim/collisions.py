@@ -1,4 +1,4 @@
-"""Overlap of oriented boxes by the separating-axis theorem, and nearness before a crash."""
+"""Overlap of oriented boxes by the separating-axis theorem, and soft crashes (dangerously small gaps)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def boxes_overlap(
     """
     c, s = torch.cos(heading), torch.sin(heading)
     oc, os = torch.cos(other_heading), torch.sin(other_heading)
-    # Of the angle between the two.
+    # Of the angle between the two boxes.
     cos, sin = (c * oc + s * os).abs(), (c * os - s * oc).abs()
     own = (0.5 * length, 0.5 * width)
     other = (0.5 * other_length, 0.5 * other_width)
@@ -75,11 +75,11 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 
 
 def _all_apart(dx: Tensor, vehicles: Vehicles) -> bool:
-    """Whether in no row anybody is near enough to the ego along the road for boxes to matter.
+    """Whether all vehicles of all rows are too far from the ego along the road to overlap it.
 
-    Two boxes can only touch within their half diagonals, of which each is at most half of length plus width. On a CPU
-    asking costs little, and a small batch is spared most of its tests; a graph, or a GPU's queue, would be
-    broken by it.
+    Boxes overlap only within the sum of their half diagonals, each at most half of length plus width. On a CPU this
+    test is cheap and saves small batches most of the exact tests. It is skipped while compiling and on a GPU, since
+    reading the result would break the graph or synchronise the device.
     """
     if torch.compiler.is_compiling() or dx.device.type != "cpu":
         return False

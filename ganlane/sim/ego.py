@@ -1,4 +1,4 @@
-"""The ego's lane changes, motion and dangers, one ego (vehicle 0) per environment."""
+"""The ego's lane changes, motion and soft crashes; one ego (vehicle 0) per environment."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ganlane.sim.vehicles import Vehicles
 
 @dataclass(frozen=True)
 class EgoParameters:
-    """How the ego takes commands and shows its lane changes; soft-crash limits in s and m."""
+    """How the ego handles commands and when others see its lane changes; soft-crash limits in s and m."""
 
     abort_lane_change: bool = False
     visibility: Visibility = Visibility.BODY
@@ -31,10 +31,10 @@ class EgoParameters:
 
 
 class Command(NamedTuple):
-    """What a command leads to, each [N].
+    """Effect of an action, each [N].
 
-    Target lane; direction of the change under way (-1 right, 0, +1 left); whether a change starts; whether the
-    command would leave the road.
+    Target lane; direction of the current lane change (-1 right, 0 none, +1 left); whether a change starts; whether
+    the action would leave the road.
     """
 
     target_lane: Tensor
@@ -44,10 +44,10 @@ class Command(NamedTuple):
 
 
 def obey(action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool) -> Command:
-    """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose change under way has ``direction``; [N] int64.
+    """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose current lane change has ``direction``; [N] int64.
 
-    While a change is under way commands are ignored and cost nothing; with ``abort`` the opposite command turns
-    back. A command that would leave the road changes nothing but says so.
+    During a lane change actions are ignored without penalty; with ``abort`` the opposite action turns back. An action
+    that would leave the road has no effect except ``off_road``.
     """
     wish = torch.where(action == LEFT, 1, torch.where(action == RIGHT, -1, 0))
     heard = (direction == 0) | (wish == -direction) if abort else direction == 0
@@ -60,7 +60,7 @@ def obey(action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Te
 
 
 def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
-    """What the ego sees: a scene with one observer."""
+    """The :class:`Scene` with the ego as the only observer."""
     return perceive(vehicles, road, slice(EGO_INDEX, EGO_INDEX + 1))
 
 
@@ -69,7 +69,7 @@ def move_ego(
 ) -> tuple[Vehicles, Tensor]:
     """The ego after ``dt`` seconds (fields [N]) and its steering angle (rad, [N]).
 
-    Along the road it takes ``acceleration`` (m/s2, [N]), across it steers for its target lane.
+    It accelerates with ``acceleration`` (m/s2, [N]) and steers towards its target lane.
     """
     ego = vehicles.at(EGO_INDEX)
     centre = road.centre_of(vehicles.target_lane[:, :1], ego.y.dtype)[:, 0]
@@ -79,7 +79,7 @@ def move_ego(
 
 
 class Surroundings(NamedTuple):
-    """What the ego finds around itself, each [N]: the acceleration that IDM asks for, m/s2, and soft crashes."""
+    """The ego's IDM acceleration, m/s2, and whether it has a soft crash ahead or behind; each [N]."""
 
     acceleration: Tensor
     soft_crash: Tensor
@@ -87,7 +87,8 @@ class Surroundings(NamedTuple):
 
 
 def look_around(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> Surroundings:
-    """The ego follows in the lanes that it attends to; it is in danger in those that its body is in."""
+    """IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that its body is
+    in."""
     body = spanned(scene.body)
     ahead = leader(scene, torch.cat((spanned(scene.attention), body), dim=-1))
     followed, near = (Neighbour(*(number[..., half] for number in ahead)) for half in (slice(0, 3), slice(3, 6)))
@@ -102,7 +103,8 @@ def look_around(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> Surroun
 
 
 def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
-    """How far a change under way has come, 0 at its start to 1 on the target lane's centre; 0 without one; [N]."""
+    """Progress of the current lane change, from 0 at its start to 1 at the target lane's centre; 0 without one;
+    [N]."""
     width = road.lane_width_m if not isinstance(road.lane_width_m, Tensor) else road.lane_width_m[:, 0]
     remaining = (ego.y - ego.target_lane.to(ego.y.dtype) * width).abs() / width
     return torch.where(direction != 0, (1.0 - remaining).clamp(0.0, 1.0), 0.0)

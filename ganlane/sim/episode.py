@@ -1,4 +1,4 @@
-"""When the ego decides, and when an episode ends."""
+"""Decision period of the ego, and end of an episode."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ganlane.keys import PHYSICS_STEP_S
 
 @dataclass(frozen=True)
 class EpisodeParameters:
-    """When the ego decides and when an episode ends; s and m."""
+    """Decision period of the ego, distance to the goal and time limit; s and m."""
 
     decision_period_s: float = 1.0
     goal_m: float = 5000.0
@@ -21,7 +21,7 @@ class EpisodeParameters:
         return round(self.decision_period_s / PHYSICS_STEP_S)
 
     def check(self) -> None:
-        """Raise :class:`UserError` where the decision period is not a whole number of physics steps."""
+        """Raise :class:`UserError` if the decision period is not a whole number of physics steps."""
         if self.substeps() < 1 or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9:
             raise UserError(
                 f"env.decision_period_s={self.decision_period_s:g} is not a multiple of {PHYSICS_STEP_S:g} s; "

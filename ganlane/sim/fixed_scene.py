@@ -1,4 +1,4 @@
-"""A scene set by hand: vehicles in rows of plain numbers, the same in every episode or with small variations."""
+"""Hand-made initial scenes: the same vehicles in every episode, optionally with small random variations."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ STRAIGHT = Road()
 
 @dataclass(frozen=True)
 class SceneVehicle:
-    """One vehicle of a scene set by hand. m, m/s.
+    """One vehicle of a hand-made scene. m, m/s.
 
     Args:
-        x_m: centre of the body along the road; only distances count, since the ego is moved to x = 0.
-        lane: it stands in the middle of this lane, 0 the rightmost; with ``y_m`` given it may be left out.
-        y_m: centre of the body across the road, where it is not that of a lane.
-        desired_speed_mps: a standing vehicle that shall not drive on has next to none (0.001).
-        target_lane: the lane it keeps or is moving to; None: the one that it stands in.
-        visibility: who sees its lane changes; None: as the scene has it for the ego and for the others.
-        origin: where it is written, for messages ("line 3").
+        x_m: centre of the body along the road; only distances matter, since the scene is shifted to ego x = 0.
+        lane: the vehicle is at the centre of this lane, 0 the rightmost; may be left out if ``y_m`` is given.
+        y_m: centre of the body across the road, if it is not a lane's centre.
+        desired_speed_mps: above 0; 0.001 for a vehicle that stays stopped.
+        target_lane: the lane it keeps or is moving to; None: the lane it is in.
+        visibility: when others see its lane changes; None: the scene's ``ego_visibility`` or ``others_visibility``.
+        origin: place in its file, for messages ("line 3").
     """
 
     x_m: float
@@ -56,20 +56,20 @@ class SceneVehicle:
 
 @dataclass(frozen=True)
 class FixedScene:
-    """The same scene in every episode, or with small variations; the first vehicle is the ego.
+    """The same initial scene in every episode, or with small random variations; the first vehicle is the ego.
 
     Args:
-        rows: the vehicles; the ego's x becomes 0, and the others keep their distance to it.
-        road: that they stand on; straight, one for all episodes.
-        jitter_m: the others' x varies by up to so much to either side from episode to episode, m.
-        jitter_mps: everybody's speed, likewise, never below 0; who stands goes on standing. Both follow from
-            (stream, seed, episode) alone.
-        ego_visibility, others_visibility: of the vehicles that say nothing of it.
+        rows: the vehicles; the ego's x becomes 0, and the others keep their distance to it. road: the road;
+        straight, the same in all episodes. jitter_m: largest random shift of the others' x, forwards or backwards,
+        per episode, m. jitter_mps: largest random change of each speed, m/s, never below 0; stopped vehicles stay
+        stopped. Both depend
+            on (stream, seed, episode) only.
+        ego_visibility, others_visibility: for vehicles without a visibility of their own.
         name: of the scene, for messages.
 
     Raises:
-        UserError: a vehicle is off the road, has an impossible number, or overlaps another; :meth:`check` adds those
-            scenes from which nobody could drive on.
+        UserError: a vehicle is off the road, has an impossible number, or overlaps another; :meth:`check` also raises
+            it for scenes in which crashes are unavoidable.
     """
 
     rows: tuple[SceneVehicle, ...]
@@ -95,7 +95,7 @@ class FixedScene:
         return max(row.length_m for row in self.rows)
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Raise :class:`UserError` where ``road`` is another than the scene's, or somebody cannot brake in time."""
+        """Raise :class:`UserError` if ``road`` differs from the scene's, or a vehicle cannot brake in time."""
         mine, other = ((r.lanes, r.lane_width_m) for r in (self.road, road))
         if mine != other or road.ring_m is not None:
             raise UserError(
@@ -150,7 +150,7 @@ class FixedScene:
         return usual if own is None else own
 
     def label(self, index: int) -> str:
-        """How a message names a vehicle: ``the ego``, ``vehicle 3 (line 5)``."""
+        """Name of a vehicle in messages: ``the ego``, ``vehicle 3 (line 5)``."""
         name = "the ego" if index == 0 else f"vehicle {index}"
         origin = self.rows[index].origin
         return f"{name} ({origin})" if origin else name

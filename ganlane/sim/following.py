@@ -1,4 +1,4 @@
-"""Car following: the acceleration of every driver towards whoever is ahead in the lanes it attends to."""
+"""Car following: IDM acceleration of every driver behind the leaders in the lanes it attends to."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def following_acceleration(
 ) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K].
 
-    In the middle of a lane change a driver stands in two lanes, or in three, and the most demanding leader counts.
+    During a lane change a vehicle is in two lanes, or three; the smallest acceleration over the lanes is used.
     """
     ahead = leader(scene, spanned(scene.attention))
     return acceleration_behind(scene, ahead, parameters, headway_s).amin(-1)

@@ -14,8 +14,8 @@ from torch import Tensor
 class IdmParameters:
     """Table V. Lengths in metres, times in seconds, accelerations in m/s2.
 
-    The acceleration exponent is 4, written out as two squarings: a tensor power is not the same bit for bit
-    at every batch size.
+    The acceleration exponent is 4, computed as two squarings: the result of ``torch.pow`` may differ in its last bits
+    between batch sizes.
     """
 
     min_gap_m: float = 2.0
@@ -25,7 +25,7 @@ class IdmParameters:
     max_acceleration: float = 0.7
 
     def per_lane(self) -> IdmParameters:
-        """The same for every lane and every pair."""
+        """The parameters, which broadcast to lanes and pairs."""
         return self
 
     def brake_scale(self) -> float:
@@ -34,7 +34,7 @@ class IdmParameters:
 
 
 class DriverIdm(NamedTuple):
-    """IDM with parameters of its own for every driver: tensors [N, M] in the place of Table V's numbers."""
+    """Per-driver IDM parameters: tensors [N, M] instead of Table V's numbers."""
 
     min_gap_m: float
     headway_s: Tensor
@@ -43,7 +43,7 @@ class DriverIdm(NamedTuple):
     max_acceleration: Tensor
 
     def per_lane(self) -> DriverIdm:
-        """Each driver's for several lanes, or for pairs with all others: [N, M, 1]."""
+        """The parameters as [N, M, 1], to broadcast over lanes or pairs."""
         return DriverIdm(self.min_gap_m, *(value[..., None] for value in self[1:]))
 
     def brake_scale(self) -> Tensor:
@@ -53,7 +53,7 @@ class DriverIdm(NamedTuple):
 
 AnyIdm: TypeAlias = IdmParameters | DriverIdm
 TABLE_V = IdmParameters()
-#: A gap below this is treated as this one: the interaction term stays finite and asks for the hardest braking.
+#: Lower bound of the gap in the interaction term, m, which stays finite and gives the hardest braking.
 SMALLEST_GAP_M = 0.1
 
 
@@ -63,9 +63,9 @@ def desired_gap(
     parameters: AnyIdm = TABLE_V,
     headway_s: Tensor | float | None = None,
 ) -> Tensor:
-    """Gap in metres that a driver at ``speed`` wants to a leader it closes in on at ``closing_speed`` (m/s).
+    """Desired gap in metres at ``speed`` behind a leader that is approached at ``closing_speed`` (m/s).
 
-    The dynamic part is never negative, so a leader that pulls away does not invite tailgating.
+    The dynamic part is never negative, so a faster leader does not reduce the desired gap below the minimum.
     """
     headway = parameters.headway_s if headway_s is None else headway_s
     dynamic = speed * headway + speed * closing_speed / parameters.brake_scale()
@@ -85,11 +85,11 @@ def idm_acceleration(
     Args:
         speed: own speed, m/s, at least 0.
         desired_speed: own desired speed, m/s, above 0.
-        gap: net gap to the leader (bumper to bumper), m; Table V's 10 000 m where there is none.
+        gap: net gap to the leader (bumper to bumper), m; Table V's 10 000 m without a leader.
             A gap of 0 or less (an overlap) gives the hardest braking.
-        leader_speed: m/s; irrelevant where the gap is the free one, but for the approach term.
-        parameters: everybody's, or each driver's own (:class:`DriverIdm`).
-        headway_s: a time headway per vehicle in place of Table V's.
+        leader_speed: m/s; without a leader it only enters the (negligible) approach term.
+        parameters: common to all drivers, or per driver (:class:`DriverIdm`).
+        headway_s: time headway per vehicle, s, instead of Table V's.
     """
     ratio = speed / desired_speed
     square = ratio * ratio
@@ -100,7 +100,7 @@ def idm_acceleration(
 
 
 def equilibrium_gap(speed: Tensor, desired_speed: Tensor | float, parameters: IdmParameters = TABLE_V) -> Tensor:
-    """Gap in metres at which a platoon at constant ``speed`` neither closes up nor opens (below desired speed)."""
+    """Gap in metres at which the IDM acceleration behind a leader of equal ``speed`` is 0 (below desired speed)."""
     ratio = speed / desired_speed
     square = ratio * ratio
     return (parameters.min_gap_m + speed * parameters.headway_s) / torch.sqrt(1.0 - square * square)

@@ -1,10 +1,10 @@
-"""Which lanes a vehicle is in: for others, and for its own driver.
+"""Which lanes a vehicle occupies: as seen by others, and by its own driver.
 
-Who sees a vehicle that changes lanes decides how often drivers crash, so it is a property of each vehicle:
+When others see a lane change strongly affects the number of crashes, so it is a property of each vehicle:
 
 - ``CENTRE``: only in the lane of its centre;
 - ``BODY``: in every lane that its body enters by more than :data:`ENTRY_M`;
-- ``SIGNALLED``: as ``BODY``, and in its target lane from the command on.
+- ``SIGNALLED``: as ``BODY``, and in its target lane from the start of the change on.
 
 The driver of a vehicle always attends to the lanes of its body *and* to its target lane.
 """
@@ -21,14 +21,14 @@ from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 
 ENTRY_M = 0.1
-#: Stands in a first scene for a :class:`Visibility` that differs from episode to episode: the traffic knows which.
+#: In an initial scene: the traffic sets a :class:`Visibility` per episode.
 VISIBILITY_OF_EPISODE = -1
 #: A lane change is complete, and the next one possible, within this distance of the target lane's centre.
 ARRIVED_M = 0.3
 
 
 class Visibility(IntEnum):
-    """When others see that a vehicle enters their lane."""
+    """When others see a vehicle that enters their lane."""
 
     CENTRE = 0
     BODY = 1
@@ -42,20 +42,20 @@ class LaneRange(NamedTuple):
     high: Tensor
 
     def columns(self, which: slice) -> LaneRange:
-        """Those of a slice of the vehicles."""
+        """The ranges of a slice of the vehicles."""
         return self if which == slice(None) else LaneRange(self.low[:, which], self.high[:, which])
 
 
 def spanned(lanes: LaneRange) -> Tensor:
-    """The lanes of a range, [..., 3]: lowest, middle and highest. A body that is turned can stand in three.
+    """The lanes of a range, [..., 3]: lowest, middle and highest.
 
-    Narrow lanes, long vehicles and one change right after another make that happen.
+    A vehicle at an angle can be in three lanes, if lanes are narrow, vehicles long or changes consecutive.
     """
     return torch.stack((lanes.low, torch.minimum(lanes.low + 1, lanes.high), lanes.high), dim=-1)
 
 
 def lateral_half_extent(vehicles: Vehicles) -> Tensor:
-    """Half of the lateral space that each body takes, m, its heading included."""
+    """Half of the lateral space that each body takes at its heading, m."""
     return 0.5 * (vehicles.width * torch.cos(vehicles.heading) + vehicles.length * torch.sin(vehicles.heading).abs())
 
 
@@ -67,13 +67,13 @@ def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
 
 
 def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
-    """``lanes`` widened to the target lane: what the driver attends to."""
+    """``lanes`` extended to the target lane: the lanes that the driver attends to."""
     target = vehicles.target_lane.to(lanes.low.dtype)
     return LaneRange(torch.minimum(lanes.low, target), torch.maximum(lanes.high, target))
 
 
 def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRange) -> LaneRange:
-    """Lanes in which the others see each vehicle, by its visibility; none for one that is not valid."""
+    """Lanes in which others see each vehicle, by its visibility; an empty range for invalid vehicles."""
     centre = road.lane_of(vehicles.y)
     signalled = vehicles.visibility == int(Visibility.SIGNALLED)
     by_body = vehicles.visibility == int(Visibility.BODY)
@@ -84,6 +84,6 @@ def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRan
 
 
 def settled(vehicles: Vehicles, road: Road) -> Tensor:
-    """Whether no lane change is under way: the centre within :data:`ARRIVED_M` of the target lane's, bool."""
+    """Whether the lane change is done: centre within :data:`ARRIVED_M` of the target lane's centre, bool."""
     centre = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
     return (vehicles.y - centre).abs() < ARRIVED_M

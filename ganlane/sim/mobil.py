@@ -18,18 +18,18 @@ from ganlane.sim.road import Road
 
 @dataclass(frozen=True)
 class MobilParameters:
-    """Table IV. The politeness ``q`` weighs the old ('rear') follower, ``p`` the new ('side') one."""
+    """Table IV. The politeness ``q`` weights the old ('rear') follower, ``p`` the new ('side') one."""
 
     threshold: float = 0.1
     politeness_rear: float = 0.5
     politeness_side: float = 1.0
     safe_deceleration: float = 4.0
-    #: Of several that want into one lane within this distance, only the foremost goes, m.
+    #: Of several vehicles that want to enter one lane within this distance, only the foremost does, m.
     exclusive_m: float = 60.0
 
 
 class DriverMobil(NamedTuple):
-    """MOBIL with a politeness of its own for every driver: tensors [N, M, 1] in the place of Table IV's numbers."""
+    """Per-driver politeness: tensors [N, M, 1] instead of Table IV's numbers."""
 
     threshold: float
     politeness_rear: Tensor
@@ -43,10 +43,10 @@ TABLE_IV = MobilParameters()
 
 
 class Prospect(NamedTuple):
-    """Accelerations in lanes where an observer stands or could stand, m/s2, [N, K, L].
+    """Accelerations in the observer's lane and its neighbours, m/s2, [N, K, L].
 
-    ``own`` is the observer's; ``with_it`` and ``without`` are those of its follower there with the observer in front
-    of it and without, equal where there is no follower.
+    ``own`` is the observer's; ``with_it`` and ``without`` are its follower's in that lane with and without the
+    observer in front of it, both 0 where there is no follower.
     """
 
     own: Tensor
@@ -59,21 +59,21 @@ class Prospect(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What a change into a lane would bring: the incentive, m/s2, and whether it is safe."""
+    """Incentive of a change into a lane, m/s2, and whether it is safe."""
 
     incentive: Tensor
     safe: Tensor
 
 
 def _gap_over(behind: Follower, ahead: Neighbour, length: Tensor) -> Tensor:
-    """Gap from the follower to the leader with the vehicle between them gone, m."""
+    """Gap from the follower to the leader without the vehicle between them, m."""
     return torch.where(ahead.gap < FREE_GAP_M, behind.gap + length + ahead.gap, FREE_GAP_M)
 
 
 def prospect(scene: Scene, lanes: Tensor, idm: AnyIdm) -> Prospect:
     """The :class:`Prospect` of each observer in ``lanes`` [N, K, L] (float).
 
-    Where drivers have parameters of their own, each takes the others to drive by its own.
+    With per-driver parameters, each driver predicts the others with its own parameters.
     """
     ahead, behind = leader(scene, lanes), follower(scene, lanes)
     speed, length = (number[..., None] for number in (scene.observers.speed, scene.observers.length))
@@ -87,14 +87,14 @@ def prospect(scene: Scene, lanes: Tensor, idm: AnyIdm) -> Prospect:
 
 
 def weigh(there: Prospect, here: Prospect, mobil: AnyMobil) -> Change:
-    """MOBIL's criteria for a change from ``here`` [N, K, 1] to ``there`` [N, K, L]."""
+    """MOBIL's incentive and safety criterion for a change from ``here`` [N, K, 1] to ``there`` [N, K, L]."""
     burden, relief = there.with_it - there.without, here.without - here.with_it
     incentive = there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
     return Change(incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration)
 
 
 def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
-    """Whether a change into ``lane`` [N, K] (float) asks nobody to brake harder than is safe, bool."""
+    """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
     there = prospect(scene, lane[..., None], idm)
     return weigh(there, there, mobil).safe[..., 0]
 
@@ -105,15 +105,15 @@ def on_road(lane: Tensor, road: Road) -> Tensor:
 
 
 def without_ego(wish: Tensor) -> Tensor:
-    """``wish`` [N, M] with nothing wished by the ego: nobody can read its mind."""
+    """``wish`` [N, M] with the ego's column zeroed: others do not know its intention."""
     return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
 
 
 def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
-    """``wish`` (-1, 0, +1 lanes, [N, M]) less those who are in the way of somebody ahead who wants the same lane.
+    """``wish`` (-1, 0, +1 lanes, [N, M]), 0 where a vehicle ahead that wants the same lane is too close.
 
-    In the way is who is nearer than ``exclusive_m`` (centre to centre), and who would have to brake harder than is
-    safe: neither has looked at the other, since neither is in that lane yet.
+    Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking. MOBIL's criteria
+    do not cover this case, since neither vehicle is in that lane yet.
     """
     vehicles, wants = scene.observers, wish != 0
     target = vehicles.target_lane + wish
@@ -125,10 +125,9 @@ def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyM
 
 
 def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
-    """Lane change that each driver wishes for: -1 right, 0 none, +1 left, int64 [N, K].
+    """Lane change that MOBIL proposes to each driver: -1 right, 0 none, +1 left, int64 [N, K].
 
-    A driver in the middle of a change wishes for none. Where both sides pay, the better one is taken, the left
-    one at a tie.
+    None during a lane change. If both sides qualify, the one with the larger incentive, left if equal.
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)
@@ -144,8 +143,8 @@ def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobi
 
 
 def mobil_changes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
-    """Lane change that each driver starts: as :func:`mobil_wishes`, with one vehicle per gap.
+    """Lane change that each driver starts: :func:`mobil_wishes` filtered by :func:`one_at_a_time`.
 
-    The ego (vehicle 0) decides for itself: here it wishes for nothing, and holds nobody back.
+    The ego (vehicle 0) is controlled by the agent: its column is 0, and it blocks no other change.
     """
     return one_at_a_time(scene, without_ego(mobil_wishes(scene, road, idm, mobil)), idm, mobil)

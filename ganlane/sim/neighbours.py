@@ -1,7 +1,7 @@
 """Leaders and followers, for all vehicles of all environments at once.
 
-Everything works on pairs [N, K, M]: entry (i, j) is what observer i sees of vehicle j. All vehicles observe
-(K = M), or a slice of them (the ego alone: K = 1). Several lanes are asked for at once: [N, K, L].
+Everything works on pairs [N, K, M]: entry (i, j) describes vehicle j relative to observer i. The observers are all
+vehicles (K = M) or a slice of them (the ego alone: K = 1). Several lanes are evaluated at once: [N, K, L].
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from ganlane.sim.lanes import LaneRange, body_lanes, presence, with_target
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 
-#: Table V's 'maximum gap for empty lane': stands for 'nobody there', m.
+#: Gap in an empty lane, m (Table V's 'maximum gap for empty lane').
 FREE_GAP_M = 10_000.0
-#: Added to a number that does not count: far beyond every one that does.
+#: Added to masked values, so that a minimum ignores them.
 _BEYOND = 1e9
 #: Breaks ties of position without changing any other distance, m.
 _TIE_M = 1e-30
@@ -26,8 +26,8 @@ _TIE_M = 1e-30
 class Neighbour(NamedTuple):
     """The nearest vehicle of a kind, per observer and lane.
 
-    ``gap`` is bumper to bumper, m, :data:`FREE_GAP_M` where there is nobody, negative for an overlap along
-    the road; ``speed`` in m/s, the own speed where there is nobody.
+    ``gap`` is bumper to bumper, m, :data:`FREE_GAP_M` without a neighbour, negative for an overlap along
+    the road; ``speed`` in m/s, the observer's speed without a neighbour.
     """
 
     gap: Tensor
@@ -35,7 +35,8 @@ class Neighbour(NamedTuple):
 
 
 class Follower(NamedTuple):
-    """The nearest vehicle behind, per observer and lane: gap (m), speed and desired speed (m/s), if there is one."""
+    """The nearest vehicle behind, per observer and lane: gap (m), speed and desired speed (m/s), and whether it
+    exists."""
 
     gap: Tensor
     speed: Tensor
@@ -44,12 +45,12 @@ class Follower(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What K observers see of M vehicles, computed once a step.
+    """Geometry of M vehicles relative to K observers, computed once per step.
 
-    ``observers`` and the lane ranges ``body`` and ``attention`` are theirs, [N, K]; ``presence`` [N, M] tells in
-    which lanes each vehicle is seen. ``distance`` [N, K, M] is the signed one to each vehicle's centre, m, and
-    ``bumpers`` what lies of it within the two bodies. Of two vehicles at the same x the one of lower index is ahead:
-    ``order`` [N, K, M] is the distance with such ties broken.
+    ``observers`` and the lane ranges ``body`` and ``attention`` are [N, K]; ``presence`` [N, M] holds the lanes in
+    which others see each vehicle. ``distance`` [N, K, M] is the signed distance between the centres, m, and
+    ``bumpers`` the sum of the two half lengths. ``order`` [N, K, M] is the distance with ties broken: of two
+    vehicles at the same x the one with the lower index is ahead.
     """
 
     observers: Vehicles
@@ -73,10 +74,10 @@ class Scene(NamedTuple):
 
 
 def _beyond(number: Tensor, where: Tensor) -> Tensor:
-    """``number`` with so much added ``where`` it does not count that no minimum finds it.
+    """Adds 1e9 where masked, so that ``min`` ignores it (branch-free ``where``).
 
-    A sum in place of ``torch.where``: on a CPU that one branches at every element, which costs five times as much.
-    Adding 0 leaves a number as it is, to the last bit; NaN would stay NaN, so padding has to be finite.
+    On a CPU ``torch.where`` branches at every element and takes five times as long. Adding 0 leaves a number
+    unchanged to the last bit; NaN would stay NaN, so padding has to be finite.
     """
     return torch.add(number, where, alpha=_BEYOND)
 
@@ -107,7 +108,7 @@ def perceive(vehicles: Vehicles, road: Road, observers: slice = slice(None)) -> 
 
 
 def in_lane(scene: Scene, lane: Tensor) -> Tensor:
-    """Whether j stands in a lane that observer i asks for; bool [N, K, M], or [N, K, L, M] for L lanes [N, K, L]."""
+    """Whether vehicle j is in ``lane`` of observer i; bool [N, K, M], or [N, K, L, M] for L lanes [N, K, L]."""
     low, high = (each[:, None, None, :] if lane.ndim == 3 else each[:, None, :] for each in scene.presence)
     asked = lane[..., None]
     return (low <= asked) & (asked <= high)
@@ -116,7 +117,7 @@ def in_lane(scene: Scene, lane: Tensor) -> Tensor:
 def leader(scene: Scene, lane: Tensor) -> Neighbour:
     """The nearest vehicle ahead of each observer in its lane (float; [N, K], or [N, K, L] for L of them).
 
-    Of two as near the slower one counts.
+    Of two at the same gap the slower one is taken.
     """
     if lane.ndim == 2:
         return Neighbour(*(found[..., 0] for found in leader(scene, lane[..., None])))

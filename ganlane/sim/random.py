@@ -1,4 +1,4 @@
-"""Counter-based randomness: every number is a pure function of where it is used.
+"""Counter-based randomness: every number is a pure function of its place of use.
 
 A draw depends on (stream, seed, episode, vehicle, step, purpose) and on nothing else: not on the batch, the
 row, the device or what was drawn before. Each field is mixed into a 64-bit key on its own with the finaliser
@@ -19,7 +19,7 @@ _MIX_B = -7723592293110705685  # 0x94D049BB133111EB
 
 
 class Stream(IntEnum):
-    """Disjoint families of episodes: nobody is tested on what it was trained or chosen on."""
+    """Disjoint sets of episodes: for training, for selection (validation), and for reported results (test)."""
 
     TRAIN = 0
     SELECT = 1
@@ -27,7 +27,7 @@ class Stream(IntEnum):
 
 
 class Purpose(IntEnum):
-    """What a random number is for; each stands for a fixed column of draws."""
+    """Use of a random number; members are appended, never renumbered, since the number enters the hash."""
 
     SPAWN_LANE = 0
     SPAWN_POSITION = 1
@@ -52,7 +52,7 @@ class Purpose(IntEnum):
     SENSED_SPEED = 67
     SENSED_DROPOUT = 68
     BLIND_EPISODE = 69
-    DRIVER = 70  # and the 15 purposes after it: what is each driver's own (traffic=idm_random)
+    DRIVER = 70  # and the 15 purposes after it: per-driver parameters (traffic=idm_random)
     SPAWN_TRUCK = 90
     FOREIGN_DRIVER = 128  # and the 15 purposes after it: drivers of a foreign simulator, one per parameter
 

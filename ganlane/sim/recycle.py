@@ -1,8 +1,8 @@
-"""Vehicles that the ego has left behind return in front of it, and the reverse, so that the road never empties.
+"""Moves vehicles far behind the ego to far ahead of it, and the reverse, so that the road never empties.
 
-The ego sees ``range_m`` ahead and behind. A vehicle beyond that is moved by twice the range to the other side, as
-if the road were a ring around the ego: lane, speed, driver and memory stay its own. It waits where it is until
-there is room: nobody may have to brake harder than is safe because of it.
+A vehicle more than ``range_m`` from the ego is moved by twice the range to the other side, as if the road were a ring
+around the ego; lane, speed, driver and internal state are kept. It is moved only when there is room, that is, when no
+vehicle would have to brake harder than is safe because of it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 
-#: The range of Table III's positions, m.
+#: Range of the positions in Table III, m.
 RANGE_M = 200.0
-#: What nobody may have to exceed because of a vehicle that returns: MOBIL's safe deceleration, m/s2.
+#: Largest deceleration that a moved vehicle may require of any vehicle: MOBIL's safe deceleration, m/s2.
 SAFE_DECELERATION = 4.0
 
 
@@ -29,10 +29,10 @@ def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Te
 
 
 def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
-    """Whether each of the first M vehicles and all others, pair by pair, could drive on at ``safe``, bool [N, M].
+    """Whether each of the first M vehicles requires no deceleration above ``safe`` in any pair, bool [N, M].
 
-    ``there`` holds 2 M vehicles: all of them where they would go, then all of them where they are. So it does not
-    matter who else goes: each pair is judged in both places.
+    ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the result holds
+    whichever of the others move too.
     """
     count = there.observers.x.shape[1]
     low, high = (torch.cat((each, each), dim=1) for each in there.attention)
@@ -56,9 +56,9 @@ def recycle(
     range_m: float = RANGE_M,
     safe_deceleration: float = SAFE_DECELERATION,
 ) -> Vehicles:
-    """``vehicles`` with those out of range, for whom there is room, on the other side of the ego.
+    """``vehicles`` with those out of range moved to the other side of the ego, where there is room.
 
-    Of several the room of each is judged against every other one where it is *and* where it would go.
+    Room is tested against every other vehicle at its current *and* at its new position.
     """
     away = out_of_range(vehicles, road, range_m)
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)

@@ -13,7 +13,7 @@ from torch import Tensor
 class Road:
     """Lane 0 is the rightmost; the centre of lane k lies at ``y = k * lane_width_m``.
 
-    ``lanes`` and ``lane_width_m`` may be tensors [N, 1] where every environment has a road of its own
+    ``lanes`` and ``lane_width_m`` may be tensors [N, 1] if every environment has its own road
     (recorded scenes). ``ring_m`` closes the road to a ring of that length: positions stay unwrapped, only
     distances between vehicles are taken modulo the ring.
     """
@@ -46,7 +46,7 @@ class Road:
         return -0.5 * self.lane_width_m
 
     def distance_ahead(self, start: Tensor, end: Tensor) -> Tensor:
-        """Signed distance ``end - start`` along the road, m; on a ring the nearer way round."""
+        """Signed distance ``end - start`` along the road, m; on a ring the shorter way."""
         distance = end - start
         if self.ring_m is None:
             return distance
@@ -55,6 +55,6 @@ class Road:
 
 
 def road_in(state: Any, default: Road) -> Road:
-    """The road of each row as ``state["road"]`` (a TensorDict) has it; ``default`` where it has none."""
+    """The road of each row from ``state["road"]`` (a TensorDict), or ``default`` without that key."""
     rows = state.get("road", None)
     return default if rows is None else Road(rows.get("lanes"), rows.get("lane_width_m"))

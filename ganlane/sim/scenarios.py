@@ -1,6 +1,6 @@
-"""Scenes that test a driver: cut-in, stalled car, stop-and-go wave, blocked lane. m, m/s; the ego comes first.
+"""Test scenarios: cut-in, stalled car, stop-and-go wave, blocked lane. m, m/s; the ego comes first.
 
-Each is a function from a few numbers to the rows of a :class:`~ganlane.sim.fixed_scene.FixedScene`.
+Each is a function of a few numbers that returns the rows of a :class:`~ganlane.sim.fixed_scene.FixedScene`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from ganlane.sim.fixed_scene import SceneVehicle
 from ganlane.sim.idm import TABLE_V, IdmParameters
 
 LENGTH_M = 4.5
-#: Desired speed of a vehicle that has broken down; 0 is no speed that IDM knows.
+#: Desired speed of a broken-down vehicle; IDM requires more than 0.
 STALLED_MPS = 0.001
-#: A broken-down car stands this far right of its lane's middle. Drivers who are not where they want to be start no
-#: lane change, so MOBIL's politeness does not make it creep across the road to let the others pass.
+#: A broken-down car is this far right of its lane's centre. Off-centre vehicles start no lane change, so MOBIL's
+#: politeness does not make it change lanes to let others pass.
 ASKEW_M = 0.6
 
 
@@ -33,8 +33,8 @@ def cut_in(
 ) -> tuple[SceneVehicle, ...]:
     """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its lane at once.
 
-    A leader 80 m ahead of the ego, a follower 35 m behind it, one behind the vehicle that cuts in, and (on three
-    lanes) one beside the ego to the right make braking the nearest way out.
+    There are a leader 80 m ahead of the ego, a follower 35 m behind it, a vehicle behind the one that cuts in, and
+    (on three lanes) one on the ego's right, so that braking is the obvious reaction.
     """
     _at_least(lanes, 2, "cut_in")
     own = lanes - 2
@@ -59,7 +59,7 @@ def stalled_car(
 ) -> tuple[SceneVehicle, ...]:
     """A broken-down vehicle ``distance_m`` ahead in the ego's lane, the rightmost.
 
-    A vehicle follows the ego, and in the next lane (if any) five pass, ``spacing_m`` from each other.
+    A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there is one.
     """
     beside = () if lanes == 1 else _column(1, 5, 0.5 * spacing_m, spacing_m, speed_mps, 22.0)
     return (
@@ -79,9 +79,9 @@ def blocked_lane(
     desired_speed_mps: float = 25.0,
     lane_width_m: float = 4.0,
 ) -> tuple[SceneVehicle, ...]:
-    """The rightmost lane is closed by ``standing`` vehicles in a row, from ``distance_m`` on; traffic passes beside.
+    """The rightmost lane is closed by ``standing`` vehicles in a row, from ``distance_m`` on; the others are open.
 
-    In each of the other lanes six vehicles, ``spacing_m`` from each other: the ego has to find a gap.
+    In each open lane drive six vehicles, ``spacing_m`` apart: the ego has to find a gap.
     """
     _at_least(lanes, 2, "blocked_lane")
     closed = (stalled(distance_m + (LENGTH_M + 1.5) * k, 0, lane_width_m) for k in range(standing))
@@ -97,7 +97,7 @@ def blocked_lane(
 def _column(
     lane: int, vehicles: int, first_m: float, spacing_m: float, speed_mps: float, desired_speed_mps: float
 ) -> tuple[SceneVehicle, ...]:
-    """Vehicles one behind the other, from ``first_m`` backwards."""
+    """Vehicles in one lane, from ``first_m`` backwards."""
     return tuple(SceneVehicle(first_m - spacing_m * k, lane, speed_mps, desired_speed_mps) for k in range(vehicles))
 
 
@@ -109,11 +109,11 @@ def stop_and_go(
     desired_speed_mps: float = 25.0,
     idm: IdmParameters = TABLE_V,
 ) -> tuple[SceneVehicle, ...]:
-    """Columns in every lane in which ``per_wave`` standing and ``per_wave`` flowing vehicles take turns.
+    """Columns in every lane, of alternately ``per_wave`` stopped and ``per_wave`` moving vehicles.
 
-    From the head: vehicles that flow off, then ``waves`` times a queue that stands bumper to bumper at IDM's smallest
-    gap and a group that drives up to it at ``speed_mps``, in steady following. The ego is the last but one of the
-    rightmost lane. All the others want to go 15 m/s.
+    From the head: two moving vehicles, then ``waves`` times a stopped queue at IDM's minimum gap and a group that
+    approaches it at ``speed_mps`` in steady following. The ego is the last but one of the rightmost lane. The
+    desired speed of the others is 15 m/s.
     """
     steady = LENGTH_M + 1.1 * (idm.min_gap_m + idm.headway_s * speed_mps)
     queue = LENGTH_M + idm.min_gap_m

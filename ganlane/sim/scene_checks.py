@@ -1,4 +1,4 @@
-"""Refusal of scenes from which nobody could drive on, naming the vehicles that are to blame."""
+"""Checks of hand-made scenes: impossible numbers, overlaps, unavoidable crashes; errors name the vehicles."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ganlane.sim.vehicles import Vehicles
 if TYPE_CHECKING:
     from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
 
-#: How long the drive of :func:`check_drive` lasts, s, and how many of the varied episodes it takes.
+#: Duration of the test drive of :func:`check_drive`, s, and number of episodes with jitter that it simulates.
 DRIVE_S = 15.0
 DRIVES = 32
 
@@ -46,7 +46,7 @@ def check_rows(scene: FixedScene) -> None:
 
 
 def _fault(row: SceneVehicle, road: Road) -> str:
-    """What is wrong with a vehicle taken alone; empty where nothing is."""
+    """What is wrong with one vehicle; empty if nothing is."""
     given = {"x_m": row.x_m, "y_m": row.y_m, "speed_mps": row.speed_mps, "desired_speed_mps": row.desired_speed_mps}
     for name, value in (given | {"length_m": row.length_m, "width_m": row.width_m}).items():
         if value is not None and not -torch.inf < value < torch.inf:
@@ -77,7 +77,7 @@ def _misplaced(row: SceneVehicle, road: Road) -> str:
 
 
 def check_overlaps(scene: FixedScene) -> None:
-    """Raise :class:`UserError` where two bodies overlap, or may do so with the worst jitter."""
+    """Raise :class:`UserError` if two vehicles overlap, or may do so with the largest jitter."""
     vehicles = scene.base()
     longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
     longer[:, 0] = 0.0
@@ -91,10 +91,10 @@ def check_overlaps(scene: FixedScene) -> None:
 
 
 def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
-    """Raise :class:`UserError` where a follower would need more than the strongest braking, pair by pair.
+    """Raise :class:`UserError` if any follower would need to brake harder than ``idm.min_acceleration``.
 
-    A leader is whoever is ahead, in a lane that the follower's body is in or that it is moving to, and keeps its
-    speed. Jitter is taken at its worst.
+    Leaders are all vehicles ahead in a lane that the follower is in or moving to; they are taken to keep their speed.
+    Jitter is taken at its worst.
     """
     vehicles = scene.base()
     seen = perceive(vehicles, scene.road)
@@ -115,7 +115,7 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
 
 
 def check_drive(scene: FixedScene, idm: IdmParameters) -> None:
-    """Raise :class:`UserError` where vehicles that only follow and finish their lane changes run into each other."""
+    """Raise :class:`UserError` if vehicles that only follow and finish their lane changes collide."""
     hit = _first_overlap(scene, idm)
     if hit is not None:
         one, other, seconds = hit
@@ -127,7 +127,7 @@ def check_drive(scene: FixedScene, idm: IdmParameters) -> None:
 
 @lru_cache(maxsize=64)
 def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, float] | None:
-    """The first two vehicles that overlap and when, s; None where nobody does."""
+    """The first two vehicles that overlap and the time, s; None without an overlap."""
     rows = DRIVES if scene.jitter_m or scene.jitter_mps else 1
     numbers = torch.arange(rows)
     vehicles = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
@@ -142,7 +142,7 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
 
 
 def _follow(vehicles: Vehicles, steering: Tensor, road: Road, idm: IdmParameters) -> tuple[Vehicles, Tensor]:
-    """Everybody after a physics step of IDM and steering; nobody starts a lane change."""
+    """All vehicles after a physics step of IDM and steering, without new lane changes."""
     v = vehicles
     acceleration = following_acceleration(perceive(v, road), idm)
     centre = road.centre_of(v.target_lane, v.y.dtype)

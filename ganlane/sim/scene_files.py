@@ -1,7 +1,7 @@
 """Scenes from a file: CSV (one line per vehicle) or JSON. The first vehicle is the ego.
 
-CSV has a header and these columns, of which ``x_m`` and ``lane`` (or ``y_m``) are needed; lines that start with ``#``
-are skipped, and an empty cell stands for the default::
+CSV has a header and these columns, of which ``x_m`` and ``lane`` (or ``y_m``) are required; lines that start with
+``#`` are skipped, and an empty cell means the default::
 
     x_m, lane, y_m, speed_mps, desired_speed_mps, length_m, width_m, target_lane, visibility
 
@@ -32,9 +32,9 @@ def read_scene(path: str | Path, lanes: int | None = None, lane_width_m: float |
     """The scene in a CSV or JSON file; ``replace`` sets its jitter and visibility.
 
     Args:
-        path: of the file; its ending says which kind it is.
-        lanes: of the road; None: as the file says, or just enough for its vehicles.
-        lane_width_m: m; None: as the file says, or 4.
+        path: the file; its ending gives the format.
+        lanes: number of lanes; None: as in the file, or just enough for its vehicles.
+        lane_width_m: m; None: as in the file, or 4.
 
     Raises:
         UserError: no such file, not CSV or JSON, a wrong column or value (named by file, line and column), a road
@@ -61,7 +61,7 @@ def with_ego_speed(scene: FixedScene, desired_speed_mps: float) -> FixedScene:
 
 
 def _agreed(path: Path, name: str, in_file: Any, given: float | None) -> Any:
-    """What the file says or the caller gives, if they do not contradict each other."""
+    """The value of the file or of the caller; an error if they differ."""
     if in_file is not None and given is not None and in_file != given:
         raise UserError(
             f"{path}: {name} is {in_file:g} in the file and {given:g} was asked for; leave one of them out."
@@ -70,7 +70,7 @@ def _agreed(path: Path, name: str, in_file: Any, given: float | None) -> Any:
 
 
 def _lanes_in(rows: list[SceneVehicle], lane_width_m: float) -> int:
-    """Just enough lanes for all vehicles and where they want to go."""
+    """Just enough lanes for all vehicles and their target lanes."""
     lanes = [row.lane if row.lane is not None else round((row.y_m or 0.0) / lane_width_m) for row in rows]
     return 1 + max((*lanes, *(row.target_lane or 0 for row in rows), 0))
 
@@ -129,18 +129,18 @@ def _json_road(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_names(names: list[str], where: str, need_place: bool = True) -> None:
-    """Column names are known, each stands once, and those that are needed are there."""
+    """Check that column names are known and unique, and that the required ones are present."""
     for name in names:
         if name not in COLUMNS:
             raise UserError(f"{where}: unknown column {name or '(empty)'}; expected some of {', '.join(COLUMNS)}.")
         if names.count(name) > 1:
-            raise UserError(f"{where}: column {name} stands there twice; leave one.")
+            raise UserError(f"{where}: column {name} is given twice; remove one.")
     if need_place and ("x_m" not in names or not {"lane", "y_m"} & set(names)):
         raise UserError(f"{where}: columns x_m and lane (or y_m) are needed; the header has {', '.join(names)}.")
 
 
 def _row(given: Mapping[str, Any], where: str, origin: str) -> SceneVehicle:
-    """A vehicle from what a file says of it."""
+    """A vehicle from its values in a file."""
     if "x_m" not in given:
         raise UserError(f"{where}: column x_m: no value; give the position along the road in m.")
     values = {name: _value(name, value, f"{where}: column {name}") for name, value in given.items()}

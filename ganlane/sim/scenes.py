@@ -1,7 +1,7 @@
-"""Where the vehicles of an episode start: at random (Table II), or in a scene that somebody set.
+"""Initial vehicles of an episode: random (Table II) or hand-made.
 
-Anything that is a :class:`Scenes` will do: it is called with the episode keys [N] and gives the first vehicles.
-:class:`RandomScenes` draws them, :class:`~ganlane.sim.fixed_scene.FixedScene` holds vehicles set by hand.
+A :class:`Scenes` is called with the episode keys [N] and returns the initial vehicles. :class:`RandomScenes` draws
+them, :class:`~ganlane.sim.fixed_scene.FixedScene` holds hand-made ones.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STRAIGHT = Road()
 
 
 class Scenes(Protocol):
-    """Makes the first scene of every episode."""
+    """Makes the initial scene of every episode."""
 
     @property
     def vehicles(self) -> int:
@@ -32,11 +32,11 @@ class Scenes(Protocol):
 
     @property
     def longest_m(self) -> float:
-        """No vehicle of any episode, the ego included, is longer, m."""
+        """Length of the longest vehicle of all episodes, the ego included, m."""
         ...
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Raise :class:`UserError` where the scene does not suit the road, or nobody could drive on from it."""
+        """Raise :class:`UserError` if the scene does not fit the road, or crashes are unavoidable."""
         ...
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
@@ -68,11 +68,11 @@ class RandomScenes:
 
     @property
     def longest_m(self) -> float:
-        """No vehicle of any episode is longer, m."""
+        """Length of the longest vehicle of all episodes, m."""
         return self.parameters.longest_m
 
     def _check_room(self, lane_width_m: float, ring_m: float | None) -> None:
-        """Side by side, and where a ring closes: the last vehicle is the first one's leader."""
+        """Check the room side by side, and where a ring closes: there the last vehicle is the first one's leader."""
         p = self.parameters
         if lane_width_m <= p.widest_m:
             wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
@@ -84,7 +84,7 @@ class RandomScenes:
             more = f" ({p.spacing_m:g} with lorries)" if p.spacing_m > p.min_spacing_m else ""
             raise UserError(
                 f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and env.min_spacing_m="
-                f"{p.min_spacing_m:g}{more} together, or the first vehicles stand upon the last; lengthen the ring "
+                f"{p.min_spacing_m:g}{more} together, or the first vehicles overlap the last; lengthen the ring "
                 "or lower env.spread_m."
             )
 

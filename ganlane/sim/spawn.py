@@ -15,7 +15,7 @@ from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Purpose, draw_keys, uniform
 from ganlane.sim.vehicles import Vehicles
 
-#: What is drawn for every vehicle, in the order of the columns.
+#: Purposes of the draws for every vehicle, in the order of the columns.
 _DRAWN: list[int] = [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED, Purpose.SPAWN_DESIRED_SPEED, Purpose.SPAWN_TRUCK]
 _SIZES = (
     "spread_m",
@@ -31,9 +31,9 @@ _DESIRED = ("desired_speed_mps", "truck_desired_speed_mps")
 
 @dataclass(frozen=True)
 class SpawnParameters:
-    """Table II, and lorries, which it does not have. Distances in m, speeds in m/s, (low, high) ranges.
+    """Table II, extended by lorries. Distances in m, speeds in m/s, (low, high) ranges.
 
-    ``min_spacing_m`` is centre to centre in a lane, between cars; lorries get as much more as they are longer
+    ``min_spacing_m`` is centre to centre in a lane, between cars; it is larger by the extra length of lorries
     (:attr:`spacing_m`). Each vehicle but the ego is a lorry with probability ``truck_share``. The defaults: 12 m and
     2.5 m, the longest rigid lorry of Directive 96/53/EC and about its 2.55 m; desired speeds of 80 to 90 km/h, from
     Germany's limit for lorries to the speed limiter of Directive 92/6/EEC.
@@ -55,17 +55,17 @@ class SpawnParameters:
 
     @property
     def longest_m(self) -> float:
-        """Length of the longest vehicle that there may be, m."""
+        """Length of the longest possible vehicle, m."""
         return max(self.length_m, self.truck_length_m) if self.truck_share > 0 else self.length_m
 
     @property
     def widest_m(self) -> float:
-        """Width of the widest vehicle that there may be, m."""
+        """Width of the widest possible vehicle, m."""
         return max(self.width_m, self.truck_width_m) if self.truck_share > 0 else self.width_m
 
     @property
     def spacing_m(self) -> float:
-        """Least distance between centres in a lane, m: from bumper to bumper two lorries have as much as two cars."""
+        """Minimum distance between centres in a lane, m: the gap between two lorries is that between two cars."""
         return self.min_spacing_m + (self.longest_m - self.length_m)
 
     def lane_capacity(self) -> int:
@@ -73,7 +73,8 @@ class SpawnParameters:
         return int(self.spread_m / self.spacing_m) + 1
 
     def check(self, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V) -> None:
-        """Raise :class:`UserError`: impossible numbers, ``vehicles`` that do not fit, overlap, or cannot brake."""
+        """Raise :class:`UserError` for impossible numbers, or if ``vehicles`` do not fit, overlap, or cannot
+        brake."""
         self._check_sizes()
         self._check_speeds()
         if self.min_spacing_m <= self.length_m:
@@ -115,12 +116,11 @@ class SpawnParameters:
             low, high = getattr(self, name)
             if low <= 0:
                 raise UserError(
-                    f"env.{name}=({low:g}, {high:g}): expected speeds above 0, since a driver that wants to stand "
-                    "still is no driver; raise the lower one."
+                    f"env.{name}=({low:g}, {high:g}): expected speeds above 0, as IDM requires; raise the lower one."
                 )
 
     def worst_followers(self) -> tuple[tuple[str, float, float, float], ...]:
-        """Who may start fastest behind whom: key, highest speed, the leader's lowest, highest desired speed, m/s."""
+        """Fastest followers: key, highest speed, the leader's lowest speed, highest desired speed, m/s."""
         front, rear, ego = self.front_speed_mps, self.rear_speed_mps, self.ego_speed_mps
         others = max(self.desired_speed_mps[1], self.truck_desired_speed_mps[1] if self.truck_share > 0 else 0.0)
         return (
@@ -130,9 +130,9 @@ class SpawnParameters:
         )
 
     def _check_braking(self, key: str, speed: float, leader: float, desired: float, idm: IdmParameters) -> None:
-        """The fastest vehicle must survive the slowest leader at the smallest gap, which brakes hard.
+        """The fastest vehicle must avoid the slowest leader, at the smallest gap, when it brakes at the limit.
 
-        The gap is the same whoever is a lorry (:attr:`spacing_m`).
+        The gap does not depend on which vehicles are lorries (:attr:`spacing_m`).
         """
         gap = self.min_spacing_m - self.length_m
         if not can_brake(gap, speed, leader, desired, idm):
@@ -140,9 +140,9 @@ class SpawnParameters:
             slower = highest_speed(gap, leader, desired, idm)
             raise UserError(
                 f"env.min_spacing_m={self.min_spacing_m:g} is too little for env.{key} up to {speed:g} m/s: a gap "
-                f"of {gap:g} m nobody can avoid a leader of {leader:g} m/s that brakes at env.idm.min_acceleration="
-                f"{idm.min_acceleration:g} m/s2; raise env.min_spacing_m to {spacing:.1f} or lower env.{key} to "
-                f"{slower:.1f}."
+                f"of {gap:g} m is too short to avoid a leader of {leader:g} m/s that brakes at "
+                f"env.idm.min_acceleration={idm.min_acceleration:g} m/s2; raise env.min_spacing_m to {spacing:.1f} "
+                f"or lower env.{key} to {slower:.1f}."
             )
 
 
@@ -150,7 +150,7 @@ TABLE_II = SpawnParameters()
 
 
 def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
-    """How many come before each, by ``value`` [N, M] and then index, among those where ``same`` [N, M, M] holds."""
+    """Rank of each by ``value`` [N, M] and then index, among those where ``same`` [N, M, M] is true."""
     index = torch.arange(value.shape[1], device=value.device)
     mine, other = value[:, :, None], value[:, None, :]
     before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
@@ -179,7 +179,7 @@ def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -
 
 
 def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
-    """Order by position with the vehicle of rank (M - 1) // 2, the ego, in front; the ego at x = 0."""
+    """Order by position, but with the vehicle of rank (M - 1) // 2, the ego, first; shift the ego to x = 0."""
     rank = _rank(x)
     order = torch.where(rank == (x.shape[1] - 1) // 2, -1, rank).argsort(dim=1)
     x, lane = x.gather(1, order), lane.gather(1, order)

@@ -27,7 +27,7 @@ class Vehicles(NamedTuple):
 
     @classmethod
     def of(cls, mapping: Any) -> Vehicles:
-        """From a mapping of names to tensors, a TensorDict for one."""
+        """From a mapping of names to tensors, for example a TensorDict."""
         named = dict(mapping.items())
         return cls(*(named[name] for name in VEHICLE_FIELDS))
 
@@ -55,7 +55,7 @@ class Vehicles(NamedTuple):
         return Vehicles(*(torch.where(is_first, one[:, None], all_) for one, all_ in zip(first, self)))
 
     def with_finite_padding(self) -> Vehicles:
-        """The same vehicles with finite numbers for those not valid: a sum with NaN would reach everybody."""
+        """The same vehicles with finite numbers in invalid entries, so that NaN does not spread through sums."""
 
         def finite(field: Tensor) -> Tensor:
             return torch.where(self.valid, field, torch.nan_to_num(field, 1.0, 1.0, 1.0))
@@ -63,6 +63,6 @@ class Vehicles(NamedTuple):
         return Vehicles(*(finite(field) if field.is_floating_point() else field for field in self))
 
     def where(self, rows: Tensor, other: Vehicles) -> Vehicles:
-        """These vehicles in the rows [N] (or [N, 1], [N, M]) where ``rows`` holds, ``other`` elsewhere."""
+        """These vehicles where ``rows`` ([N], [N, 1] or [N, M]) is true, ``other`` elsewhere."""
         mask = rows[:, None] if rows.ndim == 1 else rows
         return Vehicles(*(torch.where(mask, mine, theirs) for mine, theirs in zip(self, other)))

@@ -13,8 +13,7 @@ from typing import Literal
 
 import polars as pl
 
-from ganlane.data.prepared import write_prepared
-from ganlane.data.scenes import COLUMNS
+from ganlane.data.scenes import COLUMNS, write_prepared
 from ganlane.data.schema import sort
 from ganlane.errors import UserError
 from ganlane.files import atomic_path

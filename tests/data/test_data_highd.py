@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.recordings import HIGHD_CARS, write_highd
 
-from ganlane.data import SCHEMA, RowCount, highd_scenes, read_highd
-from ganlane.data.resampling import resampling
+from ganlane.data import SCHEMA, RowCount, highd_scenes, read_recordings
+from ganlane.data.highd import resample
 from ganlane.errors import UserError
 
 
@@ -52,7 +52,7 @@ def test_cars_drive_forward_from_the_centre_of_their_box(recording):
 
 
 def test_frames_are_a_tenth_of_a_second_apart(recording):
-    frames = read_highd(recording).filter(pl.col("vehicle") == 1)["frame"].to_list()
+    frames = read_recordings("highd", recording).filter(pl.col("vehicle") == 1)["frame"].to_list()
     # Recorded are the frames 1 to 200 at 25 Hz, 0.04 to 8 s.
     assert frames == list(range(1, 81))
 
@@ -95,35 +95,35 @@ def damaged(path, column, row, value):
 def test_a_damaged_field_is_named(recording, column, row, value, told):
     damaged(recording, column, row, value)
     with pytest.raises(UserError, match=told):
-        read_highd(recording)
+        read_recordings("highd", recording)
 
 
 def test_units_that_cannot_be_are_refused(recording):
     rows = pl.read_csv(recording)
     rows.with_columns(xVelocity=3.6 * pl.col("xVelocity")).write_csv(recording)
     with pytest.raises(UserError, match=r"highd-01-upper.*column speed: the median is 1\d\d"):
-        read_highd(recording)
+        read_recordings("highd", recording)
     rows.with_columns(xVelocity=-pl.col("xVelocity")).write_csv(recording)
     with pytest.raises(UserError, match="columns x and speed"):
-        read_highd(recording)
+        read_recordings("highd", recording)
 
 
 def test_what_stands_beside_the_tracks_is_needed_and_checked(recording):
     meta = recording.with_name("01_recordingMeta.csv")
     damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
     with pytest.raises(UserError, match=r"recordingMeta.csv, line 2, column upperLaneMarkings: '8.0;moon'"):
-        read_highd(recording)
+        read_recordings("highd", recording)
     meta.unlink()
     with pytest.raises(UserError, match=r"01_recordingMeta.csv: no such file"):
-        read_highd(recording)
+        read_recordings("highd", recording)
     write_highd(recording.parent)
     damaged(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
     with pytest.raises(UserError, match=r"01_tracksMeta.csv, line 3, column drivingDirection: 3 is neither"):
-        read_highd(recording)
+        read_recordings("highd", recording)
     with pytest.raises(UserError, match=r"no XX_tracks.csv in this folder"):
-        read_highd(recording.parent.parent)
+        read_recordings("highd", recording.parent.parent)
     with pytest.raises(UserError, match=r"expected highD's XX_tracks.csv"):
-        read_highd(meta)
+        read_recordings("highd", meta)
 
 
 @given(first=st.integers(0, 40), length=st.integers(1, 120), rate=st.sampled_from([10.0, 25.0, 30.0, 50.0]))
@@ -131,7 +131,7 @@ def test_resampling_agrees_with_interpolation_over_time(first, length, rate):
     frame = np.concatenate((np.arange(length) + first, np.arange(7)))
     begins = np.r_[True, np.zeros(length - 1, bool), True, np.zeros(6, bool)]
     values = np.sin(0.3 * frame) + frame
-    new = resampling(begins, frame, rate)
+    new = resample(begins, frame, rate)
     one = slice(0, int(np.searchsorted(new.before, length)))
     inside = [k for k in range(2000) if first / rate - 1e-9 <= k * 0.1 <= (first + length - 1) / rate + 1e-9]
     assert new.frame[one].tolist() == inside
@@ -141,6 +141,6 @@ def test_resampling_agrees_with_interpolation_over_time(first, length, rate):
 
 def test_at_the_same_rate_resampling_changes_nothing():
     frame = np.arange(5, 25)
-    new = resampling(np.arange(20) == 0, frame, 10.0)
+    new = resample(np.arange(20) == 0, frame, 10.0)
     assert new.frame.tolist() == frame.tolist()
     assert new.nearest(frame).tolist() == frame.tolist()

@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ganlane.data import (
+    find_lane_changes,
     lane_changes_of_arrays,
-    lane_changes_of_frame,
     synthetic_scenes,
+    tracks_of_frame,
 )
 
 WIDTH = 3.6
@@ -107,7 +108,7 @@ def test_a_coarser_step_finds_the_same_change():
 def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(seed):
     frame = synthetic_scenes(seed=seed)
     widths = {"synthetic-0": 3.5, "synthetic-1": 3.5}
-    of_frame = lane_changes_of_frame(frame, widths)
+    of_frame = find_lane_changes(tracks_of_frame(frame, widths))
     y = frame["y"].to_numpy().reshape(24, 100).T
     of_arrays, _ = lane_changes_of_arrays(y, 3.5)
     mirrored, _ = lane_changes_of_arrays(7.0 - y, 3.5)

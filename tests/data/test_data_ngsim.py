@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 from reference.recordings import LANE_M, START_MS, ngsim_rows, portal_csv, raw_text, traffic
 
-from ganlane.data import SCHEMA, NgsimParameters, RowCount, ngsim_scenes, read_ngsim, read_recordings, validate
+from ganlane.data import SCHEMA, NgsimParameters, RowCount, ngsim_scenes, read_recordings, validate
 from ganlane.errors import UserError
 
 LATER_MS = START_MS + 900_000
@@ -95,7 +95,7 @@ def test_ramps_are_left_out_and_end_a_track(tmp_path):
 
 def test_lanes_is_how_many_are_kept_from_the_left(tmp_path):
     path = text_file(tmp_path, ngsim_rows(FIRST))
-    kept = read_ngsim(path, NgsimParameters(lanes=2))
+    kept = read_recordings("ngsim", path, NgsimParameters(lanes=2))
     assert kept.height == FIRST.filter(pl.col("lane") >= 1).height
     assert sorted(kept["lane"].unique()) == [0, 1]
 
@@ -134,20 +134,20 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
         lines[row + 1] = lines[row + 1].replace(",drop,", ",")
     path = portal_file(tmp_path, "\n".join(lines) + "\n")
     with pytest.raises(UserError, match=told) as caught:
-        read_ngsim(path, NgsimParameters(block_bytes=block_bytes))
+        read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
     assert str(path) in str(caught.value)
 
 
 def test_a_file_that_breaks_off_is_told_from_a_whole_one(tmp_path):
     rows = ngsim_rows(FIRST)
     whole = portal_csv(rows, thousands=False)
-    assert read_ngsim(portal_file(tmp_path, whole.rstrip("\n"))).height == 540
+    assert read_recordings("ngsim", portal_file(tmp_path, whole.rstrip("\n"))).height == 540
     with pytest.raises(UserError, match=r"line 541, column lane_id: the file breaks off here, 14 of 19 columns"):
-        read_ngsim(portal_file(tmp_path, ",".join(whole.rstrip("\n").split(",")[:-5])))
+        read_recordings("ngsim", portal_file(tmp_path, ",".join(whole.rstrip("\n").split(",")[:-5])))
     text = text_file(tmp_path, rows)
     text.write_bytes(text.read_bytes()[:-30])
     with pytest.raises(UserError, match=r"line 540, column \w+: the file breaks off here"):
-        read_ngsim(text)
+        read_recordings("ngsim", text)
 
 
 def test_frames_of_a_text_file_must_grow_even_across_blocks(tmp_path):
@@ -158,7 +158,7 @@ def test_frames_of_a_text_file_must_grow_even_across_blocks(tmp_path):
     path = text_file(tmp_path, swapped.sort("index").drop("index"))
     for block_bytes in (150, 2**25):
         with pytest.raises(UserError, match=r"line 12, column frame_id: 10 is before the last frame"):
-            read_ngsim(path, NgsimParameters(block_bytes=block_bytes))
+            read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
 
 
 @pytest.mark.parametrize(
@@ -175,25 +175,25 @@ def test_frames_of_a_text_file_must_grow_even_across_blocks(tmp_path):
 def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, told):
     rows = ngsim_rows(FIRST).with_columns(pl.col(name) * factor for name in columns)
     with pytest.raises(UserError, match=told) as caught:
-        read_ngsim(text_file(tmp_path, rows))
+        read_recordings("ngsim", text_file(tmp_path, rows))
     assert "line 1" in str(caught.value)
 
 
 def test_missing_columns_and_files_that_are_none_are_refused(tmp_path):
     without = portal_csv(ngsim_rows(FIRST).drop("v_Vel", "Lane_ID"))
     with pytest.raises(UserError, match=r"line 1: no column v_vel, lane_id; found vehicle_id"):
-        read_ngsim(portal_file(tmp_path, without))
+        read_recordings("ngsim", portal_file(tmp_path, without))
     with pytest.raises(UserError, match=r"line 1: 17 columns; expected the 18"):
-        read_ngsim(text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")))
+        read_recordings("ngsim", text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")))
     with pytest.raises(UserError, match="no such file"):
-        read_ngsim(tmp_path / "nowhere.txt")
+        read_recordings("ngsim", tmp_path / "nowhere.txt")
     with pytest.raises(UserError, match="the file is empty"):
-        read_ngsim(portal_file(tmp_path, ""))
+        read_recordings("ngsim", portal_file(tmp_path, ""))
     (tmp_path / "packed.zip").write_bytes(b"PK\x03\x04\xff\xfe\x00" * 40)
     with pytest.raises(UserError, match=r"packed.zip, line 1: not text"):
-        read_ngsim(tmp_path / "packed.zip")
+        read_recordings("ngsim", tmp_path / "packed.zip")
     with pytest.raises(UserError, match=r"no rows of us-101, i-80; check data.locations"):
-        read_ngsim(portal_file(tmp_path, portal_csv(ngsim_rows(FIRST), "peachtree")))
+        read_recordings("ngsim", portal_file(tmp_path, portal_csv(ngsim_rows(FIRST), "peachtree")))
 
 
 def test_nothing_is_left_of_what_was_put_aside(tmp_path):
@@ -207,11 +207,12 @@ def test_nothing_is_left_of_what_was_put_aside(tmp_path):
 
 def test_a_small_extract_is_a_period_of_its_own(tmp_path):
     rows = ngsim_rows(FIRST).filter((pl.col("Vehicle_ID") < 3) & (pl.col("Frame_ID") < 20))
-    assert read_ngsim(portal_file(tmp_path, portal_csv(rows))).height == 40
+    assert read_recordings("ngsim", portal_file(tmp_path, portal_csv(rows))).height == 40
 
 
 def test_recordings_are_read_whole_by_their_kind(tmp_path):
     path = text_file(tmp_path, ngsim_rows(FIRST))
-    assert read_recordings("ngsim", path).equals(read_ngsim(path))
+    (scene,) = ngsim_scenes(path)
+    assert read_recordings("ngsim", path).equals(scene.frame)
     with pytest.raises(UserError, match="moon: no such kind of recordings; expected scenes, ngsim or highd"):
         read_recordings("moon", path)

@@ -4,7 +4,14 @@ import numpy as np
 import polars as pl
 import pytest
 
-from ganlane.data import default_scenes, driving_statistics, lane_changes_of_frame, read_scenes, scene_lane_widths
+from ganlane.data import (
+    default_scenes,
+    driving_statistics,
+    find_lane_changes,
+    read_scenes,
+    scene_lane_widths,
+    tracks_of_frame,
+)
 from ganlane.errors import UserError
 
 
@@ -44,7 +51,7 @@ def test_the_lane_changes(measured):
 
 
 def test_the_lane_changes_of_each_scene(scenes):
-    rows = lane_changes_of_frame(scenes).sample
+    rows = find_lane_changes(tracks_of_frame(scenes)).sample
     counts = dict(scenes[rows]["scene"].value_counts().iter_rows())
     assert [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"] == [16, 5, 3, 21, 2, 0, 3, 3, 0, 3, 1]
 

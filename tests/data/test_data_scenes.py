@@ -8,12 +8,10 @@ import pytest
 from ganlane.data import (
     SCHEMA,
     SyntheticTraffic,
-    data_folder,
-    default_scenes,
     read_scenes,
     scene_lane_counts,
     synthetic_scenes,
-    validate,
+    write_prepared,
     write_scene_csv,
 )
 from ganlane.errors import UserError
@@ -138,40 +136,24 @@ def test_files_that_hold_nothing_or_no_table_are_refused(tmp_path):
         read_scenes(tmp_path)
 
 
-def test_the_validator_checks_frames_that_come_from_nowhere():
-    made = synthetic_scenes(SyntheticTraffic(scenes=1))
-    assert validate(made, "made").equals(made)
-    with pytest.raises(UserError, match="made: no column speed"):
-        validate(made.drop("speed"), "made")
-    with pytest.raises(UserError, match="made: no rows"):
-        validate(made.clear(), "made")
-    with pytest.raises(UserError, match="made, column x: String found, Float64 expected"):
-        validate(made.with_columns(x=pl.lit("here")), "made")
-    holed = made.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
-    with pytest.raises(UserError, match="made, line 9, column x: None is not a finite number"):
-        validate(holed, "made")
+def test_a_scene_in_two_files_is_refused(tmp_path):
+    write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
+    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet")
+    with pytest.raises(UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
+        read_scenes(tmp_path)
 
 
-def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
-    monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
-    assert data_folder() == tmp_path
-    with pytest.raises(UserError, match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"):
-        default_scenes()
-    (tmp_path / "ngsim").mkdir()
-    deep = tmp_path / "ngsim" / "us101_scenes.csv"
-    deep.write_text(HEADER)
-    assert default_scenes() == deep
-    monkeypatch.setenv("GANLANE_DATA", str(tmp_path / "nowhere"))
-    with pytest.raises(UserError, match="no such folder"):
-        data_folder()
-
-
-def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
-    monkeypatch.delenv("GANLANE_DATA", raising=False)
-    monkeypatch.setattr("ganlane.data.find.__file__", str(tmp_path / "site" / "ganlane" / "data" / "find.py"))
-    work = tmp_path / "work"
-    work.mkdir()
-    monkeypatch.chdir(work)
-    assert data_folder() is None
-    (tmp_path / "shared" / "data").mkdir(parents=True)
-    assert data_folder() == tmp_path / "shared" / "data"
+def test_damaged_parquet_is_refused(tmp_path):
+    path = tmp_path / "x.parquet"
+    with pytest.raises(UserError, match="no such file"):
+        read_scenes(path)
+    path.write_bytes(b"PAR1 not really")
+    with pytest.raises(UserError, match="not a readable Parquet file"):
+        read_scenes(path)
+    made = synthetic_scenes()
+    write_prepared(made.drop("speed"), path)
+    with pytest.raises(UserError, match=r"x.parquet: no column speed"):
+        read_scenes(path)
+    write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
+    with pytest.raises(UserError, match=r"x.parquet, row 0, column x: nan is not a finite number"):
+        read_scenes(path)

@@ -1,4 +1,4 @@
-"""Equations 9 and 10, intervals, durations, and whole statistics against values worked by hand."""
+"""Equations 9 and 10, intervals, and whole statistics against values worked by hand."""
 
 import json
 
@@ -10,8 +10,6 @@ from ganlane.data import (
     SCHEMA,
     DrivingStatistics,
     SyntheticTraffic,
-    describe,
-    describe_durations,
     driving_statistics,
     follower_headways,
     poisson_interval,
@@ -51,36 +49,6 @@ def test_equation_10s_mean_time_between_changes():
 def test_the_exact_interval_of_a_count_is_the_tabled_one(count, low, high):
     # Garwood's limits as tabled in textbooks of epidemiology.
     assert poisson_interval(count) == pytest.approx((low, high), rel=2e-3)
-
-
-def test_durations_cut_off_push_the_mean_up():
-    # Kaplan and Meier by hand: ends at 1 and 3, cut off at 2. S = 1 until 1, 2/3 until 3, then 0.
-    durations = describe_durations([1.0, 2.0, 3.0], [True, False, True])
-    assert durations.survival_mean_s == pytest.approx(1.0 + 2.0 * 2.0 / 3.0)
-    assert durations.survival_median_s == 3.0
-    assert durations.complete.mean == pytest.approx(2.0)
-    assert durations.complete.sd == pytest.approx(np.sqrt(2.0))
-    assert (durations.complete.count, durations.censored) == (2, 1)
-
-
-def test_durations_none_of_which_was_seen_whole_have_no_mean():
-    durations = describe_durations([1.0, 2.0], [False, False])
-    assert durations.censored == 2
-    assert durations.survival_mean_s is None
-    assert durations.complete.mean is None
-    # One seen and a longer one cut off: the curve stays at one half or above after the last end.
-    open_ended = describe_durations([1.0, 2.0, 2.5], [True, False, False])
-    assert open_ended.survival_median_s is None
-    assert open_ended.survival_mean_s == pytest.approx(1.0 + 1.5 * 2.0 / 3.0)
-
-
-def test_a_sample_is_summed_up():
-    summary = describe(np.arange(101.0))
-    assert (summary.count, summary.mean) == (101, 50.0)
-    assert summary.quantile(0.05) == pytest.approx(5.0)
-    assert summary.quantile(0.5) == pytest.approx(50.0)
-    assert describe([]).quantiles == ()
-    assert describe([2.0]).sd is None
 
 
 def test_a_steady_acceleration_is_found_by_either_measure_and_a_lost_frame_splits_a_track():

@@ -5,10 +5,11 @@ import pytest
 
 from ganlane.data import (
     SyntheticTraffic,
-    lane_changes_of_frame,
+    find_lane_changes,
     leader_gaps,
     scene_lane_counts,
     synthetic_scenes,
+    tracks_of_frame,
     validate,
 )
 
@@ -42,6 +43,6 @@ def test_speed_is_the_rate_of_the_position():
 def test_the_share_of_changing_vehicles_is_found_by_the_detector():
     widths = {"synthetic-0": 3.5}
     all_change = SyntheticTraffic(scenes=1, vehicles=40, changing_share=1.0, wander_m=0.0)
-    assert len(lane_changes_of_frame(synthetic_scenes(all_change), widths)) == 40
+    assert len(find_lane_changes(tracks_of_frame(synthetic_scenes(all_change), widths))) == 40
     none_change = SyntheticTraffic(scenes=1, vehicles=40, changing_share=0.0)
-    assert len(lane_changes_of_frame(synthetic_scenes(none_change), widths)) == 0
+    assert len(find_lane_changes(tracks_of_frame(synthetic_scenes(none_change), widths))) == 0

@@ -275,7 +275,7 @@ def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
         ("x_m,lane\n0,0\n", "1 vehicles; a scene needs the ego and at least one other"),
         ("x_m,speed_mps\n0,1\n", "line 1: columns x_m and lane (or y_m) are needed"),
         ("x_m,lane,sped\n0,0,1\n", "line 1: unknown column sped"),
-        ("x_m,lane,lane\n0,0,1\n", "line 1: column lane stands there twice"),
+        ("x_m,lane,lane\n0,0,1\n", "line 1: column lane is given twice"),
         ("x_m,lane\n0,0\n30\n", "line 3: 1 cells, the header has 2"),
         ("x_m,lane\n0,0\n\nfar,0\n", "line 4: column x_m: 'far': expected a number"),
         ("x_m,lane\n0,0\n30,0.5\n", "line 3: column lane: '0.5': expected a whole number"),

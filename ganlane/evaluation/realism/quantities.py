@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from ganlane.data import FRAME_S, find_lane_changes, leader_gaps, tracks_of_frame
-from ganlane.data.histograms import Bins
+from ganlane.data.distributions import Bins
 from ganlane.data.schema import TRACK
 
 #: A vehicle's first seconds do not count.

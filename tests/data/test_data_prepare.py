@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
+import errno
+from pathlib import Path
+
 import polars as pl
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 
 from ganlane.data import (
-    Bins,
-    Histogram,
     PooledStatistics,
     Scene,
     SyntheticTraffic,
     cut_into_scenes,
-    describe,
-    describe_durations,
     driving_statistics,
     long_report,
     prepare_recordings,
@@ -25,12 +21,15 @@ from ganlane.data import (
     read_scenes,
     scene_lane_widths,
     short_report,
-    survival_curve,
     synthetic_scenes,
     write_prepared,
     write_scene_csv,
 )
+from ganlane.data.prepare import whole_folder
 from ganlane.errors import UserError
+from ganlane.files import write_bytes
+
+TOO_LONG = "s" * 300
 
 
 def pooled(frame: pl.DataFrame) -> PooledStatistics:
@@ -54,36 +53,6 @@ def test_scenes_one_by_one_say_what_they_say_together(seed):
         one, other = apart.describe(name), getattr(together, name)
         assert (one.count, one.mean, one.sd) == pytest.approx((other.count, other.mean, other.sd)), name
         assert one.quantiles == pytest.approx(other.quantiles, abs=0.02), name
-
-
-@given(st.lists(st.floats(-30.0, 30.0), min_size=2, max_size=300), st.integers(1, 5))
-def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
-    histogram = Histogram(Bins(-20.0, 20.0, 400))
-    for part in np.array_split(np.array(values), parts):
-        histogram.add(part)
-    found, exact = histogram.describe(), describe(values)
-    assert (found.count, found.mean) == (exact.count, pytest.approx(exact.mean, abs=1e-9))
-    assert found.sd == pytest.approx(exact.sd, abs=1e-5)
-    ordered = np.clip(np.sort(values), -20.0, 20.0)
-    for level, value in ((0.25, found.quantile(0.25)), (0.5, found.quantile(0.5)), (0.95, found.quantile(0.95))):
-        # Between the neighbours of the exact place, and a bin's width more.
-        at = level * len(ordered)
-        low, high = ordered[max(int(np.floor(at)) - 1, 0)], ordered[min(int(np.ceil(at)), len(ordered) - 1)]
-        assert low - 0.1 - 1e-9 <= value <= high + 0.1 + 1e-9
-
-
-def test_a_histogram_of_nothing_says_nothing():
-    assert Histogram(Bins(0.0, 1.0, 10)).describe() == describe([])
-
-
-def test_the_survival_curve_takes_censored_times_as_lower_bounds():
-    # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one ends at 3 (2/3 of
-    # 4/5), one is cut off at 4, the last ends at 5.
-    times, shares = survival_curve([3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False])
-    assert times.tolist() == [1.0, 3.0, 5.0]
-    assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
-    found = describe_durations([3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False])
-    assert found.survival_mean_s == pytest.approx(1.0 + 2 * 0.8 + 2 * 0.8 * 2 / 3)
 
 
 def test_what_is_written_reads_back_the_same(tmp_path):
@@ -144,29 +113,6 @@ def test_a_recording_of_parked_cars_is_refused(tmp_path):
         prepare_recordings("scenes", tmp_path / "parked.parquet", tmp_path / "out")
 
 
-def test_a_scene_in_two_files_is_refused(tmp_path):
-    write_prepared(synthetic_scenes(), tmp_path / "a.parquet")
-    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "b.parquet")
-    with pytest.raises(UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
-        read_scenes(tmp_path)
-
-
-def test_damaged_parquet_is_refused(tmp_path):
-    path = tmp_path / "x.parquet"
-    with pytest.raises(UserError, match="no such file"):
-        read_scenes(path)
-    path.write_bytes(b"PAR1 not really")
-    with pytest.raises(UserError, match="not a readable Parquet file"):
-        read_scenes(path)
-    made = synthetic_scenes()
-    write_prepared(made.drop("speed"), path)
-    with pytest.raises(UserError, match=r"x.parquet: no column speed"):
-        read_scenes(path)
-    write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
-    with pytest.raises(UserError, match=r"x.parquet, row 0, column x: nan is not a finite number"):
-        read_scenes(path)
-
-
 def test_prepared_scenes_of_the_same_name_do_not_overwrite_each_other(tmp_path):
     write_prepared(synthetic_scenes(), tmp_path / "in" / "a.parquet")
     write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "in" / "b.parquet")
@@ -197,3 +143,37 @@ def test_recordings_without_anybody_on_the_lanes_are_refused(tmp_path):
     pl.read_csv(tracks).with_columns(laneId=pl.lit(9)).write_csv(tracks)
     with pytest.raises(UserError, match="no vehicle on any of the lanes kept"):
         read_recordings("highd", tmp_path)
+
+
+@pytest.fixture(params=["absolute", "relative"])
+def out(request, tmp_path, monkeypatch):
+    """Where the folder is to be, as a user may give it."""
+    monkeypatch.chdir(tmp_path)
+    return (tmp_path if request.param == "absolute" else Path()) / "scenes"
+
+
+def test_a_refused_file_is_named_as_in_the_folder_to_be(out):
+    with pytest.raises(OSError, match="too long") as caught, whole_folder(out) as folder:
+        write_bytes(folder / TOO_LONG, b"")
+    assert (caught.value.errno, caught.value.filename) == (errno.ENAMETOOLONG, str(out / TOO_LONG))
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_a_refusal_about_the_folder_names_it(out):
+    with pytest.raises(FileExistsError) as caught, whole_folder(out) as folder:
+        folder.mkdir()
+    assert caught.value.filename == str(out)
+
+
+def test_a_folder_that_cannot_be_made_is_named(out):
+    long = out.with_name(TOO_LONG[:250])  # the hidden one beside it has a longer name
+    with pytest.raises(OSError, match="too long") as caught, whole_folder(long):
+        raise AssertionError("nothing to write into")
+    assert (caught.value.errno, caught.value.filename) == (errno.ENAMETOOLONG, str(long))
+
+
+@pytest.mark.parametrize("name", ["scenes.csv", ".hidden/scenes.csv", None])
+def test_other_files_keep_their_names(out, name):
+    with pytest.raises(FileNotFoundError) as caught, whole_folder(out):
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", name)
+    assert caught.value.filename == name

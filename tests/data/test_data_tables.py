@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ganlane.data.blocks import LINE, read_blocks
-from ganlane.data.layout import TextTable, csv_table
-from ganlane.data.tables import convert
+from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks
 from ganlane.errors import UserError
 
 
@@ -39,7 +37,7 @@ def test_the_size_of_a_block_changes_nothing(tmp_path_factory, rows, block_bytes
 
 @pytest.mark.parametrize("block_bytes", [3, 2**20])
 @pytest.mark.parametrize(
-    ("lines", "told"),
+    ("lines", "message"),
     [
         (["1,2,3", "4,5", "7,8,9"], r"line 3, column b: the row ends after 2 of 3 fields"),
         (["1,2,3", "4,5,6,6", "7,8,9"], r"line 3: 4 fields, expected 3"),
@@ -49,9 +47,9 @@ def test_the_size_of_a_block_changes_nothing(tmp_path_factory, rows, block_bytes
         (["1,2,3", "4,5,6", "7,8"], r"line 4, column b: the row ends after 2 of 3 fields"),
     ],
 )
-def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, told, block_bytes):
+def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, message, block_bytes):
     content = "\n".join(["a,b,c", *lines]).encode() + b"\n"
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         read(tmp_path / "t.csv", content, block_bytes=block_bytes)
 
 

@@ -1,0 +1,307 @@
+"""From any reader to Parquet files and pooled statistics, one scene at a time, so that memory stays bounded."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+
+from ganlane.data.distributions import Bins, Distribution, Histogram, describe
+from ganlane.data.download import name_in_errors
+from ganlane.data.highd import highd_scenes
+from ganlane.data.lane_changes import LaneChanges, find_lane_changes
+from ganlane.data.ngsim import NgsimParameters, ngsim_scenes
+from ganlane.data.scenes import cut_into_scenes, parquet_name, read_scenes, scene_csv_scenes, write_prepared
+from ganlane.data.schema import FRAME_S, TRACK, RowCount, Scene, sort
+from ganlane.data.statistics import (
+    Exposure,
+    LaneChangeStatistics,
+    followers,
+    lane_change_statistics,
+    leader_gaps,
+    measure_exposure,
+    median_headways,
+    raw_accelerations,
+    smoothed_accelerations,
+)
+from ganlane.data.tables import OnProgress
+from ganlane.data.tracks import tracks_of_frame
+from ganlane.errors import UserError
+
+#: Bins of each quantity in m/s, m/s2, s or m; quantiles are accurate to a bin's width.
+QUANTITIES: Final = {
+    "speed": Bins(0.0, 60.0, 6000),
+    "acceleration_raw": Bins(-20.0, 20.0, 8000),
+    "acceleration_smoothed": Bins(-20.0, 20.0, 8000),
+    "headway": Bins(-2.0, 30.0, 6400),
+    "time_headway": Bins(0.0, 40.0, 8000),
+    "gap": Bins(0.0, 300.0, 6000),
+}
+#: Accelerations beyond this are counted separately, m/s2: few cars reach it.
+STRONG_MPS2: Final = 3.0
+
+
+@dataclass(frozen=True)
+class SceneSummary:
+    """One scene in numbers: a row of the report.
+
+    ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre is nearest: near 1 where
+    the road is straight in the recording's coordinates. Rates as in :class:`LaneChangeStatistics`.
+    """
+
+    name: str
+    rows: int
+    tracks: int
+    seconds: float
+    lanes: int
+    lane_width_m: float
+    nearest_lane_share: float
+    vehicle_km: float
+    mean_speed_mps: float
+    lane_changes: int
+    srlc: float
+    per_vehicle_km: float
+    per_vehicle_km_low: float
+    per_vehicle_km_high: float
+
+
+class PooledStatistics:
+    """Statistics over scenes: :meth:`add` each one, then read the attributes."""
+
+    def __init__(self) -> None:
+        self.histograms = {name: Histogram(bins) for name, bins in QUANTITIES.items()}
+        self.scenes: list[SceneSummary] = []
+        self._exposures: list[Exposure] = []
+        self._changes: list[LaneChanges] = []
+        #: One number per car: few enough to be stored.
+        self._headways: list[np.ndarray] = []
+        self._strong = dict.fromkeys(("acceleration_raw", "acceleration_smoothed"), 0)
+
+    def add(self, scene: Scene) -> SceneSummary:
+        """Measure one more scene."""
+        frame, exposure = scene.frame, measure_exposure(scene.frame)
+        tracks = tracks_of_frame(frame, {scene.name: scene.lane_width_m})
+        changes = find_lane_changes(tracks)
+        quantities = _quantities(frame)
+        self._headways.append(quantities["headway"])
+        for name, values in quantities.items():
+            self.histograms[name].add(values)
+            if name in self._strong:
+                self._strong[name] += int(np.count_nonzero(np.abs(values) > STRONG_MPS2))
+        self._exposures.append(exposure)
+        self._changes.append(changes)
+        speed = float(frame["speed"].mean())  # type: ignore[arg-type]
+        rates = lane_change_statistics(changes, exposure, speed)
+        frames = int(frame["frame"].max() - frame["frame"].min()) + 1  # type: ignore[operator, arg-type]
+        summary = SceneSummary(
+            name=scene.name,
+            rows=frame.height,
+            tracks=exposure.tracks,
+            seconds=round(FRAME_S * frames, 1),
+            lanes=scene.lanes,
+            lane_width_m=scene.lane_width_m,
+            nearest_lane_share=float(np.mean(tracks.lane == frame["lane"].to_numpy())),
+            vehicle_km=exposure.vehicle_km,
+            mean_speed_mps=speed,
+            lane_changes=rates.count,
+            srlc=rates.srlc,
+            per_vehicle_km=rates.per_vehicle_km,
+            per_vehicle_km_low=rates.per_vehicle_km_low,
+            per_vehicle_km_high=rates.per_vehicle_km_high,
+        )
+        self.scenes.append(summary)
+        return summary
+
+    @property
+    def exposure(self) -> Exposure:
+        """Total amount of driving; the road's length is the mean over the cars."""
+        cars = [each.cars for each in self._exposures]
+        total = {
+            name: sum(getattr(each, name) for each in self._exposures)
+            for name in ("scenes", "tracks", "cars", "samples", "vehicle_km")
+        }
+        return Exposure(road_m=float(np.average([each.road_m for each in self._exposures], weights=cars)), **total)
+
+    @property
+    def changes(self) -> LaneChanges:
+        """All lane changes; ``sample`` counts within each scene."""
+        parts = {field.name: [getattr(each, field.name) for each in self._changes] for field in fields(LaneChanges)}
+        return LaneChanges(**{name: np.concatenate(values) for name, values in parts.items()})
+
+    @property
+    def lane_changes(self) -> LaneChangeStatistics:
+        """Rates, durations and lateral speeds over all scenes."""
+        return lane_change_statistics(self.changes, self.exposure, float(self.describe("speed").mean or 0.0))
+
+    def describe(self, quantity: str) -> Distribution:
+        """Summary of a quantity: exact for headways, for others with quantiles accurate to a bin's width."""
+        if quantity == "headway":
+            return describe(np.concatenate([np.empty(0), *self._headways]))
+        return self.histograms[quantity].describe()
+
+    def strong_share(self, quantity: str) -> float | None:
+        """Share of the accelerations beyond 3 m/s2; None without any."""
+        total = self.histograms[quantity].total
+        return self._strong[quantity] / total if total else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain numbers and dataclasses."""
+        return {
+            "exposure": self.exposure,
+            "lane_changes": self.lane_changes,
+            **{name: self.describe(name) for name in self.histograms},
+            **{f"{name}_beyond_3_mps2": self.strong_share(name) for name in self._strong},
+            "scenes": self.scenes,
+        }
+
+
+def _quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
+    """Samples of every quantity in one scene; time headways of followers only."""
+    # Sorting needs most memory: only once, and with no more columns than needed.
+    columns = frame.select("scene", "vehicle", "frame", "x", "speed", "lane", "length")
+    with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
+    following = followers(with_leader)
+    return {
+        "speed": frame["speed"].to_numpy(),
+        "acceleration_raw": raw_accelerations(frame).to_numpy(),
+        "acceleration_smoothed": smoothed_accelerations(frame).to_numpy(),
+        "headway": median_headways(following).to_numpy(),
+        "time_headway": (following["gap"] / following["speed"]).to_numpy(),
+        "gap": with_leader["gap"].to_numpy(),
+    }
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """Result of :func:`prepare_recordings`: rows read, dropped and written, files, and statistics of all scenes."""
+
+    count: RowCount
+    written: int
+    files: tuple[str, ...]
+    statistics: PooledStatistics
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers for ``results.json``."""
+        count = self.count
+        rows = {"read": count.read, "kept": count.kept, "dropped": dict(count.dropped), "written": self.written}
+        return {"rows": rows, "files": list(self.files), **self.statistics.to_dict()}
+
+
+def open_scenes(
+    kind: str,
+    path: str | Path,
+    count: RowCount,
+    parameters: NgsimParameters | None = None,
+    scratch: Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> Iterator[Scene]:
+    """The scenes of recordings of a ``kind``: ``scenes``, ``ngsim`` or ``highd``.
+
+    Args:
+        kind: which reader.
+        path: file, or folder where the reader takes one.
+        count: rows read and dropped are added to it.
+        parameters: which rows of an NGSIM file to read.
+        scratch: folder for temporary files (NGSIM).
+        on_progress: called with the bytes read (NGSIM).
+
+    Raises:
+        UserError: a damaged or missing file, or an unknown kind.
+    """
+    if kind == "ngsim":
+        return ngsim_scenes(path, parameters, count, scratch, on_progress)
+    if kind == "highd":
+        return highd_scenes(path, count)
+    if kind == "scenes":
+        return scene_csv_scenes(path, count)
+    raise UserError(f"{kind}: no such kind of recordings; expected scenes, ngsim or highd.")
+
+
+def read_recordings(
+    kind: str, path: str | Path, parameters: NgsimParameters | None = None, on_progress: OnProgress | None = None
+) -> pl.DataFrame:
+    """All scenes of recordings in one frame, sorted; for recordings that fit into memory.
+
+    Arguments and errors are those of :func:`open_scenes`; a recording without any usable row is an error too.
+    """
+    if kind == "scenes":
+        return read_scenes(path)
+    frames = [scene.frame for scene in open_scenes(kind, path, RowCount(), parameters, on_progress=on_progress)]
+    if not frames:
+        raise UserError(
+            f"{path}: no vehicle on any of the lanes kept; give a recording of a road with traffic on it."
+        )
+    return sort(pl.concat(frames))
+
+
+def prepare_recordings(
+    kind: str,
+    path: str | Path,
+    out: str | Path,
+    parameters: NgsimParameters | None = None,
+    scene_s: float | None = None,
+    on_progress: OnProgress | None = None,
+    on_scene: Callable[[SceneSummary], None] | None = None,
+) -> Preparation:
+    """Read recordings, write each as a Parquet file into the folder ``out``, and measure them.
+
+    The folder ``out`` appears only when everything is written.
+
+    Args:
+        kind, path, parameters: as in :func:`open_scenes`.
+        out: folder to make.
+        scene_s: cut recordings into scenes of so many seconds when they are written; they are measured whole.
+        on_progress: called with the bytes read (NGSIM).
+        on_scene: called after each recording.
+
+    Raises:
+        UserError: a damaged or missing file, no moving vehicle in it, or ``out`` exists already.
+    """
+    count, statistics, files, written = RowCount(), PooledStatistics(), [], 0
+    with whole_folder(out) as folder:
+        for scene in open_scenes(kind, path, count, parameters, folder, on_progress):
+            if scene.frame["speed"].max() == 0.0 or scene.frame["frame"].n_unique() < 2:
+                count.drop("scene in which nobody drives", scene.frame.height)
+                continue
+            summary, file = statistics.add(scene), parquet_name(scene.name)
+            if file in files:
+                raise UserError(f"{path}: a second scene that {file} is the file of; rename one.")
+            files.append(file)
+            write_prepared(cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame, folder / file)
+            written += scene.frame.height
+            if on_scene is not None:
+                on_scene(summary)
+        if not files:
+            raise UserError(f"{path}: no scene in which anybody drives; give a recording of moving traffic.")
+    return Preparation(count, written, tuple(files), statistics)
+
+
+@contextmanager
+def whole_folder(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder next to ``path`` to write into; on success it is renamed to ``path``, else removed.
+
+    Raises:
+        UserError: there is something at ``path`` already.
+        OSError: the file system's error; it names ``path``, or the file in it that was to be written.
+    """
+    path = Path(path)
+    if path.is_file() or (path.is_dir() and any(path.iterdir())):
+        raise UserError(f"{path}: there already; choose another folder with out=FOLDER, or remove it.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with name_in_errors(path):
+        part = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
+        try:
+            yield part
+            part.chmod(0o755)
+            if path.is_dir():
+                path.rmdir()
+            part.replace(path)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)

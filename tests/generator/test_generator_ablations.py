@@ -4,11 +4,12 @@ from dataclasses import asdict, replace
 import pytest
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.ablations import ablate, ablation_table, variants
-from ganlane.generator.calibrated import CalibratedConfig
-from ganlane.generator.fitting import PaperConfig
+from ganlane.fit_report import ablation_table
+from ganlane.generator.cross_validation import ablate, variants
+from ganlane.generator.fit_calibrated import CalibratedConfig
+from ganlane.generator.fit_paper import PaperConfig
+from ganlane.generator.loop import LoopConfig
 from ganlane.generator.networks import GeneratorSizes
-from ganlane.generator.schedule import LoopConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 LOOP = LoopConfig(updates=8, evaluate_every=8, warmup=4)
@@ -35,7 +36,7 @@ def test_ablations_of_the_papers_preset_stand_side_by_side(tmp_path):
     frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=5.0))
     config = PaperConfig(SIZES, loop=LOOP, stride=6, samples=2, batch=4)
     names, updates = [], []
-    rows = ablate("paper", frame, config, ("synthetic-1",), tmp_path, names.append, updates.append)
+    rows = ablate(frame, config, ("synthetic-1",), tmp_path, names.append, updates.append)
     assert list(rows) == names == list(variants(config))
     assert len(updates) == 2 * len(rows)
     assert rows["p_l = 4"]["windows"] > rows["p_l = 12"]["windows"]
@@ -48,7 +49,7 @@ def test_ablations_of_the_calibrated_preset_are_rolled_out_too(tmp_path):
     frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=4, seconds=6.5))
     sizes = replace(SIZES, extra_inputs=4)
     config = CalibratedConfig(sizes, LOOP, (4,), (1.0,), held_out_horizon=8, batch=2, held_out_stride=20)
-    rows = ablate("calibrated", frame, config, ("synthetic-1",), tmp_path)
+    rows = ablate(frame, config, ("synthetic-1",), tmp_path)
     assert variants(config)["without washout"].anchor.washout_s == math.inf
     assert all(math.isfinite(row["rmse_5_s_ratio"]["mean"]) for row in rows.values())
     assert rows["as it is"] != rows["without traits"]

@@ -1,7 +1,8 @@
 import numpy as np
 
-from ganlane.generator.baselines import RidgeForecast, constant_acceleration, constant_velocity, mean_velocity
-from ganlane.generator.windows import Windows
+from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.generator.forecasts import RidgeForecast, baseline_forecasts, constant_acceleration, repeated
+from ganlane.generator.windows import Windows, scene_tracks
 
 RANDOM = np.random.default_rng(0)
 
@@ -20,8 +21,12 @@ def course(start_mps: float, acceleration: float, frames: int = 17) -> np.ndarra
 
 def test_steady_driving_is_foreseen_by_all():
     windows = windows_of(course(20.0, 0.0))
-    for forecast in (constant_velocity, mean_velocity, constant_acceleration):
-        np.testing.assert_allclose(forecast(windows.past, 8), windows.future, atol=1e-9)
+    for positions in (
+        repeated(windows.past[:, -1], 8),
+        repeated(windows.past.mean(1), 8),
+        constant_acceleration(windows.past, 8),
+    ):
+        np.testing.assert_allclose(positions, windows.future, atol=1e-9)
     np.testing.assert_allclose(windows.future[0, :, 0], 2.0 * np.arange(1, 9))
 
 
@@ -29,14 +34,17 @@ def test_steady_acceleration_is_foreseen_by_constant_acceleration_alone():
     windows = windows_of(course(10.0, 1.5))
     np.testing.assert_allclose(constant_acceleration(windows.past, 8), windows.future, atol=1e-9)
     # the displacement grows by 0.015 m a step, so after 8 steps 0.015 * (1 + 2 + ... + 8) m are missing
-    missing = windows.future - constant_velocity(windows.past, 8)
+    missing = windows.future - repeated(windows.past[:, -1], 8)
     np.testing.assert_allclose(missing[0, -1], [0.015 * 36, 0.0], atol=1e-9)
 
 
 def test_the_mean_velocity_looks_at_all_that_was_observed():
-    past = np.zeros((1, 8, 2))
-    past[0, :4, 0], past[0, 4:, 0] = 1.0, 2.0
-    np.testing.assert_allclose(mean_velocity(past, 2)[0], [[1.5, 0.0], [3.0, 0.0]])
+    steps = np.array([1.0] * 4 + [2.0] * 4 + [0.0] * 8)
+    x = np.concatenate([[0.0], steps.cumsum()])
+    windows = windows_of(np.stack([x, np.zeros(17)], axis=-1)[None].repeat(3, axis=0))
+    scene = scene_tracks(synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=3, seconds=4.0)))
+    mean = baseline_forecasts(windows, scene, 3)["mean_velocity"]
+    np.testing.assert_allclose(mean[0, :2], [[1.5, 0.0], [3.0, 0.0]])
 
 
 def noisy_followers(count: int) -> np.ndarray:

@@ -3,21 +3,20 @@ import pytest
 import torch
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.anchored import EXTRA_INPUTS
+from ganlane.generator.closed_loop import EXTRA_INPUTS
+from ganlane.generator.fit_calibrated import CalibratedConfig
 from ganlane.generator.forecasts import (
+    by_kind,
     calibrated_forecasts,
-    driven_courses,
+    driven_windows,
     idm_forecasts,
     paper_forecasts,
-    summarised,
 )
 from ganlane.generator.groups import group_windows
-from ganlane.generator.metrics import open_loop
 from ganlane.generator.networks import Generator, GeneratorSizes
-from ganlane.generator.scores import displacement_errors, errors_of
-from ganlane.generator.stretches import scene_sources
-from ganlane.generator.tracks import scene_tracks
-from ganlane.generator.windows import cut_windows
+from ganlane.generator.scores import displacement_errors, errors_of, window_errors
+from ganlane.generator.segments import segment_sources
+from ganlane.generator.windows import cut_windows, scene_tracks
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 STRIDE = 7
@@ -34,7 +33,7 @@ def scenes():
 
 @pytest.fixture(scope="module")
 def sources(scenes):
-    return scene_sources(scenes, {scene.name: 3.5 for scene in scenes})
+    return segment_sources(scenes, {scene.name: 3.5 for scene in scenes})
 
 
 def small_generator(extra_inputs: int) -> Generator:
@@ -45,7 +44,7 @@ def small_generator(extra_inputs: int) -> Generator:
 @pytest.mark.parametrize("horizon", [8, 20])
 def test_driven_windows_are_the_cut_windows_in_the_same_order(scenes, sources, horizon):
     windows = cut_windows(scenes, STRIDE, 9 + horizon)
-    recorded = driven_courses(lambda stretch: stretch.future[None], sources, horizon, STRIDE)[0]
+    recorded = driven_windows(lambda stretch: stretch.future[None], sources, horizon, STRIDE)[0]
     np.testing.assert_allclose(recorded, windows.future, atol=1e-4)
 
 
@@ -54,18 +53,17 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
     samples = np.zeros((22, 2, 3, 2))
     samples[1:, ..., 0] = 5.0
     samples[4, 0], samples[9, 1] = 1.0, 2.0
-    found = summarised(samples, recorded)
+    found = by_kind(samples, recorded)
     np.testing.assert_array_equal(found["best_of_20"], np.stack([samples[4, 0], samples[9, 1]]))
-    assert summarised(samples[:1], recorded).keys() == {"mean"}
-    assert summarised(samples[:2], recorded).keys() == {"mean", "single"}
+    assert by_kind(samples[:1], recorded).keys() == {"mean"}
+    assert by_kind(samples[:2], recorded).keys() == {"mean", "single"}
 
 
 def test_forecasts_of_the_papers_preset_score_as_the_groups_do(scenes):
     generator, windows = small_generator(0), cut_windows(scenes, STRIDE)
     forecasts = paper_forecasts(generator, windows, 4)
     row = displacement_errors(errors_of({**forecasts, "constant_velocity": forecasts["mean"]}, windows.future))
-    names = tuple(scene.name for scene in scenes)
-    groups = open_loop(generator, group_windows(windows, 4), names)["all"]
+    groups = window_errors(generator, group_windows(windows, 4))["all"]
     assert row["ade_m"]["mean"] == pytest.approx(groups["ade_m/mean"], rel=1e-3)
     assert row["fde_m"]["mean"] == pytest.approx(groups["fde_m/mean"], rel=1e-3)
     assert row["ade_m"]["best_of_20"] < row["ade_m"]["mean"] < 1.5 * row["ade_m"]["single"]
@@ -76,7 +74,7 @@ def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes, sou
     with torch.no_grad():
         generator.head.weight.zero_()
         generator.head.bias.zero_()
-    forecasts = calibrated_forecasts(generator, sources, 8, STRIDE, samples=3)
+    forecasts = calibrated_forecasts(generator, sources, 8, STRIDE, CalibratedConfig(), samples=3)
     np.testing.assert_allclose(forecasts["single"], forecasts["mean"], atol=1e-5)
     # without a residual the anchor alone drives: along the road that is IDM with the driver's own headway
     idm = idm_forecasts(sources, 8, STRIDE)["idm_own_headway"]

@@ -1,4 +1,4 @@
-"""``ganlane realism``: how close a traffic comes to recorded driving, as JSON, table and figures.
+"""The realism card, and its command: how close a traffic comes to recorded driving.
 
     ganlane realism traffic=gan_calibrated
     ganlane realism traffic=gan data.path=recordings.csv 'against=[idm_mobil,gan_calibrated]'
@@ -8,11 +8,29 @@
 
 Writes results.json, distributions.png, distances.png and drift.png into its run folder. Without recordings on the
 machine it uses the histograms that ship, and says so.
+
+Every traffic of a card drives from the same starts: the recorded scenes, for as long as they were recorded. Simulated
+and recorded trajectories go through the same measurement. Each quantity gets the distance between both distributions,
+with an interval over scenes, on a scale with two ends: one half of the recordings against the other, and random
+driving. Long runs without an ego show what a traffic does over minutes.
+
+The modules, from the bottom up:
+
+- :mod:`~ganlane.realism.quantities`: what is measured of trajectories, recorded or simulated.
+- :mod:`~ganlane.realism.distances`: the distance of two distributions, with intervals.
+- :mod:`~ganlane.realism.recordings`: recorded scenes as arrays.
+- :mod:`~ganlane.realism.references`: the histograms that ship, and reference drivers.
+- :mod:`~ganlane.realism.replay_starts`: a traffic drives recorded scenes.
+- :mod:`~ganlane.realism.fit_speeds`: measures that, and fits each traffic's desired speeds.
+- :mod:`~ganlane.realism.counters`, :mod:`~ganlane.realism.long_runs`: events and long runs.
+- :mod:`~ganlane.realism.starts`: every traffic from recorded or spawned starts, by folds where asked for.
+- :mod:`~ganlane.realism.card`: the numbers and checks of a card.
+- :mod:`~ganlane.realism.make_card`: drives a card from the command's configuration.
+- :mod:`~ganlane.realism.figures`, :mod:`~ganlane.realism.output`: figures, tables and documents.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -22,11 +40,11 @@ from ganlane.config.realism import RealismConfig
 
 
 def realism(config: RealismConfig, folder: Path) -> str:
-    """Drive, measure, print, draw, keep."""
+    """Make a card: drive, measure, print and save; the line that names its results."""
     from ganlane.build import set_threads
-    from ganlane.cards import check_targets, draw, drive_card, publish, scenes_path, show
     from ganlane.evaluation import write_results
-    from ganlane.evaluation.realism import card_text
+    from ganlane.realism.make_card import drive_card, scenes_path
+    from ganlane.realism.output import card_text, check_targets, draw, publish, show
 
     config = config.shortened()
     set_threads(config.threads)
@@ -44,7 +62,3 @@ def realism(config: RealismConfig, folder: Path) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit status."""
     return run_command("realism", realism, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

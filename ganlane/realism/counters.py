@@ -1,4 +1,4 @@
-"""What is counted while traffic drives: what must not happen, and how much of the driving is the guard's."""
+"""Counts events while a traffic drives: overlaps, vehicles off the road, standstills, and a guard's interventions."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic import Guard, TrafficModule
 
-#: A body that reaches further beyond the edge is off the road, m: rounding does not count.
+#: A body further beyond the edge than this is off the road, m; less is rounding.
 EDGE_M: Final = 0.01
-#: Slower than this with nobody so near ahead, a vehicle stands still for no reason, m/s and m.
+#: A vehicle slower than this with a leader no nearer than that stands still without reason, m/s and m.
 STANDING_MPS: Final = 1.0
 FREE_M: Final = 50.0
-#: Standing still is looked for once a second.
+#: Standstills are tested once in so many steps.
 _SECOND: Final = 10
-#: Less than this is no intervention, m/s2 and m.
+#: A guard intervenes where it alters more than this, m/s2 and m.
 ALTERED_ACCELERATION: Final = 0.1
 ALTERED_POSITION_M: Final = 0.02
 
@@ -44,11 +44,11 @@ class EventCounter:
         self._before: dict[str, Tensor] = {}
 
     def begin(self) -> None:
-        """Another batch of episodes begins."""
+        """Forget the last state: a new batch of episodes begins."""
         self._before = {}
 
     def count(self, vehicles: Vehicles, step: int) -> None:
-        """Look at the vehicles after a physics step."""
+        """Count the events of a physics step."""
         others = vehicles.columns(slice(1, None))
         self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
         half = lateral_half_extent(others) - EDGE_M
@@ -64,7 +64,7 @@ class EventCounter:
         return slow & (ahead.gap > FREE_M)
 
     def _onsets(self, name: str, now: Tensor) -> int:
-        """How many of ``now`` were not so when last looked at."""
+        """Number of entries that are true now and were not at the last count."""
         before = self._before.get(name, torch.zeros_like(now))
         self._before[name] = now
         return int((now & ~before).sum())
@@ -100,7 +100,7 @@ class GuardMeter:
 
 @contextmanager
 def watched(traffic: TrafficModule, meter: GuardMeter) -> Iterator[None]:
-    """Let ``meter`` see every guard in ``traffic``, for as long as the context lasts."""
+    """Attach ``meter`` to every guard in ``traffic`` within the context."""
     guards = [part for part in traffic.modules() if isinstance(part, Guard)]
     before = [guard.observer for guard in guards]
     for guard in guards:

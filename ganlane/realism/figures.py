@@ -1,4 +1,4 @@
-"""Figures of the realism card: recorded and simulated distributions, distances, and the drift of long runs."""
+"""Figures of the realism card: distributions, distances, and the speeds of long runs over time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ganlane.evaluation.realism import FLOORS, QUANTITIES, UNITS, Starts
+from ganlane.realism.fit_speeds import FLOORS
+from ganlane.realism.quantities import QUANTITIES, UNITS
+from ganlane.realism.starts import Starts
 from ganlane.view.figures import FAINT, GRID, INK, STYLE, FloatArray, add_legend, palette, panel_grid, plot_line
 
 RECORDED = INK
@@ -52,7 +54,7 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     Upright lines are the ends of the scale: recordings against each other, and random driving.
 
     Args:
-        quantities: rows of :func:`ganlane.evaluation.realism.card.quantity_rows`.
+        quantities: rows of :func:`ganlane.realism.card.quantity_rows`.
         traffic: the card's own.
     """
     others = list(next(iter(quantities.values()))["against"])
@@ -88,7 +90,7 @@ def draw_drift(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
     """Mean and spread of the speeds of long runs over time; the recorded spread as a level.
 
     Args:
-        runs: as :func:`ganlane.evaluation.realism.long_summary.summary` gives them.
+        runs: as :func:`ganlane.realism.long_runs.summary` gives them.
         spread_mps: the recorded mean spread within a frame.
     """
     figure, grid = panel_grid(2)

@@ -87,7 +87,7 @@ def measure(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> Measured:
     """Measure trajectories.
 
     Args:
-        frame: as :func:`ganlane.evaluation.realism.recordings.frame_of` gives it, sorted by track.
+        frame: as :func:`ganlane.realism.recordings.frame_of` gives it, sorted by track.
         lane_widths: m, by scene.
     """
     motion = _motion(frame)

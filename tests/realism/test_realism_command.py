@@ -11,10 +11,11 @@ from PIL import Image
 
 from ganlane.config.realism import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.evaluation.realism import QUANTITIES, SHIPPED_REFERENCE
 from ganlane.files import load_weights, save_weights
 from ganlane.generator import shipped_generator
 from ganlane.realism import main
+from ganlane.realism.quantities import QUANTITIES
+from ganlane.realism.references import SHIPPED_REFERENCE
 
 QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
 
@@ -22,7 +23,7 @@ QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
 @pytest.fixture(autouse=True)
 def _in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
     nothing = tmp_path / "nothing"
     nothing.mkdir()
     monkeypatch.setenv("GANLANE_DATA", str(nothing))
@@ -184,7 +185,7 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, reco
 
 
 def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, monkeypatch, tmp_path):
-    import ganlane.evaluation.realism as module
+    from ganlane.realism import references as module
 
     assert not RealismConfig().publish
     there = tmp_path / "shipped.json"

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from ganlane.evaluation.realism.counters import EventCounter, GuardMeter, watched
-from ganlane.evaluation.realism.long import LongRunParameters, spawned
+from ganlane.realism.counters import EventCounter, GuardMeter, watched
+from ganlane.realism.long_runs import LongRunParameters, spawned_vehicles
 from ganlane.sim.random import episode_key
 from ganlane.sim.road import Road
 from ganlane.traffic import Guard, IdmTraffic, TrafficModule
@@ -13,7 +13,7 @@ from ganlane.traffic import Guard, IdmTraffic, TrafficModule
 def start(road):
     """Three episodes of nine vehicles; index 0 is nobody."""
     key = episode_key(2, torch.zeros(3, dtype=torch.int64), torch.arange(3))
-    return spawned(IdmTraffic(road), LongRunParameters(), key)
+    return spawned_vehicles(IdmTraffic(road), LongRunParameters(), key)
 
 
 def test_events_are_counted_when_they_begin():

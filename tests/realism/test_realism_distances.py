@@ -10,9 +10,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
-from ganlane.evaluation.realism.card import verdict
-from ganlane.evaluation.realism.distances import ceiling, distance, distance_difference, jensen_shannon
 from ganlane.evaluation.statistics import Estimate
+from ganlane.realism.card import verdict
+from ganlane.realism.distances import ceiling, distance, distance_difference, jensen_shannon
 
 COUNTS = arrays(np.float64, (2, 7), elements=st.integers(0, 50)).filter(lambda rows: rows.sum(1).min() > 0)
 

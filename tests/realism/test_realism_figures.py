@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+from ganlane.realism.figures import draw_distances, draw_distributions, draw_drift
 from ganlane.view.figures import COLOURS, INK
-from ganlane.view.realism import draw_distances, draw_distributions, draw_drift
 
 
 def in_colour(axes, colour):

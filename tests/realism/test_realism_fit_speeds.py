@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from ganlane.evaluation.realism.drivers import ConstantVelocity
-from ganlane.evaluation.realism.fitting import fit_excess
-from ganlane.evaluation.realism.recordings import Recording
-from ganlane.evaluation.realism.simulation import StartOptions
+from ganlane.realism.fit_speeds import fit_excess
+from ganlane.realism.recordings import Recording
+from ganlane.realism.references import ConstantVelocity
+from ganlane.realism.replay_starts import StartOptions
 
 
 def test_the_excess_that_was_used_is_the_one_that_is_fitted():

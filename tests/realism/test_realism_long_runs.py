@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from ganlane.evaluation.realism.drivers import ConstantVelocity, RandomDriving
-from ganlane.evaluation.realism.long import LongRunParameters, long_run, spawned
-from ganlane.evaluation.realism.long_summary import totals
+from ganlane.realism.long_runs import LongRunParameters, long_run, spawned_vehicles, totals
+from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.sim.random import episode_key
 from ganlane.sim.road import Road
 from ganlane.traffic import IdmTraffic
@@ -16,7 +15,7 @@ SHORT = LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0)
 
 def start(road, vehicles=9):
     key = episode_key(2, torch.zeros(3, dtype=torch.int64), torch.arange(3))
-    return spawned(IdmTraffic(road), LongRunParameters(vehicles=vehicles), key)
+    return spawned_vehicles(IdmTraffic(road), LongRunParameters(vehicles=vehicles), key)
 
 
 def test_all_but_the_ego_are_there_and_start_as_the_simulators_episodes_do():

@@ -1,10 +1,9 @@
 """The card as text."""
 
-from ganlane.evaluation.realism.checks import card_checks
-from ganlane.evaluation.realism.drivers import ConstantVelocity
-from ganlane.evaluation.realism.long import LongRunParameters, long_run
-from ganlane.evaluation.realism.long_summary import totals
-from ganlane.evaluation.realism.table import checks_text, long_table
+from ganlane.realism.card import card_checks
+from ganlane.realism.long_runs import LongRunParameters, long_run, totals
+from ganlane.realism.output import checks_text, long_table
+from ganlane.realism.references import ConstantVelocity
 from ganlane.sim.road import Road
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 

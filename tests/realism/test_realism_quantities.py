@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ganlane.evaluation.realism.quantities import QUANTITIES, measure
-from ganlane.evaluation.realism.recordings import Recording, recorded_frame, stretches
+from ganlane.realism.quantities import QUANTITIES, measure
+from ganlane.realism.recordings import Recording, recorded_frame, segments
 
 
 def recording(x, y=None, name="scene", lanes=3, present=None):
@@ -98,7 +98,7 @@ def test_vehicles_that_are_replayed_are_led_by_but_not_measured():
 
 
 def test_stretches_keep_their_unit_and_leave_out_what_was_to_be_skipped():
-    pieces = stretches(recording(10.0 * TIME), 3.0, skip_s=3.5)
+    pieces = segments(recording(10.0 * TIME), 3.0, skip_s=3.5)
     assert [piece.name for piece in pieces] == ["scene@35", "scene@65"]
     assert {piece.unit for piece in pieces} == {"scene"}
     assert pieces[1].x[0, 0] == pytest.approx(65.0)

@@ -4,8 +4,8 @@ import polars as pl
 import pytest
 
 from ganlane.errors import UserError
-from ganlane.evaluation.realism.driving import measure_recordings
-from ganlane.evaluation.realism.i80 import I80_FILES, i80_files, read_i80
+from ganlane.realism.fit_speeds import measure_recordings
+from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
 
 
 def lane_file(path):

@@ -7,10 +7,10 @@ import pytest
 
 from ganlane.data import SyntheticTraffic, default_scenes, read_scenes, scene_lane_widths, synthetic_scenes
 from ganlane.errors import UserError
-from ganlane.evaluation.realism.driving import measure_recordings
-from ganlane.evaluation.realism.quantities import QUANTITIES
-from ganlane.evaluation.realism.recordings import recordings_of
-from ganlane.evaluation.realism.reference import SHIPPED_REFERENCE, Reference, reference_of
+from ganlane.realism.fit_speeds import measure_recordings
+from ganlane.realism.quantities import QUANTITIES
+from ganlane.realism.recordings import recordings_of
+from ganlane.realism.references import SHIPPED_REFERENCE, Reference, reference_of
 
 
 @pytest.fixture

@@ -5,12 +5,14 @@ import pytest
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
-from ganlane.evaluation.realism.card import rows_of
-from ganlane.evaluation.realism.distances import ceiling
-from ganlane.evaluation.realism.drivers import ConstantVelocity
-from ganlane.evaluation.realism.folds import Fold
-from ganlane.evaluation.realism.simulation import StartOptions
-from ganlane.evaluation.realism.starts import recorded_starts
+from ganlane.realism.card import card_rows
+from ganlane.realism.distances import ceiling
+from ganlane.realism.long_runs import LongRunParameters
+from ganlane.realism.references import ConstantVelocity
+from ganlane.realism.replay_starts import StartOptions
+from ganlane.realism.starts import Fold, recorded_starts, spawned_frame
+from ganlane.sim.road import Road
+from ganlane.traffic import IdmTraffic
 
 NAMES = [f"synthetic-{number}" for number in range(4)]
 MAKERS = {"cruise": ConstantVelocity}
@@ -28,11 +30,11 @@ def starts_of(frame, *folds, fit=False):
 
 def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
     starts, _ = starts_of(frame, Fold(MAKERS, NAMES, NAMES[1:3]))
-    assert starts.unseen == NAMES[1:3]
-    alone = rows_of(starts.only(starts.unseen), "cruise", 100)
+    assert starts.separately_held_out == NAMES[1:3]
+    alone = card_rows(starts.restricted_to(starts.separately_held_out), "cruise", 100)
     for name in ("speed", "gap"):
         assert alone[name]["ceiling"] == ceiling(starts.recorded[name][1:3])
-        assert alone[name]["ceiling"] != rows_of(starts, "cruise", 100)[name]["ceiling"]
+        assert alone[name]["ceiling"] != card_rows(starts, "cruise", 100)[name]["ceiling"]
         assert alone[name]["recorded_samples"] == starts.recorded[name][1:3].sum()
 
 
@@ -41,7 +43,7 @@ def test_folds_are_driven_one_by_one_and_told_together(frame):
     apart, _ = starts_of(frame, *folds)
     whole, _ = starts_of(frame, Fold(MAKERS, NAMES, []))
     assert apart.scenes == whole.scenes == NAMES
-    assert apart.unseen == []
+    assert apart.separately_held_out == []
     assert np.array_equal(apart.driven["cruise"].counts["speed"], whole.driven["cruise"].counts["speed"])
 
 
@@ -52,3 +54,9 @@ def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(frame):
         starts_of(frame, Fold(MAKERS, [], []))
     with pytest.raises(UserError, match="moon"):
         starts_of(frame, Fold(MAKERS, NAMES, ["moon"]))
+
+
+def test_spawned_trajectories_are_whole_tracks_in_the_schema():
+    frame = spawned_frame(IdmTraffic, Road(), LongRunParameters(5, most_s=10.0), 2)
+    assert frame.height == 2 * 5 * 101
+    assert frame["unit"].unique().sort().to_list() == ["spawned-0", "spawned-1"]

@@ -26,8 +26,9 @@ from torch import Tensor, nn
 
 from ganlane.benchmarks.script import parser_of, run_script
 from ganlane.data import FRAME_S, default_scenes, read_scenes, scene_lane_widths
-from ganlane.evaluation.realism import StartOptions, drive_recordings, recorded_frame, recordings_of
 from ganlane.generator import Discriminator, Generator, load_generator, shipped_generator
+from ganlane.realism.recordings import recorded_frame, recordings_of
+from ganlane.realism.replay_starts import StartOptions, drive_recordings
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.traffic import TrafficModule
@@ -164,7 +165,7 @@ def draw_space_time(scene: str, lane: int, courses: Mapping[str, pl.DataFrame]) 
     Args:
         scene: its name.
         lane: whose vehicles are drawn.
-        courses: name to trajectories (:func:`ganlane.evaluation.realism.recordings.frame_of`) of the same scene.
+        courses: name to trajectories (:func:`ganlane.realism.recordings.frame_of`) of the same scene.
     """
     first, *others = courses
     colours = {first: INK, **palette(others)}

@@ -27,9 +27,9 @@ import torch
 
 from ganlane.benchmarks.report import machine_sentence
 from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
-from ganlane.evaluation.realism.long import LongRunParameters
 from ganlane.files import write_json
 from ganlane.memory import keep_freed_memory
+from ganlane.realism.long_runs import LongRunParameters
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.ablations.driving import drive

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.evaluation.realism import check_cover, fold_weights
+from ganlane.realism.starts import check_folds_cover, fold_weights
 from ganlane.train_generator import main
 
 FEW = ["generator.loop.updates=2", "generator.loop.evaluate_every=1", "generator.batch=4"]
@@ -43,7 +43,7 @@ def test_the_folds_generators_are_kept_and_cover_every_scene(recordings, capsys)
     paths = [folder / f"generator_paper_fold_{number}.safetensors" for number in (1, 2, 3)]
     folds = fold_weights(paths)
     assert [weights["paper"] for weights in folds.values()] == paths
-    check_cover(list(folds), sorted(frame["scene"].unique()))
+    check_folds_cover(list(folds), sorted(frame["scene"].unique()))
 
 
 def broken(path: Path, how: str) -> None:

@@ -24,7 +24,7 @@ ORDER = [
     {"view"},
     {"config"},
     {"build"},
-    {"compare", "phases", "fit_report", "benchmarks", "diagnosis", "cards"},
+    {"compare", "phases", "fit_report", "benchmarks", "diagnosis"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
     # The typed calls run the commands' own functions.
     {"api"},

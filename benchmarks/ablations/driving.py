@@ -7,9 +7,8 @@ from statistics import median
 from typing import Any
 
 from benchmarks.ablations.variants import Variant
-from ganlane.evaluation.realism.counters import EventCounter, GuardMeter, watched
-from ganlane.evaluation.realism.long import LongRunParameters, drive_spawned
-from ganlane.evaluation.realism.long_summary import Course, measured, summary
+from ganlane.realism.counters import EventCounter, GuardMeter, watched
+from ganlane.realism.long_runs import LongRunParameters, Trajectories, batch_statistics, drive_spawned, summary
 from ganlane.sim.road import Road
 from ganlane.traffic import TrafficModule
 
@@ -41,7 +40,7 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
         clock = StepClock(traffic)
         with watched(traffic, meter):
             course = drive_spawned(traffic, parameters, batch * len(parts), batch, events)
-        parts.append(measured(course, Road()))
+        parts.append(batch_statistics(course, Road()))
         ends.append(at_the_end(course))
         seconds += clock.seconds
         if parts[-1]["vehicle_km"] <= 0.0:
@@ -56,7 +55,7 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     }
 
 
-def at_the_end(course: Course) -> tuple[float, float]:
+def at_the_end(course: Trajectories) -> tuple[float, float]:
     """Mean speed, and standard deviation within an episode, at the end of all episodes, m/s."""
     last = course.speed[-1].astype("float64")
     return float(last.mean()), float(last.std(axis=-1, ddof=1).mean())

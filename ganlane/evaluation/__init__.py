@@ -8,7 +8,7 @@ on recorded scenes crashes per km come from :func:`crashes_by_scene`, which resa
 :func:`paired_rows` compares the first driver with the others on the same episodes; :func:`text_table` and
 :func:`paired_table` print them; :func:`write_results` and :func:`write_episodes` keep it. :func:`drive` keeps the
 actions of its episodes, and :func:`replay` drives them again.
-Traffics are measured, too: :mod:`~ganlane.evaluation.realism` holds them against recorded driving.
+Traffics are compared with recorded driving in :mod:`ganlane.realism`.
 """
 
 from ganlane.evaluation.by_scene import CrashesByScene, crashes_by_scene

@@ -5,8 +5,7 @@ draws its frames; :class:`Film` chooses them by time, and :func:`write_film` wri
 :func:`write_player` writes one HTML page that plays several episodes beside each other. :func:`to_tracks` gives an
 episode in the form of recorded traffic, :func:`write_tracks` writes it as CSV or Parquet.
 
-Charts are in :mod:`ganlane.view.figures` (learning curves, recordings) and :mod:`ganlane.view.realism`, which films
-do not need: they alone load matplotlib.
+Charts are in :mod:`ganlane.view.figures` (learning curves, recordings), which alone loads matplotlib.
 """
 
 from ganlane.view.films import Film, film_strip, write_film

@@ -11,9 +11,9 @@ from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import GanCalibratedTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig
-from ganlane.evaluation.realism.long import LongRunParameters
-from ganlane.evaluation.realism.spawned_scenes import spawned_frame
 from ganlane.generator.closed_loop import extra_inputs
+from ganlane.realism.long_runs import LongRunParameters
+from ganlane.realism.starts import spawned_frame
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.traffic import IdmTraffic
 

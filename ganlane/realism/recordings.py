@@ -1,0 +1,235 @@
+"""Recorded scenes as dense arrays: the starts of simulations, and what those are measured against.
+
+Two sources: scenes in the project's schema, and three files of I-80, a site that no generator was fitted to.
+``i80_1600_lane1.csv`` holds every car of one lane, all of which are driven (no lengths are given: 4.5 m). The two
+others hold pairs, in which the follower is driven behind its recorded leader. All three are cut into segments of
+15 s, each of which starts as recorded, on a road of one lane. Positions in the files are of the front bumper; here
+they are of the centre, as everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ganlane.data import FRAME_S, SCHEMA
+from ganlane.data.lane_widths import STANDARD_LANE_WIDTH_M
+from ganlane.data.tables import read_table
+from ganlane.errors import UserError
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+#: A scene must last longer than the part that is left out of every measure, s.
+SHORTEST_S = 4.0
+#: Name to file.
+I80_FILES: Final = {"lane_1": "i80_1600_lane1.csv", "pairs": "i80_1600_pairs.csv", "following": "i80_following.csv"}
+SEGMENT_S: Final = 15.0
+#: The first seconds of a pair, in which the published smoothing bends the follower's speed, s.
+EDGE_S: Final = 3.0
+_LENGTH_M: Final = 4.5
+_WIDTH_M: Final = 2.0
+_NUMBERS = {"frame": pl.Int64, "x": pl.Float64}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recorded scene of T frames (0.1 s apart) and V tracks; entries that are not ``present`` are 0.
+
+    Attributes:
+        name: the scene's; no other recording has it.
+        unit: what is resampled together: the scene, or the pair that several segments come from.
+        lanes, lane_width_m: its road.
+        x, y, speed: [T, V] centre of the body, m, and m/s.
+        present: [T, V] recorded in this frame; a track has no gap.
+        length, width: [V] m.
+        driven: [V] simulated; the others are replayed as recorded and left out of every measure.
+    """
+
+    name: str
+    unit: str
+    lanes: int
+    lane_width_m: float
+    x: Floats
+    y: Floats
+    speed: Floats
+    present: Flags
+    length: Floats
+    width: Floats
+    driven: Flags
+
+    @property
+    def end_m(self) -> float:
+        """Where its road ends, as far as the recording shows, m."""
+        return float(self.x[self.present].max())
+
+
+def recordings_of(
+    frame: pl.DataFrame, lane_widths: Mapping[str, float], scenes: Sequence[str] | None = None
+) -> list[Recording]:
+    """The scenes of a frame in the schema, in the order of their names.
+
+    Args:
+        frame: in the schema; a track must have no gap.
+        lane_widths: m, by scene.
+        scenes: names; None takes all.
+    """
+    names = sorted(frame["scene"].unique().to_list() if scenes is None else scenes)
+    return [_recording(name, frame.filter(pl.col("scene") == name), lane_widths[name]) for name in names]
+
+
+def _recording(name: str, rows: pl.DataFrame, lane_width_m: float) -> Recording:
+    vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
+    frame = rows["frame"].to_numpy()
+    row = frame - frame.min()
+    shape = (int(row.max()) + 1, len(vehicles))
+    dense = {field: np.zeros(shape) for field in ("x", "y", "speed")}
+    for field, values in dense.items():
+        values[row, column] = rows[field].to_numpy()
+    present = np.zeros(shape, dtype=bool)
+    present[row, column] = True
+    size = {field: np.zeros(len(vehicles)) for field in ("length", "width")}
+    for field, flat in size.items():
+        flat[column] = rows[field].to_numpy()
+    lanes = int(rows["lane"].to_numpy().max()) + 1
+    everybody = np.ones(len(vehicles), dtype=bool)
+    return Recording(name, name, lanes, lane_width_m, **dense, present=present, **size, driven=everybody)
+
+
+def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: str) -> pl.DataFrame:
+    """Trajectories [T, V] of the vehicles of ``recording`` as a frame in the schema, sorted by track.
+
+    The lane is the one whose centre is nearest, and the speed is 0: everything is measured from positions. The
+    further columns ``unit`` and ``driven`` are the recording's.
+    """
+    vehicle, time = np.nonzero(present.T)
+    width = recording.lane_width_m
+    columns = {
+        "scene": np.full(len(vehicle), name),
+        "vehicle": vehicle,
+        "frame": time,
+        "x": x[time, vehicle].astype(np.float64),
+        "y": y[time, vehicle].astype(np.float64),
+        "speed": np.zeros(len(vehicle)),
+        "lane": np.rint(y[time, vehicle] / width).astype(np.int64).clip(0, recording.lanes - 1),
+        "length": recording.length[vehicle],
+        "width": recording.width[vehicle],
+    }
+    whose = pl.lit(recording.unit).alias("unit")
+    driven = pl.Series("driven", recording.driven[vehicle])
+    return pl.DataFrame(columns, schema=SCHEMA).with_columns(whose, driven)
+
+
+def recorded_frame(recordings: Sequence[Recording]) -> pl.DataFrame:
+    """The recordings in the form in which simulations are measured."""
+    return pl.concat([frame_of(each, each.x, each.y, each.present, each.name) for each in recordings])
+
+
+def segments(recording: Recording, seconds: float, skip_s: float = 0.0) -> list[Recording]:
+    """Cuts ``recording`` from ``skip_s`` on into pieces of ``seconds``, each with the vehicles present in it."""
+    length, first = round(seconds / FRAME_S), round(skip_s / FRAME_S)
+    pieces = []
+    for start in range(first, len(recording.x) - length + 1, length):
+        rows = slice(start, start + length)
+        who = recording.present[rows].any(0)
+        dense = {field: getattr(recording, field)[rows][:, who] for field in ("x", "y", "speed", "present")}
+        flat = {field: getattr(recording, field)[who] for field in ("length", "width", "driven")}
+        name = f"{recording.name}@{start}"
+        pieces.append(Recording(name, recording.unit, recording.lanes, recording.lane_width_m, **dense, **flat))
+    return pieces
+
+
+def i80_files(folder: Path) -> dict[str, Path]:
+    """The I-80 files that exist in ``folder``, by name."""
+    return {name: folder / file for name, file in I80_FILES.items() if (folder / file).is_file()}
+
+
+def read_i80(name: str, path: Path) -> list[Recording]:
+    """Segments of 15 s from one of the files.
+
+    Args:
+        name: which of :data:`I80_FILES` it is.
+        path: the file.
+
+    Raises:
+        UserError: it is damaged, or no track in it lasts 15 s.
+    """
+    readers = {"lane_1": _lane, "pairs": _pairs, "following": _following}
+    whole = readers[name](path)
+    pieces = [piece for each in whole for piece in each if piece.driven.any()]
+    if not pieces:
+        raise UserError(f"{path}: nothing in it lasts {SEGMENT_S:g} s; give the whole file.")
+    return pieces
+
+
+def _lane(path: Path) -> list[list[Recording]]:
+    rows = read_table(path, {"vehicle": pl.Int64, **_NUMBERS}).with_columns(
+        length=pl.lit(_LENGTH_M), x=pl.col("x") - 0.5 * _LENGTH_M, driven=pl.lit(True)
+    )
+    # Each segment is a unit of its own: the whole lane would be a single unit, and gives no interval.
+    whole = _i80_recording("lane_1", rows)
+    return [[replace(piece, unit=piece.name) for piece in segments(whole, SEGMENT_S)]]
+
+
+def _pairs(path: Path) -> list[list[Recording]]:
+    columns = {"pair": pl.String, "role": pl.String, "vehicle": pl.Int64, "length": pl.Float64, **_NUMBERS}
+    rows = read_table(path, columns).with_columns(
+        x=pl.col("x") - 0.5 * pl.col("length"), driven=pl.col("role") == "follower"
+    )
+    groups = rows.group_by("pair", maintain_order=True)
+    return [_cut(_i80_recording(f"pair-{name}", group)) for (name,), group in groups]
+
+
+def _following(path: Path) -> list[list[Recording]]:
+    names = ("x_follower", "x_leader", "leader_length")
+    columns = {"period": pl.String, "follower": pl.Int64, "leader": pl.Int64, "frame": pl.Int64}
+    table = read_table(path, columns | {name: pl.Float64 for name in names})
+    length = pl.col("leader_length")
+    behind = table.select(
+        "period", "follower", "leader", "frame",
+        vehicle=pl.col("follower"), x=pl.col("x_follower") - 0.5 * _LENGTH_M,
+        length=pl.lit(_LENGTH_M), driven=pl.lit(True),
+    )  # fmt: skip
+    ahead = table.select(
+        "period", "follower", "leader", "frame",
+        vehicle=pl.col("leader"), x=pl.col("x_leader") - 0.5 * length, length=length, driven=pl.lit(False),
+    )  # fmt: skip
+    groups = pl.concat([behind, ahead]).group_by("period", "follower", "leader", maintain_order=True)
+    return [_cut(_i80_recording("-".join(map(str, name)), rows)) for name, rows in groups]
+
+
+def _cut(pair: Recording) -> list[Recording]:
+    return segments(pair, SEGMENT_S, EDGE_S)
+
+
+def _i80_recording(name: str, rows: pl.DataFrame) -> Recording:
+    """One lane of cars; a speed is the mean over the second around its frame, cut off at the ends of the track."""
+    rows = rows.sort("vehicle", "frame")
+    # A gap splits a track, since a recording's tracks have none.
+    part = ((pl.col("frame").diff() != 1) | (pl.col("vehicle").diff() != 0)).fill_null(False).cum_sum()
+    rows = rows.with_columns(column=part, row=pl.col("frame") - pl.col("frame").min())
+    row, column = rows["row"].to_numpy(), rows["column"].to_numpy()
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    x, present = np.zeros(shape), np.zeros(shape, dtype=bool)
+    x[row, column], present[row, column] = rows["x"].to_numpy(), True
+    flat = {field: np.zeros(shape[1], dtype=kind) for field, kind in (("length", float), ("driven", bool))}
+    for field, values in flat.items():
+        values[column] = rows[field].to_numpy()
+    return Recording(
+        name, name, 1, STANDARD_LANE_WIDTH_M, x, np.zeros(shape), _speeds(x, present), present,
+        flat["length"], np.full(shape[1], _WIDTH_M), flat["driven"],
+    )  # fmt: skip
+
+
+def _speeds(x: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Speeds [T, V], m/s: over up to 0.5 s on either side, within the track."""
+    index = np.arange(len(x))[:, None]
+    first, last = present.argmax(0), len(x) - 1 - present[::-1].argmax(0)
+    before, after = np.clip(index - 5, first, last), np.clip(index + 5, first, last)
+    moved = np.take_along_axis(x, after, 0) - np.take_along_axis(x, before, 0)
+    return np.where(present, moved / (np.maximum(after - before, 1) * FRAME_S), 0.0)

@@ -1,0 +1,219 @@
+"""What a traffic is compared with: recorded driving as histograms that ship, and reference drivers.
+
+Two drivers mark the ends of the scale (random driving, constant velocity); :class:`HeadwayIdm` is a control.
+The file that ships holds histograms and derived numbers, never an excerpt of a recording.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ganlane.errors import UserError
+from ganlane.evaluation.counts import poisson_interval
+from ganlane.files import write_json
+from ganlane.generator.traits import headway_from_uniform
+from ganlane.paths import CHECKPOINTS
+from ganlane.realism.distances import Array, ceiling
+from ganlane.realism.quantities import QUANTITIES, Measured
+from ganlane.sim.following import following_acceleration
+from ganlane.sim.hazard import random_side
+from ganlane.sim.neighbours import perceive
+from ganlane.sim.random import Purpose, Stream, uniform
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic.base import TrafficModule
+
+#: The file that ships.
+SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"
+LEVELS = (0.05, 0.5, 0.95)
+_KIND = "ganlane realism reference"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Recorded driving as histograms and rates.
+
+    Attributes:
+        source: where it was recorded.
+        units: names of the scenes.
+        counts: by quantity, [units, bins].
+        quantiles: by quantity, by level as text.
+        lane_changes, vehicle_km: from 3 s after each vehicle's first frame.
+        whole: lane changes and vehicle-km of all frames, and ``speed_spread_mps``; long runs are compared with these.
+        floors: by driver (``random``, ``constant_velocity``), by quantity: its distance from here.
+    """
+
+    source: str
+    units: list[str]
+    counts: Mapping[str, Array]
+    quantiles: Mapping[str, Mapping[str, float | None]]
+    lane_changes: int
+    vehicle_km: float
+    whole: Mapping[str, float]
+    floors: Mapping[str, Mapping[str, float]]
+
+    @property
+    def ceilings(self) -> dict[str, float | None]:
+        """By quantity, the distance of one half of the scenes to the other."""
+        return {quantity: ceiling(counts) for quantity, counts in self.counts.items()}
+
+    @property
+    def spread_mps(self) -> float:
+        """Recorded spread of speeds within a frame, its mean over the frames, m/s."""
+        return self.whole["speed_spread_mps"]
+
+    def rate(self) -> dict[str, Any]:
+        """Lane changes per vehicle-km of the whole recording, with its exact interval."""
+        return rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, atomically."""
+        bins = {name: [b.low, b.high, b.number] for name, b in QUANTITIES.items()}
+        plain = {**vars(self), "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()}}
+        write_json(path, {"kind": _KIND, "bins": bins, "ceilings": self.ceilings, **plain})
+
+    @classmethod
+    def load(cls, path: Path) -> Reference:
+        """What :meth:`save` wrote.
+
+        Raises:
+            UserError: no such file, another file, or one with other bins.
+        """
+        try:
+            numbers = json.loads(path.read_text())
+            if numbers.pop("kind") != _KIND:
+                raise ValueError("another kind of file")
+            if numbers.pop("bins") != {name: [b.low, b.high, b.number] for name, b in QUANTITIES.items()}:
+                raise ValueError("its histograms have other bins")
+            numbers.pop("ceilings")
+            counts = {name: np.asarray(value, dtype=np.float64) for name, value in numbers.pop("counts").items()}
+            return cls(counts=counts, **numbers)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"{path}: not the histograms of recorded driving that the realism card needs ({error}); give the "
+                "recordings with data.path=FILE."
+            ) from error
+
+
+def rate(changes: int, km: float) -> dict[str, Any]:
+    """Lane changes, vehicle-km, and their ratio with its exact 95 % interval."""
+    interval = poisson_interval(changes).interval or []
+    return {
+        "lane_changes": changes,
+        "vehicle_km": km,
+        "per_vehicle_km": changes / km if km else None,
+        "per_vehicle_km_ci": [bound / km for bound in interval] if km else None,
+    }
+
+
+def quantiles_of(measured: Measured) -> dict[str, dict[str, float | None]]:
+    """By quantity, the quantiles at :data:`LEVELS`."""
+    return {
+        quantity: {f"{level:g}": measured.quantile(quantity, level) for level in LEVELS} for quantity in QUANTITIES
+    }
+
+
+def reference_of(
+    measured: Measured,
+    units: Sequence[str],
+    whole: Mapping[str, float],
+    source: str,
+    floors: Mapping[str, Mapping[str, float]] | None = None,
+) -> Reference:
+    """Makes a reference of measured recordings."""
+    return Reference(
+        source=source,
+        units=list(units),
+        counts={quantity: measured.counts(units, quantity) for quantity in QUANTITIES},
+        quantiles=quantiles_of(measured),
+        lane_changes=sum(measured.lane_changes.values()),
+        vehicle_km=sum(measured.vehicle_km.values()),
+        whole=dict(whole),
+        floors=floors or {},
+    )
+
+
+class ConstantVelocity(TrafficModule):
+    """Every vehicle keeps its lane and the speed at which it entered."""
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step along the road."""
+        v = vehicles
+        return v.with_(x=v.x + v.speed * self.dt, acceleration=torch.zeros_like(v.speed)), memory
+
+
+class RandomDriving(TrafficModule):
+    """Drivers that ignore all others: the far end of the scale.
+
+    An acceleration is drawn every second, uniform up to ``hardest`` either way; a lane change to a random side starts
+    at a constant hazard and takes ``change_s`` seconds. Speeds are never negative.
+
+    Args:
+        road, stream: as for every traffic module.
+        hardest: m/s2.
+        every_s: mean time between two lane changes of a vehicle, s.
+        change_s: how long a change takes, s.
+    """
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        hardest: float = 3.0,
+        every_s: float = 20.0,
+        change_s: float = 4.0,
+    ) -> None:
+        super().__init__(road, stream)
+        self.hardest, self.every_s, self.change_s = hardest, every_s, change_s
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step: the second's acceleration, and towards the target lane."""
+        v, m, dtype = vehicles, vehicles.x.shape[1], vehicles.x.dtype
+        pace = uniform(key, torch.div(step, 10, rounding_mode="floor"), m, [Purpose.ACCELERATION], dtype)[..., 0]
+        drawn = uniform(key, step, m, [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE], dtype)
+        remaining = self.road.centre_of(v.target_lane, dtype) - v.y
+        starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
+        side = torch.where(starts, random_side(drawn[..., 1], v.target_lane, self.road.lanes), 0)
+        target = v.target_lane + side
+        stride = self.road.lane_width_m * self.dt / self.change_s
+        aside = (remaining / stride).clamp(-1.0, 1.0) * stride
+        speed = (v.speed + self.hardest * (2.0 * pace - 1.0) * self.dt).clamp_min(0.0)
+        moved = v.with_(
+            x=v.x + 0.5 * (v.speed + speed) * self.dt,
+            y=v.y + aside,
+            speed=speed,
+            acceleration=(speed - v.speed) / self.dt,
+            target_lane=target,
+        )
+        return moved, memory
+
+
+class HeadwayIdm(TrafficModule):
+    """IDM without lane changes, each driver with its own headway: generated traffic without its network.
+
+    A control, none of the shipped traffics: Table V gives everybody the same headway. Memory: ``headway`` [N, M]
+    in s, drawn from the recorded distribution, or taken from a recorded start.
+    """
+
+    memory_fields = {"headway": ((), None)}  # noqa: RUF012
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+        """A random headway for each driver."""
+        u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
+        return {"headway": headway_from_uniform(u)}
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step along the road."""
+        v = vehicles
+        wanted = following_acceleration(perceive(v, self.road), headway_s=memory["headway"])
+        speed = (v.speed + wanted * self.dt).clamp_min(0.0)
+        x = v.x + 0.5 * (v.speed + speed) * self.dt
+        return v.with_(x=x, speed=speed, acceleration=(speed - v.speed) / self.dt), memory

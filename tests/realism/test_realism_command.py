@@ -1,0 +1,198 @@
+"""``ganlane realism`` from end to end, with tiny budgets, in process."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import polars as pl
+import pytest
+from PIL import Image
+
+from ganlane.config.realism import RealismConfig
+from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.files import load_weights, save_weights
+from ganlane.generator import shipped_generator
+from ganlane.realism import main
+from ganlane.realism.quantities import QUANTITIES
+from ganlane.realism.references import SHIPPED_REFERENCE
+
+QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
+    nothing = tmp_path / "nothing"
+    nothing.mkdir()
+    monkeypatch.setenv("GANLANE_DATA", str(nothing))
+
+
+@pytest.fixture
+def recordings(tmp_path):
+    path = tmp_path / "recordings" / "scenes.csv"
+    path.parent.mkdir()
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=8, seconds=7.0)), path)
+    return path
+
+
+def run(capsys, *arguments):
+    """Exit status, results.json (None without), stdout, stderr."""
+    status = main([*QUICK, *arguments])
+    out, err = capsys.readouterr()
+    last = (out.splitlines() or [""])[-1]
+    path = Path(last.removeprefix("results: ")) if last.startswith("results: ") else None
+    return status, None if path is None else {**json.loads(path.read_text()), "folder": path.parent}, out, err
+
+
+def test_card_holds_every_quantity_with_its_scale_and_the_rival(recordings, capsys):
+    status, results, out, _ = run(
+        capsys, "traffic=idm", f"data.path={recordings}", "data.held_out=[synthetic-1,synthetic-2]"
+    )
+    assert status == 0
+    assert results["traffic"] == "idm"
+    assert results["scenes"] == ["synthetic-1", "synthetic-2"]
+    assert results["quantities"].keys() == QUANTITIES.keys()
+    row = results["quantities"]["speed"]
+    assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
+    assert row["ceiling"] is not None
+    assert row["floor"] is not None
+    assert row["against"]["idm_mobil"]["verdict"] in ("closer", "farther", "undecided")
+    for key in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km_ci", "off_road", "checks", "machine"):
+        assert results[key] is not None
+    assert results["long_runs"][0]["vehicle_km"] >= 0.5
+    assert "changes per vehicle-km" in out
+    for name in ("distributions.png", "distances.png", "drift.png"):
+        assert Image.open(results["folder"] / name).width > 400
+
+
+def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recordings, capsys):
+    arguments = ["quick=false", "repeats=1", "i80=false", "vehicle_km=0", "resamples=100", "against=[]"]
+    held_out = "data.held_out=[synthetic-1]"
+    _, results, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *arguments)
+    assert "idm: fitting desired speeds on 3 scenes" in err
+    assert results["desired_above_mps"].keys() == {"idm"}
+    assert results["long_runs"] == []
+    assert results["overlaps_per_1000_vehicle_km"] is None
+
+
+def test_tables_and_figures_go_where_a_document_wants_them(recordings, capsys, tmp_path):
+    document, figures = tmp_path / "page.md", tmp_path / "figures"
+    figures.mkdir()
+    document.write_text("before\n<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\nafter\n")
+    held_out = "data.held_out=[synthetic-1]"
+    asked = ["scenes=all", f"report={document}", f"figures={figures}", "long_against=true", held_out]
+    status, results, _, _ = run(capsys, "traffic=idm", f"data.path={recordings}", *asked)
+    assert status == 0
+    text = document.read_text()
+    assert text.startswith("before\n<!-- begin realism idm all -->\n")
+    assert text.endswith("<!-- end realism idm all -->\nafter\n")
+    assert "former" not in text
+    assert "python -m ganlane.realism quick=true" in text
+    assert "held-out scenes alone" in text
+    assert "idm_mobil, long runs" in text
+    assert text.count("```text") == 6
+    assert results["quantities_held_out"]["speed"]["samples"] < results["quantities"]["speed"]["samples"]
+    assert results["long_runs_against"].keys() == {"idm_mobil"}
+    names = {"realism_distributions.png", "realism_distances.png", "realism_drift.png"}
+    assert {path.name for path in figures.iterdir()} == names
+
+
+def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):
+    status, results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
+    assert status == 0
+    assert results["starts"] == "spawned"
+    assert "no recordings here" in err
+    assert results["quantities"]["speed"]["ceiling"] is not None
+    assert results["quantities"]["speed"]["floor"] is not None
+    assert results["i80"] == {}
+
+
+def test_a_users_own_traffic_gets_a_card(recordings, capsys):
+    own = ["traffic=idm", "traffic._target_=entry_own_parts.Cruise", "against=[idm]"]
+    status, results, _, _ = run(capsys, *own, f"data.path={recordings}", "scenes=all")
+    assert status == 0
+    assert results["traffic"] == "entry_own_parts.Cruise"
+    assert results["quantities"]["speed"]["against"].keys() == {"idm"}
+    assert len(results["scenes"]) == 4
+
+
+def test_i80_beside_the_scenes_gets_cards_of_its_own(recordings, capsys):
+    rows = [("0400pm", 2, 1, frame, 0.7 * frame, 0.7 * frame + 16.0, 6.0) for frame in range(200)]
+    names = ["period", "follower", "leader", "frame", "x_follower", "x_leader", "leader_length"]
+    pl.DataFrame(rows, schema=names, orient="row").write_csv(recordings.parent / "i80_following.csv")
+    _, results, out, _ = run(
+        capsys, "traffic=idm", f"data.path={recordings}", "i80=true", "against=[]", "vehicle_km=0"
+    )
+    assert results["i80"]["following"].keys() == {"speed", "acceleration", "time_headway"}
+    assert "I-80, following" in out
+
+
+def fold(path, held_out):
+    """The shipped weights, as if they had been fitted without some scenes."""
+    tensors, metadata = load_weights(shipped_generator("calibrated"), "generator")
+    metadata["data"]["held_out"] = held_out
+    save_weights(path, metadata.pop("kind"), tensors, metadata)
+    return path
+
+
+def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings, capsys, tmp_path):
+    pairs = (["synthetic-0", "synthetic-3"], ["synthetic-1", "synthetic-2"])
+    files = [fold(tmp_path / f"fold{index}.safetensors", pair) for index, pair in enumerate(pairs)]
+    arguments = ["traffic=gan_calibrated", "vehicle_km=0", f"data.path={recordings}"]
+    status, results, _, _ = run(capsys, *arguments, f"fold_weights=[{files[0]},{files[1]}]")
+    assert status == 0
+    assert results["scenes"] == [*pairs[0], *pairs[1]]
+    assert results["held_out"] == list(pairs)
+    assert results["driving"]["recorded"]["vehicle_km"] == pytest.approx(
+        results["driving"]["constant_velocity"]["vehicle_km"], rel=0.2
+    )
+    status, _, _, err = run(capsys, *arguments, f"fold_weights=[{files[0]}]")
+    assert status == 2
+    assert "synthetic-1 is held out 0 times" in err
+    status, _, _, err = run(capsys, "traffic=gan", *arguments[1:], f"fold_weights=[{files[0]},{files[1]}]")
+    assert status == 2
+    assert "needs the preset paper" in err
+
+
+@pytest.mark.usefixtures("hydra_from_memory")
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["data.path=gone.csv"], "gone.csv: no such file"),
+        (["data.held_out=[moon]"], "moon"),
+        (["against=[idm_mobli]"], "did you mean 'idm_mobil'"),
+        (["against=[random]"], "leave it out"),
+        (["traffic=replay"], "recordings themselves"),
+        (["data=ngsim"], "ganlane prepare"),
+        (["i80=true"], "i80=true"),
+        (["publish=true"], "scenes=all"),
+        (["scenes=some"], "held_out, all"),
+        (["device=cuda"], "device=cuda"),
+        (["report=gone.md"], "gone.md: no such file"),
+        (["figures=gone"], "figures=gone: no such folder"),
+        (["traffic.path=gone.safetensors", "traffic=gan"], "gone.safetensors"),
+    ],
+)
+def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, recordings, capsys, tmp_path):
+    before = sorted(path.name for path in tmp_path.iterdir())
+    status, _, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", "vehicle_km=0", *arguments)
+    assert status == 2
+    assert part in err
+    assert "Traceback" not in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, monkeypatch, tmp_path):
+    from ganlane.realism import references as module
+
+    assert not RealismConfig().publish
+    there = tmp_path / "shipped.json"
+    before = SHIPPED_REFERENCE.read_bytes()
+    monkeypatch.setattr(module, "SHIPPED_REFERENCE", there)
+    arguments = ["against=[]", "vehicle_km=0", "scenes=all", "publish=true"]
+    status, _, _, _ = run(capsys, "traffic=idm", f"data.path={recordings}", *arguments)
+    assert status == 0
+    assert module.Reference.load(there).source == "scenes.csv"
+    assert SHIPPED_REFERENCE.read_bytes() == before

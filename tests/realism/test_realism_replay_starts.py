@@ -1,0 +1,197 @@
+"""Recorded scenes driven by traffic models: who is there, when, and what stays as recorded."""
+
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
+from ganlane.realism.distances import pooled_distance
+from ganlane.realism.fit_speeds import drive, measure_recordings
+from ganlane.realism.recordings import Recording, recorded_frame, recordings_of
+from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
+from ganlane.realism.replay_starts import StartOptions, balanced_headways, drive_recordings, with_recorded_headways
+from ganlane.sim.following import following_acceleration
+from ganlane.sim.neighbours import perceive
+from ganlane.sim.road import Road
+from ganlane.sim.vehicles import Vehicles
+from ganlane.traffic import IdmMobilTraffic, TrafficModule
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+
+
+def steady(**changed):
+    """Three cars for 10 s at speeds of their own, the last of which appears after 4 s and leaves after 8."""
+    time = np.arange(100)[:, None] * 0.1
+    speed = np.array([10.0, 12.0, 15.0])
+    x = np.array([0.0, 40.0, 20.0]) + speed * time
+    y = np.broadcast_to(np.array([0.0, 0.0, 3.5]), x.shape).copy()
+    present = np.ones(x.shape, bool)
+    present[:40, 2] = present[80:, 2] = False
+    size = np.ones(3)
+    fields = {"x": x, "y": y, "speed": np.broadcast_to(speed, x.shape).copy(), "present": present}
+    return Recording(
+        "steady", "steady", 2, 3.5, **{**fields, **changed}, length=4 * size, width=2 * size, driven=size > 0
+    )
+
+
+def test_constant_velocity_repeats_a_recording_of_constant_velocity():
+    there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
+    recorded = recorded_frame([steady()])
+    assert there.height == recorded.height
+    joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")
+    assert joined.height == recorded.height
+    assert (joined["x"] - joined["x_recorded"]).abs().max() < 1e-3
+    assert (joined["y"] - joined["y_recorded"]).abs().max() < 1e-5
+
+
+def test_its_distance_is_then_0_in_every_quantity():
+    recordings = [steady()]
+    recorded = measure_recordings(recordings)
+    driven = drive(ConstantVelocity, recordings, StartOptions())
+    for name in ("speed", "gap", "time_headway"):
+        # Speeds of 10 m/s lie on an edge of the bins, which rounding may cross; compare at the middle.
+        assert driven.measured.quantile(name, 0.5) == pytest.approx(recorded.quantile(name, 0.5), abs=1e-2)
+    assert pooled_distance(driven.counts["gap"], recorded.counts(["steady"], "gap")) < 0.15
+
+
+def test_a_vehicle_enters_when_it_was_recorded_first_and_leaves_when_last():
+    there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
+    frames = there.group_by("vehicle").agg(pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"))
+    assert frames.sort("vehicle").rows() == [(0, 0, 99), (1, 0, 99), (2, 40, 79)]
+
+
+def test_a_vehicle_waits_while_another_stands_in_its_place():
+    blocked = steady()
+    # The third appears in the first lane, where a car driven at constant velocity is just then.
+    x, y = blocked.x.copy(), blocked.y.copy()
+    y[:, 2] = 0.0
+    x[:, 2] = x[:, 0] + 3.0 * (np.arange(100) * 0.1 - 4.0)
+    there = drive_recordings(ConstantVelocity, [steady(x=x, y=y)], StartOptions())
+    first = there.filter(pl.col("vehicle") == 2)["frame"].min()
+    # 4 m of length and 2 m of room at 3 m/s of difference: 2 s later.
+    assert first == pytest.approx(60, abs=1)
+
+
+def test_nobody_drives_beyond_the_end_of_the_recorded_road():
+    class Fast(ConstantVelocity):
+        def move(self, vehicles, memory, key, step):
+            return super().move(vehicles.with_(speed=vehicles.speed + 1.0), memory, key, step)
+
+    recording = steady()
+    there = drive_recordings(Fast, [recording], StartOptions())
+    assert there["x"].max() <= recording.end_m + 0.02
+    assert there.height < recorded_frame([recording]).height
+
+
+def test_replayed_vehicles_drive_as_recorded_whatever_the_model_does():
+    recording = Recording(**{**vars(steady()), "driven": np.array([True, False, True])})
+    there = drive_recordings(RandomDriving, [recording], StartOptions())
+    replayed = there.filter(pl.col("vehicle") == 1)
+    assert replayed["x"].to_numpy() == pytest.approx(recording.x[:, 1], abs=1e-3)
+    assert not replayed["driven"].any()
+
+
+def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entry():
+    seen = []
+
+    class Watcher(TrafficModule):
+        def move(self, vehicles: Vehicles, memory, key, step):
+            seen.append(vehicles)
+            return vehicles, memory
+
+    drive_recordings(Watcher, [steady()], StartOptions(desired_above_mps=3.0, repeats=50))
+    assert not any(bool(vehicles.valid[:, 0].any()) for vehicles in seen)
+    excess = (seen[0].desired_speed - seen[0].speed)[:, 1:3]
+    assert excess.min() >= 0.0
+    assert excess.max() <= 6.0
+    assert excess.mean() == pytest.approx(3.0, abs=0.5)
+
+
+def test_repeats_differ_and_the_same_seed_repeats_them():
+    runs = [drive_recordings(RandomDriving, [steady()], StartOptions(repeats=2, seed=seed)) for seed in (0, 0, 1)]
+    assert runs[0].equals(runs[1])
+    assert not runs[0].equals(runs[2])
+    one, other = (runs[0].filter(pl.col("scene") == f"steady#{number}")["x"] for number in (0, 1))
+    assert not one.equals(other)
+
+
+@pytest.mark.parametrize("make", [IdmMobilTraffic, gan_traffic, gan_calibrated_traffic, RandomDriving])
+def test_every_traffic_stays_finite_from_recorded_starts(make):
+    frame = synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=8, seconds=5.0))
+    there = drive_recordings(make, recordings_of(frame, scene_lane_widths(frame)), StartOptions())
+    for name in ("x", "y"):
+        assert there[name].is_finite().all()
+    assert there["lane"].is_between(0, 2).all()
+
+
+def test_the_floor_drives_neither_backwards_nor_smoothly():
+    there = drive(RandomDriving, [steady()], StartOptions(repeats=20)).measured
+    assert there.quantile("acceleration", 0.95) > 1.0
+    assert there.quantile("speed", 0.0) >= 0.0
+
+
+ROAD = Road()
+DRAWN = 9.0
+
+
+def queue(x, speed=10.0, desired=20.0):
+    """One row of vehicles of 4 m in the first lane; index 0 is nobody."""
+    position = torch.tensor([[-500.0, *x]])
+    same = torch.full_like(position, speed)
+    lane = torch.zeros(position.shape, dtype=torch.int64)
+    return Vehicles(
+        x=position, y=0.0 * same, heading=0.0 * same, speed=same, acceleration=0.0 * same, length=0.0 * same + 4.0,
+        width=0.0 * same + 2.0, desired_speed=torch.full_like(position, desired), target_lane=lane,
+        visibility=lane, valid=torch.tensor([[False, *[True] * len(x)]]),
+    )  # fmt: skip
+
+
+def headways(vehicles):
+    return balanced_headways(vehicles, ROAD, torch.full_like(vehicles.x, DRAWN))[0, 1:].tolist()
+
+
+def test_a_follower_at_20_m_and_10_m_per_s_shows_a_headway_of_1_74_s():
+    behind, ahead = headways(queue([0.0, 24.0]))
+    # (20 m sqrt(1 - (10 / 20)^4) - 2 m) / (10 m/s)
+    assert behind == pytest.approx((20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0, abs=1e-4)
+    assert ahead == DRAWN
+
+
+def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
+    vehicles = queue([0.0, 12.0, 40.0, 60.0])
+    shown = balanced_headways(vehicles, ROAD, torch.ones_like(vehicles.x))
+    acceleration = following_acceleration(perceive(vehicles, ROAD), headway_s=shown)
+    assert acceleration[0, 1:4].abs().max() < 1e-4
+
+
+def test_whoever_is_far_behind_has_shown_none_and_nobody_follows_closer_than_a_tenth_of_a_second():
+    assert headways(queue([0.0, 64.0]))[0] == DRAWN
+    assert headways(queue([0.0, 5.0]))[0] == pytest.approx(0.1)
+
+
+def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are():
+    vehicles = queue([0.0, 24.0, 48.0])
+    drawn = torch.full_like(vehicles.x, DRAWN)
+    memory = TensorDict({"driver": TensorDict({"headway": drawn, "noise": drawn}, [1]), "wish": drawn}, [1])
+    who = torch.tensor([[False, True, False, False]])
+    after = with_recorded_headways(memory, vehicles, ROAD, who)
+    assert after["driver", "headway"][0, 1] < 3.0
+    assert (after["driver", "headway"][0, 2:] == DRAWN).all()
+    assert torch.equal(after["driver", "noise"], drawn)
+    assert torch.equal(after["wish"], drawn)
+    assert (memory["driver", "headway"] == DRAWN).all()
+
+
+def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
+    time = np.arange(60)[:, None] * 0.1
+    x = np.array([0.0, 12.0, 40.0, 55.0]) + 10.0 * time
+    size = np.ones(4)
+    driven = np.array([True, True, True, False])
+    dense = (x, 0 * x, 0 * x + 10.0, x > -1)
+    scene = Recording("platoon", "platoon", 1, 4.0, *dense, 4 * size, 2 * size, driven)
+    there = drive_recordings(HeadwayIdm, [scene], StartOptions(desired_above_mps=5.0))
+    ends = there.filter(there["frame"] == 59).sort("vehicle")["x"].to_numpy()
+    assert np.abs(ends - x[59]).max() < 0.01

@@ -26,16 +26,16 @@ def test_each_direction_is_a_scene_with_x_forward_and_lane_0_rightmost(recording
     assert upper.frame.schema == lower.frame.schema == SCHEMA
     assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
     # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12) and 3.
-    told = {
+    driven = {
         vehicle: (rows["lane"].unique().to_list(), rows["y"][0], rows["speed"][0])
         for scene in (upper, lower)
         for (vehicle,), rows in scene.frame.group_by("vehicle")
     }
-    assert told[1] == ([0], pytest.approx(0.0), 30.0)
-    assert told[2] == ([1], pytest.approx(4.5), 35.0)
+    assert driven[1] == ([0], pytest.approx(0.0), 30.0)
+    assert driven[2] == ([1], pytest.approx(4.5), 35.0)
     # Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
-    assert told[3] == ([0], pytest.approx(0.0), 25.0)
-    assert told[4] == ([1], pytest.approx(4.0), 28.0)
+    assert driven[3] == ([0], pytest.approx(0.0), 25.0)
+    assert driven[4] == ([1], pytest.approx(4.0), 28.0)
 
 
 def test_cars_drive_forward_from_the_centre_of_their_box(recording):
@@ -83,7 +83,7 @@ def damaged(path, column, row, value):
 
 
 @pytest.mark.parametrize(
-    ("column", "row", "value", "told"),
+    ("column", "row", "value", "message"),
     [
         ("x", 10, "left", r"01_tracks.csv, line 12, column x: 'left' is not a number"),
         ("xVelocity", 3, "NaN", r"01_tracks.csv, line 5, column xvelocity: 'NaN' is not a finite number"),
@@ -92,9 +92,9 @@ def damaged(path, column, row, value):
         ("width", 0, "0", r"01_tracks.csv, line 2, column width: 0.0 is not above 0"),
     ],
 )
-def test_a_damaged_field_is_named(recording, column, row, value, told):
+def test_a_damaged_field_is_named(recording, column, row, value, message):
     damaged(recording, column, row, value)
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         read_recordings("highd", recording)
 
 

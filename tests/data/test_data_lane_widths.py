@@ -1,4 +1,4 @@
-"""Lane widths told by positions and lane numbers."""
+"""Lane widths estimated from positions and lane numbers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""NGSIM files, written out from recordings made up: what is read, in how many pieces, and how damage is told."""
+"""NGSIM files, generated from synthetic recordings: what is read, in how many blocks, and errors in damaged files."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def changed(row: int, column: str, value: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("row", "column", "value", "told"),
+    ("row", "column", "value", "message"),
     [
         (3, "local_y", "far", r"line 5, column local_y: 'far' is not a number"),
         (400, "local_x", "NaN", r"line 402, column local_x: 'NaN' is not a finite number"),
@@ -128,12 +128,12 @@ def changed(row: int, column: str, value: str) -> list[str]:
     ],
 )
 @pytest.mark.parametrize("block_bytes", [1_000, 2**25])
-def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, told, block_bytes):
+def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message, block_bytes):
     lines = changed(row, column, value)
     if value == "drop":
         lines[row + 1] = lines[row + 1].replace(",drop,", ",")
     path = portal_file(tmp_path, "\n".join(lines) + "\n")
-    with pytest.raises(UserError, match=told) as caught:
+    with pytest.raises(UserError, match=message) as caught:
         read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
     assert str(path) in str(caught.value)
 
@@ -162,7 +162,7 @@ def test_frames_of_a_text_file_must_grow_even_across_blocks(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("columns", "factor", "told"),
+    ("columns", "factor", "message"),
     [
         (("Local_X", "Local_Y", "v_length", "v_Width", "v_Vel"), 0.3048, "column v_length: .*they look like metres"),
         (("v_Vel",), 1.09728, "columns local_y and v_vel: vehicles cover 0.91 times"),
@@ -172,9 +172,9 @@ def test_frames_of_a_text_file_must_grow_even_across_blocks(tmp_path):
         (("v_length",), 30.48, "they look like centimetres or inches"),
     ],
 )
-def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, told):
+def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, factor, message):
     rows = ngsim_rows(FIRST).with_columns(pl.col(name) * factor for name in columns)
-    with pytest.raises(UserError, match=told) as caught:
+    with pytest.raises(UserError, match=message) as caught:
         read_recordings("ngsim", text_file(tmp_path, rows))
     assert "line 1" in str(caught.value)
 

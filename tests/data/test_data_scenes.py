@@ -1,4 +1,4 @@
-"""Scene CSV and the schema: what is read, and how each kind of damage is told."""
+"""Scene CSV and Parquet: what is read, and the error for each kind of damage."""
 
 from pathlib import Path
 
@@ -68,7 +68,7 @@ def field(row: int, column: str, value: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("lines", "told"),
+    ("lines", "message"),
     [
         (field(3, "x", "abc"), r"line 5, column x: 'abc' is not a number"),
         (field(0, "y", "NaN"), r"line 2, column y: 'NaN' is not a finite number"),
@@ -82,9 +82,9 @@ def field(row: int, column: str, value: str) -> list[str]:
         ([*ROWS[:-1], "s,2,5,45.0"], r"line 13, column y: the field is empty; the row is incomplete"),
     ],
 )
-def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, lines, told):
+def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, lines, message):
     path = written(tmp_path, lines)
-    with pytest.raises(UserError, match=told) as caught:
+    with pytest.raises(UserError, match=message) as caught:
         read_scenes(path)
     assert str(path) in str(caught.value)
 
@@ -96,7 +96,7 @@ def scaled(column: str, factor: float) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("column", "factor", "told"),
+    ("column", "factor", "message"),
     [
         ("v", 10.0, "line 2, column speed: the median is 100.0"),
         ("v", 3.6, "line 3, columns x and speed: x moves by 10.0 m per second where speed says 36.0"),
@@ -107,8 +107,8 @@ def scaled(column: str, factor: float) -> list[str]:
         ("y", -1.0, "lanes are -3.50 m apart"),
     ],
 )
-def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, told):
-    with pytest.raises(UserError, match=told):
+def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, message):
+    with pytest.raises(UserError, match=message):
         read_scenes(written(tmp_path, scaled(column, factor)))
 
 

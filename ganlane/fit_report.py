@@ -1,10 +1,10 @@
-"""What ``ganlane train_generator`` shows and keeps of a fit."""
+"""Progress, tables and results of ``ganlane train_generator``."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import TracebackType
 from typing import Any
 
@@ -13,17 +13,25 @@ from tqdm import tqdm
 from ganlane.generator import FitResult, Progress
 
 _ERRORS = ("ade_m", "fde_m", "end_m")
+_BASELINE = "constant_velocity"
+_PUBLISHED_VELOCITY_M = (0.73, 1.78, 3.13, 4.78, 6.68)
+#: RMSE in m after 1 to 5 s on NGSIM, as published: on other test sets than ours, so only roughly comparable.
+PUBLISHED_RMSE_M = {
+    "constant velocity (published)": _PUBLISHED_VELOCITY_M,
+    "CS-LSTM (published)": (0.61, 1.27, 2.09, 3.10, 4.37),
+    "Social-GAN (published)": (0.57, 1.32, 2.22, 3.26, 4.40),
+}
 
 
 class FitProgress:
-    """A bar on a terminal, elsewhere a line per evaluation; a context that closes the bar."""
+    """Shows a fit as a bar on a terminal, elsewhere as a line per evaluation; a context that closes the bar."""
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
         self._best = math.inf
 
     def next_fit(self, name: str) -> None:
-        """Told that another fit begins: everything starts anew."""
+        """Start the display of another fit."""
         self.__exit__(None, None, None)
         self._bar, self._best = None, math.inf
         print(name, file=sys.stderr, flush=True)
@@ -31,20 +39,17 @@ class FitProgress:
     def __call__(self, progress: Progress) -> None:
         """Called by the fit after every update."""
         if sys.stderr.isatty():
-            self._move_bar(progress)
+            if self._bar is None:
+                self._bar = tqdm(total=progress.updates, desc="fit", unit="update", file=sys.stderr)
+            self._bar.update(progress.update - self._bar.n)
+            if progress.score is not None:
+                self._bar.set_postfix_str(f"validation score {progress.score:.4f}, best {progress.best:.4f}")
         elif progress.best < self._best or progress.update == progress.updates:
             self._best = progress.best
             left = progress.seconds / progress.update * (progress.updates - progress.update)
             head = f"{progress.update} of {progress.updates} updates, at most {left:.0f} s left"
             scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
             print(f"{head}, {scores}", file=sys.stderr, flush=True)
-
-    def _move_bar(self, progress: Progress) -> None:
-        if self._bar is None:
-            self._bar = tqdm(total=progress.updates, desc="fit", unit="update", file=sys.stderr)
-        self._bar.update(progress.update - self._bar.n)
-        if progress.score is not None:
-            self._bar.set_postfix_str(f"validation score {progress.score:.4f}, best {progress.best:.4f}")
 
     def __enter__(self) -> FitProgress:
         return self
@@ -84,19 +89,87 @@ def results_of(result: FitResult) -> dict[str, Any]:
     }
 
 
+def _line(name: str, cells: Iterable[str], first: int = 32, width: int = 15) -> str:
+    """A row of a table: the name in a column ``first`` wide, then the cells."""
+    return f"{name:<{first}}" + "".join(f"{cell:>{width}}" for cell in cells)
+
+
 def metrics_table(metrics: Mapping[str, Mapping[str, float]]) -> str:
-    """ADE and FDE of the generator beside constant velocity on the held-out scenes, as text."""
+    """ADE and FDE of the generator and of constant velocity on the held-out scenes, as text."""
     overall = _by_kind(metrics["all"])
-    kinds = list(overall["ade_m"])
     errors = [error for error in _ERRORS if error in overall]
-    lines = [
-        f"{'held-out scenes':<20}"
-        + "".join(f"{name.replace('_m', ', m'):>10}" for name in errors)
-        + f"{'ADE to CV':>12}"
-    ]
-    baseline = overall["ade_m"]["constant_velocity"]
-    for kind in kinds:
-        change = 100.0 * (overall["ade_m"][kind] / baseline - 1.0)
-        figures = "".join(f"{overall[error].get(kind, math.nan):>10.3f}" for error in errors)
-        lines.append(f"{kind:<20}{figures}{change:>+10.1f} %")
+    heads = (error.replace("_m", ", m") for error in errors)
+    lines = [f"{_line('held-out scenes', heads, 20, 10)}{'ADE to CV':>12}"]
+    for kind, ade in overall["ade_m"].items():
+        change = 100.0 * (ade / overall["ade_m"][_BASELINE] - 1.0)
+        cells = (f"{overall[error].get(kind, math.nan):.3f}" for error in errors)
+        lines.append(f"{_line(kind, cells, 20, 10)}{change:>+10.1f} %")
+    return "\n".join(lines)
+
+
+def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """The ablations as text: changes of ADE over all predicted steps and over the first 0.4 s, the ratio at 5 s."""
+    first = next(iter(rows.values()))
+    kinds = [kind for kind in first["ade_change_percent"] if kind != _BASELINE]
+    heads = [*kinds, *(f"{kind}, 0.4 s" for kind in kinds), *(["RMSE 5 s"] if "rmse_5_s_ratio" in first else [])]
+    lines = [_line("ADE to CV, a quarter of the updates", heads, 36, 18)]
+    for name, row in rows.items():
+        parts = (row["ade_change_percent"], row["ade_change_percent_0.4_s"])
+        cells = [f"{part[kind]:+.1f} %" for part in parts for kind in kinds]
+        cells += [f"{row['rmse_5_s_ratio']['mean']:.2f}"] if "rmse_5_s_ratio" in row else []
+        lines.append(_line(name, cells, 36, 18))
+    return "\n".join(lines)
+
+
+def fold_tables(folds: Mapping[str, Any]) -> str:
+    """All tables of :func:`ganlane.generator.cross_validate`'s result, as text."""
+    scores = folds["open_loop"]
+    tables = [_pooled(scores), _rows("by fold", scores["folds"]), _rows("by scene", scores["scenes"])]
+    tables += [_rows("by lane (1 leftmost) and class", scores["parts"]), _direction(scores)]
+    if "rollout" in folds:
+        tables.append(_rollout(folds["rollout"]))
+    return "\n\n".join(tables)
+
+
+def _pooled(scores: Mapping[str, Any]) -> str:
+    """ADE and FDE of all forecasts over the windows of all folds."""
+    lines = [_line(f"{scores['windows']} windows of all folds", ("ADE, m", "FDE, m", "ADE to CV"))]
+    for kind, ade in scores["ade_m"].items():
+        change = f"{scores['ade_change_percent'][kind]:+.1f} %"
+        lines.append(_line(kind, (f"{ade:.3f}", f"{scores['fde_m'][kind]:.3f}", change)))
+    return "\n".join(lines)
+
+
+def _rows(title: str, rows: Mapping[str, Any]) -> str:
+    """Windows, constant velocity's ADE, and the generator's change of it, for every row."""
+    first = next(iter(rows.values()))
+    kinds = [kind for kind in first["ade_m"] if kind in ("mean", "single") or kind.startswith("best_of")]
+    lines = [_line(title, ("windows", "CV, m", *kinds))]
+    for name, row in rows.items():
+        changes = [f"{row['ade_change_percent'][kind]:+.1f} %" for kind in kinds]
+        lines.append(_line(name, (str(row["windows"]), f"{row['ade_m'][_BASELINE]:.3f}", *changes)))
+    return "\n".join(lines)
+
+
+def _direction(scores: Mapping[str, Any]) -> str:
+    """Share of lateral moves of more than 0.1 m that are predicted to the right side."""
+    later, whole = scores["direction"], scores["direction_whole_window"]
+    lines = [_line("lateral move to the right side", ("after present", "whole window"))]
+    lines.append(_line("windows that move", (str(later["windows"]), str(whole["windows"]))))
+    for kind, share in later["share_right"].items():
+        shares = (share, whole["share_right"].get(kind))
+        lines.append(_line(kind, ("" if value is None else f"{100 * value:.1f} %" for value in shares)))
+    return "\n".join(lines)
+
+
+def _rollout(rollout: Mapping[str, Any]) -> str:
+    """RMSE after 1 to 5 s, with published values."""
+    seconds = list(next(iter(rollout["rmse_m"].values())))
+    lines = [_line(f"RMSE, m ({rollout['windows']} windows)", (*seconds, "to CV"))]
+    for kind, values in rollout["rmse_m"].items():
+        ratio = f"{rollout['ratio_to_constant_velocity'][kind]:.2f}"
+        lines.append(_line(kind, (*(f"{value:.2f}" for value in values.values()), ratio)))
+    for kind, published in PUBLISHED_RMSE_M.items():
+        ratio = f"{published[-1] / _PUBLISHED_VELOCITY_M[-1]:.2f}"
+        lines.append(_line(kind, (*(f"{value:.2f}" for value in published), ratio)))
     return "\n".join(lines)

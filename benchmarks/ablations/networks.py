@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from ganlane.generator import Generator
-from ganlane.generator.lstm import MotionLSTM, motion_features
+from ganlane.generator.layers import MotionLSTM, PairPooling, motion_features
 from ganlane.generator.networks import Observation
-from ganlane.generator.pooling import PairPooling
 
 
 class Bfloat16Motion(MotionLSTM):

@@ -14,7 +14,7 @@ from torch import nn
 from benchmarks.ablations.networks import Bfloat16Generator, PlanningGenerator
 from ganlane.errors import UserError
 from ganlane.generator import load_generator
-from ganlane.generator.traits import COMMON_SPEED_MPS
+from ganlane.generator.rollout import COMMON_SPEED_MPS
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.road import Road
 from ganlane.sim.spawn import TABLE_II, SpawnParameters

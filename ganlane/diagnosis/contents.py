@@ -69,7 +69,7 @@ def recordings() -> Finding:
 
 def cache() -> Finding:
     """Where groups of windows are kept between fits."""
-    from ganlane.generator.cache import VARIABLE, cache_folder
+    from ganlane.generator.groups import VARIABLE, cache_folder
 
     folder = cache_folder()
     if folder is None:

@@ -1,9 +1,9 @@
-"""Saving and loading a generator: weights, and everything that says what they are."""
+"""A fitted generator with its description, saved and loaded."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -13,15 +13,67 @@ from torch import Tensor
 from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.files import load_weights, save_weights
-from ganlane.generator.anchored import EXTRA_INPUTS
+from ganlane.generator.closed_loop import EXTRA_INPUTS
 from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.scores import Metrics
 from ganlane.paths import CHECKPOINTS
 
 KIND = "generator"
 Preset = Literal["paper", "calibrated"]
-#: Numbers beside the motion that each preset sees.
+#: Inputs in addition to the motion, by preset.
 PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
+#: Sizes that older files do not have; they get their defaults.
 _NAMED_LATER = {"differences"}
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A fitted generator and what it was fitted with.
+
+    Attributes:
+        preset: ``"paper"`` or ``"calibrated"``.
+        module: the generator with the weights that were best on the validation scenes.
+        metrics: of these weights on the held-out scenes, for ``"all"`` and each scene; the paper's preset also
+            has ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored together.
+        config: settings of the fit, as plain data.
+        data: file, rows and tracks, and the names of the fitted, validation and held-out scenes.
+        statistics: ``ganlane.data.DrivingStatistics.to_dict()`` of all recordings, held out or not; for a fold's fit
+            of its other scenes.
+        updates: updates after which the weights were taken (early stopping).
+        seconds: duration of the fit, with its evaluations on the validation scenes.
+    """
+
+    preset: Preset
+    module: Generator
+    metrics: Metrics
+    config: dict[str, Any]
+    data: dict[str, Any]
+    statistics: dict[str, Any]
+    updates: int
+    seconds: float
+
+    def save(
+        self, path: str | Path, folds: Mapping[str, Any] | None = None, code: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write weights and metadata, atomically.
+
+        Args:
+            path: where to write.
+            folds: result of :func:`ganlane.generator.cross_validate`, if it was called.
+            code: the code's version in more detail than the package's number.
+        """
+        metadata = {
+            "preset": self.preset,
+            "sizes": asdict(self.module.sizes),
+            "config": self.config,
+            "data": self.data,
+            "metrics": {**self.metrics, "fit": {"updates": self.updates, "seconds": round(self.seconds, 1)}},
+            "driving_statistics": self.statistics,
+            "folds": None if folds is None else dict(folds),
+            "code": {} if code is None else dict(code),
+            "ganlane": __version__,
+        }
+        save_weights(path, KIND, self.module.state_dict(), metadata)
 
 
 def shipped_generator(preset: Preset) -> Path:
@@ -29,54 +81,15 @@ def shipped_generator(preset: Preset) -> Path:
     return CHECKPOINTS / f"generator_{preset}.safetensors"
 
 
-def save_generator(
-    path: str | Path,
-    generator: Generator,
-    preset: Preset,
-    *,
-    config: Mapping[str, Any],
-    data: Mapping[str, Any],
-    metrics: Mapping[str, Any],
-    driving_statistics: Mapping[str, Any],
-    folds: Mapping[str, Any] | None = None,
-    code: Mapping[str, Any] | None = None,
-) -> None:
-    """Save the generator with its description, atomically.
-
-    Args:
-        path: where to write.
-        generator: what was fitted.
-        preset: for which closed loop.
-        config: what it was fitted with.
-        data: the recordings: file, scenes fitted and held out, counts.
-        metrics: on the held-out scenes.
-        driving_statistics: ``ganlane.data.DrivingStatistics.to_dict()`` of the recordings, for the overlays.
-        folds: what :func:`ganlane.generator.cross_validation.cross_validate` gave, if it was called.
-        code: the code's version in more detail than the package's number.
-    """
-    metadata = {
-        "preset": preset,
-        "sizes": asdict(generator.sizes),
-        "config": dict(config),
-        "data": dict(data),
-        "metrics": dict(metrics),
-        "driving_statistics": dict(driving_statistics),
-        "folds": None if folds is None else dict(folds),
-        "code": {} if code is None else dict(code),
-        "ganlane": __version__,
-    }
-    save_weights(path, KIND, generator.state_dict(), metadata)
-
-
 def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Generator, dict[str, Any]]:
     """The generator in evaluation mode, without gradients, and its metadata.
 
     Args:
-        path: what :func:`save_generator` wrote.
-        preset: the one that is needed; None takes any.
+        path: what :meth:`FitResult.save` wrote.
+        preset: the required one; None accepts any.
 
     Raises:
-        UserError: absent, foreign, of another preset, or its weights do not fit its own sizes.
+        UserError: no such file, another kind of file, another preset, or weights that do not fit the stored sizes.
     """
     tensors, metadata = load_weights(path, KIND)
     found = str(metadata.get("preset"))
@@ -96,7 +109,7 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
 
 
 def _build(path: str | Path, metadata: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Generator:
-    """Networks of the stored sizes with the stored weights; sizes named later have their defaults in older files."""
+    """A generator of the stored sizes with the stored weights."""
     sizes: Any = metadata.get("sizes")
     kinds = {field.name: type(field.default) for field in fields(GeneratorSizes)}
     needed = set(kinds) - _NAMED_LATER
@@ -115,5 +128,5 @@ def _build(path: str | Path, metadata: Mapping[str, Any], tensors: Mapping[str, 
 
 
 def _is_size(value: Any, kind: type) -> bool:
-    """A switch, or a whole number that a layer can have: bounded, so a damaged file cannot ask for all memory."""
+    """A bool or an integer in a range that layers have, so that a damaged file cannot request all memory."""
     return isinstance(value, int) and type(value) is kind and (kind is bool or 0 <= value <= 4096)

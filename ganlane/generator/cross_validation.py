@@ -1,35 +1,126 @@
-"""k folds by scene: every scene is forecast by a generator that never saw it, and all windows are scored together."""
+"""Many fits, scored on the scenes that each has not used: k folds by scene, and ablations.
+
+State and forecasts of every fit are kept in a folder under a hash of recordings and settings, so that an interrupted
+run resumes and nothing is fitted twice.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 
-from ganlane.data import driving_statistics, scene_lane_widths
-from ganlane.generator.calibrated import CalibratedConfig
-from ganlane.generator.checkpoint import Preset
-from ganlane.generator.fit import FitResult, describe
-from ganlane.generator.fitting import PaperConfig
-from ganlane.generator.folds import Split, assign_folds, split_for_fit
-from ganlane.generator.loop import OnProgress
-from ganlane.generator.reports import Fitted, fit_and_report, pooled, rollout_scores
-from ganlane.generator.scores import open_loop_scores
-from ganlane.generator.tracks import scene_tracks
+from ganlane.data import scene_lane_widths
+from ganlane.files import atomic_path
+from ganlane.generator.checkpoint import FitResult
+from ganlane.generator.fit import Config, Task, fit_key, fit_result, fit_task, preset_of
+from ganlane.generator.fit_calibrated import CalibratedConfig, CalibratedTask
+from ganlane.generator.forecasts import baseline_forecasts, calibrated_forecasts, idm_forecasts, paper_forecasts
+from ganlane.generator.groups import save_arrays
+from ganlane.generator.loop import FitLoop, LoopConfig, OnProgress
+from ganlane.generator.scores import (
+    BASELINE,
+    SAMPLES,
+    Forecasts,
+    displacement_errors,
+    errors_of,
+    long_rollout_scores,
+    open_loop_scores,
+)
+from ganlane.generator.segments import segment_sources
+from ganlane.generator.splits import Split, assign_folds, split_for_fit
+from ganlane.generator.windows import OBSERVED_POSITIONS, Windows, cut_windows, join_windows, scene_tracks
 
-#: Told what is fitted next.
+#: Frames between the starts of two scored windows, the same for both presets.
+STRIDE = 3
+#: Steps of the long rollouts (5 s), and frames between their starts.
+LONG_STEPS, LONG_STRIDE = 50, 5
+#: An ablation has this fraction of the updates: 1 / BUDGET.
+BUDGET = 4
+#: History noise that is tried, in units of a typical difference.
+_NOISE = 0.5
+#: Steps at which predictions of any length can be compared (0.4 s).
+_COMMON_STEPS = 4
+#: Called with the name of the next fit.
 OnFit = Callable[[str], None]
-#: Given each fold's number, from 1 on, and its generator.
+#: Called with each fold's number, from 1, and its generator.
 OnFold = Callable[[int, FitResult], None]
 
 
+@dataclass(frozen=True)
+class HeldOut:
+    """Windows of held-out scenes and all forecasts of them."""
+
+    windows: Windows
+    forecasts: Forecasts
+
+
+@dataclass(frozen=True)
+class ScoredFit:
+    """A finished fit and forecasts of its held-out scenes: ``short`` as far as the preset predicts, ``long`` for 5 s.
+
+    Long forecasts are made by the calibrated preset only, and only if a vehicle was recorded for long enough.
+    """
+
+    task: Task
+    loop: FitLoop
+    short: HeldOut
+    long: HeldOut | None
+
+
+def fit_and_forecast(
+    config: Config, split: Split, widths: dict[str, float], folder: Path, on_progress: OnProgress | None = None
+) -> ScoredFit:
+    """Fit to ``split`` and forecast its held-out scenes; resumes from what ``folder`` holds."""
+    task = fit_task(config, split, widths)
+    path = folder / f"{preset_of(config)}_{fit_key(config, split)}.pt"
+    loop = FitLoop(task, config.loop, path)
+    loop.run(on_progress)
+    short, long = _forecasts(path, task, split, widths, config.sizes.predicted, STRIDE), None
+    frames = OBSERVED_POSITIONS + LONG_STEPS
+    if isinstance(config, CalibratedConfig) and any(
+        (scene.present.sum(0) >= frames).any() for scene in split.held_out
+    ):
+        long = _forecasts(path, task, split, widths, LONG_STEPS, LONG_STRIDE)
+    return ScoredFit(task, loop, short, long)
+
+
+def _forecasts(path: Path, task: Task, split: Split, widths: dict[str, float], steps: int, stride: int) -> HeldOut:
+    """Forecasts of the held-out windows by the generator, IDM and all baselines, saved next to the fit's state."""
+    path = path.with_name(f"{path.stem}_{steps}.npz")
+    windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
+    if path.exists():
+        with np.load(path, allow_pickle=False) as kept:
+            return HeldOut(windows, dict(kept))
+    sources = segment_sources(split.held_out, widths)
+    if isinstance(task, CalibratedTask):
+        samples = 1 if steps == LONG_STEPS else SAMPLES  # the best of 20 is for short forecasts only
+        own = calibrated_forecasts(task.generator, sources, steps, stride, task.config, samples)
+    else:
+        own = paper_forecasts(task.generator, windows, task.config.group_size, task.config.seed)
+    baselines = baseline_forecasts(windows, split.fitted + split.validation, stride)
+    every = own | baselines | idm_forecasts(sources, steps, stride)
+    forecasts = {name: positions.astype(np.float32) for name, positions in every.items()}
+    with atomic_path(path) as part, part.open("wb") as file:
+        save_arrays(file, forecasts)
+    return HeldOut(windows, forecasts)
+
+
+def pooled(parts: list[HeldOut]) -> tuple[Windows, Forecasts, np.ndarray]:
+    """All folds' windows and forecasts, and the fold [W] of each window."""
+    forecasts = {name: np.concatenate([part.forecasts[name] for part in parts]) for name in parts[0].forecasts}
+    fold = np.concatenate([np.full(len(part.windows), number) for number, part in enumerate(parts)])
+    return join_windows([part.windows for part in parts]), forecasts, fold
+
+
 def cross_validate(
-    preset: Preset,
     frame: pl.DataFrame,
-    config: PaperConfig | CalibratedConfig,
+    config: Config,
     folds: int,
     folder: Path,
     on_fit: OnFit | None = None,
@@ -39,54 +130,99 @@ def cross_validate(
 ) -> dict[str, Any]:
     """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
 
-    Within a fold a part of the other scenes chooses when to stop. Called again with the same ``folder`` it goes on
-    where it was stopped. ``on_fold`` is given each fold's generator, with driving statistics of its other scenes:
-    the fold's own have no say in it. ``source`` names the recordings in its metadata.
+    Within a fold a part of the other scenes is for early stopping. ``on_fold`` gets each fold's generator, with
+    driving statistics of its other scenes only. ``source`` names the recordings in its metadata.
 
     Returns:
         ``open_loop`` (:func:`ganlane.generator.scores.open_loop_scores`), ``splits`` (names of the scenes of each
-        fold's parts), and for the calibrated preset ``rollout`` (:func:`ganlane.generator.reports.rollout_scores`).
+        fold's parts), and for the calibrated preset ``rollout``
+        (:func:`ganlane.generator.scores.long_rollout_scores`).
 
     Raises:
         UserError: too many folds for the recordings.
     """
     scenes, widths = scene_tracks(frame), scene_lane_widths(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
-    fits: list[Fitted] = []
+    fits: list[ScoredFit] = []
     for number, split in enumerate(splits, start=1):
         if on_fit is not None:
             on_fit(f"fold {number} of {folds}")
-        fits.append(fit_and_report(preset, config, split, widths, folder, on_progress))
+        fit = fit_and_forecast(config, split, widths, folder, on_progress)
+        fits.append(fit)
         if on_fold is not None:
-            on_fold(number, _fold_result(preset, config, fits[-1], split, frame, widths, source))
+            others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
+            on_fold(number, fit_result(fit.task, fit.loop, split, frame, widths, source, {}, others))
     scores: dict[str, Any] = {
         "splits": [split.names for split in splits],
-        "open_loop": open_loop_scores(*pooled([fit.near for fit in fits])),
+        "open_loop": open_loop_scores(*pooled([fit.short for fit in fits])),
     }
-    far = [fit.far for fit in fits if fit.far is not None]
-    if far:
-        scores["rollout"] = rollout_scores(*pooled(far)[:2])
+    long = [fit.long for fit in fits if fit.long is not None]
+    if long:
+        scores["rollout"] = long_rollout_scores(*pooled(long)[:2])
     return scores
 
 
-def _fold_result(
-    preset: Preset,
-    config: PaperConfig | CalibratedConfig,
-    fitted: Fitted,
-    split: Split,
+def variants(config: Config) -> dict[str, Config]:
+    """Settings of the ablations by name, with a quarter of the updates; the first is the preset itself."""
+    short: dict[str, int] = {
+        name: max(1, getattr(config.loop, name) // BUDGET) for name in ("updates", "evaluate_every", "warmup")
+    }
+    loop: LoopConfig = replace(config.loop, **short)  # type: ignore[arg-type]  # all of these are whole numbers
+    config = replace(config, loop=loop)
+    if isinstance(config, CalibratedConfig):
+        return {
+            "as it is": config,
+            "without washout": replace(config, washout_s=math.inf),
+            "without further inputs": replace(config, further_inputs=False),
+            "without traits": replace(config, traits=False),
+        }
+    sizes, weights = config.sizes, config.weights
+    return {
+        "as it is (p_l = 8)": config,
+        "p_l = 4": replace(config, sizes=replace(sizes, predicted=4)),
+        "p_l = 12": replace(config, sizes=replace(sizes, predicted=12)),
+        "without pooling": replace(config, sizes=replace(sizes, neighbours=0)),
+        "without differences as inputs": replace(config, sizes=replace(sizes, differences=False)),
+        "without adversarial term": replace(config, weights=replace(weights, adversarial=0.0)),
+        "without single-sample term": replace(config, weights=replace(weights, single=0.0)),
+        "variety term alone": replace(config, weights=replace(weights, single=0.0, mean=0.0, adversarial=0.0)),
+        f"with history noise of {_NOISE}": replace(config, history_noise=_NOISE),
+    }
+
+
+def ablate(
     frame: pl.DataFrame,
-    widths: dict[str, float],
-    source: str,
-) -> FitResult:
-    """A fold's generator, described as one that is fitted by itself."""
-    others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
-    return FitResult(
-        preset=preset,
-        module=fitted.generator,
-        metrics={},
-        config=asdict(config),
-        data=describe(source, frame, split),
-        statistics=driving_statistics(others, widths).to_dict(),
-        updates=fitted.updates,
-        seconds=fitted.seconds,
-    )
+    config: Config,
+    held_out: tuple[str, ...],
+    folder: Path,
+    on_fit: OnFit | None = None,
+    on_progress: OnProgress | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Fit the preset with one part changed at a time to one split, and score every variant on ``held_out``.
+
+    Returns:
+        Per variant ``windows``, the change of ADE to constant velocity's in % (``ade_change_percent``) by kind, over
+        all predicted steps and over the first 0.4 s (``ade_change_percent_0.4_s``), and for the calibrated preset
+        ``rmse_5_s_ratio``, the RMSE after 5 s divided by constant velocity's.
+    """
+    split, widths = split_for_fit(scene_tracks(frame), held_out), scene_lane_widths(frame)
+    rows = {}
+    for name, variant in variants(config).items():
+        if on_fit is not None:
+            on_fit(name)
+        rows[name] = _ablation_row(fit_and_forecast(variant, split, widths, folder, on_progress))
+    return rows
+
+
+def _ablation_row(fit: ScoredFit) -> dict[str, Any]:
+    errors = errors_of(fit.short.forecasts, fit.short.windows.future)
+    kinds = [kind for kind in errors if kind in ("mean", "single") or kind.startswith("best_of")]
+    errors = {kind: errors[kind] for kind in (*kinds, BASELINE)}
+    early = displacement_errors({kind: values[:, :_COMMON_STEPS] for kind, values in errors.items()})
+    whole = displacement_errors(errors)
+    row = {"windows": whole["windows"], "ade_change_percent": whole["ade_change_percent"]}
+    row["ade_change_percent_0.4_s"] = early["ade_change_percent"]
+    if fit.long is not None:
+        ratio = long_rollout_scores(fit.long.windows, fit.long.forecasts)["ratio_to_constant_velocity"]
+        row["rmse_5_s_ratio"] = {kind: ratio[kind] for kind in ("mean", "single")}
+    return row

@@ -1,44 +1,56 @@
-"""Predicted courses of recorded windows, by the generators and by IDM, all in one form."""
+"""Forecasts of recorded windows in one form: by both presets, by IDM, and by baselines without a network.
+
+Every function returns positions [W, T, 2] in m relative to the present, for the windows of
+:func:`ganlane.generator.windows.cut_windows` in the same order.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import torch
+from sklearn.linear_model import RidgeCV
+from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
-from ganlane.generator.anchored import ANCHOR, AnchorParameters
+from ganlane.generator.closed_loop import displacement_of, moved_by
+from ganlane.generator.fit_calibrated import CalibratedConfig
 from ganlane.generator.groups import group_windows
-from ganlane.generator.history import displacement_of, moved_by
-from ganlane.generator.metrics import SAMPLES
 from ganlane.generator.networks import Generator
-from ganlane.generator.rollout_metrics import Traits
-from ganlane.generator.rollouts import drive, rollout
-from ganlane.generator.stretches import RolloutScenes, SceneSource, cut_stretches
-from ganlane.generator.traits import common_traits, typical_traits
-from ganlane.generator.windows import PRESENT, Windows
+from ganlane.generator.rollout import (
+    DriverParams,
+    common_driver_params,
+    drive,
+    sampled_rollouts,
+    typical_driver_params,
+)
+from ganlane.generator.scores import SAMPLES, Forecasts
+from ganlane.generator.segments import Segments, SegmentSource, constant_velocity
+from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.following import following_acceleration
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.vehicles import Vehicles
 
-#: Name of a forecast to predicted positions [W, T, 2] in m, relative to the window's present.
-Forecasts = dict[str, np.ndarray]
-BEST = f"best_of_{SAMPLES}"
-#: Groups, and stretches times samples, in one pass; bounds the memory.
-_GROUPS, _STRETCHES = 128, 160
+#: Groups, and segments times samples, in one pass; bounds the memory.
+_GROUPS, _ROLLOUTS = 128, 160
+#: Penalties from which the ridge regression chooses by leave-one-out validation.
+_PENALTIES = tuple(10.0**power for power in range(-2, 6))
 
 
-def summarised(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
-    """``mean`` (z = 0), ``single`` and ``best_of_20`` (by ADE) of courses [1 + K, W, T, 2], the first with z = 0."""
+def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
+    """``mean`` (z = 0), ``single`` and ``best_of_20`` (by ADE) of samples [1 + K, W, T, 2], the first with z = 0."""
     if len(samples) < 2:
         return {"mean": samples[0]}
-    errors = np.linalg.norm(samples[1:] - recorded, axis=-1).mean(-1)
-    best = samples[1:][errors.argmin(0), np.arange(len(recorded))]
-    return {"mean": samples[0], "single": samples[1]} | ({BEST: best} if len(samples) > SAMPLES else {})
+    kinds = {"mean": samples[0], "single": samples[1]}
+    if len(samples) > SAMPLES:
+        errors = np.linalg.norm(samples[1:] - recorded, axis=-1).mean(-1)
+        kinds[f"best_of_{SAMPLES}"] = samples[1:][errors.argmin(0), np.arange(len(recorded))]
+    return kinds
 
 
 @torch.no_grad()
@@ -48,98 +60,135 @@ def paper_forecasts(generator: Generator, windows: Windows, group_size: int = 9,
     samples = np.empty((1 + SAMPLES, *windows.future.shape))
     for rows in torch.arange(len(groups)).split(_GROUPS):
         chunk = groups.select(rows)
-        seen = generator.observe(chunk.displacements[..., : generator.sizes.observed, :], chunk.position, chunk.mask)
+        past = chunk.displacements[..., : generator.sizes.observed, :]
         noise = torch.randn(1 + SAMPLES, *chunk.mask.shape, generator.sizes.noise, generator=random)
         noise[0] = 0.0
-        course = generator(seen, noise).cumsum(dim=-2)
-        samples[:, chunk.window[chunk.mask].numpy()] = course[:, chunk.mask].double().numpy()
-    return summarised(samples, windows.future)
+        positions = generator(generator.observe(past, chunk.position, chunk.mask), noise).cumsum(dim=-2)
+        samples[:, chunk.window[chunk.mask].numpy()] = positions[:, chunk.mask].double().numpy()
+    return by_kind(samples, windows.future)
 
 
-#: Courses [K, B, H, V, 2] in m of a batch of stretches, everybody driven jointly.
-Driver = Callable[[RolloutScenes], Tensor]
+#: From a batch of segments to positions [K, B, H, V, 2] in m, all vehicles driven jointly.
+Driver = Callable[[Segments], Tensor]
 
 
-def driven_courses(
-    driver: Driver, sources: list[SceneSource], horizon: int, stride: int, copies: int = 1
+def driven_windows(
+    driver: Driver, sources: list[SegmentSource], horizon: int, stride: int, samples: int = 1
 ) -> np.ndarray:
-    """What ``driver`` makes of every window of 9 + ``horizon`` frames, [K, W, H, 2] in m, relative to the present.
+    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames by a ``driver`` of K = ``samples`` samples.
 
-    The windows and their order are those of :func:`ganlane.generator.windows.cut_windows`: of a stretch those
-    vehicles are kept that were recorded throughout. ``copies`` tells how often the driver repeats a stretch.
+    Of every segment the vehicles are kept that were recorded throughout: these are the windows.
     """
-    courses = []
-    for scenes in _stretches(sources, horizon, stride, max(1, _STRETCHES // copies)):
-        course = driver(scenes.without_intentions()) - scenes.positions[:, PRESENT, None]
-        whole = scenes.present.all(dim=1)
-        courses.append(course.transpose(2, 3)[:, whole].double().numpy())
-    return np.concatenate(courses, axis=1)
-
-
-def _stretches(sources: list[SceneSource], horizon: int, stride: int, chunk: int) -> Iterator[RolloutScenes]:
+    forecasts = []
     for source in sources:
-        rows = source.starts(horizon, stride)
-        for at in range(0, len(rows), chunk):
-            yield cut_stretches([(source, row) for row in rows[at : at + chunk]], horizon)
+        for segments in source.batches(horizon, stride, max(1, _ROLLOUTS // samples)):
+            positions = driver(segments.without_intentions()) - segments.positions[:, PRESENT, None]
+            whole = segments.present.all(dim=1)
+            forecasts.append(positions.transpose(2, 3)[:, whole].double().numpy())
+    return np.concatenate(forecasts, axis=1)
 
 
 @torch.no_grad()
 def calibrated_forecasts(
     generator: Generator,
-    sources: list[SceneSource],
+    sources: list[SegmentSource],
     horizon: int,
     stride: int,
+    config: CalibratedConfig,
     samples: int = SAMPLES,
-    noise_period_s: float = 5.0,
-    seed: int = 0,
-    parameters: AnchorParameters = ANCHOR,
-    traits: Traits = typical_traits,
 ) -> Forecasts:
-    """The calibrated preset, rolled out through whole scenes; target lanes and traits look at the present alone."""
-    random = torch.Generator().manual_seed(seed)
+    """The calibrated preset, rolled out through whole scenes with the anchor and the noise of ``config``.
 
-    def driver(scenes: RolloutScenes) -> Tensor:
-        copies, shape = 1 + samples, scenes.length.shape
-        headway, desired = (trait.repeat(copies, 1) for trait in traits(scenes))
-        fresh = torch.randn(1 + horizon, copies, *shape, generator.sizes.noise, generator=random)
-        fresh[:, 0] = 0.0
-        noise = fresh.flatten(1, 2)
-        many = scenes.repeated(copies)
-        course = rollout(generator, many, headway, desired, noise[0], noise[1:], noise_period_s, parameters)
-        return course.unflatten(0, (copies, shape[0]))
+    Target lanes and driver parameters are those of the present.
+    """
+    random = torch.Generator().manual_seed(0)
 
-    courses = driven_courses(driver, sources, horizon, stride, 1 + samples)
-    return summarised(courses, _recorded(sources, horizon, stride))
+    def driver(segments: Segments) -> Tensor:
+        headway, desired = config.evaluation_params(segments)
+        noise = torch.randn(1 + horizon, 1 + samples, *headway.shape, generator.sizes.noise, generator=random)
+        noise[:, 0] = 0.0
+        return sampled_rollouts(generator, segments, headway, desired, noise, config.noise_period_s, config.anchor)
+
+    forecasts = driven_windows(driver, sources, horizon, stride, 1 + samples)
+    recorded = driven_windows(lambda segments: segments.future[None], sources, horizon, stride)[0]
+    return by_kind(forecasts, recorded)
 
 
 @torch.no_grad()
-def idm_forecasts(sources: list[SceneSource], horizon: int, stride: int) -> Forecasts:
-    """IDM along the road in whole scenes, the lateral position kept.
+def idm_forecasts(sources: list[SegmentSource], horizon: int, stride: int) -> Forecasts:
+    """IDM along the road in whole scenes, with constant lateral positions.
 
-    ``idm``: everybody with Table V's headway and a desired speed of 22 m/s. ``idm_own_headway``: with the headway
+    ``idm``: all drivers with Table V's headway and a desired speed of 22 m/s. ``idm_own_headway``: with the headway
     at which each driver is in balance at present, the calibrated preset's anchor.
     """
-    forecasts = {}
-    for name, traits in (("idm", common_traits), ("idm_own_headway", typical_traits)):
-        driver = partial(_idm_courses, traits=traits)
-        forecasts[name] = driven_courses(driver, sources, horizon, stride)[0]
-    return forecasts
+
+    def driver(segments: Segments, driver_params: DriverParams) -> Tensor:
+        headway, desired = driver_params(segments)
+
+        def move(vehicles: Vehicles, step: int) -> Vehicles:
+            acceleration = following_acceleration(perceive(vehicles, segments.road), TABLE_V, headway)
+            velocity = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S + acceleration * PHYSICS_STEP_S
+            return moved_by(vehicles, velocity, torch.zeros_like(velocity))
+
+        return drive(segments, desired, move)[None]
+
+    kinds = {"idm": common_driver_params, "idm_own_headway": typical_driver_params}
+    return {
+        name: driven_windows(partial(driver, driver_params=params), sources, horizon, stride)[0]
+        for name, params in kinds.items()
+    }
 
 
-def _idm_courses(scenes: RolloutScenes, traits: Traits) -> Tensor:
-    headway, desired = traits(scenes)
-    road = scenes.road
+def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int) -> Forecasts:
+    """Forecasts without a network; the ridge regression is fitted to windows of the scenes ``others``.
 
-    def move(vehicles: Vehicles, step: int) -> Vehicles:
-        acceleration = following_acceleration(perceive(vehicles, road), TABLE_V, headway)
-        velocity = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S + acceleration * PHYSICS_STEP_S
-        return moved_by(vehicles, velocity, torch.zeros_like(velocity))
+    ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less than the last one.
+    """
+    past, steps = windows.past, windows.future.shape[1]
+    return {
+        "constant_velocity": repeated(past[:, -1], steps),
+        "mean_velocity": repeated(past.mean(axis=1), steps),
+        "constant_acceleration": constant_acceleration(past, steps),
+        "ridge": RidgeForecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps))(past),
+    }
 
-    return drive(scenes, desired, move)[None]
+
+def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
+    """Positions [W, T, 2] in m when ``displacement`` [W, 2] is repeated (:func:`constant_velocity` for arrays)."""
+    return constant_velocity(torch.from_numpy(displacement), steps).numpy()
 
 
-def _recorded(sources: list[SceneSource], horizon: int, stride: int) -> np.ndarray:
-    def driver(scenes: RolloutScenes) -> Tensor:
-        return scenes.future[None]
+def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
+    """Positions [W, T, 2] in m when the displacement keeps changing by its mean observed change per step."""
+    change = ((past[:, -1] - past[:, 0]) / (past.shape[1] - 1))[:, None]
+    ahead = np.arange(1.0, steps + 1.0)[:, None]
+    return repeated(past[:, -1], steps) + 0.5 * change * ahead * (ahead + 1.0)
 
-    return driven_courses(driver, sources, horizon, stride)[0]
+
+class RidgeForecast:
+    """Linear regression with a penalty, from the generator's history to the error of constant velocity.
+
+    Inputs are the last displacement and the differences of all observed ones; fitted to windows and their mirror
+    images.
+
+    Args:
+        windows: to fit to.
+    """
+
+    def __init__(self, windows: Windows):
+        past, future = windows.past, windows.future
+        past = np.concatenate([past, past * (1.0, -1.0)])
+        future = np.concatenate([future, future * (1.0, -1.0)])
+        self.steps = future.shape[1]
+        error = (future - repeated(past[:, -1], self.steps)).reshape(len(past), -1)
+        self.model: Pipeline = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
+        self.model.fit(self._features(past), error)
+
+    def __call__(self, past: np.ndarray) -> np.ndarray:
+        """Positions [W, T, 2] in m that follow the displacements ``past`` [W, 8, 2]."""
+        error = self.model.predict(self._features(past)).reshape(len(past), self.steps, 2)
+        return repeated(past[:, -1], self.steps) + error
+
+    @staticmethod
+    def _features(past: np.ndarray) -> np.ndarray:
+        return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)

@@ -1,8 +1,19 @@
-"""k-means groups of neighbouring vehicles (section III of the paper), padded to one tensor."""
+"""k-means groups of neighbouring vehicles (section III of the paper), padded to one tensor, and their cache.
+
+Grouping takes most of the time before a fit, so it is cached under a hash of everything that it follows from: a stale
+result is never used.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import sklearn
@@ -10,8 +21,56 @@ import torch
 from sklearn.cluster import KMeans
 from torch import Tensor
 
-from ganlane.generator.cache import cached, content_hash
+from ganlane.files import atomic_path
 from ganlane.generator.windows import PRESENT, Windows
+
+#: Environment variable with the cache folder; empty switches the cache off.
+VARIABLE = "GANLANE_CACHE"
+
+
+def cache_folder() -> Path | None:
+    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder; None if switched off."""
+    named = os.environ.get(VARIABLE)
+    if named is not None:
+        return Path(named) if named else None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
+
+
+def content_hash(settings: Any, *arrays: np.ndarray) -> str:
+    """Hash of plain ``settings`` and of the arrays' types, shapes and bytes."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for array in arrays:
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:32]
+
+
+def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays that ``compute`` returns, from the cache if it ran for this ``key`` before.
+
+    A damaged file is computed again, and a folder that cannot be written to is ignored: the cache never causes a
+    wrong result or a failure.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return compute()
+    path = folder / f"{name}_{key}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            return dict(kept)
+    except (OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError):
+        arrays = compute()
+    try:
+        with atomic_path(path) as part, part.open("wb") as file:
+            save_arrays(file, arrays)
+    except OSError:
+        pass
+    return arrays
+
+
+def save_arrays(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as .npz; reading them needs no pickle."""
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's stub takes a name for an option
 
 
 @dataclass(frozen=True)
@@ -24,6 +83,7 @@ class Groups:
         mask: [B, G] bool, false is padding.
         scene: [B] int64, index of the group's scene.
         window: [B, G] int64, row in :class:`Windows`; -1 is padding.
+        scene_names: names of the scenes.
     """
 
     displacements: Tensor
@@ -31,6 +91,7 @@ class Groups:
     mask: Tensor
     scene: Tensor
     window: Tensor
+    scene_names: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -38,14 +99,20 @@ class Groups:
     def select(self, rows: Tensor) -> Groups:
         """The groups of the given rows, without padding that none of them needs."""
         width = int(self.mask[rows].sum(1).max())
-        chosen = {field.name: getattr(self, field.name)[rows] for field in fields(self)}
-        return Groups(**{name: value if value.dim() == 1 else value[:, :width] for name, value in chosen.items()})
+        return replace(
+            self,
+            displacements=self.displacements[rows, :width],
+            position=self.position[rows, :width],
+            mask=self.mask[rows, :width],
+            scene=self.scene[rows],
+            window=self.window[rows, :width],
+        )
 
     def mirrored(self, flip: Tensor) -> Groups:
         """The same groups, left and right swapped where ``flip`` [B] is true."""
         sign = torch.ones(len(self), 1, 2)
         sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
-        return Groups(self.displacements * sign[:, :, None], self.position * sign, self.mask, self.scene, self.window)
+        return replace(self, displacements=self.displacements * sign[:, :, None], position=self.position * sign)
 
 
 def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
@@ -59,8 +126,8 @@ def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
 def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
     """Split the vehicles of every (scene, start) into k-means groups of about ``size`` and pad them.
 
-    The split looks at the last observed positions alone, and is the same for the same ``seed``. It takes most of the
-    time, so each scene's is kept (:mod:`ganlane.generator.cache`).
+    Uses the last observed positions only, and gives the same groups for the same ``seed``. It takes most of the
+    time, so each scene's is cached (:func:`cached`).
     """
     now = windows.positions[:, PRESENT]
     labels, used = np.empty(len(now), dtype=np.int64), 0
@@ -104,4 +171,5 @@ def _pad(windows: Windows, now: np.ndarray, labels: np.ndarray) -> Groups:
         torch.from_numpy(mask),
         torch.from_numpy(scene),
         torch.from_numpy(window),
+        windows.scene_names,
     )

@@ -1,4 +1,4 @@
-"""The fitting loop that both presets share: updates, evaluations on validation scenes, early stopping, resuming."""
+"""The fitting loop of both presets: updates, evaluations on validation scenes, early stopping, resuming."""
 
 from __future__ import annotations
 
@@ -15,12 +15,34 @@ from torch import Tensor, nn
 
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
-from ganlane.generator.schedule import LoopConfig, learning_rate
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """How long to fit.
+
+    Attributes:
+        updates: updates at most; the learning rate falls to 0 over them.
+        evaluate_every: updates between two evaluations on the validation scenes.
+        patience: evaluations without improvement before stopping.
+        learning_rate: of Adam, after the warm-up.
+        warmup: updates over which the learning rate rises.
+        largest_gradient: norm at which gradients are clipped.
+        max_seconds: stop after this long; None is never.
+    """
+
+    updates: int = 1200
+    evaluate_every: int = 150
+    patience: int = 8
+    learning_rate: float = 4e-3
+    warmup: int = 100
+    largest_gradient: float = 1.0
+    max_seconds: float | None = None
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress bar or a log shows.
+    """State of a fit, for a progress bar or a log.
 
     Attributes:
         update: updates done.
@@ -43,7 +65,7 @@ OnProgress = Callable[[Progress], None]
 
 
 class FitTask(Protocol):
-    """What is fitted: networks, their optimisers, one update, one evaluation."""
+    """What a loop fits: networks, their optimisers, one update, one evaluation."""
 
     modules: dict[str, nn.Module]
     optimisers: dict[str, torch.optim.Optimizer]
@@ -57,12 +79,12 @@ class FitTask(Protocol):
 
 
 class FitLoop:
-    """Runs a task until it stops improving; ``state_dict`` holds everything that a later run needs to go on.
+    """Runs a task until it stops improving; ``state_dict`` holds everything that a later run needs to resume.
 
     Args:
         task: what is fitted.
-        config: how long.
-        resume_path: file in which the state is kept after every evaluation, and from which it goes on.
+        config: its schedule.
+        resume_path: file that keeps the state after every evaluation; the fit resumes from it if it exists.
 
     ``seconds`` is the time that the updates took, in earlier runs of the same fit too.
     """
@@ -124,7 +146,7 @@ class FitLoop:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict`.
+        """Resume from :meth:`state_dict`.
 
         Raises:
             UserError: the state belongs to other networks.
@@ -145,15 +167,29 @@ class FitLoop:
 
 
 def load_resume(path: Path) -> dict[str, Any]:
-    """Read what :class:`FitLoop` keeps; never executes code.
+    """Read the state that :class:`FitLoop` keeps; never executes code.
 
     Raises:
         UserError: not such a file.
     """
     try:
         state = torch.load(path, weights_only=True)
+        if "counters" not in state:
+            raise ValueError("no counters")
     except Exception as error:
         raise UserError(f"{path}: not the state of a fit; give the file that a fit keeps, or remove it.") from error
-    if not isinstance(state, dict) or "counters" not in state:
-        raise UserError(f"{path}: not the state of a fit; give the file that a fit keeps, or remove it.")
     return state
+
+
+def learning_rate(config: LoopConfig, number: int) -> float:
+    """Linear warm-up, then a half cosine to 0."""
+    rise = min(1.0, (number + 1) / max(1, config.warmup))
+    return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))
+
+
+def descend(optimiser: torch.optim.Optimizer, loss: Tensor, module: nn.Module, largest: float) -> None:
+    """One step of ``optimiser`` down ``loss``, with the gradient's norm clipped at ``largest``."""
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    nn.utils.clip_grad_norm_(module.parameters(), largest)
+    optimiser.step()

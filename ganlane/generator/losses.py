@@ -1,4 +1,4 @@
-"""The generator's and the discriminator's losses (Gupta et al. 2018, with the changes that made it learn here)."""
+"""The generator's and the discriminator's losses (Gupta et al. 2018, with the changes that the fit needs here)."""
 
 from __future__ import annotations
 
@@ -29,52 +29,50 @@ class LossWeights:
     adversarial: float = 0.02
 
 
-def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
-    """Euclidean distances [..., T] in m between two courses given as displacements [..., T, 2]."""
-    apart = (predicted - recorded).cumsum(dim=-2)
+def distance(one: Tensor, other: Tensor) -> Tensor:
+    """Euclidean distance [...] between positions [..., 2], with a finite gradient at distance 0."""
+    apart = one - other
     return torch.sqrt((apart * apart).sum(-1) + _SMALLEST_DISTANCE_M * _SMALLEST_DISTANCE_M)
 
 
+def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
+    """Distances [..., T] in m between two trajectories given as displacements [..., T, 2]."""
+    apart = (predicted - recorded).cumsum(dim=-2)
+    return distance(apart, torch.zeros_like(apart))
+
+
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of ``values`` where ``mask`` (broadcast) holds."""
+    """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
     kept = mask.expand_as(values).to(values.dtype)
     return (values * kept).sum() / kept.sum().clamp_min(1.0)
 
 
-def variety_loss(errors: Tensor, mask: Tensor) -> Tensor:
-    """Mean error of each vehicle's best sample; ``errors`` is [K, B, G] in m, ``mask`` [B, G]."""
-    return masked_mean(errors.amin(dim=0), mask)
+def variety_loss(errors: Tensor) -> Tensor:
+    """Mean error of each vehicle's best sample; ``errors`` is [K, n] in m."""
+    return errors.amin(dim=0).mean()
 
 
-def adversarial_loss(logits: Tensor, mask: Tensor) -> Tensor:
-    """Cross-entropy of calling the generated courses recorded; ``logits`` and ``mask`` are [..., B, G]."""
-    return masked_mean(binary_cross_entropy_with_logits(logits, torch.ones_like(logits), reduction="none"), mask)
+def adversarial_loss(logits: Tensor) -> Tensor:
+    """Cross-entropy of classifying generated trajectories as recorded; ln 2 is chance."""
+    return binary_cross_entropy_with_logits(logits, torch.ones_like(logits), reduction="none").mean()
 
 
-def discriminator_loss(recorded: Tensor, generated: Tensor, mask: Tensor) -> Tensor:
-    """Cross-entropy of telling the two apart; logits [..., B, G] each; ln 2 is chance."""
-    true = binary_cross_entropy_with_logits(recorded, torch.ones_like(recorded), reduction="none")
-    false = binary_cross_entropy_with_logits(generated, torch.zeros_like(generated), reduction="none")
-    return 0.5 * (masked_mean(true, mask) + masked_mean(false, mask))
+def discriminator_loss(recorded: Tensor, generated: Tensor) -> Tensor:
+    """Cross-entropy of classifying recorded and generated trajectories by their logits; ln 2 is chance."""
+    fake = binary_cross_entropy_with_logits(generated, torch.zeros_like(generated), reduction="none").mean()
+    return 0.5 * (adversarial_loss(recorded) + fake)
 
 
-def discriminator_accuracy(recorded: Tensor, generated: Tensor, mask: Tensor) -> Tensor:
-    """Share told right, recorded and generated counted alike; 0.5 is chance."""
-    right_true, right_false = (recorded > 0).to(recorded.dtype), (generated <= 0).to(generated.dtype)
-    return 0.5 * (masked_mean(right_true, mask) + masked_mean(right_false, mask))
+def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
+    """Share of logits with the right sign, both classes with equal weight; 0.5 is chance."""
+    return 0.5 * ((recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean())
 
 
 def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
-    """Energy score of two samples, in the unit of the positions: mean error less half their distance.
+    """Energy score of two samples, in the unit of the positions: mean error minus half their distance.
 
-    All are positions [..., 2]; a proper score, least in expectation when the samples are drawn from the
-    distribution of what was recorded (Gneiting and Raftery 2007).
+    All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from the distribution
+    of the recordings (Gneiting and Raftery 2007).
     """
     mean_error = 0.5 * (distance(one, recorded) + distance(other, recorded))
     return mean_error - 0.5 * distance(one, other)
-
-
-def distance(one: Tensor, other: Tensor) -> Tensor:
-    """Euclidean distance [...] between positions [..., 2], with a finite gradient where they meet."""
-    apart = one - other
-    return torch.sqrt((apart * apart).sum(-1) + _SMALLEST_DISTANCE_M * _SMALLEST_DISTANCE_M)

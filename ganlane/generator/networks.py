@@ -9,9 +9,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
-from ganlane.generator.dense import apply
-from ganlane.generator.lstm import DIFFERENCE_SCALE_M, MotionLSTM
-from ganlane.generator.pooling import PairPooling
+from ganlane.generator.layers import DIFFERENCE_SCALE_M, MotionLSTM, PairPooling, apply
 
 
 @dataclass(frozen=True)
@@ -26,10 +24,10 @@ class GeneratorSizes:
         context: width of the layer between encoder and decoder.
         noise: width Z of the latent vector; below ``hidden``.
         neighbours: how many of the nearest vehicles are pooled; 0 is no pooling (an ablation).
-        extra_inputs: numbers per vehicle beside its motion (0 for the paper's preset, positions only).
+        extra_inputs: inputs per vehicle in addition to its motion (0 for the paper's preset, positions only).
         observed: displacements that are observed (the paper's ``o_l``).
         predicted: displacements that are predicted (the paper's ``p_l``).
-        differences: whether the displacements' differences are inputs too; false is an ablation.
+        differences: whether the displacements' differences are inputs too; false is for an ablation.
     """
 
     embedding: int = 64
@@ -46,12 +44,12 @@ class GeneratorSizes:
 
 
 class Observation(NamedTuple):
-    """What the generator sees of [B, G] vehicles.
+    """The generator's input for [B, G] vehicles.
 
     Attributes:
         projections: [B, G, observed - 1, 4H], input projections of the observed motions
             (:meth:`Generator.project`), oldest first. A motion is a displacement and its difference to the one
-            before, so 8 displacements are 7 motions. Or as many tensors [B, G, 4H].
+            before, so 8 displacements are 7 motions. Also accepted: a sequence of tensors [B, G, 4H].
         displacement: [B, G, 2], the last displacement, m per 0.1 s.
         difference: [B, G, 2], its difference to the one before, m.
         position: [B, G, 2], m, relative to any common point.
@@ -91,7 +89,7 @@ class Generator(nn.Module):
         return self.encoder.project(displacements[..., 1:, :], displacements.diff(dim=-2))
 
     def observe(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Observation:
-        """Observation without further inputs from observed displacements [B, G, observed, 2]."""
+        """The input from observed displacements [B, G, observed, 2], without further inputs."""
         last, before = displacements[..., -1, :], displacements[..., -2, :]
         extra = last.new_zeros((*last.shape[:-1], 0))
         return Observation(self.project(displacements), last, last - before, position, valid, extra)
@@ -109,7 +107,8 @@ class Generator(nn.Module):
         ``context`` is [..., H - Z] and ``noise`` [..., Z]; leading dimensions broadcast, so that several
         samples share one context. Each output is the change of the displacement that the next step continues.
         """
-        hidden = torch.cat(_joined(context, noise), dim=-1)
+        leading = torch.broadcast_shapes(context.shape[:-1], noise.shape[:-1])
+        hidden = torch.cat([context.expand(*leading, -1), noise.expand(*leading, -1)], dim=-1)
         cell = torch.zeros_like(hidden)
         scale = hidden.new_tensor(DIFFERENCE_SCALE_M)
         displacement, difference, outputs = seen.displacement, seen.difference, []
@@ -126,19 +125,13 @@ class Generator(nn.Module):
         return displacements_of(outputs, seen.displacement)
 
 
-def _joined(context: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Context and noise, their leading dimensions broadcast against each other."""
-    shape = torch.broadcast_shapes(context.shape[:-1], noise.shape[:-1])
-    return context.expand(*shape, -1), noise.expand(*shape, -1)
-
-
 def displacements_of(outputs: Tensor, last: Tensor) -> Tensor:
     """Displacements [..., steps, 2] that follow ``last`` [..., 2] when it changes by the decoder's outputs."""
     return last[..., None, :] + outputs.cumsum(dim=-2) * outputs.new_tensor(DIFFERENCE_SCALE_M)
 
 
 class Discriminator(nn.Module):
-    """Tells recorded from generated displacements; ends in a plain logit (the original's ReLU cannot say 'fake')."""
+    """Classifies displacements as recorded or generated; outputs a logit (the original's ReLU cannot say 'fake')."""
 
     def __init__(self, embedding: int = 64, hidden: int = 32):
         super().__init__()

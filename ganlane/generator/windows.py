@@ -1,6 +1,6 @@
-"""Windows of 9 observed and 8 future positions, cut from recorded scenes as they were recorded.
+"""Recorded scenes as dense arrays, and the windows of 9 observed and 8 future positions that are cut from them.
 
-Nothing is smoothed: a filter run before windows are cut would carry the future into the past.
+Nothing is smoothed: a filter applied before windows are cut would carry the future into the past.
 """
 
 from __future__ import annotations
@@ -8,10 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+import polars as pl
 
 from ganlane.errors import UserError
-from ganlane.generator.tracks import SceneTracks
 
+REQUIRED_COLUMNS = ("scene", "vehicle", "frame", "x", "y", "speed", "lane", "length", "width")
 #: Observed positions; they give 8 observed displacements (the paper's ``o_l`` = 8).
 OBSERVED_POSITIONS = 9
 #: Row of the last of them.
@@ -19,6 +20,62 @@ PRESENT = OBSERVED_POSITIONS - 1
 #: Predicted positions (the paper's ``p_l``): 0.8 s.
 PREDICTED_STEPS = 8
 WINDOW_FRAMES = OBSERVED_POSITIONS + PREDICTED_STEPS
+
+
+@dataclass(frozen=True)
+class SceneTracks:
+    """One recorded scene of T frames (0.1 s apart) and V vehicles; entries of absent vehicles are 0.
+
+    Attributes:
+        name: the scene's name.
+        first_frame: frame number of row 0.
+        vehicles: [V] vehicle numbers.
+        positions: [T, V, 2] float64, centre of the body, m; x along the road, y to the left.
+        lane: [T, V] int64, 0 is the rightmost.
+        present: [T, V] bool.
+        length, width: [V] float64, m.
+    """
+
+    name: str
+    first_frame: int
+    vehicles: np.ndarray
+    positions: np.ndarray
+    lane: np.ndarray
+    present: np.ndarray
+    length: np.ndarray
+    width: np.ndarray
+
+
+def _one_scene(name: str, rows: pl.DataFrame) -> SceneTracks:
+    vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
+    frame = rows["frame"].to_numpy()
+    row = frame - frame.min()
+    shape = (int(row.max()) + 1, len(vehicles))
+    positions, lane = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.int64)
+    present, size = np.zeros(shape, dtype=bool), np.zeros((2, len(vehicles)))
+    positions[row, column] = rows.select("x", "y").to_numpy()
+    lane[row, column] = rows["lane"].to_numpy()
+    present[row, column] = True
+    size[:, column] = rows.select("length", "width").to_numpy().T
+    return SceneTracks(name, int(frame.min()), vehicles, positions, lane, present, size[0], size[1])
+
+
+def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
+    """Every scene of a trajectory frame (``ganlane.data``'s schema), in order of their names.
+
+    Raises:
+        UserError: a column is missing, or there is no row.
+    """
+    missing = [name for name in REQUIRED_COLUMNS if name not in frame.columns]
+    if missing:
+        raise UserError(
+            f"trajectory frame: columns {missing} are missing; expected {list(REQUIRED_COLUMNS)}; "
+            "read the recordings with ganlane.data.read_scenes."
+        )
+    if frame.is_empty():
+        raise UserError("trajectory frame: no rows; give recordings of at least 1.7 s.")
+    names = sorted(frame["scene"].unique().to_list())
+    return [_one_scene(name, frame.filter(pl.col("scene") == name)) for name in names]
 
 
 @dataclass(frozen=True)
@@ -60,7 +117,7 @@ class Windows:
 
 
 def join_windows(parts: list[Windows]) -> Windows:
-    """All windows of ``parts``, whose scenes are different ones, in their order."""
+    """All windows of ``parts`` in order; no scene is in two parts."""
     names = tuple(name for part in parts for name in part.scene_names)
     before = np.cumsum([0, *(len(part.scene_names) for part in parts[:-1])])
     joined = {
@@ -73,7 +130,7 @@ def join_windows(parts: list[Windows]) -> Windows:
 
 
 def _whole(scene: SceneTracks, frames: int) -> np.ndarray:
-    """Whether each vehicle is present throughout the ``frames`` frames from each row on; bool [S, V]."""
+    """Whether each vehicle is present in all ``frames`` frames that start at each row; bool [S, V]."""
     if len(scene.present) < frames:
         return np.zeros((0, scene.present.shape[1]), dtype=bool)
     running = np.concatenate([np.zeros_like(scene.present[:1], dtype=np.int64), scene.present.cumsum(0)])
@@ -87,7 +144,7 @@ def _cut(scene: SceneTracks, stride: int, frames: int) -> tuple[np.ndarray, np.n
 
 
 def count_windows(scene: SceneTracks, frames: int) -> int:
-    """How many windows of ``frames`` frames a scene holds, one from every frame on."""
+    """Number of windows of ``frames`` frames in a scene, one per possible start."""
     return int(_whole(scene, frames).sum())
 
 
@@ -97,17 +154,17 @@ def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW
     Raises:
         UserError: no vehicle is present for a whole window.
     """
-    cuts = [_cut(scene, stride, frames) for scene in scenes]
+    cuts = [_cut(tracks, stride, frames) for tracks in scenes]
     start, vehicle = (np.concatenate(part) for part in zip(*cuts))
     if not len(start):
         raise UserError(
             f"recordings: no vehicle is present for {frames} frames in a row; give longer tracks (10 Hz)."
         )
-    which = np.concatenate([np.full(len(cut[0]), index) for index, cut in enumerate(cuts)])
-    gathered = [_gather(scene, *cut, frames) for scene, cut in zip(scenes, cuts)]
+    scene = np.concatenate([np.full(len(cut[0]), index) for index, cut in enumerate(cuts)])
+    gathered = [_gather(tracks, *cut, frames) for tracks, cut in zip(scenes, cuts)]
     positions, lane, from_left, length = (np.concatenate(part) for part in zip(*gathered))
-    names = tuple(scene.name for scene in scenes)
-    return Windows(positions, which, start, vehicle, lane, from_left, length, names)
+    names = tuple(tracks.name for tracks in scenes)
+    return Windows(positions, scene, start, vehicle, lane, from_left, length, names)
 
 
 def _gather(scene: SceneTracks, start: np.ndarray, vehicle: np.ndarray, frames: int) -> tuple[np.ndarray, ...]:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.generator.anchored import ANCHOR, EXTRA_INPUTS, AnchorParameters, DriverMemory, anchored_step
+from ganlane.generator.closed_loop import ANCHOR, EXTRA_INPUTS, AnchorParameters, DriverMemory, anchored_step
 from ganlane.generator.networks import Generator
-from ganlane.generator.traits import HEADWAY_QUANTILES_S, headway_from_uniform
+from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -59,7 +59,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
 
     @torch.no_grad()
     def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
-        """One :func:`~ganlane.generator.anchored.anchored_step`."""
+        """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
         noise = self.next_noise(memory, key, step)
         driver = DriverMemory(self.history(memory), memory["residual_mean"], memory["headway"])
         moved, driver = anchored_step(

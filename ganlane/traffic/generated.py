@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.generator.history import History, start
+from ganlane.generator.closed_loop import History, start, wander
 from ganlane.generator.networks import Generator
-from ganlane.generator.noise import wander
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Purpose, Stream, normal

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
+from ganlane.generator.closed_loop import Plan, paper_step
 from ganlane.generator.networks import Generator
-from ganlane.generator.paper import Plan, paper_step
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ganlane.generator.cache import VARIABLE
+from ganlane.generator.groups import VARIABLE
 
 
 @pytest.fixture(autouse=True)

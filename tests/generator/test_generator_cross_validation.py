@@ -1,16 +1,17 @@
-from dataclasses import replace
+import math
+from dataclasses import asdict, replace
 
 import polars as pl
 import pytest
 
 from ganlane.data import SyntheticTraffic, measure_exposure, synthetic_scenes
-from ganlane.generator.calibrated import CalibratedConfig
+from ganlane.fit_report import ablation_table, fold_tables
 from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.cross_validation import cross_validate
-from ganlane.generator.fitting import PaperConfig
-from ganlane.generator.fold_tables import fold_tables
+from ganlane.generator.cross_validation import ablate, cross_validate, variants
+from ganlane.generator.fit_calibrated import CalibratedConfig
+from ganlane.generator.fit_paper import PaperConfig
+from ganlane.generator.loop import LoopConfig
 from ganlane.generator.networks import GeneratorSizes
-from ganlane.generator.schedule import LoopConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)
@@ -25,7 +26,7 @@ def frame():
 
 
 def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(frame, tmp_path):
-    scores = cross_validate("paper", frame, PAPER, 3, tmp_path)
+    scores = cross_validate(frame, PAPER, 3, tmp_path)
     assert {name for split in scores["splits"] for name in split["held_out"]} == set(scores["open_loop"]["scenes"])
     for split in scores["splits"]:
         assert not set(split["held_out"]) & {*split["fitted"], *split["validation"]}
@@ -37,32 +38,32 @@ def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(frame, tm
 
 
 def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, tmp_path):
-    first = cross_validate("paper", frame, PAPER, 3, tmp_path)
+    first = cross_validate(frame, PAPER, 3, tmp_path)
     updates = []
-    again = cross_validate("paper", frame, PAPER, 3, tmp_path, on_progress=updates.append)
+    again = cross_validate(frame, PAPER, 3, tmp_path, on_progress=updates.append)
     assert again == first
     assert not updates
-    cross_validate("paper", frame, replace(PAPER, seed=1), 3, tmp_path, on_progress=updates.append)
+    cross_validate(frame, replace(PAPER, seed=1), 3, tmp_path, on_progress=updates.append)
     assert len(updates) == 3 * LOOP.updates
 
 
 def test_an_interrupted_fold_goes_on(frame, tmp_path):
-    whole = cross_validate("paper", frame, PAPER, 3, tmp_path / "whole")
+    whole = cross_validate(frame, PAPER, 3, tmp_path / "whole")
 
     def stop(progress):
         if progress.update == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        cross_validate("paper", frame, PAPER, 3, tmp_path / "parts", on_progress=stop)
+        cross_validate(frame, PAPER, 3, tmp_path / "parts", on_progress=stop)
     updates = []
-    resumed = cross_validate("paper", frame, PAPER, 3, tmp_path / "parts", on_progress=updates.append)
+    resumed = cross_validate(frame, PAPER, 3, tmp_path / "parts", on_progress=updates.append)
     assert len(updates) == 3 * LOOP.updates - 2
     assert resumed["open_loop"]["ade_m"]["mean"] == pytest.approx(whole["open_loop"]["ade_m"]["mean"], rel=1e-4)
 
 
 def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(frame, tmp_path):
-    scores = cross_validate("calibrated", frame, CALIBRATED, 3, tmp_path)
+    scores = cross_validate(frame, CALIBRATED, 3, tmp_path)
     rollout = scores["rollout"]
     assert rollout["tracks"] == 15
     assert list(rollout["rmse_m"]["mean"]) == ["1 s", "2 s", "3 s", "4 s", "5 s"]
@@ -74,9 +75,9 @@ def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(frame, tmp_pa
 @pytest.mark.parametrize(("preset", "config"), [("paper", PAPER), ("calibrated", CALIBRATED)])
 def test_the_folds_generators_are_told_and_forecast_what_was_scored(preset, config, frame, tmp_path):
     told = {}
-    scores = cross_validate(preset, frame, config, 3, tmp_path, on_fold=told.__setitem__, source="folder/made.csv")
+    scores = cross_validate(frame, config, 3, tmp_path, on_fold=told.__setitem__, source="folder/made.csv")
     again = {}
-    cross_validate(preset, frame, config, 3, tmp_path, on_fold=again.__setitem__)
+    cross_validate(frame, config, 3, tmp_path, on_fold=again.__setitem__)
     assert list(told) == list(again) == [1, 2, 3]
     for (number, fold), split in zip(told.items(), scores["splits"]):
         path = tmp_path / f"{number}.safetensors"
@@ -91,8 +92,52 @@ def test_the_folds_generators_are_told_and_forecast_what_was_scored(preset, conf
 
 def test_a_folds_driving_statistics_are_those_of_its_other_scenes(frame, tmp_path):
     told = {}
-    cross_validate("paper", frame, PAPER, 3, tmp_path, on_fold=told.__setitem__)
+    cross_validate(frame, PAPER, 3, tmp_path, on_fold=told.__setitem__)
     for fold in told.values():
         others = frame.filter(~pl.col("scene").is_in(fold.data["held_out"]))
         assert 0.0 < fold.statistics["exposure"]["vehicle_km"] == measure_exposure(others).vehicle_km
         assert fold.statistics["exposure"]["vehicle_km"] < measure_exposure(frame).vehicle_km
+
+
+SHORT_LOOP = LoopConfig(updates=8, evaluate_every=8, warmup=4)
+
+
+def flat(config) -> dict:
+    """Settings and the settings within them."""
+    plain = asdict(config)
+    parts = {key: part for key, part in plain.items() if isinstance(part, dict)}
+    inner = {f"{key}.{name}": value for key, part in parts.items() for name, value in part.items()}
+    return {key: value for key, value in plain.items() if key not in parts} | inner
+
+
+@pytest.mark.parametrize("config", [PaperConfig(), CalibratedConfig()])
+def test_every_variant_has_a_quarter_of_the_updates_and_differs_in_its_part_alone(config):
+    first, *others = variants(config).items()
+    assert flat(first[1])["loop.updates"] == config.loop.updates // 4
+    for name, variant in others:
+        changed = {key for key, value in flat(variant).items() if value != flat(first[1])[key]}
+        assert 1 <= len(changed) <= (3 if name == "variety term alone" else 1), name
+
+
+def test_ablations_of_the_papers_preset_stand_side_by_side(tmp_path):
+    frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=5.0))
+    config = PaperConfig(SIZES, loop=SHORT_LOOP, stride=6, samples=2, batch=4)
+    names, updates = [], []
+    rows = ablate(frame, config, ("synthetic-1",), tmp_path, names.append, updates.append)
+    assert list(rows) == names == list(variants(config))
+    assert len(updates) == 2 * len(rows)
+    assert rows["p_l = 4"]["windows"] > rows["p_l = 12"]["windows"]
+    short = rows["p_l = 4"]
+    assert short["ade_change_percent"] == short["ade_change_percent_0.4_s"]
+    assert len(ablation_table(rows).splitlines()) == 1 + len(rows)
+
+
+def test_ablations_of_the_calibrated_preset_are_rolled_out_too(tmp_path):
+    frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=4, seconds=6.5))
+    sizes = replace(SIZES, extra_inputs=4)
+    config = CalibratedConfig(sizes, SHORT_LOOP, (4,), (1.0,), held_out_horizon=8, batch=2, held_out_stride=20)
+    rows = ablate(frame, config, ("synthetic-1",), tmp_path)
+    assert variants(config)["without washout"].anchor.washout_s == math.inf
+    assert all(math.isfinite(row["rmse_5_s_ratio"]["mean"]) for row in rows.values())
+    assert rows["as it is"] != rows["without traits"]
+    assert "RMSE 5 s" in ablation_table(rows)

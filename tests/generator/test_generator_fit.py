@@ -7,13 +7,13 @@ import torch
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
 from ganlane.files import save_weights
-from ganlane.generator.calibrated import CalibratedConfig
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import fit_generator
-from ganlane.generator.fitting import PaperConfig
+from ganlane.generator.fit_calibrated import CalibratedConfig
+from ganlane.generator.fit_paper import PaperConfig
+from ganlane.generator.loop import LoopConfig, learning_rate
 from ganlane.generator.losses import LossWeights
 from ganlane.generator.networks import Generator, GeneratorSizes
-from ganlane.generator.schedule import LoopConfig, learning_rate
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 HELD_OUT = ("synthetic-1",)
@@ -58,8 +58,8 @@ def test_fitting_the_calibrated_preset_runs_and_reports(frame):
 
 def test_the_calibrated_loss_falls(frame):
     from ganlane.data import scene_lane_widths
-    from ganlane.generator.calibrated import CalibratedTask
-    from ganlane.generator.tracks import scene_tracks
+    from ganlane.generator.fit_calibrated import CalibratedTask
+    from ganlane.generator.windows import scene_tracks
 
     fitted, held_out = scene_tracks(frame)
     task = CalibratedTask([fitted], [held_out], scene_lane_widths(frame), calibrated_config(24))

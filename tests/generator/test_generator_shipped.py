@@ -6,16 +6,14 @@ import pytest
 
 from ganlane.data import default_scenes, read_scenes, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.generator.calibrated import CalibratedConfig
 from ganlane.generator.checkpoint import load_generator, shipped_generator
-from ganlane.generator.fitting import PaperConfig
-from ganlane.generator.folds import split_scenes
+from ganlane.generator.fit_calibrated import CalibratedConfig
+from ganlane.generator.fit_paper import PaperConfig
 from ganlane.generator.groups import group_windows
-from ganlane.generator.metrics import open_loop
-from ganlane.generator.rollout_metrics import rollout_metrics
-from ganlane.generator.stretches import SceneSource
-from ganlane.generator.tracks import scene_tracks
-from ganlane.generator.windows import cut_windows
+from ganlane.generator.scores import rollout_errors, window_errors
+from ganlane.generator.segments import segment_sources
+from ganlane.generator.splits import split_scenes
+from ganlane.generator.windows import cut_windows, scene_tracks
 
 CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}
 
@@ -99,7 +97,7 @@ def test_the_stated_errors_of_the_paper_preset_are_those_of_the_shipped_weights(
     config = PaperConfig()
     _, held_out = split_scenes(scene_tracks(recordings), tuple(metadata["data"]["held_out"]))
     groups = group_windows(cut_windows(held_out, config.held_out_stride), config.group_size, config.seed)
-    measured = open_loop(generator, groups, tuple(scene.name for scene in held_out), config.seed)["all"]
+    measured = window_errors(generator, groups, config.seed)["all"]
     stated = metadata["metrics"]["all"]
     for name in ("ade_m/mean", "fde_m/mean", "ade_m/constant_velocity", "windows"):
         assert measured[name] == pytest.approx(stated[name], rel=0.01), name
@@ -109,8 +107,8 @@ def test_the_stated_errors_of_the_calibrated_preset_are_those_of_the_shipped_wei
     generator, metadata = load_generator(shipped_generator("calibrated"), "calibrated")
     config, widths = CalibratedConfig(), scene_lane_widths(recordings)
     _, held_out = split_scenes(scene_tracks(recordings), tuple(metadata["data"]["held_out"]))
-    sources = [SceneSource.of(scene, widths[scene.name]) for scene in held_out]
-    measured = rollout_metrics(
+    sources = segment_sources(held_out, widths)
+    measured = rollout_errors(
         generator, sources, config.held_out_horizon, config.held_out_stride, config.noise_period_s
     )["all"]
     for name in ("ade_m/mean", "end_m/mean", "end_m/constant_velocity", "windows"):

@@ -4,10 +4,8 @@ import pytest
 
 from ganlane.data.schema import SCHEMA
 from ganlane.errors import UserError
-from ganlane.generator.folds import split_scenes
-from ganlane.generator.groups import group_windows, kmeans_labels
-from ganlane.generator.tracks import scene_tracks
-from ganlane.generator.windows import OBSERVED_POSITIONS, WINDOW_FRAMES, cut_windows
+from ganlane.generator.splits import split_scenes
+from ganlane.generator.windows import OBSERVED_POSITIONS, WINDOW_FRAMES, cut_windows, scene_tracks
 
 
 def recording(seed: int = 0, scenes: int = 3, vehicles: int = 14) -> pl.DataFrame:
@@ -65,50 +63,6 @@ def test_a_window_carries_the_lane_and_length_of_its_vehicle():
     same = (pl.col("scene") == scene.name) & (pl.col("vehicle") == number) & (pl.col("frame") == now)
     record = frame.filter(same).row(0, named=True)
     assert (windows.lane[row], windows.length[row]) == (record["lane"], record["length"])
-
-
-def test_groups_never_mix_scenes_or_frames_and_lose_nobody():
-    windows = cut_windows(scene_tracks(recording()))
-    groups = group_windows(windows, size=4)
-    members = groups.window[groups.mask].numpy()
-    assert sorted(members) == list(range(len(windows.scene)))
-    for row in range(len(groups)):
-        inside = groups.window[row][groups.mask[row]].numpy()
-        assert len(set(zip(windows.scene[inside], windows.start[inside]))) == 1
-        assert (windows.scene[inside] == groups.scene[row].item()).all()
-
-
-def test_groups_hold_the_displacements_of_their_windows():
-    windows = cut_windows(scene_tracks(recording()))
-    groups = group_windows(windows, size=4)
-    inside = groups.window[5][groups.mask[5]].numpy()
-    kept = groups.displacements[5][groups.mask[5]].numpy()
-    np.testing.assert_allclose(kept, np.diff(windows.positions[inside], axis=1), atol=1e-6)
-    place = windows.positions[inside, OBSERVED_POSITIONS - 1]
-    np.testing.assert_allclose(groups.position[5][groups.mask[5]].numpy(), place - place.mean(0), atol=1e-4)
-
-
-def test_kmeans_puts_two_distant_platoons_into_two_groups():
-    platoon = np.array([[5.0 * k, 0.0] for k in range(9)])
-    labels = kmeans_labels(np.concatenate([platoon, platoon + 400.0]), size=9, seed=0)
-    assert len(set(labels[:9])) == len(set(labels[9:])) == 1
-    assert labels[0] != labels[9]
-
-
-def test_grouping_is_repeatable():
-    windows = cut_windows(scene_tracks(recording()))
-    one, other = group_windows(windows, 4, seed=3), group_windows(windows, 4, seed=3)
-    assert (one.window == other.window).all()
-
-
-def test_mirroring_turns_only_the_chosen_groups_round():
-    groups = group_windows(cut_windows(scene_tracks(recording())), size=4).select(slice(0, 2))
-    flipped = groups.mirrored(groups.scene == -1)
-    assert (flipped.displacements == groups.displacements).all()
-    flipped = groups.mirrored((groups.scene >= 0) & (groups.scene.cumsum(0) >= 0))
-    assert (flipped.displacements[..., 1] == -groups.displacements[..., 1]).all()
-    assert (flipped.displacements[..., 0] == groups.displacements[..., 0]).all()
-    assert (flipped.position[..., 1] == -groups.position[..., 1]).all()
 
 
 def test_split_keeps_every_scene_on_one_side():

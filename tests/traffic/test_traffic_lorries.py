@@ -13,7 +13,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import GanCalibratedTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.evaluation.realism.long import LongRunParameters
 from ganlane.evaluation.realism.spawned_scenes import spawned_frame
-from ganlane.generator.anchored import extra_inputs
+from ganlane.generator.closed_loop import extra_inputs
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.traffic import IdmTraffic
 

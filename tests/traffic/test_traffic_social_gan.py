@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from ganlane.errors import UserError
-from ganlane.generator.anchored import EXTRA_INPUTS
+from ganlane.generator.closed_loop import EXTRA_INPUTS
 from ganlane.generator.networks import Generator, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.road import Road

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.generator.traits import headway_from_uniform
+from ganlane.generator.rollout import headway_from_uniform
 from ganlane.sim.following import following_acceleration
 from ganlane.sim.hazard import random_side
 from ganlane.sim.neighbours import perceive

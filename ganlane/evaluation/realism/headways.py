@@ -3,8 +3,8 @@
 A driver who was recorded behind a leader has shown how closely it follows. A headway drawn blind contradicts that:
 half of the drivers would begin with hard braking, and the first seconds would measure nothing else. So a traffic
 whose drivers each have a headway of their own (a memory ``headway`` [N, M] in s) starts with the ones that balance
-the present gaps, as :func:`ganlane.generator.traits.typical_traits` does where generators are evaluated. Traffic
-whose headway is the same for everybody (IDM's Table V) keeps it: that is what its parameters say.
+the present gaps, as :func:`ganlane.generator.rollout.typical_driver_params` does where generators are evaluated.
+Traffic whose headway is the same for everybody (IDM's Table V) keeps it: that is what its parameters say.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from ganlane.generator.traits import HEADWAY_QUANTILES_S, SHORTEST_HEADWAY_S
+from ganlane.generator.rollout import HEADWAY_QUANTILES_S, SHORTEST_HEADWAY_S
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
 from ganlane.sim.road import Road

@@ -2,9 +2,8 @@ import pytest
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
-from ganlane.generator.folds import assign_folds, split_for_fit
-from ganlane.generator.tracks import scene_tracks
-from ganlane.generator.windows import WINDOW_FRAMES, count_windows, cut_windows
+from ganlane.generator.splits import assign_folds, split_for_fit
+from ganlane.generator.windows import WINDOW_FRAMES, count_windows, cut_windows, scene_tracks
 
 
 @pytest.fixture(scope="module")

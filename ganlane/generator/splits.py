@@ -1,19 +1,18 @@
-"""k folds by scene, and within a fold the scenes that choose when to stop: never the ones that are reported."""
+"""Splits of recorded scenes: fitted, validation (chooses when to stop) and held out (reported); k folds by scene."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 from ganlane.errors import UserError
-from ganlane.generator.tracks import SceneTracks
-from ganlane.generator.windows import WINDOW_FRAMES, count_windows
+from ganlane.generator.windows import WINDOW_FRAMES, SceneTracks, count_windows
 
-#: Share of the windows at hand that the validation scenes hold at least.
+#: Least share of the remaining windows that the validation scenes hold.
 VALIDATION_SHARE = 1 / 12
 
 
 class Split(NamedTuple):
-    """Scenes by what they are for: fitted to, choosing when to stop, and reported."""
+    """Scenes by use: fitted, validation (early stopping) and held out (reported)."""
 
     fitted: list[SceneTracks]
     validation: list[SceneTracks]
@@ -26,10 +25,10 @@ class Split(NamedTuple):
 
 
 def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]:
-    """Names of the scenes of every fold: the largest first, each into the fold with the fewest windows so far.
+    """Names of the scenes in each fold, balanced: the largest first, each to the fold with the fewest windows so far.
 
     Raises:
-        UserError: fewer than 2 folds, or more than scenes less one (a fold needs others to fit to and to stop by).
+        UserError: fewer than 2 folds, more folds than scenes with windows, or fewer than 3 such scenes.
     """
     usable = [scene for scene in scenes if count_windows(scene, WINDOW_FRAMES)]
     if not 2 <= folds <= len(usable) or len(usable) < 3:
@@ -49,8 +48,8 @@ def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]
 def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split:
     """The three parts of a fit that reports ``held_out``.
 
-    Of the other scenes the smallest choose when to stop: as few as hold a twelfth of the others' windows. Where
-    there is but one other scene it does both.
+    The smallest of the other scenes are for validation, as few as hold a twelfth of their windows. A single other
+    scene is used for both fitting and validation.
 
     Raises:
         UserError: as :func:`split_scenes`.
@@ -72,7 +71,7 @@ def split_scenes(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> tuple[
     """(others, held out), split by the scenes' names.
 
     Raises:
-        UserError: there is but one scene, a held-out name is not among them, or one of the two parts is empty.
+        UserError: there is only one scene, a held-out name is not among them, or one of the two parts is empty.
     """
     names = [scene.name for scene in scenes]
     if len(names) < 2:

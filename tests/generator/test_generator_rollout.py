@@ -3,13 +3,19 @@ import pytest
 import torch
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.anchored import EXTRA_INPUTS
+from ganlane.generator.closed_loop import EXTRA_INPUTS
+from ganlane.generator.losses import distance
 from ganlane.generator.networks import Generator, GeneratorSizes
-from ganlane.generator.rollout_metrics import closed_form_errors, rollout_metrics
-from ganlane.generator.rollouts import rollout
-from ganlane.generator.stretches import SceneSource, cut_stretches, extrapolate, intended_lanes
-from ganlane.generator.tracks import scene_tracks
-from ganlane.generator.traits import balanced_headway, fitting_traits, typical_traits
+from ganlane.generator.rollout import (
+    balanced_headway,
+    recorded_vehicles,
+    rollout,
+    sampled_driver_params,
+    typical_driver_params,
+)
+from ganlane.generator.scores import rollout_errors
+from ganlane.generator.segments import cut_segments, extrapolate, intended_lanes, segment_sources
+from ganlane.generator.windows import PRESENT, scene_tracks
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 WIDTH = 3.5
@@ -18,7 +24,8 @@ WIDTH = 3.5
 @pytest.fixture(scope="module")
 def sources():
     frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=7, seconds=8.0))
-    return [SceneSource.of(scene, WIDTH) for scene in scene_tracks(frame)]
+    scenes = scene_tracks(frame)
+    return segment_sources(scenes, {scene.name: WIDTH for scene in scenes})
 
 
 @pytest.fixture
@@ -44,8 +51,8 @@ def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(sources):
     assert first == max(0, crossed - 20)
 
 
-def test_cut_stretches_show_the_recorded_positions(sources):
-    scenes = cut_stretches([(sources[0], 3), (sources[1], 5)], horizon=6)
+def test_cut_segments_show_the_recorded_positions(sources):
+    scenes = cut_segments([(sources[0], 3), (sources[1], 5)], horizon=6)
     assert scenes.positions.shape == (2, 15, 7, 2)
     recorded = sources[1].scene.positions[5:20]
     shown = scenes.positions[1].numpy()
@@ -54,7 +61,7 @@ def test_cut_stretches_show_the_recorded_positions(sources):
 
 
 def test_mirroring_twice_changes_nothing_and_once_swaps_the_lanes(sources):
-    scenes = cut_stretches([(sources[0], 0)], horizon=4)
+    scenes = cut_segments([(sources[0], 0)], horizon=4)
     once = scenes.mirrored()
     torch.testing.assert_close(once.mirrored().positions, scenes.positions, atol=1e-5, rtol=0)
     assert (once.target_lane == 2 - scenes.target_lane).all()
@@ -62,10 +69,10 @@ def test_mirroring_twice_changes_nothing_and_once_swaps_the_lanes(sources):
 
 
 def test_a_rollout_is_the_same_with_more_padding(sources, generator):
-    scenes = cut_stretches([(sources[0], 0)], horizon=5)
-    headway, desired = typical_traits(scenes)
+    scenes = cut_segments([(sources[0], 0)], horizon=5)
+    headway, desired = typical_driver_params(scenes)
     course = rollout(generator, scenes, headway, desired, torch.zeros(1, 7, 4))
-    wide = cut_stretches([(sources[0], 0)], horizon=5)
+    wide = cut_segments([(sources[0], 0)], horizon=5)
     wide = type(wide)(
         positions=torch.nn.functional.pad(wide.positions, (0, 0, 0, 4)),
         present=torch.nn.functional.pad(wide.present, (0, 4)),
@@ -75,15 +82,15 @@ def test_a_rollout_is_the_same_with_more_padding(sources, generator):
         lanes=wide.lanes,
         lane_width=wide.lane_width,
     )
-    headway, desired = typical_traits(wide)
+    headway, desired = typical_driver_params(wide)
     padded = rollout(generator, wide, headway, desired, torch.zeros(1, 11, 4))
     torch.testing.assert_close(padded[:, :, :7], course)
 
 
 def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(sources, generator):
-    scenes = cut_stretches([(sources[0], 0)], horizon=9)
+    scenes = cut_segments([(sources[0], 0)], horizon=9)
     scenes.present[:, :12, 2] = False
-    headway, desired = typical_traits(scenes)
+    headway, desired = typical_driver_params(scenes)
     course = rollout(generator, scenes, headway, desired, torch.zeros(1, 7, 4))
     torch.testing.assert_close(course[:, :4, 2], scenes.future[:, :4, 2])
     assert not torch.allclose(course[:, 4:, 2], scenes.future[:, 4:, 2], atol=1e-5)
@@ -91,20 +98,20 @@ def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(sour
 
 
 def test_where_a_later_vehicle_goes_is_not_told(sources, generator):
-    scenes = cut_stretches([(sources[0], 0)], horizon=9)
+    scenes = cut_segments([(sources[0], 0)], horizon=9)
     scenes.present[:, :12, 2] = False
     altered = type(scenes)(**{name: value.clone() for name, value in vars(scenes).items()})
     altered.positions[:, 14:, 2] += 5.0
     courses = []
     for stretch in (scenes, altered):
-        headway, desired = typical_traits(stretch)
+        headway, desired = typical_driver_params(stretch)
         courses.append(rollout(generator, stretch, headway, desired, torch.zeros(1, 7, 4)))
     torch.testing.assert_close(courses[0], courses[1])
 
 
 def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(sources, generator):
-    scenes = cut_stretches([(sources[0], 0), (sources[1], 9)], horizon=6)
-    headway, desired = typical_traits(scenes)
+    scenes = cut_segments([(sources[0], 0), (sources[1], 9)], horizon=6)
+    headway, desired = typical_driver_params(scenes)
     course = rollout(generator, scenes, headway, desired, torch.randn(2, 7, 4), torch.randn(6, 2, 7, 4))
     (course - scenes.future).abs()[scenes.scored].sum().backward()
     for name, parameter in generator.named_parameters():
@@ -114,43 +121,44 @@ def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(sources, ge
 
 
 def test_nothing_of_the_future_enters_an_evaluation(sources, generator):
-    scenes = cut_stretches([(sources[0], 0)], horizon=5)
-    altered = cut_stretches([(sources[0], 0)], horizon=5)
+    scenes = cut_segments([(sources[0], 0)], horizon=5)
+    altered = cut_segments([(sources[0], 0)], horizon=5)
     altered.positions[:, 9:] += 7.0
     altered.target_lane[:, 9:] = 0
     courses = []
     for stretch in (scenes.without_intentions(), altered.without_intentions()):
-        headway, desired = typical_traits(stretch)
+        headway, desired = typical_driver_params(stretch)
         courses.append(rollout(generator, stretch, headway, desired, torch.zeros(1, 7, 4)))
     torch.testing.assert_close(courses[0], courses[1])
 
 
 def test_a_balanced_driver_neither_brakes_nor_speeds_up(sources):
-    scenes = cut_stretches([(sources[0], 0)], horizon=1)
+    scenes = cut_segments([(sources[0], 0)], horizon=1)
     desired = torch.full((1, 7), 30.0)
-    shown = balanced_headway(scenes, desired, torch.full((1, 7), -1.0))
+    shown = balanced_headway(recorded_vehicles(scenes, PRESENT, desired), scenes.road, torch.full((1, 7), -1.0))
     assert ((shown >= 0.5) | (shown == -1.0)).all()
     assert (shown != -1.0).any()
 
 
-def test_fitting_traits_are_above_the_present_speed_and_repeatable(sources):
-    scenes = cut_stretches([(sources[0], 0)], horizon=1)
-    one = fitting_traits(scenes, torch.Generator().manual_seed(4))
-    other = fitting_traits(scenes, torch.Generator().manual_seed(4))
+def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(sources):
+    scenes = cut_segments([(sources[0], 0)], horizon=1)
+    one = sampled_driver_params(scenes, torch.Generator().manual_seed(4))
+    other = sampled_driver_params(scenes, torch.Generator().manual_seed(4))
     assert all((a == b).all() for a, b in zip(one, other))
     speed = (scenes.positions[:, 8] - scenes.positions[:, 7]).norm(dim=-1) * 10
     assert (one[1] > speed + 0.99).all()
 
 
 def test_constant_velocity_errs_as_worked_by_hand(sources):
-    scenes = cut_stretches([(sources[0], 0)], horizon=4)
+    scenes = cut_segments([(sources[0], 0)], horizon=4)
     step = scenes.positions[0, 8, 3] - scenes.positions[0, 7, 3]
     expected = (scenes.positions[0, 8, 3] + 3 * step - scenes.positions[0, 11, 3]).norm()
-    assert closed_form_errors(scenes)[0, 2, 3].item() == pytest.approx(expected.item(), abs=1e-3)
+    errors = distance(scenes.constant_velocity, scenes.future)
+    assert errors[0, 2, 3].item() == pytest.approx(expected.item(), abs=1e-3)
 
 
 def test_metrics_name_every_scene_and_count_its_vehicles(sources, generator):
-    metrics = rollout_metrics(generator, sources, horizon=9, stride=20, noise_period_s=5.0)
+    metrics = rollout_errors(generator, sources, horizon=9, stride=20, noise_period_s=5.0)
     assert set(metrics) == {"all", "synthetic-0", "synthetic-1"}
     assert metrics["all"]["windows"] == metrics["synthetic-0"]["windows"] + metrics["synthetic-1"]["windows"]
     assert metrics["all"]["end_s"] == pytest.approx(0.9)

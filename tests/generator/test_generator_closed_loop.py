@@ -3,20 +3,24 @@ import math
 import pytest
 import torch
 
-from ganlane.generator.anchored import (
+from ganlane.generator.closed_loop import (
     ANCHOR,
     EXTRA_INPUTS,
+    STEEPEST,
     DriverMemory,
+    Plan,
     anchored_step,
     bounded,
+    displacement_of,
     inside_lane,
+    moved_by,
+    paper_step,
+    start,
+    wander,
     washout,
 )
-from ganlane.generator.history import STEEPEST, displacement_of, moved_by, start
 from ganlane.generator.networks import Generator, GeneratorSizes
-from ganlane.generator.noise import wander
-from ganlane.generator.paper import Plan, paper_step
-from ganlane.generator.traits import HEADWAY_QUANTILES_S, headway_from_uniform
+from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.road import Road

@@ -124,7 +124,7 @@ def roll_out(decisions: int, **options: Any) -> dict[str, Group]:
     }
 
 
-def rollouts(told: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
+def rollouts(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
     """Every traffic for long; every other option for a short while."""
     from ganlane.errors import UserError
 
@@ -190,7 +190,7 @@ def results_in(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "results.json").read_text(encoding="utf-8"))
 
 
-def trainings(told: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
+def trainings(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
     """Tiny runs: from scratch with a first phase, the same gone on with, and warm-started from a shipped agent."""
     scratch, warm = work / "scratch", work / "warm"
     run_command("train", scratch, *FROM_SCRATCH, *TWO_PHASES)
@@ -202,16 +202,16 @@ def trainings(told: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group
     yield "warm-started, weights", weights_of(warm / "agent.safetensors")
 
 
-def evaluations(told: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
+def evaluations(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
     """One table of all drivers on two traffics, a row each."""
     folder = work / "evaluation"
     names = (f"agents=[{','.join(AGENTS)}]", "traffics=[idm_mobil,gan_calibrated]")
-    run_command("evaluate", folder, *names, f"episodes={told.episodes}")
+    run_command("evaluate", folder, *names, f"episodes={arguments.episodes}")
     for row in results_in(folder)["rows"]:
-        yield f"{row['agent']} on {row['traffic']}, {told.episodes} episodes", values_of(row)
+        yield f"{row['agent']} on {row['traffic']}, {arguments.episodes} episodes", values_of(row)
 
 
-def cards(told: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
+def cards(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
     """The quick realism card of the calibrated traffic, its parts one by one."""
     folder = work / "realism"
     run_command("realism", folder, "quick=true", "traffic=gan_calibrated")
@@ -220,13 +220,15 @@ def cards(told: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
         yield f"quick card, {name}", values_of(results[name])
 
 
-def loaders(told: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
+def loaders(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
     """The agents that ship: their weights, and what they decide."""
     import ganlane
 
     for name in SHIPPED_AGENTS:
         agent = ganlane.load_agent(name)
-        yield f"{name}, weights", {key: digest(value) for key, value in agent.policy.state_dict().items()}
+        state = agent.policy.state_dict()
+        # The noise of noisy layers is drawn when they are made, and is no weight.
+        yield f"{name}, weights", {key: digest(value) for key, value in state.items() if "epsilon" not in key}
         form = agent.observation.name if hasattr(agent.observation, "name") else "lane_view_overlap"
         env = ganlane.make_env(traffic="idm_mobil", num_envs=ROWS, observation=form, stream="report")
         actions = env.rollout(SHORT, agent.policy, break_when_any_done=False)["action"]
@@ -243,11 +245,11 @@ SECTIONS: dict[str, Callable[[argparse.Namespace, Path], Iterator[tuple[str, Gro
 }
 
 
-def record(told: argparse.Namespace, section: str) -> dict[str, Group]:
+def record(arguments: argparse.Namespace, section: str) -> dict[str, Group]:
     """The digests of a section, by name."""
     with tempfile.TemporaryDirectory() as work:
         found = {}
-        for name, group in SECTIONS[section](told, Path(work)):
+        for name, group in SECTIONS[section](arguments, Path(work)):
             print(f"{section}: {name}", file=sys.stderr, flush=True)
             found[name] = group
         return found
@@ -265,19 +267,19 @@ def verdict(before: Group | None, after: Group | None) -> str:
     return f"DIFFERS: {', '.join(names[:4])}" + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def make(told: argparse.Namespace, section: str, path: Path) -> list[tuple[str, str]]:
+def make(arguments: argparse.Namespace, section: str, path: Path) -> list[tuple[str, str]]:
     """Record a section into its file."""
-    found = record(told, section)
+    found = record(arguments, section)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return [(f"{section}: {name}", f"{len(group)} digests") for name, group in found.items()]
 
 
-def compare(told: argparse.Namespace, section: str, path: Path) -> list[tuple[str, str]]:
+def compare(arguments: argparse.Namespace, section: str, path: Path) -> list[tuple[str, str]]:
     """Record a section again and hold it against its file."""
     if not path.is_file():
-        sys.exit(f"{path}: no such file; run `make {told.folder}` before the change.")
-    before, after = json.loads(path.read_text(encoding="utf-8")), record(told, section)
+        sys.exit(f"{path}: no such file; run `make {arguments.folder}` before the change.")
+    before, after = json.loads(path.read_text(encoding="utf-8")), record(arguments, section)
     names = [*before, *(name for name in after if name not in before)]
     return [(f"{section}: {name}", verdict(before.get(name), after.get(name))) for name in names]
 
@@ -289,14 +291,16 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="where the digests are, outside the repository")
     parser.add_argument("--episodes", type=int, default=64, help="of the evaluation; the same in both tasks")
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     lines: list[tuple[str, str]] = []
-    for section in told.only:
-        lines += (make if told.task == "make" else compare)(told, section, told.folder / f"{section}.json")
+    for section in arguments.only:
+        lines += (make if arguments.task == "make" else compare)(
+            arguments, section, arguments.folder / f"{section}.json"
+        )
     width = max(len(name) for name, _ in lines)
-    print(*(f"{name.ljust(width)}  {said}" for name, said in lines), sep="\n")
-    differing = [name for name, said in lines if said.startswith(("DIFFERS", "GONE"))]
+    print(*(f"{name.ljust(width)}  {result}" for name, result in lines), sep="\n")
+    differing = [name for name, result in lines if result.startswith(("DIFFERS", "GONE"))]
     print(f"{len(lines)} compared or recorded, {len(differing)} differ")
     return 1 if differing else 0
 

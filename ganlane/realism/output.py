@@ -98,13 +98,13 @@ def document_text(tables: Sequence[str], numbers: Mapping[str, Any], command: st
     here, code = machine(), code_version()
     revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
     excess = ", ".join(f"{name} {value:g}" for name, value in numbers["desired_above_mps"].items())
-    said = [
+    paragraphs = [
         f"Written by the command on {written}:\n\n    {command}",
         f"Taken with Python {here['python']}, torch {here['torch']}, ganlane {code['version']}{revision}, from "
         f"{numbers['starts']} starts: {', '.join(numbers['scenes']) or 'none recorded'}. Desired speeds above the "
         f"speed at entry, mean, m/s: {excess or 'not fitted'}.",
     ]
-    return "\n\n".join([*said, *(f"```text\n{table}\n```" for table in tables)])
+    return "\n\n".join([*paragraphs, *(f"```text\n{table}\n```" for table in tables)])
 
 
 def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:

@@ -19,7 +19,7 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.evaluation.counts import poisson_interval
 from ganlane.files import write_json
-from ganlane.generator.traits import headway_from_uniform
+from ganlane.generator.rollout import headway_from_uniform
 from ganlane.paths import CHECKPOINTS
 from ganlane.realism.distances import Array, ceiling
 from ganlane.realism.quantities import QUANTITIES, Measured

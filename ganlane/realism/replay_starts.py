@@ -27,7 +27,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.generator.traits import HEADWAY_QUANTILES_S, SHORTEST_HEADWAY_S
+from ganlane.generator.rollout import HEADWAY_QUANTILES_S, SHORTEST_HEADWAY_S
 from ganlane.realism.recordings import Recording, frame_of
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import ENTRY_M

@@ -59,8 +59,8 @@ def _offered(env: EnvConfig, stream: int) -> dict[str, Any]:
     return {
         "road": make_road(env),
         "stream": stream,
-        "idm": env.idm.parameters(),
-        "mobil": env.mobil.parameters(),
+        "idm": env.idm,
+        "mobil": env.mobil,
         "steering": STEERING,
         "spawn": env.spawn_parameters(),
     }
@@ -111,9 +111,9 @@ def make_env(
         num_envs,
         env.vehicles,
         env.spawn_parameters(),
-        env.ego.parameters(),
+        env.ego,
         env.episode_parameters(),
-        env.idm.parameters(),
+        env.idm,
         stream=traffic.stream,
         seed=seed,
         first_episode=first_episode,
@@ -138,7 +138,7 @@ def _mask_transforms(mask: MaskConfig, base: HighwayEnv, env: EnvConfig) -> list
     """The transform that ``mask`` asks for; none for ``mask=none``."""
     if mask.form == "none":
         return []
-    judged_by, abort = env.idm.parameters(), env.ego.abort_lane_change
+    judged_by, abort = env.idm, env.ego.abort_lane_change
     return [ActionMaskTransform(base.road, mask.form, mask.safe_deceleration, judged_by, abort)]
 
 

@@ -10,13 +10,14 @@ from typing import Any, TypeAlias
 
 from omegaconf import OmegaConf
 
-from ganlane.config.checks import did_you_mean
 from ganlane.config.mask import MASKS
 from ganlane.config.messages import CONFIG_ERRORS, sentence
+from ganlane.config.nodes import made, node_of
 from ganlane.config.observation import FORMS
 from ganlane.config.store import SCHEMAS
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import did_you_mean
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
@@ -94,11 +95,11 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
         UserError: an unknown key, a value of the wrong type or out of range.
     """
     try:
-        node = OmegaConf.structured(config)
+        node = node_of(config)
         holder: Any = OmegaConf.create({where: node}) if where else node
         given = {name: _plain(value) for name, value in values.items()}
         merged: Any = OmegaConf.merge(holder, {where: given} if where else given)
-        return OmegaConf.to_object(merged.get(where) if where else merged)
+        return made(merged.get(where) if where else merged, where)
     except CONFIG_ERRORS as error:
         told = sentence(error).replace("; run the command with --help to see all keys", "")
         raise UserError(told) from error
@@ -110,6 +111,8 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return node_of(value)
     if isinstance(value, Path):
         return str(value)
     return value.item() if hasattr(value, "item") else value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -66,7 +65,7 @@ def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehi
 
     The length of the decision stands outside the rules, so that compiled graphs serve whatever it is.
     """
-    rules = env.rules._replace(episode=replace(env.rules.episode, goal_m=math.inf, timeout_s=1e9))
+    rules = env.rules._replace(episode=replace(env.rules.episode, goal_m=1e9, timeout_s=1e9))
     vehicles, ego = Vehicles.of(state.get(keys.VEHICLES)), dict(state.get(keys.EGO).items())
     keep = torch.full_like(state.get(keys.STEP), keys.KEEP)
     start, _ = env.physics.begin(rules, keep, vehicles, ego, state.get(keys.STEP))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import above, at_least, between, check, every, number, one_of, optional
 from ganlane.config.observation import LISTS, ObservationConfig
 from ganlane.config.plain import plain_copy
 from ganlane.errors import UserError
+from ganlane.parameters.checks import above, at_least, between, check, every, number, one_of, optional
 
 if TYPE_CHECKING:
     from ganlane.agents import RainbowConfig

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from ganlane.config.agent import AgentConfig
-from ganlane.config.checks import Rule, between, check, every, one_of
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import NAMES, all_traffics
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import Rule, between, check, every, one_of
 
 SUITES = ("sim", "traffic", "train")
 MODES = ("eager", "compiled")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.config.checks import Rule, at_least, between, check, did_you_mean, one_of
 from ganlane.config.env import EnvConfig
 from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
@@ -15,6 +14,7 @@ from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficC
 from ganlane.config.traffic_mixed import MixedTrafficConfig, reacting_traffics
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import Rule, at_least, between, check, did_you_mean, one_of
 
 #: Families of episodes that can be driven for a table: to choose on, to report on.
 STREAMS = ("report", "select")

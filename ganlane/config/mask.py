@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ganlane.config.checks import above, check, one_of
+from ganlane.parameters.checks import above, check, one_of
 
 #: As in :data:`ganlane.transforms.MASKS`; repeated here so that a wrong name is found without loading torch.
 MASKS = ("none", "legal", "safe")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import above, at_least, between, check, one_of
 from ganlane.config.plain import plain_copy
+from ganlane.parameters.checks import above, at_least, between, check, one_of
 
 if TYPE_CHECKING:
     from ganlane.transforms.sensors import SensorParameters

@@ -6,7 +6,6 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ganlane.config.checks import Rule, above, at_least, between, check, every, optional, text
 from ganlane.config.env import EnvConfig
 from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
@@ -14,6 +13,7 @@ from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import Rule, above, at_least, between, check, every, optional, text
 
 #: Films of one episode; pages and tables of any number of episodes.
 FILMS = ("gif", "mp4", "png")

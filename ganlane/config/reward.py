@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import at_most, below, check, number
 from ganlane.config.plain import plain_copy
 from ganlane.errors import UserError
+from ganlane.parameters.checks import at_most, below, check, number
 
 if TYPE_CHECKING:
     from ganlane.config.env import EnvConfig

@@ -18,6 +18,7 @@ from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorCo
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
 from ganlane.config.mask import MaskConfig
+from ganlane.config.nodes import node_of
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.prepare import PrepareConfig
 from ganlane.config.realism import RealismConfig
@@ -97,5 +98,5 @@ def register() -> None:
         for name, schema in options.items():
             # Storing one takes OmegaConf milliseconds, and a command comes here twice.
             if f"{name}{SUFFIX}.yaml" not in kept:
-                store.store(group=group or None, name=name + SUFFIX, node=schema, provider="ganlane")
+                store.store(group=group or None, name=name + SUFFIX, node=node_of(schema), provider="ganlane")
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)

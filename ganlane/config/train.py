@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ganlane.config.agent import AgentConfig, check_agent
-from ganlane.config.checks import at_least, between, check
 from ganlane.config.collector import CollectorConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import NAMES
@@ -17,6 +16,7 @@ from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import at_least, between, check
 
 
 @dataclass

@@ -5,7 +5,7 @@ order, what each driver sees (:func:`perceive`, :mod:`~ganlane.sim.lanes`, :mod:
 hard it accelerates (:mod:`~ganlane.sim.idm`, :mod:`~ganlane.sim.following`), whether it changes lanes
 (:mod:`~ganlane.sim.mobil`), how it turns the wheel (:mod:`~ganlane.sim.steering`), where the car goes
 (:mod:`~ganlane.sim.bicycle`) and whether it hits something (:mod:`~ganlane.sim.collisions`).
-:mod:`~ganlane.sim.spawn` makes the first scene of an episode, :mod:`~ganlane.sim.episode` says when one ends,
+:mod:`~ganlane.sim.spawn` makes the first scene of an episode,
 :mod:`~ganlane.sim.recycle` keeps the road populated and :mod:`~ganlane.sim.random` makes every random number.
 """
 

@@ -2,35 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class IdmParameters:
-    """Table V. Lengths in metres, times in seconds, accelerations in m/s2.
-
-    The acceleration exponent is 4, written out as two squarings: a tensor power is not the same bit for bit
-    at every batch size.
-    """
-
-    min_gap_m: float = 2.0
-    headway_s: float = 1.6
-    comfortable_deceleration: float = 1.7
-    min_acceleration: float = -20.0
-    max_acceleration: float = 0.7
-
-    def per_lane(self) -> IdmParameters:
-        """The same for every lane and every pair."""
-        return self
-
-    def brake_scale(self) -> float:
-        """``2 sqrt(a b)`` of the approach term, m/s2."""
-        return 2.0 * math.sqrt(self.max_acceleration * self.comfortable_deceleration)
+from ganlane.parameters.driving import IdmParameters
 
 
 class DriverIdm(NamedTuple):

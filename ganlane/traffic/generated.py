@@ -15,7 +15,7 @@ from ganlane.generator.history import History, start
 from ganlane.generator.networks import Generator
 from ganlane.generator.noise import wander
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Purpose, Stream, normal
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

@@ -18,7 +18,7 @@ from ganlane.config import agent as agent_config
 from ganlane.config.agent import AgentConfig, DqnConfig, check_agent
 from ganlane.config.compose import check
 from ganlane.config.data import NgsimDataConfig
-from ganlane.config.env import EgoConfig, EnvConfig, IdmConfig, MobilConfig
+from ganlane.config.env import EnvConfig
 from ganlane.config.generator import (
     CalibratedGeneratorConfig,
     CalibratedLoopOptions,
@@ -39,7 +39,6 @@ from ganlane.config.traffic_faults import (
     ReactionFaultsConfig,
 )
 from ganlane.data import NgsimParameters
-from ganlane.env import EpisodeParameters
 from ganlane.errors import UserError
 from ganlane.generator import (
     CalibratedConfig,
@@ -49,11 +48,10 @@ from ganlane.generator import (
     load_generator,
     shipped_generator,
 )
+from ganlane.parameters.driving import EgoParameters
 from ganlane.paths import conf_folder
 from ganlane.phases.description import describe
 from ganlane.phases.phase import phases_of
-from ganlane.sim import IdmParameters, MobilParameters, SpawnParameters
-from ganlane.sim.ego import EgoParameters
 from ganlane.traffic import AbortFaults, BrakingFaults, HesitationFaults, ReactionFaults
 from ganlane.traffic.presets import DriverFaults
 from ganlane.transforms import OBSERVATIONS, RewardParameters, SensorParameters
@@ -120,11 +118,6 @@ def test_no_schema_is_without_its_yaml():
 
 
 MIRRORS = [
-    (IdmConfig(), IdmParameters, set()),
-    (MobilConfig(), MobilParameters, set()),
-    (EgoConfig(), EgoParameters, {"visibility"}),
-    (EnvConfig(), SpawnParameters, set()),
-    (EnvConfig(), EpisodeParameters, set()),
     (AgentConfig(), RainbowConfig, set()),
     (RewardConfig(), RewardParameters, set()),
     (ObservationConfig(), ObservationScale, set()),
@@ -188,7 +181,7 @@ def test_who_learns_only_when_free_cannot_turn_back():
     agent, observation = AgentConfig(decide_when_free=True), ObservationConfig()
     check_agent(agent, observation, EnvConfig())
     with pytest.raises(UserError, match=r"env\.ego\.abort_lane_change=true"):
-        check_agent(agent, observation, EnvConfig(ego=EgoConfig(abort_lane_change=True)))
+        check_agent(agent, observation, EnvConfig(ego=EgoParameters(abort_lane_change=True)))
 
 
 @pytest.mark.parametrize("form", FORMS)

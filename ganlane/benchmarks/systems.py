@@ -14,10 +14,10 @@ from ganlane.benchmarks.case import COMPILED, Runner
 from ganlane.build import make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.decision import Decision
+from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.vehicles import Vehicles
 
@@ -32,7 +32,7 @@ class Scenario:
     env: EnvConfig
     traffic: TrafficConfig
     observation: ObservationConfig
-    reward: RewardConfig
+    reward: RewardParameters
     seed: int = 0
 
 

@@ -10,6 +10,7 @@ from ganlane.parameters.checks import above, between, check
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.parameters.records import assign, part_of
+from ganlane.parameters.reward import RewardParameters
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import Scenes
@@ -77,6 +78,15 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     def episode_parameters(self) -> EpisodeParameters:
         """Decision period, goal and time-out alone."""
         return part_of(self, EpisodeParameters)
+
+
+def check_pay(env: EnvConfig, reward: RewardParameters) -> None:
+    """The speed reward runs from 0 at its base speed to 1 at the ego's desired speed, so that must be the higher."""
+    if env.ego_desired_speed_mps <= reward.base_speed_mps:
+        raise UserError(
+            f"env.ego_desired_speed_mps={env.ego_desired_speed_mps:g}: expected more than reward.base_speed_mps="
+            f"{reward.base_speed_mps:g}, where the speed reward is 0; raise the one or lower the other."
+        )
 
 
 @dataclass(frozen=True)

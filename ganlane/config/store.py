@@ -17,13 +17,11 @@ from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorConfig
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
-from ganlane.config.mask import MaskConfig
 from ganlane.config.nodes import node_of
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.prepare import PrepareConfig
 from ganlane.config.realism import RealismConfig
 from ganlane.config.render import RenderConfig
-from ganlane.config.reward import ConsiderateRewardConfig, RewardConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -44,6 +42,8 @@ from ganlane.config.traffic_random import IdmRandomTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.reward import RewardParameters
 
 #: Group (empty at the root) to schema name to dataclass.
 SCHEMAS: dict[str, dict[str, Any]] = {
@@ -80,8 +80,8 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
     "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
     "observation": {"observation": ObservationConfig},
-    "mask": {"mask": MaskConfig},
-    "reward": {"paper": RewardConfig, "considerate": ConsiderateRewardConfig},
+    "mask": {"mask": MaskParameters},
+    "reward": {"paper": RewardParameters},
     "collector": {"single": CollectorConfig, "multi": MultiCollectorConfig, "ray": RayCollectorConfig},
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},

@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 
 from ganlane.config.agent import AgentConfig, check_agent
 from ganlane.config.collector import CollectorConfig
-from ganlane.config.env import EnvConfig
+from ganlane.config.env import EnvConfig, check_pay
 from ganlane.config.evaluate import NAMES
 from ganlane.config.init import InitConfig
 from ganlane.config.logger import LoggerConfig
-from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters.checks import at_least, between, check
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.reward import RewardParameters
 
 
 @dataclass
@@ -64,8 +64,8 @@ class TrainConfig(RunConfig):
     init: InitConfig = field(default_factory=InitConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskConfig = field(default_factory=MaskConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
+    mask: MaskParameters = field(default_factory=MaskParameters)
+    reward: RewardParameters = field(default_factory=RewardParameters)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)

@@ -19,11 +19,11 @@ from ganlane.config.agent import AgentConfig
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.reward import RewardParameters
 
-SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardConfig())
+SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())
 TRAFFICS = {"idm_mobil": IdmMobilTrafficConfig(), "idm": IdmTrafficConfig()}
 RAINBOW = AgentConfig(hidden=[16, 16], batch_size=32, decisions_per_update=8, capacity=512, warmup=64).rainbow()
 TRAINING = Training(SCENARIO, RAINBOW, stored=300)

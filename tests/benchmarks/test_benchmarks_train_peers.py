@@ -14,10 +14,10 @@ from ganlane.benchmarks.train_peer import baselines_case, start_baselines
 from ganlane.config.agent import AgentConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
+from ganlane.parameters.reward import RewardParameters
 
-SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardConfig())
+SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())
 RAINBOW = AgentConfig(hidden=[16, 16], batch_size=32, decisions_per_update=8, capacity=512, warmup=64).rainbow()
 TRAINING = Training(SCENARIO, RAINBOW, stored=128)
 

@@ -21,7 +21,7 @@ ROAD = EnvConfig(lanes=2, idm=IdmParameters(headway_s=1.2), mobil=MobilParameter
 
 @pytest.mark.parametrize("form", FORMS)
 def test_built_environments_keep_their_specs(form):
-    check_env_specs(make_env(make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(form), num_envs=2))
+    check_env_specs(make_env(make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(form=form), num_envs=2))
 
 
 def test_a_reset_runs_the_episodes_that_were_asked_for():

@@ -34,8 +34,8 @@ class ParameterError(UserError):
         return re.sub(r"\{([\w.]+)\}", rf"{place}\1", self.text)
 
     def below(self, where: str) -> ParameterError:
-        """The same with the record's key, unless it has one."""
-        return self if self.where else ParameterError(self.text, where)
+        """The same with the record's key."""
+        return ParameterError(self.text, where)
 
 
 def as_typed(value: Any) -> str:

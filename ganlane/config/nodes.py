@@ -38,6 +38,8 @@ def made(node: Any, where: str = "") -> Any:
     try:
         return OmegaConf.to_object(node)
     except ParameterError as error:
+        if error.where:
+            raise
         raise error.below(_refused(node, where)) from error
 
 

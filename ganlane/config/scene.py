@@ -9,7 +9,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError, as_typed
 from ganlane.parameters.checks import above, at_least, between, check
 from ganlane.parameters.driving import Visibility
-from ganlane.parameters.records import assign
+from ganlane.parameters.records import assign, lists_to_tuples
 
 if TYPE_CHECKING:
     from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
@@ -51,6 +51,7 @@ class SceneEnvConfig(EnvConfig):
     scene: SceneOptions = field(default_factory=SceneOptions)
 
     def __post_init__(self) -> None:
+        lists_to_tuples(self)
         self._refuse_table_ii()
         check(self, lane_width_m=above(0), lanes=between(1, 20), ego_desired_speed_mps=above(0))
         self._count_vehicles()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ganlane.config.agent import AgentConfig
 from ganlane.config.env import EnvConfig, check_pay
 from ganlane.config.evaluate import NAMES, all_traffics
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.checks import Rule, between, check, every, one_of
 from ganlane.parameters.reward import RewardParameters
 
@@ -57,7 +57,7 @@ class BenchConfig:
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     reward: RewardParameters = field(default_factory=RewardParameters)
-    agent: AgentConfig = field(default_factory=AgentConfig)
+    agent: RainbowConfig = field(default_factory=RainbowConfig)
 
     def __post_init__(self) -> None:
         sizes = between(1, 2**20)

@@ -8,7 +8,6 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from ganlane.config.agent import AgentConfig, DqnConfig
 from ganlane.config.bench import BenchConfig
 from ganlane.config.collector import CollectorConfig, MultiCollectorConfig, RayCollectorConfig
 from ganlane.config.data import DataConfig, HighdDataConfig, NgsimDataConfig
@@ -42,6 +41,7 @@ from ganlane.config.traffic_random import IdmRandomTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
+from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.observation import MaskParameters
 from ganlane.parameters.reward import RewardParameters
 
@@ -78,7 +78,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "highway_env": HighwayEnvTrafficConfig,
     },
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
-    "agent": {"rainbow": AgentConfig, "dqn": DqnConfig},
+    "agent": {"rainbow": RainbowConfig},
     "observation": {"observation": ObservationConfig},
     "mask": {"mask": MaskParameters},
     "reward": {"paper": RewardParameters},

@@ -68,7 +68,7 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "env": plain(config.env),
         "num_envs": config.collector.environments,
         "code": code_version(),
-        "agent": asdict(config.agent),
+        "agent": plain(config.agent),
         "reward": asdict(config.reward),
         "training": training,
     }

@@ -12,10 +12,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from ganlane.__main__ import COMMANDS
-from ganlane.agents import RainbowConfig
-from ganlane.agents.encoder import ENCODERS
-from ganlane.config import agent as agent_config
-from ganlane.config.agent import AgentConfig, DqnConfig, check_agent
+from ganlane.agents import RainbowConfig, read_agent
 from ganlane.config.compose import check
 from ganlane.config.data import NgsimDataConfig
 from ganlane.config.env import EnvConfig
@@ -36,6 +33,7 @@ from ganlane.config.traffic_faults import (
     IdmFaultsTrafficConfig,
     ReactionFaultsConfig,
 )
+from ganlane.config.train import check_agent
 from ganlane.data import NgsimParameters
 from ganlane.errors import UserError
 from ganlane.generator import (
@@ -125,7 +123,6 @@ def test_no_schema_is_without_its_yaml():
 
 
 MIRRORS = [
-    (AgentConfig(), RainbowConfig, set()),
     (NgsimDataConfig(), NgsimParameters, {"block_bytes"}),
     (LoopOptions(), LoopConfig, set()),
     (WeightOptions(), LossWeights, set()),
@@ -165,15 +162,14 @@ def test_observation_forms_are_those_of_the_transform():
     assert set(FORMS) == set(OBSERVATIONS)
 
 
-def test_encoders_are_those_of_the_agent():
-    assert agent_config.ENCODERS == ENCODERS
-    assert check("train", ["agent.encoder=shared", "observation=table3"]).config.agent.rainbow().encoder == "shared"
+def test_the_shared_encoder_can_be_chosen():
+    assert config_of("train", "agent.encoder=shared", "observation=table3").agent.encoder == "shared"
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_the_encoder_is_for_lists_of_vehicles_alone(form):
-    given = AgentConfig(encoder="shared"), ObservationConfig(form=form), EnvConfig()
-    check_agent(AgentConfig(), *given[1:])
+    given = RainbowConfig(encoder="shared"), ObservationConfig(form=form), EnvConfig()
+    check_agent(RainbowConfig(), *given[1:])
     if form in LISTS:
         check_agent(*given)
     else:
@@ -182,7 +178,7 @@ def test_the_encoder_is_for_lists_of_vehicles_alone(form):
 
 
 def test_who_learns_only_when_free_cannot_turn_back():
-    agent, observation = AgentConfig(decide_when_free=True), ObservationConfig()
+    agent, observation = RainbowConfig(decide_when_free=True), ObservationConfig()
     check_agent(agent, observation, EnvConfig())
     with pytest.raises(UserError, match=r"env\.ego\.abort_lane_change=true"):
         check_agent(agent, observation, EnvConfig(ego=EgoParameters(abort_lane_change=True)))
@@ -210,8 +206,31 @@ def test_the_reward_stands_in_the_agents_metadata():
     assert describe(config, phases_of(config, Path("run"))[-1])["reward"]["soft_crash_behind"] == -10.0
 
 
+@pytest.mark.parametrize("name", ["agent_idm", "agent_gan"])
+def test_metadata_are_laid_out_as_in_the_agents_of_released_versions(name):
+    config = config_of("train")
+    now, shipped = describe(config, phases_of(config, Path("run"))[-1]), read_agent(name)[2]
+    parts = [part for part in ("env", "agent", "reward", "observation_scale") if part in shipped]
+    assert parts
+    for part in parts:
+        assert flat_types(shipped[part]).items() <= flat_types(now[part]).items(), part
+
+
+def flat_types(node, prefix=""):
+    """Type of each value by its dotted key; a whole number may stand for any, and null for anything."""
+    found = {}
+    for key, value in node.items():
+        nested = flat_types(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": kind(value)}
+        found.update(nested)
+    return found
+
+
+def kind(value):
+    return "number" if type(value) in (int, float) or value is None else type(value).__name__
+
+
 def test_dqn_switches_every_component_off():
-    config = DqnConfig()
+    config = config_of("train", "agent=dqn").agent
     assert not any((config.noisy, config.dueling, config.distributional, config.double, config.prioritised))
     assert config.n_step == 1
 

@@ -14,6 +14,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.realism import Factory, Fold, check_cover, fold_weights
 from ganlane.generator import HELD_OUT
+from ganlane.parameters.records import assign
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.traffic import TrafficModule
@@ -42,7 +43,7 @@ def _maker(traffic: TrafficConfig, env: EnvConfig) -> Factory:
     def make(road: Road) -> TrafficModule:
         # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
         own = copy(env)
-        own.lanes, own.lane_width_m = int(road.lanes), float(road.lane_width_m)
+        assign(own, lanes=int(road.lanes), lane_width_m=float(road.lane_width_m))
         return make_traffic(traffic, own, Stream.REPORT)
 
     return make

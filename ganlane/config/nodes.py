@@ -51,5 +51,5 @@ def _refused(node: DictConfig, key: str) -> str:
             try:
                 OmegaConf.to_object(child)
             except ParameterError:
-                return _refused(child, f"{key}.{name}" if key else str(name))
+                return _refused(child, f"{key}.{name!s}" if key else str(name))
     return key

@@ -91,7 +91,7 @@ def optional(rule: Rule) -> Rule:
     return Rule(lambda value: value is None or rule.holds(value), f"null or {rule.expected}")
 
 
-def check(config: Any, where: str = "", **rules: Rule) -> None:
+def check(config: Any, where: str = "", /, **rules: Rule) -> None:
     """Hold fields of a dataclass against ``rules``.
 
     Args:

@@ -9,7 +9,7 @@ Record = TypeVar("Record")
 
 
 def assign(record: Any, **values: Any) -> None:
-    """Set fields of a frozen ``record``; for its ``__post_init__`` alone."""
+    """Set fields of a frozen ``record``; for its ``__post_init__``, or of a copy that is not to be checked."""
     for name, value in values.items():
         object.__setattr__(record, name, value)
 

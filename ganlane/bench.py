@@ -99,7 +99,7 @@ def train_suite(config: BenchConfig) -> Suite:
     options = TrainOptions(
         scenario=Scenario(config.env, config.traffic, config.observation, config.reward, config.seed),
         traffics=config.chosen_train_traffics(),
-        agent=config.agent.rainbow(),
+        agent=config.agent.for_phase(1),
         batches=tuple(config.train_batches),
         modes=tuple(config.modes),
         threads=tuple(config.threads),

@@ -23,13 +23,13 @@ from ganlane.agents.checkpoint import SHIPPED
 from ganlane.agents.drivers import DRIVERS
 from ganlane.agents.policy import MaskedPolicy
 from ganlane.config.env import EnvConfig
-from ganlane.config.mask import MASKS, MaskConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.targets import call_with, import_target
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.errors import UserError
+from ganlane.errors import ParameterError, UserError
+from ganlane.parameters.observation import MASKS, MaskParameters
+from ganlane.parameters.reward import RewardParameters
 from ganlane.paths import CHECKPOINTS
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
@@ -59,8 +59,8 @@ def _offered(env: EnvConfig, stream: int) -> dict[str, Any]:
     return {
         "road": make_road(env),
         "stream": stream,
-        "idm": env.idm.parameters(),
-        "mobil": env.mobil.parameters(),
+        "idm": env.idm,
+        "mobil": env.mobil,
         "steering": STEERING,
         "spawn": env.spawn_parameters(),
     }
@@ -93,27 +93,27 @@ def make_env(
     traffic: TrafficModule,
     env: EnvConfig,
     observation: ObservationConfig | None = None,
-    reward: RewardConfig | None = None,
+    reward: RewardParameters | None = None,
     num_envs: int = 1,
     seed: int = 0,
     device: str = "cpu",
     first_episode: int = 0,
-    mask: MaskConfig | None = None,
+    mask: MaskParameters | None = None,
 ) -> TransformedEnv:
     """A batched environment with observation, reward and, where asked for, action mask; its stream is the traffic's.
 
     Raises:
         UserError: see :class:`ganlane.env.HighwayEnv`.
     """
-    observation, reward = observation or ObservationConfig(), reward or RewardConfig()
+    observation, reward = observation or ObservationConfig(), reward or RewardParameters()
     base = HighwayEnv(
         traffic,
         num_envs,
         env.vehicles,
         env.spawn_parameters(),
-        env.ego.parameters(),
+        env.ego,
         env.episode_parameters(),
-        env.idm.parameters(),
+        env.idm,
         stream=traffic.stream,
         seed=seed,
         first_episode=first_episode,
@@ -122,23 +122,26 @@ def make_env(
         recycle=env.recycle,
     )
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
-    masks = _mask_transforms(mask or MaskConfig(), base, env)
+    masks = _mask_transforms(mask or MaskParameters(), base, env)
     if env.compile:
         base.compile()
         seen.compile_graphs()
         for each in masks:
             each.compile_graphs()
-    errors = observation.sensor_parameters()
-    sensors = [] if errors is None else [SensorTransform(errors, traffic.stream, env.decision_period_s)]
-    pay = RewardTransform(env.decision_period_s, reward.parameters())
+    errors = observation.sensors
+    try:
+        sensors = [] if errors is None else [SensorTransform(errors, traffic.stream, env.decision_period_s)]
+    except ParameterError as error:
+        raise error.below("observation.sensors") from error
+    pay = RewardTransform(env.decision_period_s, reward)
     return TransformedEnv(base, Compose(*sensors, seen, *masks, pay))
 
 
-def _mask_transforms(mask: MaskConfig, base: HighwayEnv, env: EnvConfig) -> list[ActionMaskTransform]:
+def _mask_transforms(mask: MaskParameters, base: HighwayEnv, env: EnvConfig) -> list[ActionMaskTransform]:
     """The transform that ``mask`` asks for; none for ``mask=none``."""
     if mask.form == "none":
         return []
-    judged_by, abort = env.idm.parameters(), env.ego.abort_lane_change
+    judged_by, abort = env.idm, env.ego.abort_lane_change
     return [ActionMaskTransform(base.road, mask.form, mask.safe_deceleration, judged_by, abort)]
 
 
@@ -156,11 +159,11 @@ class Driver:
     name: str
     policy: TensorDictModuleBase
     observation: ObservationConfig | None = None
-    mask: MaskConfig | None = None
+    mask: MaskParameters | None = None
 
-    def behind(self, mask: MaskConfig | None) -> tuple[MaskConfig, TensorDictModuleBase]:
+    def behind(self, mask: MaskParameters | None) -> tuple[MaskParameters, TensorDictModuleBase]:
         """The mask that holds where ``mask`` is the default, and the policy behind it."""
-        chosen = self.mask or mask or MaskConfig()
+        chosen = self.mask or mask or MaskParameters()
         return chosen, self.policy if chosen.form == "none" else MaskedPolicy(self.policy)
 
 
@@ -182,7 +185,7 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     plain, plus, form = name.rpartition("+")
     if plus and form in MASKS:
         driver = make_driver(plain, env, stream, device)
-        kept = driver.mask if driver.mask is not None and driver.mask.form == form else MaskConfig(form)
+        kept = driver.mask if driver.mask is not None and driver.mask.form == form else MaskParameters(form)
         return replace(driver, name=name, mask=kept)
     if name in DRIVERS:
         policy = call_with(DRIVERS[name], _offered(env, stream), {}, "agents")
@@ -206,14 +209,14 @@ def _trained(name: str, env: EnvConfig, device: str) -> Driver:
     return Driver(name, policy, observation, mask_of(metadata))
 
 
-def mask_of(metadata: dict[str, Any]) -> MaskConfig | None:
+def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
     """The mask that an agent was trained with; None for one that was trained without, or before there were any.
 
     Raises:
         UserError: the metadata name one that there is not.
     """
     try:
-        mask = MaskConfig(**metadata.get("mask", {}))
+        mask = MaskParameters(**metadata.get("mask", {}))
     except TypeError as error:
         raise UserError(f"the agent's metadata name no mask that is known here ({error}); train it again.") from error
     return None if mask.form == "none" else mask
@@ -226,7 +229,7 @@ def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
         UserError: they name none that there is.
     """
     try:
-        return ObservationConfig(metadata["observation"], **metadata["observation_scale"])
+        return ObservationConfig(form=metadata["observation"], **metadata["observation_scale"])
     except (KeyError, TypeError) as error:
         raise UserError(
             f"the agent's metadata name no observation that is known here ({error}); train it again or give another."

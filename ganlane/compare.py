@@ -15,9 +15,7 @@ from tqdm import tqdm
 from ganlane.build import Driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.mask import MaskConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.evaluation import (
     crashes_by_scene,
@@ -29,6 +27,8 @@ from ganlane.evaluation import (
     write_episodes,
     write_results,
 )
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic, TrafficModule
 
@@ -37,14 +37,14 @@ def compare(
     drivers: Sequence[Driver],
     traffics: Mapping[str, TrafficConfig],
     env: EnvConfig,
-    reward: RewardConfig | None = None,
+    reward: RewardParameters | None = None,
     observation: ObservationConfig | None = None,
     episodes: int = 100,
     seed: int = 0,
     num_envs: int = 512,
     device: str = "cpu",
     stream: int = Stream.REPORT,
-    mask: MaskConfig | None = None,
+    mask: MaskParameters | None = None,
 ) -> pl.DataFrame:
     """Run the episodes 0 to ``episodes - 1`` with each driver on each traffic.
 
@@ -64,7 +64,7 @@ def compare(
     modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(num_envs, episodes), []
-    made: tuple[tuple[str, ObservationConfig, MaskConfig], EnvBase] | None = None
+    made: tuple[tuple[str, ObservationConfig, MaskParameters], EnvBase] | None = None
     with _Progress(len(pairs) * episodes) as progress:
         for traffic, driver in pairs:
             seen = (observation or ObservationConfig()).read_by(driver.observation)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 
@@ -11,6 +12,30 @@ class UserError(Exception):
     The message names the value, what was expected and what to do. Entry points print it alone, without a
     traceback, and exit with status 2 (design: 'Errors').
     """
+
+
+class ParameterError(UserError):
+    """A parameter out of its range, or parameters that do not go together.
+
+    The record that finds it knows its fields, not where a user set them. So the sentence holds the fields in braces,
+    ``"{timeout_s}=0: expected a number above 0."``; who knows the record's place names it by :meth:`below`.
+
+    Args:
+        text: the sentence.
+        where: key of the record, for instance ``env.idm``; empty: fields go by their own names.
+    """
+
+    def __init__(self, text: str, where: str = "") -> None:
+        super().__init__(text, where)
+        self.text, self.where = text, where
+
+    def __str__(self) -> str:
+        place = f"{self.where}." if self.where else ""
+        return re.sub(r"\{([\w.]+)\}", rf"{place}\1", self.text)
+
+    def below(self, where: str) -> ParameterError:
+        """The same with the record's key."""
+        return ParameterError(self.text, where)
 
 
 def as_typed(value: Any) -> str:

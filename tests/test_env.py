@@ -88,7 +88,6 @@ def test_a_decision_is_a_whole_number_of_physics_steps(period):
 @pytest.mark.parametrize(("period", "substeps"), [(0.1, 1), (0.3, 3), (0.7, 7), (1.0, 10), (2.0, 20)])
 def test_decision_periods_and_their_substeps(period, substeps):
     episode = EpisodeParameters(decision_period_s=period)
-    episode.check()
     assert episode.substeps() == substeps
     env = environment(period_s=period)
     assert step(env, env.reset())[keys.STEP].tolist() == [substeps]

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from ganlane import keys
 from ganlane.env.decision import Decision
 from ganlane.env.frozen import Frozen
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 from ganlane.traffic import IdmTraffic, Overlay, TrafficModule, TrafficSequential
 
 

@@ -8,7 +8,7 @@ from reference.worlds import environment, leaves, same_bits
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 
 Track = list[torch.Tensor]
 

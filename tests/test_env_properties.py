@@ -14,7 +14,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic

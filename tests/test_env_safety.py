@@ -12,9 +12,9 @@ from reference.worlds import environment
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver
 from ganlane.env import HighwayEnv
+from ganlane.parameters.driving import Visibility
+from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.lanes import Visibility
-from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.vehicles import Vehicles
 
 ROWS = 16

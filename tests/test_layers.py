@@ -13,6 +13,7 @@ PACKAGE = Path(ganlane.__file__).parent
 #: From the bottom up; what stands in one line may import each other's neighbours to the left only within itself.
 ORDER = [
     {"_version", "keys", "errors", "files", "paths", "compiling", "memory"},
+    {"parameters"},
     {"data", "sim"},
     {"generator"},
     {"traffic"},
@@ -68,7 +69,12 @@ def test_imports_point_down(path):
         )
 
 
-@pytest.mark.parametrize("part", ["sim", "data", "generator", "traffic", "env", "transforms", "agents", "evaluation"])
+BELOW_CONFIG = [
+    *("parameters", "sim", "data", "generator", "traffic", "env", "transforms", "agents", "evaluation"),
+]
+
+
+@pytest.mark.parametrize("part", BELOW_CONFIG)
 def test_nothing_below_config_knows_hydra(part):
     for path in MODULES:
         if part_of(path) == part:

@@ -10,12 +10,12 @@ run that is to go on. :mod:`~ganlane.agents.checkpoint` writes the trained netwo
 """
 
 from ganlane.agents.checkpoint import agent_file, load_agent, read_agent, save_agent
-from ganlane.agents.config import RainbowConfig
 from ganlane.agents.handover import transfer
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import NetworkConfig, QNetwork
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy
 from ganlane.agents.rainbow import Rainbow
+from ganlane.parameters.agent import RainbowConfig
 
 __all__ = [
     "ExploringPolicy",

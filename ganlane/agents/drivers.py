@@ -12,9 +12,10 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
+from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.sim.ego import ego_scene
-from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_wishes
+from ganlane.sim.idm import TABLE_V
+from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles

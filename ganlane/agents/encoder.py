@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from ganlane.agents.linear import linear
 from ganlane.errors import UserError
+from ganlane.parameters.agent import ENCODERS
 
 #: What stands before the noisy layers: nothing, or :class:`VehicleEncoder`.
-ENCODERS: Final = ("none", "shared")
 #: Table III: numbers of the ego at the front, numbers per vehicle, and those of the ego's lane change at the end.
 OWN: Final = 3
 PER_VEHICLE: Final = 3

@@ -17,10 +17,10 @@ from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane import keys
-from ganlane.agents.config import RainbowConfig
 from ganlane.agents.network import QNetwork, Weights
 from ganlane.agents.policy import allowed_values
 from ganlane.agents.projection import outside_support, pick, project
+from ganlane.parameters.agent import RainbowConfig
 
 
 class _TargetNetwork:

@@ -9,7 +9,7 @@ convolution here, and a second hidden layer per stream would cost half as much a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from math import isfinite
 
@@ -20,6 +20,7 @@ from torchrl.modules import NoisyLinear
 from ganlane.agents.encoder import make_encoder
 from ganlane.agents.linear import linear
 from ganlane.errors import UserError
+from ganlane.parameters.agent import RainbowConfig
 
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]
@@ -50,6 +51,12 @@ class NetworkConfig:
     v_min: float = -120.0
     v_max: float = 120.0
     noisy_sigma: float = 0.5
+
+    @classmethod
+    def of(cls, config: RainbowConfig, observation_size: int, actions: int = 3) -> NetworkConfig:
+        """The network of an agent for observations of size D and A actions."""
+        shared = {own.name: getattr(config, own.name) for own in fields(cls) if hasattr(config, own.name)}
+        return cls(observation_size=observation_size, actions=actions, **shared)
 
     def __post_init__(self) -> None:
         sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}

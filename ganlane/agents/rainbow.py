@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from ganlane.agents.config import RainbowConfig
 from ganlane.agents.free_decisions import FreeDecisionWindow
 from ganlane.agents.loss import make_loss
 from ganlane.agents.n_step import NStepWindow
@@ -18,6 +17,8 @@ from ganlane.agents.noise import mean_sigma, redraw_noise
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
 from ganlane.agents.replay import annealed, make_replay
 from ganlane.agents.resume import agent_state, load_agent_state
+from ganlane.errors import ParameterError
+from ganlane.parameters.agent import RainbowConfig
 
 
 class Rainbow:
@@ -43,12 +44,17 @@ class Rainbow:
         device: torch.device | str = "cpu",
         legal: LegalActions | None = None,
     ) -> None:
+        if config.learning_rate_end is not None and config.learning_rate_decisions == 0:
+            raise ParameterError(
+                f"{{learning_rate_end}}={config.learning_rate_end:g}: within how many decisions? set "
+                "{learning_rate_decisions}, here or by for_phase(); give both or neither."
+            )
         self.config, self.device = config, torch.device(device)
         self.generators = {
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
         }
-        self.network = _fresh_network(config.network(observation_size, actions), seed).to(self.device)
+        self.network = _fresh_network(NetworkConfig.of(config, observation_size, actions), seed).to(self.device)
         self.loss = make_loss(self.network, config)
         self.optimizer = _adam(self.network, config)
         self.replay = make_replay(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from ganlane.agents.config import RainbowConfig
 from ganlane.agents.network import load_parameters, parameters_of
 from ganlane.agents.replay import load_replay_state, replay_state
 from ganlane.errors import UserError
+from ganlane.parameters.agent import RainbowConfig
 
 if TYPE_CHECKING:
     from ganlane.agents.rainbow import Rainbow

@@ -10,13 +10,15 @@ from typing import Any, TypeAlias
 
 from omegaconf import OmegaConf
 
-from ganlane.config.checks import did_you_mean
-from ganlane.config.mask import MASKS
 from ganlane.config.messages import CONFIG_ERRORS, sentence
+from ganlane.config.nodes import made, node_of
 from ganlane.config.observation import FORMS
 from ganlane.config.store import SCHEMAS
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import did_you_mean
+from ganlane.parameters.observation import MASKS
+from ganlane.paths import conf_folder
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
@@ -71,7 +73,7 @@ def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
     """Dataclass of an option and the values that its name stands for."""
     if group == "traffic" and inspect.isclass(name):
         return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
-    known = {"observation": FORMS, "mask": MASKS}.get(group) or tuple(SCHEMAS[group])
+    known = {"observation": FORMS, "mask": MASKS}.get(group) or (*SCHEMAS[group], *_from_others(group))
     if group == "traffic" and isinstance(name, str) and "." in name:
         return TrafficConfig, {"_target_": name}
     if name not in known:
@@ -79,7 +81,22 @@ def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
         raise UserError(f"{group}={name}: no such option{hint}; choose one of {', '.join(known)}.")
     if group in ("observation", "mask"):
         return SCHEMAS[group][group], {"form": name}
-    return SCHEMAS[group][name], {}
+    return _of_yaml(group, name)
+
+
+def _from_others(group: str) -> list[str]:
+    """Options without a dataclass of their own, whose YAML starts from another option."""
+    names = sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
+    return [name for name in names if name not in SCHEMAS[group]]
+
+
+def _of_yaml(group: str, name: str) -> tuple[Any, dict[str, Any]]:
+    """Dataclass of an option, and what its YAML sets on top where the dataclass is another option's."""
+    if name in SCHEMAS[group]:
+        return SCHEMAS[group][name], {}
+    values: Any = OmegaConf.to_container(OmegaConf.load(conf_folder() / group / f"{name}.yaml"))
+    kind, inherited = _of_yaml(group, values.pop("defaults")[0])
+    return kind, {**inherited, **values}
 
 
 def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
@@ -94,11 +111,11 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
         UserError: an unknown key, a value of the wrong type or out of range.
     """
     try:
-        node = OmegaConf.structured(config)
+        node = node_of(config)
         holder: Any = OmegaConf.create({where: node}) if where else node
         given = {name: _plain(value) for name, value in values.items()}
         merged: Any = OmegaConf.merge(holder, {where: given} if where else given)
-        return OmegaConf.to_object(merged.get(where) if where else merged)
+        return made(merged.get(where) if where else merged, where)
     except CONFIG_ERRORS as error:
         told = sentence(error).replace("; run the command with --help to see all keys", "")
         raise UserError(told) from error
@@ -110,6 +127,8 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return node_of(value)
     if isinstance(value, Path):
         return str(value)
     return value.item() if hasattr(value, "item") else value

@@ -10,7 +10,7 @@ from torchrl.envs import Transform, TransformedEnv
 from ganlane import build
 from ganlane.api.options import Option, option
 from ganlane.build import Driver
-from ganlane.config.reward import check_pay
+from ganlane.config.env import check_pay
 from ganlane.config.run import RunConfig
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,10 +14,10 @@ from ganlane.benchmarks.case import COMPILED, Runner
 from ganlane.build import make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.decision import Decision
+from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.vehicles import Vehicles
 
@@ -33,7 +32,7 @@ class Scenario:
     env: EnvConfig
     traffic: TrafficConfig
     observation: ObservationConfig
-    reward: RewardConfig
+    reward: RewardParameters
     seed: int = 0
 
 
@@ -66,7 +65,7 @@ def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehi
 
     The length of the decision stands outside the rules, so that compiled graphs serve whatever it is.
     """
-    rules = env.rules._replace(episode=replace(env.rules.episode, goal_m=math.inf, timeout_s=1e9))
+    rules = env.rules._replace(episode=replace(env.rules.episode, goal_m=1e9, timeout_s=1e9))
     vehicles, ego = Vehicles.of(state.get(keys.VEHICLES)), dict(state.get(keys.EGO).items())
     keep = torch.full_like(state.get(keys.STEP), keys.KEEP)
     start, _ = env.physics.begin(rules, keep, vehicles, ego, state.get(keys.STEP))

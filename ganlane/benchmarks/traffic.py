@@ -24,8 +24,8 @@ from ganlane.benchmarks.traffic_findings import PADDED, SCENE_LOOP, SCENE_LOOP_O
 from ganlane.benchmarks.traffic_tables import traffic_tables
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import TrafficConfig
+from ganlane.parameters.reward import RewardParameters
 from ganlane.paths import PACKAGE
 
 #: File under ``benchmarks/`` and further arguments of its ``start`` of each baseline.
@@ -85,7 +85,7 @@ class TrafficSuite:
 
     def _scenario(self, traffic: TrafficConfig) -> Scenario:
         env = self.options.env if traffic.label() == "replay" else replace(self.options.env, recycle=True)
-        return Scenario(env, traffic, ObservationConfig(), RewardConfig(), self.options.seed)
+        return Scenario(env, traffic, ObservationConfig(), RewardParameters(), self.options.seed)
 
     def _labels(self, system: str, traffic: str, mode: str, threads: int, batch: int) -> Labels:
         env = self.options.env

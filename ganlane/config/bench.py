@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ganlane.config.agent import AgentConfig
-from ganlane.config.checks import Rule, between, check, every, one_of
-from ganlane.config.env import EnvConfig
+from ganlane.config.env import EnvConfig, check_pay
 from ganlane.config.evaluate import NAMES, all_traffics
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.checks import Rule, between, check, every, one_of
+from ganlane.parameters.reward import RewardParameters
 
 SUITES = ("sim", "traffic", "train")
 MODES = ("eager", "compiled")
@@ -56,8 +56,8 @@ class BenchConfig:
     env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
-    agent: AgentConfig = field(default_factory=AgentConfig)
+    reward: RewardParameters = field(default_factory=RewardParameters)
+    agent: RainbowConfig = field(default_factory=RainbowConfig)
 
     def __post_init__(self) -> None:
         sizes = between(1, 2**20)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ganlane.config.checks import at_least, between, check, optional, text
+from ganlane.parameters.checks import at_least, between, check, optional, text
 
 
 @dataclass

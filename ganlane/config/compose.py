@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, open_dict
 
 from ganlane.config.messages import CONFIG_ERRORS, sentence
+from ganlane.config.nodes import made
 from ganlane.config.overrides import parse, single_runs
 from ganlane.config.store import register
 from ganlane.errors import UserError
@@ -35,7 +36,7 @@ def typed(composed: DictConfig) -> Any:
         UserError: a value is of the wrong type or out of range.
     """
     try:
-        return OmegaConf.to_object(composed)
+        return made(composed)
     except CONFIG_ERRORS as error:
         raise UserError(sentence(error)) from error
 

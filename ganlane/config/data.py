@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import Rule, at_least, check, every, one_of, optional, text
 from ganlane.errors import UserError
+from ganlane.parameters.checks import Rule, at_least, check, every, one_of, optional, text
 
 if TYPE_CHECKING:
     from ganlane.data import NgsimParameters

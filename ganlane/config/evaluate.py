@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.config.checks import Rule, at_least, between, check, did_you_mean, one_of
-from ganlane.config.env import EnvConfig
-from ganlane.config.mask import MaskConfig
+from ganlane.config.env import EnvConfig, check_pay
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
 from ganlane.config.traffic_mixed import MixedTrafficConfig, reacting_traffics
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import Rule, at_least, between, check, did_you_mean, one_of
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.reward import RewardParameters
 
 #: Families of episodes that can be driven for a table: to choose on, to report on.
 STREAMS = ("report", "select")
@@ -44,8 +44,8 @@ class EvaluateConfig(RunConfig):
     stream: str = "report"
     env: EnvConfig = field(default_factory=EnvConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskConfig = field(default_factory=MaskConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
+    mask: MaskParameters = field(default_factory=MaskParameters)
+    reward: RewardParameters = field(default_factory=RewardParameters)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     traffic_options: dict[str, TrafficConfig] = field(default_factory=all_traffics)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
-from ganlane.config.checks import above, at_least, between, check, every, one_of, optional
 from ganlane.config.plain import plain_copy
 from ganlane.errors import UserError
+from ganlane.parameters.checks import above, at_least, between, check, every, one_of, optional
 
 if TYPE_CHECKING:
     from ganlane.generator import CalibratedConfig, LoopConfig, LossWeights, PaperConfig, Preset

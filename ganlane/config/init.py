@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ganlane.config.checks import check, one_of
 from ganlane.errors import UserError
+from ganlane.parameters.checks import check, one_of
 
 #: Whose support of returns: that of the run's own ``agent``, or that of the trained agent.
 SUPPORTS = ("run", "trained")

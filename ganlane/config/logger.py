@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ganlane.config.checks import check, one_of, text
+from ganlane.parameters.checks import check, one_of, text
 
 
 @dataclass

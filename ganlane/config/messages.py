@@ -9,9 +9,9 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from ganlane.config.checks import did_you_mean
 from ganlane.config.disk import file_sentence
 from ganlane.errors import UserError
+from ganlane.parameters.checks import did_you_mean
 
 #: What Hydra and OmegaConf raise for a configuration that will not do.
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)

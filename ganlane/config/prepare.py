@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.config.checks import at_least, check, optional
 from ganlane.config.data import DataConfig
 from ganlane.config.run import RunConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import at_least, check, optional
 
 
 @dataclass

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ganlane.config.checks import at_least, between, check, did_you_mean, every, one_of, optional
 from ganlane.config.data import DataConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import all_traffics
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import at_least, between, check, did_you_mean, every, one_of, optional
 
 #: Names that the ends of the scale have.
 _TAKEN = ("random", "constant_velocity")

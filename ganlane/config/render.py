@@ -6,14 +6,14 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ganlane.config.checks import Rule, above, at_least, between, check, every, optional, text
-from ganlane.config.env import EnvConfig
-from ganlane.config.mask import MaskConfig
+from ganlane.config.env import EnvConfig, check_pay
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig, check_pay
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import Rule, above, at_least, between, check, every, optional, text
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.reward import RewardParameters
 
 #: Films of one episode; pages and tables of any number of episodes.
 FILMS = ("gif", "mp4", "png")
@@ -87,8 +87,8 @@ class RenderConfig(RunConfig):
     env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskConfig = field(default_factory=MaskConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
+    mask: MaskParameters = field(default_factory=MaskParameters)
+    reward: RewardParameters = field(default_factory=RewardParameters)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     film: FilmConfig = field(default_factory=FilmConfig)
     curves: CurvesConfig = field(default_factory=CurvesConfig)

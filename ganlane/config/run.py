@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ganlane.config.checks import at_least, between, check, one_of
 from ganlane.errors import UserError
+from ganlane.parameters.checks import at_least, between, check, one_of
 
 
 @dataclass

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import above, between, check
 from ganlane.config.scene import SceneEnvConfig, SceneOptions
 from ganlane.config.scene_file import FileSceneEnvConfig, FileSceneOptions
+from ganlane.parameters.checks import above, between, check
 
 if TYPE_CHECKING:
     from ganlane.sim.fixed_scene import SceneVehicle
@@ -42,10 +42,10 @@ class CutInOptions(SceneOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "env.scene", gap_m=above(0), speed_mps=above(0), cutter_speed_mps=above(0))
+        check(self, gap_m=above(0), speed_mps=above(0), cutter_speed_mps=above(0))
 
 
-@dataclass
+@dataclass(frozen=True)
 class CutInEnvConfig(SceneEnvConfig):
     """``env=cut_in``: a slower vehicle changes into the ego's lane, close ahead."""
 
@@ -76,10 +76,10 @@ class StalledCarOptions(SceneOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "env.scene", distance_m=above(0), speed_mps=above(0), spacing_m=above(0))
+        check(self, distance_m=above(0), speed_mps=above(0), spacing_m=above(0))
 
 
-@dataclass
+@dataclass(frozen=True)
 class StalledCarEnvConfig(SceneEnvConfig):
     """``env=stalled_car``: a broken-down vehicle in the ego's lane."""
 
@@ -117,10 +117,10 @@ class BlockedLaneOptions(SceneOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         positive = dict.fromkeys(("distance_m", "speed_mps", "spacing_m"), above(0))
-        check(self, "env.scene", standing=between(1, 100), **positive)
+        check(self, standing=between(1, 100), **positive)
 
 
-@dataclass
+@dataclass(frozen=True)
 class BlockedLaneEnvConfig(SceneEnvConfig):
     """``env=blocked_lane``: the ego's lane is closed, and traffic passes beside."""
 
@@ -157,10 +157,10 @@ class StopAndGoOptions(SceneOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "env.scene", waves=between(1, 50), per_wave=between(2, 50), speed_mps=above(0))
+        check(self, waves=between(1, 50), per_wave=between(2, 50), speed_mps=above(0))
 
 
-@dataclass
+@dataclass(frozen=True)
 class StopAndGoEnvConfig(SceneEnvConfig):
     """``env=stop_and_go``: columns in which queues stand and groups flow."""
 
@@ -181,5 +181,5 @@ class StopAndGoEnvConfig(SceneEnvConfig):
             **self.numbers(),
             lanes=self.lanes,
             desired_speed_mps=self.ego_desired_speed_mps,
-            idm=self.idm.parameters(),
+            idm=self.idm,
         )

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-from ganlane.config.checks import above, at_least, between, check
-from ganlane.config.env import VISIBILITIES, EnvConfig
-from ganlane.errors import UserError
+from ganlane.config.env import EnvConfig
+from ganlane.errors import UserError, as_typed
+from ganlane.parameters.checks import above, at_least, between, check
+from ganlane.parameters.driving import Visibility
+from ganlane.parameters.records import assign, lists_to_tuples
 
 if TYPE_CHECKING:
     from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
@@ -38,10 +40,10 @@ class SceneOptions:
     jitter_mps: float = 0.0
 
     def __post_init__(self) -> None:
-        check(self, "env.scene", jitter_m=at_least(0), jitter_mps=at_least(0))
+        check(self, jitter_m=at_least(0), jitter_mps=at_least(0))
 
 
-@dataclass
+@dataclass(frozen=True)
 class SceneEnvConfig(EnvConfig):
     """What all scenes have in common. ``vehicles`` follows from the scene; 0 says so."""
 
@@ -49,8 +51,9 @@ class SceneEnvConfig(EnvConfig):
     scene: SceneOptions = field(default_factory=SceneOptions)
 
     def __post_init__(self) -> None:
+        lists_to_tuples(self)
         self._refuse_table_ii()
-        check(self, "env", lane_width_m=above(0), lanes=between(1, 20), ego_desired_speed_mps=above(0))
+        check(self, lane_width_m=above(0), lanes=between(1, 20), ego_desired_speed_mps=above(0))
         self._count_vehicles()
         super().__post_init__()
 
@@ -60,8 +63,8 @@ class SceneEnvConfig(EnvConfig):
         for name in TABLE_II_KEYS:
             if getattr(self, name) != getattr(default, name):
                 raise UserError(
-                    f"env.{name}={getattr(self, name)}: has no effect on a scene set by hand; leave it out, or take "
-                    "env=highway."
+                    f"env.{name}={as_typed(getattr(self, name))}: has no effect on a scene set by hand; "
+                    "leave it out, or take env=highway."
                 )
 
     def _count_vehicles(self) -> None:
@@ -70,10 +73,10 @@ class SceneEnvConfig(EnvConfig):
             raise UserError(
                 f"env.vehicles={self.vehicles}: the scene has {there}, the ego included; leave this key out."
             )
-        self.vehicles = there
+        assign(self, vehicles=there)
 
     def _check_start(self) -> None:
-        self.fixed_scene().check(self._road(), self.idm.parameters())
+        self.fixed_scene().check(self._road(), self.idm)
 
     def scenes(self, others_visibility: int | None = None) -> FixedScene:
         """The scene as the environment takes it, see :meth:`EnvConfig.scenes`."""
@@ -86,12 +89,10 @@ class SceneEnvConfig(EnvConfig):
         return FixedScene(self.rows(), self._road(), name=self.name(), **self._scene_options(others_visibility))
 
     def _scene_options(self, others_visibility: int | None) -> dict[str, Any]:
-        from ganlane.sim.lanes import Visibility
-
         return {
             "jitter_m": self.scene.jitter_m,
             "jitter_mps": self.scene.jitter_mps,
-            "ego_visibility": Visibility(VISIBILITIES.index(self.ego.visibility)),
+            "ego_visibility": Visibility.named(self.ego.visibility),
             "others_visibility": Visibility.SIGNALLED if others_visibility is None else others_visibility,
         }
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from ganlane.config.checks import at_least, between, check, optional, text
 from ganlane.config.scene import SceneEnvConfig, SceneOptions
 from ganlane.errors import UserError
+from ganlane.parameters.checks import at_least, between, check, optional, text
+from ganlane.parameters.records import assign
 
 if TYPE_CHECKING:
     from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
@@ -21,10 +22,10 @@ class FileSceneOptions(SceneOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "env.scene", path=optional(text()))
+        check(self, path=optional(text()))
 
 
-@dataclass
+@dataclass(frozen=True)
 class FileSceneEnvConfig(SceneEnvConfig):
     """``env=scene env.scene.path=FILE``: a scene of one's own. 0 stands for 'as the file says'."""
 
@@ -37,10 +38,14 @@ class FileSceneEnvConfig(SceneEnvConfig):
 
     def __post_init__(self) -> None:
         numbers = dict.fromkeys(("lane_width_m", "ego_desired_speed_mps"), at_least(0))
-        check(self, "env", lanes=between(0, 20), **numbers)
+        check(self, lanes=between(0, 20), **numbers)
         scene = self._read()
-        self.lanes, self.lane_width_m = int(scene.road.lanes), float(scene.road.lane_width_m)
-        self.ego_desired_speed_mps = scene.rows[0].desired_speed_mps
+        assign(
+            self,
+            lanes=int(scene.road.lanes),
+            lane_width_m=float(scene.road.lane_width_m),
+            ego_desired_speed_mps=scene.rows[0].desired_speed_mps,
+        )
         super().__post_init__()
 
     def _read(self) -> FixedScene:

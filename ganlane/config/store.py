@@ -8,7 +8,6 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
-from ganlane.config.agent import AgentConfig, DqnConfig, TransferAgentConfig
 from ganlane.config.bench import BenchConfig
 from ganlane.config.collector import CollectorConfig, MultiCollectorConfig, RayCollectorConfig
 from ganlane.config.data import DataConfig, HighdDataConfig, NgsimDataConfig
@@ -17,12 +16,11 @@ from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.generator import CalibratedGeneratorConfig, PaperGeneratorConfig
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
-from ganlane.config.mask import MaskConfig
+from ganlane.config.nodes import node_of
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.prepare import PrepareConfig
 from ganlane.config.realism import RealismConfig
 from ganlane.config.render import RenderConfig
-from ganlane.config.reward import ConsiderateRewardConfig, RewardConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -43,6 +41,9 @@ from ganlane.config.traffic_random import IdmRandomTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.config.train import TrainConfig
 from ganlane.config.train_generator import TrainGeneratorConfig
+from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.reward import RewardParameters
 
 #: Group (empty at the root) to schema name to dataclass.
 SCHEMAS: dict[str, dict[str, Any]] = {
@@ -77,10 +78,10 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "highway_env": HighwayEnvTrafficConfig,
     },
     "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
-    "agent": {"rainbow": AgentConfig, "transfer": TransferAgentConfig, "dqn": DqnConfig},
+    "agent": {"rainbow": RainbowConfig},
     "observation": {"observation": ObservationConfig},
-    "mask": {"mask": MaskConfig},
-    "reward": {"paper": RewardConfig, "considerate": ConsiderateRewardConfig},
+    "mask": {"mask": MaskParameters},
+    "reward": {"paper": RewardParameters},
     "collector": {"single": CollectorConfig, "multi": MultiCollectorConfig, "ray": RayCollectorConfig},
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperGeneratorConfig, "calibrated": CalibratedGeneratorConfig},
@@ -97,5 +98,5 @@ def register() -> None:
         for name, schema in options.items():
             # Storing one takes OmegaConf milliseconds, and a command comes here twice.
             if f"{name}{SUFFIX}.yaml" not in kept:
-                store.store(group=group or None, name=name + SUFFIX, node=schema, provider="ganlane")
+                store.store(group=group or None, name=name + SUFFIX, node=node_of(schema), provider="ganlane")
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)

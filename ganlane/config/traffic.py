@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from ganlane.config.checks import Rule, at_least, between, check, optional
+from ganlane.parameters.checks import Rule, at_least, between, check, optional
 
 _IMPORT_PATH = Rule(
     lambda path: all(part.isidentifier() for part in path.split(".")) and "." in path,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ganlane.config.checks import Rule, above, at_least, between, check
 from ganlane.config.plain import plain_copy
 from ganlane.config.traffic import TrafficConfig
+from ganlane.parameters.checks import Rule, above, at_least, between, check
 
 if TYPE_CHECKING:
     from ganlane.traffic.presets import DriverFaults

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ganlane.config.checks import at_least, between, check
 from ganlane.config.traffic import TrafficConfig
+from ganlane.parameters.checks import at_least, between, check
 
 
 @dataclass

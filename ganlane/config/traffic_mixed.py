@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from ganlane.config.checks import Rule, check, did_you_mean
 from ganlane.config.traffic import (
     GanCalibratedTrafficConfig,
     GanTrafficConfig,
@@ -16,6 +15,7 @@ from ganlane.config.traffic import (
 from ganlane.config.traffic_faults import IdmFaultsTrafficConfig
 from ganlane.config.traffic_random import IdmRandomTrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import Rule, check, did_you_mean
 
 #: A larger sum would be a period of more episodes than anybody drives side by side.
 _MOST = 1000

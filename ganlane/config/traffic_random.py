@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ganlane.config.checks import Rule, check, speed_range
 from ganlane.config.plain import plain_copy
 from ganlane.config.traffic import TrafficConfig
+from ganlane.parameters.checks import Rule, check, speed_range
 
 if TYPE_CHECKING:
     from ganlane.traffic import RandomDrivers

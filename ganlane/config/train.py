@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ganlane.config.agent import AgentConfig, check_agent
-from ganlane.config.checks import at_least, between, check, one_of
 from ganlane.config.collector import CollectorConfig
-from ganlane.config.env import EnvConfig
+from ganlane.config.env import EnvConfig, check_pay
 from ganlane.config.evaluate import NAMES
 from ganlane.config.init import InitConfig
 from ganlane.config.logger import LoggerConfig
-from ganlane.config.mask import MaskConfig
-from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig, check_pay
+from ganlane.config.observation import LISTS, ObservationConfig
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.checks import at_least, between, check, one_of
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.reward import RewardParameters
 
 COMPILE = ("auto", "true", "false")
 #: Compiling takes one to two minutes, which a training of so many decisions gets back.
@@ -71,10 +71,10 @@ class TrainConfig(RunConfig):
     env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     init: InitConfig = field(default_factory=InitConfig)
-    agent: AgentConfig = field(default_factory=AgentConfig)
+    agent: RainbowConfig = field(default_factory=RainbowConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskConfig = field(default_factory=MaskConfig)
-    reward: RewardConfig = field(default_factory=RewardConfig)
+    mask: MaskParameters = field(default_factory=MaskParameters)
+    reward: RewardParameters = field(default_factory=RewardParameters)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
@@ -114,3 +114,21 @@ class TrainConfig(RunConfig):
         """The traffic of the final evaluation by its name: training's, unless another one was chosen."""
         chosen = self.evaluation.traffic or self.traffic
         return {chosen.label(): chosen}
+
+
+def check_agent(agent: RainbowConfig, observation: ObservationConfig, env: EnvConfig) -> None:
+    """Refuse an agent that could not read the observation, or would not learn what it is asked in ``env``.
+
+    Raises:
+        UserError: an encoder over vehicles without a list of them, or turning back while nothing is learnt.
+    """
+    if agent.encoder != "none" and observation.form not in LISTS:
+        raise UserError(
+            f"agent.encoder={agent.encoder} with observation={observation.form}: the encoder reads vehicles in Table "
+            f"III's layout; give one of {', '.join(LISTS)}, or agent.encoder=none."
+        )
+    if agent.decide_when_free and env.ego.abort_lane_change:
+        raise UserError(
+            "agent.decide_when_free=true with env.ego.abort_lane_change=true: commands are then obeyed during a lane "
+            "change, but nothing would be learnt from them; switch one of the two off."
+        )

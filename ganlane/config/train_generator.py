@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ganlane.config.checks import at_least, check
 from ganlane.config.data import DataConfig
 from ganlane.config.generator import GeneratorConfig
 from ganlane.config.run import RunConfig
 from ganlane.errors import UserError
+from ganlane.parameters.checks import at_least, check
 
 
 @dataclass

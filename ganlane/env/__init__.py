@@ -11,6 +11,6 @@ nothing. The state travels in the TensorDict, so it can be copied, saved and bra
 """
 
 from ganlane.env.highway import HighwayEnv
-from ganlane.sim.episode import EpisodeParameters
+from ganlane.parameters.episode import EpisodeParameters
 
 __all__ = ["EpisodeParameters", "HighwayEnv"]

@@ -17,14 +17,13 @@ from ganlane.env.rules import Rules
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.sim.ego import EgoParameters
-from ganlane.sim.episode import EpisodeParameters
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
+from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import episode_key
 from ganlane.sim.recycle import out_of_range
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.scenes import RandomScenes, Scenes
-from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.steering import STEERING, SteeringParameters
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule
@@ -101,7 +100,6 @@ class HighwayEnv(EnvBase):
 
     def _check_parts(self, vehicles: int | None, stream: int | None) -> None:
         """Refuse parts that do not go together; ``vehicles`` and ``stream`` as the user gave them."""
-        self.episode.check()
         if stream is not None and int(stream) != self.stream:
             raise UserError(
                 f"stream={int(stream)}: the traffic was built for stream {self.stream}; give both the same one, "
@@ -119,8 +117,8 @@ class HighwayEnv(EnvBase):
 
     def _own_scenes(self, vehicles: int) -> Scenes:
         """The traffic's recorded scenes where it has any, else random ones."""
-        recorded = self.traffic.scenes(vehicles, self.ego.visibility, self.spawn_parameters.ego_desired_speed_mps)
-        seen = (self.ego.visibility, self.traffic.visibility)
+        seen = (Visibility.named(self.ego.visibility), self.traffic.visibility)
+        recorded = self.traffic.scenes(vehicles, seen[0], self.spawn_parameters.ego_desired_speed_mps)
         return recorded or RandomScenes(self.road, vehicles, self.spawn_parameters, *seen)
 
     def _make_specs(self) -> None:

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ganlane.sim.ego import EgoParameters
-from ganlane.sim.episode import EpisodeParameters
-from ganlane.sim.idm import IdmParameters
+from ganlane.parameters.driving import EgoParameters, IdmParameters
+from ganlane.parameters.episode import EpisodeParameters
 from ganlane.sim.road import Road
 from ganlane.sim.steering import SteeringParameters
 

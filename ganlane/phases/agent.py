@@ -22,7 +22,7 @@ from ganlane.transforms import observation_size
 
 def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
     """A fresh agent for the observation of ``config``; one about to be given trained weights explores little."""
-    rainbow = config.agent.rainbow(phase.total_decisions)
+    rainbow = config.agent.for_phase(phase.total_decisions)
     if phase.init is not None:
         rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
     size = observation_size(config.observation.form, config.env.vehicles)

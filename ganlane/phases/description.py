@@ -19,7 +19,7 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         DEFAULTS: {
             f"{name}.{key}": value for name, part in parts.items() for key, value in defaults_of(part).items()
         },
-        "env": asdict(config.env),
+        "env": plain(config.env),
         "traffic": phase.traffic.description(),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
@@ -29,6 +29,17 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "collector": {name: value for name, value in asdict(config.collector).items() if name != "address"},
         "seed": config.seed,
     }
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """A dataclass by its fields' names, with lists in place of tuples, as JSON has them and older runs do."""
+    return {name: _listed(value) for name, value in asdict(config).items()}
+
+
+def _listed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _listed(each) for name, each in value.items()}
+    return [_listed(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def defaults_of(config: Any) -> dict[str, Any]:
@@ -54,10 +65,10 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         "mask": asdict(config.mask),
         "sensors": asdict(config.observation)["sensors"],
         "environment": environment,
-        "env": asdict(config.env),
+        "env": plain(config.env),
         "num_envs": config.collector.environments,
         "code": code_version(),
-        "agent": asdict(config.agent),
+        "agent": plain(config.agent),
         "reward": asdict(config.reward),
         "training": training,
     }

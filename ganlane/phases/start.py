@@ -57,9 +57,9 @@ def _of_checkpoint(path: Path, key: str) -> Start:
         state = load_checkpoint(path)
         agent, identity = state["agent"], state["identity"]
         scale = {name: identity["observation"][name] for name in ("range_m", "speed_mps")}
-        observation = ObservationConfig(identity["observation"]["form"], **scale)
+        observation = ObservationConfig(form=identity["observation"]["form"], **scale)
         size = observation_size(observation.form, identity["env"]["vehicles"])
-        network = RainbowConfig(**agent["config"]).network(size, actions=3)
+        network = NetworkConfig.of(RainbowConfig(**agent["config"]), size)
         weights = {name: value.detach() for name, value in agent["network"].items()}
         return Start(str(path), weights, network, observation, agent["optimizer"]["state"])
     except (AttributeError, KeyError, TypeError, ValueError, UserError) as error:

@@ -16,6 +16,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import HELD_OUT
+from ganlane.parameters.records import assign
 from ganlane.realism.card import Card, quantity_rows
 from ganlane.realism.fit_speeds import Report, drive_all, measure_recordings, units_of
 from ganlane.realism.long_runs import LongRunParameters, long_run
@@ -86,7 +87,7 @@ def _factory(traffic: TrafficConfig, env: EnvConfig) -> Factory:
     def make(road: Road) -> TrafficModule:
         # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
         own = copy(env)
-        own.lanes, own.lane_width_m = int(road.lanes), float(road.lane_width_m)
+        assign(own, lanes=int(road.lanes), lane_width_m=float(road.lane_width_m))
         return make_traffic(traffic, own, Stream.REPORT)
 
     return make

@@ -5,8 +5,8 @@ order: what each driver sees (:func:`perceive`, :mod:`~ganlane.sim.lanes`, :mod:
 acceleration (:mod:`~ganlane.sim.idm`, :mod:`~ganlane.sim.following`), its lane
 changes (:mod:`~ganlane.sim.mobil`), its steering (:mod:`~ganlane.sim.steering`), its motion
 (:mod:`~ganlane.sim.bicycle`) and collisions (:mod:`~ganlane.sim.collisions`).
-:mod:`~ganlane.sim.spawn` makes the initial scene of an episode, :mod:`~ganlane.sim.episode` defines its end,
-:mod:`~ganlane.sim.recycle` keeps the road populated and :mod:`~ganlane.sim.random` makes every random number.
+:mod:`~ganlane.sim.spawn` makes the initial scene of an episode, :mod:`~ganlane.sim.recycle` keeps the road populated
+and :mod:`~ganlane.sim.random` makes every random number.
 """
 
 from ganlane.sim.bicycle import advance

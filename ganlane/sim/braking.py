@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.idm import SMALLEST_GAP_M, TABLE_V, IdmParameters, idm_acceleration
+from ganlane.parameters.driving import IdmParameters
+from ganlane.sim.idm import SMALLEST_GAP_M, TABLE_V, idm_acceleration
 
 #: Simulated time, s: enough for a stop from 60 m/s at 1 m/s2.
 HORIZON_S = 60.0

@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
+from ganlane.parameters.driving import EgoParameters, IdmParameters
 from ganlane.sim.bicycle import advance
 from ganlane.sim.collisions import dangerously_close
 from ganlane.sim.following import acceleration_behind
-from ganlane.sim.idm import IdmParameters
-from ganlane.sim.lanes import Visibility, spanned
+from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import Neighbour, Scene, follower, leader, perceive
 from ganlane.sim.road import Road
 from ganlane.sim.steering import SteeringParameters, steer
 from ganlane.sim.vehicles import Vehicles
-
-
-@dataclass(frozen=True)
-class EgoParameters:
-    """How the ego handles commands and when others see its lane changes; soft-crash limits in s and m."""
-
-    abort_lane_change: bool = False
-    visibility: Visibility = Visibility.BODY
-    soft_crash_ttc_s: float = 1.5
-    soft_crash_gap_m: float = 2.0
 
 
 class Command(NamedTuple):

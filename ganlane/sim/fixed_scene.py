@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.sim.idm import IdmParameters
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.sim.random import Purpose, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.scene_checks import check_braking, check_drive, check_overlaps, check_rows

@@ -2,35 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class IdmParameters:
-    """Table V. Lengths in metres, times in seconds, accelerations in m/s2.
-
-    The acceleration exponent is 4, computed as two squarings: the result of ``torch.pow`` may differ in its last bits
-    between batch sizes.
-    """
-
-    min_gap_m: float = 2.0
-    headway_s: float = 1.6
-    comfortable_deceleration: float = 1.7
-    min_acceleration: float = -20.0
-    max_acceleration: float = 0.7
-
-    def per_lane(self) -> IdmParameters:
-        """The parameters, which broadcast to lanes and pairs."""
-        return self
-
-    def brake_scale(self) -> float:
-        """``2 sqrt(a b)`` of the approach term, m/s2."""
-        return 2.0 * math.sqrt(self.max_acceleration * self.comfortable_deceleration)
+from ganlane.parameters.driving import IdmParameters
 
 
 class DriverIdm(NamedTuple):

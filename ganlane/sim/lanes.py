@@ -11,12 +11,12 @@ The driver of a vehicle always attends to the lanes of its body *and* to its tar
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 
@@ -25,14 +25,6 @@ ENTRY_M = 0.1
 VISIBILITY_OF_EPISODE = -1
 #: A lane change is complete, and the next one possible, within this distance of the target lane's centre.
 ARRIVED_M = 0.3
-
-
-class Visibility(IntEnum):
-    """When others see a vehicle that enters their lane."""
-
-    CENTRE = 0
-    BODY = 1
-    SIGNALLED = 2
 
 
 class LaneRange(NamedTuple):

@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
+from ganlane.parameters.driving import MobilParameters
 from ganlane.sim.following import acceleration_behind
 from ganlane.sim.idm import TABLE_V, AnyIdm, idm_acceleration
 from ganlane.sim.lanes import settled
 from ganlane.sim.neighbours import FREE_GAP_M, Follower, Neighbour, Scene, follower, leader
 from ganlane.sim.road import Road
-
-
-@dataclass(frozen=True)
-class MobilParameters:
-    """Table IV. The politeness ``q`` weights the old ('rear') follower, ``p`` the new ('side') one."""
-
-    threshold: float = 0.1
-    politeness_rear: float = 0.5
-    politeness_side: float = 1.0
-    safe_deceleration: float = 4.0
-    #: Of several vehicles that want to enter one lane within this distance, only the foremost does, m.
-    exclusive_m: float = 60.0
 
 
 class DriverMobil(NamedTuple):

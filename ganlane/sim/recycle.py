@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.sim.idm import IdmParameters, idm_acceleration
+from ganlane.parameters.driving import IdmParameters
+from ganlane.sim.idm import idm_acceleration
 from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

@@ -8,8 +8,9 @@ from __future__ import annotations
 from itertools import accumulate, chain
 
 from ganlane.errors import UserError
+from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.fixed_scene import SceneVehicle
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.idm import TABLE_V
 
 LENGTH_M = 4.5
 #: Desired speed of a broken-down vehicle; IDM requires more than 0.

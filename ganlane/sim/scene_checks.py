@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.bicycle import advance
 from ganlane.sim.braking import needed_deceleration
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import IdmParameters
 from ganlane.sim.neighbours import in_lane, perceive
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.road import Road

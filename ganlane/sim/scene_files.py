@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from ganlane.errors import UserError
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
-from ganlane.sim.lanes import Visibility
 from ganlane.sim.road import Road
 
 #: Columns of a scene file.

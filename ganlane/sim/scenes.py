@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.sim.idm import IdmParameters
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import IdmParameters, Visibility
+from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.road import Road
-from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
+from ganlane.sim.spawn import TABLE_II, check_start, spawn
 from ganlane.sim.vehicles import Vehicles
 
 STRAIGHT = Road()
@@ -55,7 +55,7 @@ class RandomScenes:
     others_visibility: int = Visibility.SIGNALLED
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """See :meth:`SpawnParameters.check`; the road must be the scene's, and wide and long enough for it."""
+        """See :func:`ganlane.sim.spawn.check_start`; the road must be the scene's, wide and long enough."""
         if isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
             return  # a road for each row: its vehicles come from recordings
         if road != self.road:
@@ -63,7 +63,7 @@ class RandomScenes:
                 f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both "
                 "the same road."
             )
-        self.parameters.check(self.vehicles, road.lanes, idm)
+        check_start(self.parameters, self.vehicles, road.lanes, idm)
         self._check_room(road.lane_width_m, road.ring_m)
 
     @property

@@ -12,7 +12,7 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.compiling import compiled
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.scenes import Scenes

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.mobil import TABLE_IV, MobilParameters
+from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.sim.idm import TABLE_V
+from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.steering import STEERING, SteeringParameters

@@ -14,7 +14,7 @@ from ganlane.errors import UserError
 from ganlane.generator.closed_loop import History, start, wander
 from ganlane.generator.networks import Generator
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Purpose, Stream, normal
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

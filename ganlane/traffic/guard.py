@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.following import acceleration_behind
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import Stream

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from ganlane.compiling import compiled
+from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.sim.bicycle import advance
 from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_changes
+from ganlane.sim.idm import TABLE_V
+from ganlane.sim.mobil import TABLE_IV, mobil_changes
 from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road

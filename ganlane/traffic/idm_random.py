@@ -11,11 +11,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
+from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.sim.bicycle import advance
 from ganlane.sim.braking import needed_deceleration
 from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V, DriverIdm, IdmParameters
-from ganlane.sim.mobil import TABLE_IV, DriverMobil, MobilParameters, mobil_changes
+from ganlane.sim.idm import TABLE_V, DriverIdm
+from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb, uniform
 from ganlane.sim.road import Road

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.sim.hazard import distance_hazard, literal_hazard, random_side
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import settled
-from ganlane.sim.mobil import MobilParameters, one_at_a_time, safe_change, without_ego
+from ganlane.sim.mobil import one_at_a_time, safe_change, without_ego
 from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.random import Purpose, Stream, normal, uniform
 from ganlane.sim.road import Road

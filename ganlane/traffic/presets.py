@@ -8,7 +8,8 @@ from typing import Any
 
 from ganlane.data import DrivingStatistics
 from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.parameters.driving import IdmParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.traffic.acceleration import AccelerationOverlay

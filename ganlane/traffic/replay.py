@@ -12,8 +12,7 @@ from torch import Tensor
 from ganlane.data import default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
-from ganlane.sim.idm import IdmParameters
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

@@ -25,14 +25,15 @@ from ganlane import keys
 from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
+from ganlane.parameters.driving import IdmParameters
+from ganlane.parameters.observation import MASKS
 from ganlane.sim.ego import ego_scene
-from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import prospect
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.transforms.sensors import perceived
 
-MASKS: Final = ("none", "legal", "safe")
 ACTIONS: Final = 3
 
 

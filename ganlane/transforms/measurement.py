@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import torch
@@ -10,44 +9,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.errors import UserError
+from ganlane.parameters.observation import SensorParameters
 from ganlane.sim.random import Purpose, normal, uniform
 from ganlane.sim.vehicles import Vehicles
 
 NOISES: Final = [Purpose.SENSED_POSITION, Purpose.SENSED_LATERAL, Purpose.SENSED_SPEED]
-#: How far a delay may be from a whole number of decisions, in decisions.
-TOLERANCE: Final = 1e-6
-
-
-@dataclass(frozen=True)
-class SensorParameters:
-    """Errors in what the ego perceives of the other vehicles; all 0: none.
-
-    Standard deviations of independent Gaussian errors of the position along the road, across it, and of the speed
-    (drawn anew for every vehicle and decision); the probability that a vehicle is not seen in a decision; the age
-    of what is perceived, a whole number of decisions.
-    """
-
-    position_noise_m: float = 0.0
-    lateral_noise_m: float = 0.0
-    speed_noise_mps: float = 0.0
-    dropout: float = 0.0
-    delay_s: float = 0.0
-
-    def delay_decisions(self, decision_period_s: float) -> int:
-        """The delay in decisions.
-
-        Raises:
-            UserError: it is none, or not a whole number of them.
-        """
-        decisions = self.delay_s / decision_period_s
-        if decisions < 0 or abs(decisions - round(decisions)) > TOLERANCE:
-            raise UserError(
-                f"observation.sensors.delay_s={self.delay_s:g}: expected a multiple of the decision period "
-                f"(env.decision_period_s={decision_period_s:g}), since the ego measures once per decision; change "
-                "one of them."
-            )
-        return round(decisions)
 
 
 class Measurement(NamedTuple):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -12,34 +10,7 @@ from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX
-
-
-@dataclass(frozen=True)
-class RewardParameters:
-    """Section V.C. Speeds in m/s, deceleration in m/s2; the other numbers are rewards.
-
-    ``literal_low_acceleration``: where the ego brakes hard, the paper's text negates the speed reward, which
-    below 15 m/s pays for crawling. By default its absolute value is negated.
-
-    ``soft_crash_behind`` is not in the paper: what an onset of somebody dangerously close *behind* the ego costs
-    (:func:`ganlane.sim.ego.look_around`). At 0, the paper's reward, the term is not there.
-    """
-
-    base_speed_mps: float = 15.0
-    low_acceleration: float = -2.0
-    literal_low_acceleration: bool = False
-    lane_change: float = -1.0
-    out_of_road: float = -100.0
-    hard_crash: float = -100.0
-    soft_crash: float = -10.0
-    goal: float = 100.0
-    soft_crash_behind: float = 0.0
-
-    @property
-    def term_names(self) -> tuple[str, ...]:
-        """The terms in the order in which they are added up."""
-        return keys.REWARD_TERM_NAMES + ((keys.SOFT_CRASH_BEHIND,) if self.soft_crash_behind else ())
-
+from ganlane.parameters.reward import RewardParameters
 
 SECTION_V_C = RewardParameters()
 

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ganlane.parameters.observation import ObservationScale
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
-
-
-@dataclass(frozen=True)
-class ObservationScale:
-    """Normalisers: the range of sight, m, and of relative speed, m/s (not a cap on driving)."""
-
-    range_m: float = 200.0
-    speed_mps: float = 30.0
 
 
 class Others(NamedTuple):

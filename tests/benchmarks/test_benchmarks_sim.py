@@ -13,12 +13,12 @@ from ganlane.benchmarks.sim_findings import ENVIRONMENT, PHYSICS, ratios, scalin
 from ganlane.benchmarks.systems import Scenario
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import IdmTrafficConfig, TrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
+from ganlane.parameters.reward import RewardParameters
 
-SCENARIO = Scenario(EnvConfig(), IdmTrafficConfig(), ObservationConfig(), RewardConfig())
+SCENARIO = Scenario(EnvConfig(), IdmTrafficConfig(), ObservationConfig(), RewardParameters())
 SHORT = Budget(repetitions=2, seconds=0.001)
 
 

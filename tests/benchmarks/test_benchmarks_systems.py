@@ -16,13 +16,13 @@ from ganlane.benchmarks.systems import (
 )
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.parameters.reward import RewardParameters
 
 
 def scenario(traffic=None, **env):
     traffic = traffic or IdmMobilTrafficConfig()
-    return Scenario(EnvConfig(**env), traffic, ObservationConfig(), RewardConfig(), seed=3)
+    return Scenario(EnvConfig(**env), traffic, ObservationConfig(), RewardParameters(), seed=3)
 
 
 def test_bare_physics_moves_everybody_as_the_environment_does():

@@ -15,17 +15,17 @@ from ganlane.benchmarks.timing import take
 from ganlane.benchmarks.train import TrainOptions, TrainSuite
 from ganlane.benchmarks.train_findings import AIM, MISSED, MUST, SYSTEM, best_rows, speeds
 from ganlane.benchmarks.train_loop import Training, advance, filled_run, with_gradients
-from ganlane.config.agent import AgentConfig
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.reward import RewardParameters
 
-SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardConfig())
+SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())
 TRAFFICS = {"idm_mobil": IdmMobilTrafficConfig(), "idm": IdmTrafficConfig()}
-RAINBOW = AgentConfig(hidden=[16, 16], batch_size=32, decisions_per_update=8, capacity=512, warmup=64).rainbow()
+RAINBOW = RainbowConfig(hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64)
 TRAINING = Training(SCENARIO, RAINBOW, stored=300)
 
 

@@ -11,14 +11,14 @@ from ganlane.benchmarks.timing import Budget, take
 from ganlane.benchmarks.train_loop import Training, make_agent
 from ganlane.benchmarks.train_losses import OURS, THEIRS, WHOLE, compare_losses, random_transitions, start_update
 from ganlane.benchmarks.train_peer import baselines_case, start_baselines
-from ganlane.config.agent import AgentConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
+from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.reward import RewardParameters
 
-SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardConfig())
-RAINBOW = AgentConfig(hidden=[16, 16], batch_size=32, decisions_per_update=8, capacity=512, warmup=64).rainbow()
+SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())
+RAINBOW = RainbowConfig(hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64)
 TRAINING = Training(SCENARIO, RAINBOW, stored=128)
 
 
@@ -43,7 +43,7 @@ def test_a_whole_update_changes_the_network_and_simulates_nothing():
 
 
 ROAD = EnvConfig(vehicles=4, lanes=2)
-LEARNER = AgentConfig(hidden=[12, 8], batch_size=16, decisions_per_update=8, capacity=64, warmup=16).rainbow()
+LEARNER = RainbowConfig(hidden=(12, 8), batch_size=16, decisions_per_update=8, capacity=64, warmup=16)
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,11 @@ from ganlane.benchmarks.train_shares import (
     take_shares,
     totals,
 )
-from ganlane.config.agent import AgentConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
-from ganlane.config.reward import RewardConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
+from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.reward import RewardParameters
 
 
 class Hands:
@@ -90,8 +90,8 @@ def test_afterwards_everything_is_as_it_was(hands):
 
 
 def test_every_part_of_the_real_loop_takes_time():
-    scenario = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardConfig())
-    agent = AgentConfig(hidden=[16, 16], batch_size=32, decisions_per_update=8, capacity=256, warmup=64).rainbow()
+    scenario = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())
+    agent = RainbowConfig(hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=256, warmup=64)
     run, env = filled_run(Training(scenario, agent, 64), "eager", "cpu", 8)
     backward, updates = torch.autograd.backward, run.agent.updates
     began = time.perf_counter()

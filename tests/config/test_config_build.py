@@ -9,18 +9,19 @@ from torchrl.envs.utils import check_env_specs
 
 from ganlane.agents.drivers import DRIVERS, MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig, IdmConfig, MobilConfig
+from ganlane.config.env import EnvConfig
 from ganlane.config.observation import FORMS, ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.errors import UserError
+from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.sim.random import Stream
 
-ROAD = EnvConfig(lanes=2, idm=IdmConfig(headway_s=1.2), mobil=MobilConfig(politeness_side=0.0))
+ROAD = EnvConfig(lanes=2, idm=IdmParameters(headway_s=1.2), mobil=MobilParameters(politeness_side=0.0))
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_built_environments_keep_their_specs(form):
-    check_env_specs(make_env(make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(form), num_envs=2))
+    check_env_specs(make_env(make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(form=form), num_envs=2))
 
 
 def test_a_reset_runs_the_episodes_that_were_asked_for():

@@ -50,7 +50,7 @@ def test_a_realism_card_has_no_ego_to_drive_around(config):
 
 def test_the_first_scene_is_that_of_the_environment():
     pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
-    env = EnvConfig(spread_m=300.0, rear_speed_mps=[12.0, 13.0])
+    env = EnvConfig(spread_m=300.0, rear_speed_mps=(12.0, 13.0))
     scenes = make_traffic(SumoTrafficConfig(truck_share=0.4), env).scenes(9)
     assert scenes.cars.parameters == env.spawn_parameters()
     assert scenes.share == 0.4

@@ -13,13 +13,14 @@ from torchrl.envs.utils import step_mdp
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig, SensorsConfig
+from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import GanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.config.traffic_replay import ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
+from ganlane.parameters.observation import SensorParameters
 from ganlane.traffic import IdmTraffic
 
 SEED = 4
@@ -72,7 +73,7 @@ def sources(recordings):
     return {
         "idm_mobil": Remade(IdmMobilTrafficConfig()),
         "recycled": Remade(IdmTrafficConfig(), EnvConfig(goal_m=90.0, recycle=True)),
-        "late sensors": Remade(IdmTrafficConfig(), sensors=SensorsConfig(position_noise_m=2.0, delay_s=2.0)),
+        "late sensors": Remade(IdmTrafficConfig(), sensors=SensorParameters(position_noise_m=2.0, delay_s=2.0)),
         "replayed": Remade(recordings),
         "cut short": Remade(IdmTrafficConfig(), wrap=lambda env: env.append_transform(StepCounter(max_steps=3))),
     }

@@ -10,8 +10,8 @@ from ganlane.agents import read_agent
 from ganlane.build import make_driver
 from ganlane.config.compose import check
 from ganlane.config.env import EnvConfig
-from ganlane.config.mask import MaskConfig
 from ganlane.errors import UserError
+from ganlane.parameters.observation import MaskParameters
 from ganlane.phases import AGENT_FILE, phases_of, run_phase
 from ganlane.training.checkpoints import LAST, load_checkpoint, save_checkpoint
 
@@ -41,9 +41,9 @@ def masked(tmp_path_factory):
 
 def test_an_agent_drives_behind_the_mask_that_it_was_trained_with(masked):
     driver = make_driver(str(masked / AGENT_FILE), EnvConfig())
-    assert driver.mask == MaskConfig("safe", 3.0)
+    assert driver.mask == MaskParameters("safe", 3.0)
     assert make_driver(f"{masked / AGENT_FILE}+safe", EnvConfig()).mask == driver.mask
-    assert make_driver(f"{masked / AGENT_FILE}+legal", EnvConfig()).mask == MaskConfig("legal")
+    assert make_driver(f"{masked / AGENT_FILE}+legal", EnvConfig()).mask == MaskParameters("legal")
 
 
 def test_the_mask_of_the_next_state_is_kept_with_every_transition(masked):

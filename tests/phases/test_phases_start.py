@@ -45,5 +45,5 @@ def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_
     config = check("train", told).config
     lengths = [make_agent(config, phase).config.learning_rate_decisions for phase in phases_of(config, tmp_path)]
     assert lengths == [5000, 90]
-    config.agent.learning_rate_decisions = 300
+    config.agent = replace(config.agent, learning_rate_decisions=300)
     assert make_agent(config, phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300

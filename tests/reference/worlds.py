@@ -11,12 +11,11 @@ from tensordict import TensorDictBase
 
 from ganlane import keys
 from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.sim.ego import EgoParameters
+from ganlane.parameters.driving import EgoParameters, Visibility
+from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
-from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
@@ -82,7 +81,7 @@ def environment(
         num_envs=num_envs,
         vehicles=vehicles,
         spawn_parameters=spawn,
-        ego=EgoParameters(abort_lane_change=abort, visibility=visibility),
+        ego=EgoParameters(abort_lane_change=abort, visibility=visibility.name.lower()),
         episode=EpisodeParameters(decision_period_s=period_s, goal_m=goal_m, timeout_s=timeout_s),
         **{"dtype": DOUBLE, **others},  # type: ignore[arg-type]
     )

@@ -8,7 +8,8 @@ import pytest
 import torch
 from reference.worlds import DOUBLE, vehicles
 
-from ganlane.sim.lanes import Visibility, body_lanes, presence, settled, with_target
+from ganlane.parameters.driving import Visibility
+from ganlane.sim.lanes import body_lanes, presence, settled, with_target
 from ganlane.sim.neighbours import FREE_GAP_M, follower, leader, perceive
 from ganlane.sim.road import Road
 

@@ -17,10 +17,10 @@ from reference import scalar
 from reference.worlds import DOUBLE, vehicles
 
 from ganlane import keys
+from ganlane.parameters.driving import MobilParameters, Visibility
 from ganlane.sim import mobil as mobil_module
 from ganlane.sim.idm import TABLE_V, idm_acceleration
-from ganlane.sim.lanes import Visibility
-from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_changes, mobil_wishes, without_ego
+from ganlane.sim.mobil import TABLE_IV, mobil_changes, mobil_wishes, without_ego
 from ganlane.sim.neighbours import FREE_GAP_M, perceive
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

@@ -10,10 +10,11 @@ import pytest
 import torch
 from reference.worlds import DOUBLE
 
+from ganlane.parameters.driving import Visibility
 from ganlane.sim import following, lanes
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import idm_acceleration
-from ganlane.sim.lanes import ARRIVED_M, LaneRange, Visibility, body_lanes, spanned, with_target
+from ganlane.sim.lanes import ARRIVED_M, LaneRange, body_lanes, spanned, with_target
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.idm_mobil import IdmTraffic

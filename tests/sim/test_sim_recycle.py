@@ -10,14 +10,14 @@ from reference.worlds import DOUBLE, environment, step, vehicles
 
 from ganlane import keys
 from ganlane.agents.drivers import MobilDriver
+from ganlane.parameters.driving import Visibility
+from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.following import following_acceleration
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.lanes import Visibility
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.recycle import RANGE_M, SAFE_DECELERATION, recycle
 from ganlane.sim.road import Road
-from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.vehicles import Vehicles
 
 ROAD = Road(lanes=3)

@@ -12,15 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ganlane.errors import UserError
+from ganlane.parameters.driving import Visibility
+from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.braking import can_brake, highest_speed, least_gap, needed_deceleration
 from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.lanes import Visibility
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.scene_files import read_scene
 from ganlane.sim.scenes import RandomScenes
-from ganlane.sim.spawn import SpawnParameters
+from ganlane.sim.spawn import check_start
 
 DOUBLE = torch.float64
 ROAD = Road(2)
@@ -86,32 +87,32 @@ def test_a_column_of_twelve_survives_where_a_pair_does(gap):
 
 
 def test_table_ii_can_be_driven():
-    SpawnParameters().check(9, 3)
+    check_start(SpawnParameters(), 9, 3)
 
 
 @pytest.mark.parametrize(
     ("parameters", "key", "remedy"),
     [
-        (SpawnParameters(min_spacing_m=10.0), "env.rear_speed_mps up to 25 m/s", "lower env.rear_speed_mps to 17.7"),
-        (SpawnParameters(ego_speed_mps=(10.0, 60.0)), "env.ego_speed_mps up to 60", "lower env.ego_speed_mps to"),
-        (SpawnParameters(front_speed_mps=(0.0, 40.0)), "env.front_speed_mps up to 40", "raise env.min_spacing_m to"),
+        (SpawnParameters(min_spacing_m=10.0), "rear_speed_mps up to 25 m/s", "lower rear_speed_mps to 17.7"),
+        (SpawnParameters(ego_speed_mps=(10.0, 60.0)), "ego_speed_mps up to 60", "lower ego_speed_mps to"),
+        (SpawnParameters(front_speed_mps=(0.0, 40.0)), "front_speed_mps up to 40", "raise min_spacing_m to"),
     ],
 )
-def test_ranges_that_nobody_can_brake_from_are_refused_with_the_key(parameters, key, remedy):
+def test_ranges_that_nobody_can_brake_from_are_refused_with_the_field(parameters, key, remedy):
     with pytest.raises(UserError) as refused:
-        parameters.check(9, 3)
+        check_start(parameters, 9, 3)
     assert key in str(refused.value)
     assert remedy in str(refused.value)
 
 
 def test_the_remedies_that_the_message_names_work():
-    replace(SpawnParameters(), min_spacing_m=17.8).check(9, 3)
-    replace(SpawnParameters(), min_spacing_m=10.0, rear_speed_mps=(15.0, 17.7)).check(9, 3)
+    check_start(SpawnParameters(min_spacing_m=17.8), 9, 3)
+    check_start(SpawnParameters(min_spacing_m=10.0, rear_speed_mps=(15.0, 17.7)), 9, 3)
 
 
 def test_weak_brakes_make_table_ii_hopeless():
-    with pytest.raises(UserError, match=r"env\.idm\.min_acceleration=-5"):
-        SpawnParameters().check(9, 3, replace(TABLE_V, min_acceleration=-5.0))
+    with pytest.raises(UserError, match=r"idm\.min_acceleration=-5"):
+        check_start(SpawnParameters(), 9, 3, replace(TABLE_V, min_acceleration=-5.0))
 
 
 def refusal(scenes: RandomScenes, road: Road) -> str:

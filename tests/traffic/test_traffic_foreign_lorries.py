@@ -2,7 +2,7 @@
 
 import torch
 
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.scenes import RandomScenes

@@ -12,8 +12,8 @@ from reference.foreign import drive, start, turns
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.lanes import Visibility
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic import HighwayEnvTraffic

@@ -7,7 +7,7 @@ import torch
 from reference.worlds import DOUBLE, environment, same_bits, step, vehicles
 
 from ganlane import keys
-from ganlane.sim.mobil import MobilParameters
+from ganlane.parameters.driving import MobilParameters
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule

@@ -14,8 +14,9 @@ from ganlane.agents.drivers import DRIVERS
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.lanes import Visibility, body_lanes
+from ganlane.sim.lanes import body_lanes
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic import IdmTraffic, SumoTraffic

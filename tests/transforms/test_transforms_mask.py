@@ -18,9 +18,9 @@ from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, MaskedPolicy
 from ganlane.build import make_driver
 from ganlane.config.env import EnvConfig
-from ganlane.config.mask import MASKS as OFFERED
-from ganlane.config.mask import MaskConfig
 from ganlane.errors import UserError
+from ganlane.parameters.observation import MASKS as OFFERED
+from ganlane.parameters.observation import MaskParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.road import Road
 from ganlane.transforms import MASKS, ActionMaskTransform
@@ -249,16 +249,16 @@ def test_the_masks_of_the_command_line_are_those_of_the_transform():
 
 def test_a_suffix_puts_any_driver_behind_a_mask():
     driver = make_driver("mobil_egoistic+safe", EnvConfig())
-    assert (driver.name, driver.mask) == ("mobil_egoistic+safe", MaskConfig("safe"))
+    assert (driver.name, driver.mask) == ("mobil_egoistic+safe", MaskParameters("safe"))
     mask, policy = driver.behind(None)
     assert mask.form == "safe"
     assert isinstance(policy, MaskedPolicy)
 
 
 def test_the_suffix_none_takes_the_mask_away():
-    driver = replace(make_driver("mobil", EnvConfig()), mask=MaskConfig("safe"))
+    driver = replace(make_driver("mobil", EnvConfig()), mask=MaskParameters("safe"))
     assert driver.behind(None)[0].form == "safe"
-    assert make_driver("mobil+none", EnvConfig()).behind(MaskConfig("safe"))[0].form == "none"
+    assert make_driver("mobil+none", EnvConfig()).behind(MaskParameters("safe"))[0].form == "none"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.sim.lanes import Visibility
+from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.sim.idm import IdmParameters
+from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.random import Purpose, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.scenes import RandomScenes

@@ -12,14 +12,16 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
+from ganlane.parameters.driving import IdmParameters, Visibility
+from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.ego import ego_scene, move_ego
 from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.lanes import Visibility, body_lanes, presence, with_target
+from ganlane.sim.idm import TABLE_V
+from ganlane.sim.lanes import body_lanes, presence, with_target
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.scenes import RandomScenes, Scenes
-from ganlane.sim.spawn import TABLE_II, SpawnParameters
+from ganlane.sim.spawn import TABLE_II
 from ganlane.sim.steering import STEERING, SteeringParameters
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule

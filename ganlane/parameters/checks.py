@@ -1,4 +1,4 @@
-"""Range checks of config values, as rules with names."""
+"""Range checks of parameters, as rules with names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import MISSING, Field, fields
 from typing import Any, NamedTuple
 
-from ganlane.errors import UserError
+from ganlane.errors import ParameterError
 
 
 class Rule(NamedTuple):
@@ -73,6 +73,11 @@ def speed_range() -> Rule:
     )
 
 
+def positive_range() -> Rule:
+    """Two numbers above 0, the first not above the second."""
+    return Rule(lambda value: speed_range().holds(value) and value[0] > 0, "two numbers [low, high], 0 < low <= high")
+
+
 def every(rule: Rule) -> Rule:
     """A list, not empty, of which every entry obeys ``rule``."""
     return Rule(
@@ -86,37 +91,38 @@ def optional(rule: Rule) -> Rule:
     return Rule(lambda value: value is None or rule.holds(value), f"null or {rule.expected}")
 
 
-def check(config: Any, where: str, **rules: Rule) -> None:
-    """Hold fields of a config dataclass against ``rules``.
+def check(config: Any, where: str = "", /, **rules: Rule) -> None:
+    """Hold fields of a dataclass against ``rules``.
 
     Args:
         config: the dataclass.
-        where: how its keys are called on the command line, for instance ``env``; empty at the root.
+        where: key of the record on the command line, where it has only one; empty for the records of
+            :mod:`ganlane.parameters`, which do not know theirs, and at the root.
         rules: by field name.
 
     Raises:
-        UserError: for the first value that will not do; names key, value, what was expected, and a value that does.
+        ParameterError: for the first value that will not do; names field, value, what was expected, and a value
+            that does.
     """
     known = {field.name: field for field in fields(config)}
     for name, rule in rules.items():
         value = getattr(config, name)
         if not rule.holds(value):
-            key = f"{where}.{name}" if where else name
-            advice = _advice(key, known[name])
-            raise UserError(f"{key}={_shown(value)}: expected {rule.expected}{advice}.")
+            advice = _advice(known[name])
+            raise ParameterError(f"{{{name}}}={_shown(value)}: expected {rule.expected}{advice}.", where)
 
 
-def _advice(key: str, field: Field[Any]) -> str:
+def _advice(field: Field[Any]) -> str:
     """The default as an example, where there is one."""
     default = field.default_factory() if field.default_factory is not MISSING else field.default
-    return f"; give for instance {key}={_shown(default)}" if default not in (MISSING, None, "") else ""
+    return f"; give for instance {{{field.name}}}={_shown(default)}" if default not in (MISSING, None, "") else ""
 
 
 def _shown(value: Any) -> str:
     """As one would type it."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return f"[{','.join(map(_shown, value))}]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 

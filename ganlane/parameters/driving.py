@@ -1,0 +1,103 @@
+"""How drivers follow and change lanes: Tables IV and V, and what is special about the ego."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+from ganlane.parameters.checks import above, at_least, below, check, one_of
+
+
+class Visibility(IntEnum):
+    """When others see a vehicle that enters their lane; see :mod:`ganlane.sim.lanes`."""
+
+    CENTRE = 0
+    BODY = 1
+    SIGNALLED = 2
+
+    @classmethod
+    def named(cls, name: str) -> Visibility:
+        """From its name in lower case, as on the command line."""
+        return cls[name.upper()]
+
+
+VISIBILITIES = tuple(kind.name.lower() for kind in Visibility)
+
+
+@dataclass(frozen=True)
+class IdmParameters:
+    """The Intelligent Driver Model (Treiber et al. 2000) with the paper's Table V.
+
+    The acceleration exponent is 4, computed as two squarings: the result of ``torch.pow`` may differ in its last bits
+    between batch sizes.
+
+    Attributes:
+        min_gap_m: gap to a standing leader, m, at least 0.
+        headway_s: time headway, s, at least 0.
+        comfortable_deceleration: m/s2, above 0.
+        min_acceleration: the hardest braking, m/s2, below 0.
+        max_acceleration: m/s2, above 0.
+    """
+
+    min_gap_m: float = 2.0
+    headway_s: float = 1.6
+    comfortable_deceleration: float = 1.7
+    min_acceleration: float = -20.0
+    max_acceleration: float = 0.7
+
+    def __post_init__(self) -> None:
+        positive = dict.fromkeys(("comfortable_deceleration", "max_acceleration"), above(0))
+        check(self, min_gap_m=at_least(0), headway_s=at_least(0), min_acceleration=below(0), **positive)
+
+    def per_lane(self) -> IdmParameters:
+        """The parameters, which broadcast to lanes and pairs."""
+        return self
+
+    def brake_scale(self) -> float:
+        """``2 sqrt(a b)`` of the approach term, m/s2."""
+        return 2.0 * math.sqrt(self.max_acceleration * self.comfortable_deceleration)
+
+
+@dataclass(frozen=True)
+class MobilParameters:
+    """The lane-changing model MOBIL (Kesting et al. 2007) with the paper's Table IV; all at least 0.
+
+    Attributes:
+        threshold: least incentive for a change, m/s2.
+        politeness_rear: ``q``, weights the old ('rear') follower.
+        politeness_side: ``p``, weights the new ('side') one.
+        safe_deceleration: nobody is made to brake harder, m/s2, above 0.
+        exclusive_m: of several vehicles that want to enter one lane within this distance, only the foremost does, m.
+    """
+
+    threshold: float = 0.1
+    politeness_rear: float = 0.5
+    politeness_side: float = 1.0
+    safe_deceleration: float = 4.0
+    exclusive_m: float = 60.0
+
+    def __post_init__(self) -> None:
+        names = ("threshold", "politeness_rear", "politeness_side", "exclusive_m")
+        check(self, safe_deceleration=above(0), **dict.fromkeys(names, at_least(0)))
+
+
+@dataclass(frozen=True)
+class EgoParameters:
+    """How the ego handles commands and when others see its lane changes.
+
+    Attributes:
+        abort_lane_change: whether the opposite command turns back the current lane change.
+        visibility: when others see its lane changes: one of :data:`VISIBILITIES`.
+        soft_crash_ttc_s: a time to collision below this is a soft crash, s, at least 0.
+        soft_crash_gap_m: and so is a gap below this, m, at least 0.
+    """
+
+    abort_lane_change: bool = False
+    visibility: str = "body"
+    soft_crash_ttc_s: float = 1.5
+    soft_crash_gap_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        limits = dict.fromkeys(("soft_crash_ttc_s", "soft_crash_gap_m"), at_least(0))
+        check(self, visibility=one_of(VISIBILITIES), **limits)

@@ -1,0 +1,108 @@
+"""An episode: its initial scene (Table II), the decision period of the ego, and its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ganlane.errors import ParameterError
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.checks import above, between, check, positive_range, speed_range
+from ganlane.parameters.records import lists_to_tuples
+
+
+@dataclass(frozen=True)
+class EpisodeParameters:
+    """Decision period of the ego, distance to the goal and time limit; all above 0.
+
+    Attributes:
+        decision_period_s: a multiple of 0.1 s, the physics step.
+        goal_m: distance from the start at which the episode ends with the goal's reward, m.
+        timeout_s: time at which it is cut off, s.
+    """
+
+    decision_period_s: float = 1.0
+    goal_m: float = 5000.0
+    timeout_s: float = 1000.0
+
+    def __post_init__(self) -> None:
+        check(self, decision_period_s=above(0), goal_m=above(0), timeout_s=above(0))
+        if self.substeps() < 1 or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9:
+            raise ParameterError(
+                f"{{decision_period_s}}={self.decision_period_s:g} is not a multiple of {PHYSICS_STEP_S:g} s; "
+                "choose 0.1, 0.2, ... 1.0 or more."
+            )
+
+    def substeps(self) -> int:
+        """Physics steps per decision."""
+        return round(self.decision_period_s / PHYSICS_STEP_S)
+
+
+@dataclass(frozen=True)
+class SpawnParameters:
+    """Table II, extended by lorries. Distances in m, speeds in m/s, (low, high) ranges.
+
+    ``min_spacing_m`` is centre to centre in a lane, between cars; it is larger by the extra length of lorries
+    (:attr:`spacing_m`). Each vehicle but the ego is a lorry with probability ``truck_share``. The defaults: 12 m and
+    2.5 m, the longest rigid lorry of Directive 96/53/EC and about its 2.55 m; desired speeds of 80 to 90 km/h, from
+    Germany's limit for lorries to the speed limiter of Directive 92/6/EEC.
+
+    Sizes are above 0, speeds from 0 on, desired speeds above 0. Whether so many vehicles fit and can brake is
+    :func:`ganlane.sim.spawn.check_start`'s matter.
+    """
+
+    spread_m: float = 200.0
+    min_spacing_m: float = 25.0
+    front_speed_mps: tuple[float, float] = (10.0, 12.0)
+    rear_speed_mps: tuple[float, float] = (15.0, 25.0)
+    ego_speed_mps: tuple[float, float] = (10.0, 15.0)
+    desired_speed_mps: tuple[float, float] = (18.0, 26.0)
+    ego_desired_speed_mps: float = 25.0
+    length_m: float = 4.5
+    width_m: float = 2.5
+    truck_share: float = 0.0
+    truck_length_m: float = 12.0
+    truck_width_m: float = 2.5
+    truck_desired_speed_mps: tuple[float, float] = (22.0, 25.0)
+
+    def __post_init__(self) -> None:
+        lists_to_tuples(self)
+        sizes = ("spread_m", "min_spacing_m", "length_m", "width_m", "truck_length_m", "truck_width_m")
+        speeds = ("front_speed_mps", "rear_speed_mps", "ego_speed_mps")
+        desired = ("desired_speed_mps", "truck_desired_speed_mps")
+        check(
+            self,
+            **dict.fromkeys((*sizes, "ego_desired_speed_mps"), above(0)),
+            truck_share=between(0, 1),
+            **dict.fromkeys(speeds, speed_range()),
+            # IDM divides by the desired speed.
+            **dict.fromkeys(desired, positive_range()),
+        )
+
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest possible vehicle, m."""
+        return max(self.length_m, self.truck_length_m) if self.truck_share > 0 else self.length_m
+
+    @property
+    def widest_m(self) -> float:
+        """Width of the widest possible vehicle, m."""
+        return max(self.width_m, self.truck_width_m) if self.truck_share > 0 else self.width_m
+
+    @property
+    def spacing_m(self) -> float:
+        """Minimum distance between centres in a lane, m: the gap between two lorries is that between two cars."""
+        return self.min_spacing_m + (self.longest_m - self.length_m)
+
+    def lane_capacity(self) -> int:
+        """Vehicles that fit into one lane, whichever of them are lorries."""
+        return int(self.spread_m / self.spacing_m) + 1
+
+    def worst_followers(self) -> tuple[tuple[str, float, float, float], ...]:
+        """Fastest followers: key, highest speed, the leader's lowest speed, highest desired speed, m/s."""
+        front, rear, ego = self.front_speed_mps, self.rear_speed_mps, self.ego_speed_mps
+        others = max(self.desired_speed_mps[1], self.truck_desired_speed_mps[1] if self.truck_share > 0 else 0.0)
+        return (
+            ("rear_speed_mps", rear[1], min(rear[0], ego[0], front[0]), others),
+            ("ego_speed_mps", ego[1], front[0], self.ego_desired_speed_mps),
+            ("front_speed_mps", front[1], front[0], others),
+        )

@@ -75,7 +75,7 @@ def test_after_a_reset_nothing_has_happened_yet():
 
 
 def test_vehicles_that_do_not_fit_are_refused():
-    with pytest.raises(UserError, match=r"env\.vehicles=30"):
+    with pytest.raises(UserError, match=r"^vehicles=30 do not fit"):
         environment(lanes=3, vehicles=30)
 
 

@@ -43,18 +43,21 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
 
 
 def _defaults_of_then(run: Path) -> list[str]:
-    """What a run of version 0.1.0 had where its command line said nothing and the defaults have changed since.
+    """What a run had that began before train's defaults changed, where its command line said nothing.
 
-    Its config.yaml is recognised by knowing no masks; the numbers are taken from there.
+    Its config.yaml is recognised by not knowing ``compile``, which came with the new defaults; the numbers, and the
+    form of the mask if masks were known, are taken from there.
     """
     try:
         config: Any = OmegaConf.load(run / CONFIG)
-        if "mask" in config:
+        if "compile" in config:
             return []
         kept = {key: OmegaConf.select(config, key) for key in CHANGED_SINCE_0_1}
+        mask = OmegaConf.select(config, "mask.form") or "none"
     except Exception:  # missing, no YAML, no text; what is wrong with the run, its checkpoint will tell
         return []
-    return ["mask=none", "agent=rainbow", "compile=false", *(f"{key}={quoted(value)}" for key, value in kept.items())]
+    numbers = [f"{key}={quoted(value)}" for key, value in kept.items()]
+    return [f"mask={mask}", "agent=rainbow", "compile=false", *numbers]
 
 
 def _stored(path: Path) -> list[str]:

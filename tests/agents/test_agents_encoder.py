@@ -147,7 +147,7 @@ def test_an_observation_of_another_layout_is_refused(size):
 def test_an_unknown_encoder_is_refused():
     with pytest.raises(UserError, match="choose one of none, shared"):
         network(encoder="lstm")
-    with pytest.raises(UserError, match="choose one of none, shared"):
+    with pytest.raises(UserError, match="encoder=lstm: expected one of none, shared"):
         agent(encoder="lstm")
-    with pytest.raises(UserError, match=r"agent\.encoder_width=0"):
+    with pytest.raises(UserError, match=r"^encoder_width=0: expected at least 1"):
         RainbowConfig(encoder_width=0)

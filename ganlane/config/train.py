@@ -83,6 +83,8 @@ class TrainConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        # The command line gives true and false as truth values, which as text are True and False.
+        self.compile = str(self.compile).lower()
         check(
             self,
             "",

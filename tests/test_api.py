@@ -109,7 +109,7 @@ def test_own_drivers_and_own_names_stand_in_the_table():
 
 
 def test_a_run_is_trained_resumed_and_evaluated():
-    small = {"warmup": 64, "capacity": 1000, "hidden": [16], "batch_size": 16}
+    small = {"name": "rainbow", "warmup": 64, "capacity": 1000, "hidden": [16], "batch_size": 16}
     tiny = {"agent": small, "num_envs": 8, "goal_m": 40.0, "evaluation": {"agents": ["mobil"], "episodes": 2}}
     run = ganlane.train("idm", "none", total_decisions=256, folder="run", logger={"progress": False}, **tiny)
     assert run.agent == Path("run/agent.safetensors")

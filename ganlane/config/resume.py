@@ -45,16 +45,16 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
 def _defaults_of_then(run: Path) -> list[str]:
     """What a run of version 0.1.0 had where its command line said nothing and the defaults have changed since.
 
-    Its config.yaml is recognised by knowing no masks; the numbers are taken from there.
+    Its config.yaml is recognised by not saying whether to compile; the numbers are taken from there.
     """
     try:
         config: Any = OmegaConf.load(run / CONFIG)
-        if "mask" in config:
+        if "compile" in config:
             return []
         kept = {key: OmegaConf.select(config, key) for key in CHANGED_SINCE_0_1}
     except Exception:  # missing, no YAML, no text; what is wrong with the run, its checkpoint will tell
         return []
-    return ["mask=none", "agent=rainbow", "compile=false", *(f"{key}={quoted(value)}" for key, value in kept.items())]
+    return ["mask=none", "agent=rainbow", "compile=never", *(f"{key}={quoted(value)}" for key, value in kept.items())]
 
 
 def _stored(path: Path) -> list[str]:

@@ -18,7 +18,7 @@ from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 
-COMPILE = ("auto", "true", "false")
+COMPILE = ("auto", "always", "never")
 #: Compiling takes one to two minutes, which a training of so many decisions gets back.
 WORTH_COMPILING = 300_000
 
@@ -101,7 +101,7 @@ class TrainConfig(RunConfig):
         from ganlane.compiling import has_compiler
 
         worth = self.total_decisions >= WORTH_COMPILING and has_compiler()
-        if self.env.compile or self.compile == "false" or (self.compile == "auto" and not worth):
+        if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):
             return self
         return replace(self, env=replace(self.env, compile=True))
 

@@ -349,7 +349,15 @@ def test_a_delay_between_two_decisions_is_a_users_mistake(tmp_path, monkeypatch,
 
 
 TINY = [
-    *("env.goal_m=40", "traffic=idm", "init=none", "log_every=160", "collector.num_envs=16", "agent.hidden=[16,16]"),
+    *(
+        "env.goal_m=40",
+        "traffic=idm",
+        "init=none",
+        "agent=rainbow",
+        "log_every=160",
+        "collector.num_envs=16",
+        "agent.hidden=[16,16]",
+    ),
     *("agent.batch_size=32", "agent.warmup=64", "agent.capacity=1000"),
     *("evaluation.agents=[keep_lane]", "evaluation.episodes=2", *ERRORS),
 ]

@@ -95,7 +95,7 @@ def keys_of(config: Any, command: str, chosen: tuple[str, ...] = (), prefix: str
         value, name = getattr(config, field.name), f"{prefix}{field.name}"
         if dataclasses.is_dataclass(value):
             yield from keys_of(value, command, chosen, f"{name}.")
-        elif isinstance(value, dict) and value:
+        elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):
             for part, below in value.items():
                 yield from keys_of(below, command, chosen, f"{name}.{part}.")
         else:

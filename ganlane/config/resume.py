@@ -57,7 +57,7 @@ def _defaults_of_then(run: Path) -> list[str]:
     except Exception:  # missing, no YAML, no text; what is wrong with the run, its checkpoint will tell
         return []
     numbers = [f"{key}={quoted(value)}" for key, value in kept.items()]
-    return [f"mask={mask}", "agent=rainbow", "compile=false", *numbers]
+    return [f"mask={mask}", "agent=rainbow", "compile=never", *numbers]
 
 
 def _stored(path: Path) -> list[str]:

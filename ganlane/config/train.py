@@ -18,7 +18,7 @@ from ganlane.parameters.checks import at_least, between, check, one_of
 from ganlane.parameters.observation import MaskParameters
 from ganlane.parameters.reward import RewardParameters
 
-COMPILE = ("auto", "true", "false")
+COMPILE = ("auto", "always", "never")
 #: Compiling takes one to two minutes, which a training of so many decisions gets back.
 WORTH_COMPILING = 300_000
 
@@ -83,8 +83,6 @@ class TrainConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # The command line gives true and false as truth values, which as text are True and False.
-        self.compile = str(self.compile).lower()
         check(
             self,
             "",
@@ -103,7 +101,7 @@ class TrainConfig(RunConfig):
         from ganlane.compiling import has_compiler
 
         worth = self.total_decisions >= WORTH_COMPILING and has_compiler()
-        if self.env.compile or self.compile == "false" or (self.compile == "auto" and not worth):
+        if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):
             return self
         return replace(self, env=replace(self.env, compile=True))
 

@@ -36,6 +36,7 @@ EXTRAS: Final = {
         "peers of ganlane bench",
         ("highway-env>=1.10", "stable-baselines3>=2.4", "eclipse-sumo>=1.20", "libsumo>=1.20"),
     ),
+    "sumo": ("traffic=sumo", ("eclipse-sumo>=1.20", "libsumo>=1.20")),
     "wandb": ("logger=wandb", ("wandb>=0.18",)),
     "ray": ("distributed collection", ("ray>=2.40",)),
     "sweeps": ("sweeps in several processes", ("hydra-joblib-launcher>=1.2",)),

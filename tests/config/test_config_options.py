@@ -271,8 +271,8 @@ def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(options):
     assert json.loads(json.dumps(dataclasses.asdict(options.fit_config(seed=0)))) == shipped
 
 
-@pytest.mark.parametrize("value", ["auto", "true", "false"])
+@pytest.mark.parametrize("value", ["auto", "always", "never"])
 def test_a_training_is_told_whether_to_compile(value):
     config = config_of("train", f"compile={value}")
     assert config.compile == value
-    assert config_of("train", "total_decisions=16", f"compile={value}").compiled().env.compile is (value == "true")
+    assert config_of("train", "total_decisions=16", f"compile={value}").compiled().env.compile is (value == "always")

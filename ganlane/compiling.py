@@ -14,6 +14,8 @@ from ganlane.errors import UserError
 F = TypeVar("F", bound=Callable)
 #: Graphs that one function may have: one per batch size, road and set of parameters in a process.
 GRAPHS_PER_FUNCTION = 64
+#: With torch 2.11 on Python 3.12 a NamedTuple that leaves a compiled graph is empty; 2.13 is right.
+TRIED_FROM = (2, 13)
 COMPILERS = ("c++", "g++", "clang++", "cl")
 
 
@@ -21,6 +23,12 @@ def has_compiler() -> bool:
     """Whether torch would find a C++ compiler: the one that ``CXX`` names, or one of :data:`COMPILERS`."""
     named = os.environ.get("CXX")
     return any(shutil.which(name) for name in ((named,) if named else COMPILERS))
+
+
+def can_compile() -> bool:
+    """Whether compiling is known to work here: a C++ compiler, and a torch from :data:`TRIED_FROM` on."""
+    version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
+    return has_compiler() and version >= TRIED_FROM
 
 
 def check_compiler() -> None:

@@ -98,9 +98,9 @@ class TrainConfig(RunConfig):
 
     def compiled(self) -> TrainConfig:
         """The same with ``env.compile`` as ``compile`` says."""
-        from ganlane.compiling import has_compiler
+        from ganlane.compiling import can_compile
 
-        worth = self.total_decisions >= WORTH_COMPILING and has_compiler()
+        worth = self.total_decisions >= WORTH_COMPILING and can_compile()
         if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):
             return self
         return replace(self, env=replace(self.env, compile=True))

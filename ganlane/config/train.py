@@ -57,7 +57,8 @@ class TrainConfig(RunConfig):
     """Everything that ``ganlane train`` can be told.
 
     ``compile``: whether the training is compiled (the final evaluation is with ``env.compile=true`` alone). ``auto``:
-    where there is a C++ compiler and the training is long enough to gain by it (:data:`WORTH_COMPILING`).
+    where compiling is known to work (:func:`ganlane.compiling.can_compile`) and the training is long enough to gain
+    by it (:data:`WORTH_COMPILING`).
     """
 
     total_decisions: int = 600_000

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
+from ganlane.transforms.mask import ACTIONS
 
-ACTIONS: Final = 3
 #: Unseeded environments draw their seed below this.
 SEEDS: Final = 2**31
 

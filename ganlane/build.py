@@ -120,6 +120,7 @@ def make_env(
         device=device,
         scenes=env.scenes(traffic.visibility),
         recycle=env.recycle,
+        recycle_share=env.recycle_share,
     )
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
     masks = _mask_transforms(mask or MaskParameters(), base, env)

@@ -27,6 +27,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         lanes: 1 to 20.
         lane_width_m: above the vehicles' width; the paper gives none.
         recycle: whether vehicles that the ego leaves behind return ahead of it, and the reverse.
+        recycle_share: share of the episodes in which they do, 0 to 1.
         compile: whether physics and traffic run as compiled graphs.
         ego, idm, mobil: how the ego drives, how all follow, and how the others change lanes.
     """
@@ -35,6 +36,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     lanes: int = 3
     lane_width_m: float = 4.0
     recycle: bool = False
+    recycle_share: float = 1.0
     compile: bool = False
     ego: EgoParameters = field(default_factory=EgoParameters)
     idm: IdmParameters = field(default_factory=IdmParameters)
@@ -42,6 +44,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
 
     def __post_init__(self) -> None:
         check(self, vehicles=between(2, 1000), lanes=between(1, 20), lane_width_m=above(0))
+        check(self, recycle_share=between(0, 1))
         SpawnParameters.__post_init__(self)
         EpisodeParameters.__post_init__(self)
         self._check_together()

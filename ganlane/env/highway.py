@@ -20,7 +20,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.random import episode_key
+from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.recycle import out_of_range
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.scenes import RandomScenes, Scenes
@@ -48,6 +48,8 @@ class HighwayEnv(EnvBase):
         device, dtype: where and in which float type to simulate.
         recycle: put vehicles that the ego leaves behind back in front of it, and the reverse, after every decision
             (:mod:`ganlane.sim.recycle`), so that the road never empties.
+        recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1; which ones follows from their
+            numbers. A mixture of roads that empty and roads that do not, to train on both.
 
     An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with ``seed`` and
     ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With a mask the masked rows go on to
@@ -56,7 +58,7 @@ class HighwayEnv(EnvBase):
 
     Raises:
         UserError: the vehicles do not fit on the road or could not brake in time, the decision period is not a
-            multiple of 0.1 s, or the traffic belongs to another stream.
+            multiple of 0.1 s, the traffic belongs to another stream, or ``recycle_share`` is no share.
     """
 
     batch_locked = True
@@ -78,6 +80,7 @@ class HighwayEnv(EnvBase):
         dtype: torch.dtype = torch.float32,
         scenes: Scenes | None = None,
         recycle: bool = False,
+        recycle_share: float = 1.0,
     ) -> None:
         super().__init__(device=device or torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.traffic = traffic.to(self.device)
@@ -88,7 +91,7 @@ class HighwayEnv(EnvBase):
         self.stream, self.dtype = traffic.stream, dtype
         self.scenes = scenes or self._own_scenes(9 if vehicles is None else vehicles)
         self.vehicles = self.scenes.vehicles
-        self.first_episode, self.recycle = first_episode, recycle
+        self.first_episode, self.recycle, self.recycle_share = first_episode, recycle, recycle_share
         self.recorder: Recorder | None = None
         self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
         self.physics = Physics()
@@ -108,6 +111,10 @@ class HighwayEnv(EnvBase):
         if self.recycle and self.traffic.own_roads:
             raise UserError(
                 "env.recycle=true with replayed traffic: recorded vehicles go where they went; leave it off."
+            )
+        if not 0.0 <= self.recycle_share <= 1.0:
+            raise UserError(
+                f"env.recycle_share={self.recycle_share:g}: expected a number from 0 to 1; give such a share."
             )
         if vehicles is not None and vehicles != self.vehicles:
             raise UserError(
@@ -206,7 +213,7 @@ class HighwayEnv(EnvBase):
         }
         if self.traffic.own_roads:
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
-        return pack(self._recycled(rules, at), remembered, memory, events, rest)
+        return pack(self._recycled(rules, at, key), remembered, memory, events, rest)
 
     def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
         """The rules of every row: replayed scenes have roads and an end of their own."""
@@ -214,8 +221,12 @@ class HighwayEnv(EnvBase):
             return self.rules
         return self.rules._replace(road=road_in(state, self.road), scene_steps=self.traffic.steps_of(key))
 
-    def _recycled(self, rules: Rules, at: Substep) -> Vehicles:
+    def _recycled(self, rules: Rules, at: Substep, key: Tensor) -> Vehicles:
         """The vehicles after a decision; in rows that go on moved round the ego where it has left them behind."""
         if not self.recycle or known_false(out_of_range(at.vehicles, rules.road).any()):
             return at.vehicles
-        return self.physics.recycle(at.vehicles, rules.road, rules.idm).where(at.running, at.vehicles)
+        recycled = at.running
+        if self.recycle_share < 1.0:
+            chosen = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)[..., 0].reshape(recycled.shape)
+            recycled = recycled & (chosen < self.recycle_share)
+        return self.physics.recycle(at.vehicles, rules.road, rules.idm).where(recycled, at.vehicles)

@@ -54,6 +54,7 @@ class Purpose(IntEnum):
     BLIND_EPISODE = 69
     DRIVER = 70  # and the 15 purposes after it: per-driver parameters (traffic=idm_random)
     SPAWN_TRUCK = 90
+    RECYCLED_EPISODE = 91
     FOREIGN_DRIVER = 128  # and the 15 purposes after it: drivers of a foreign simulator, one per parameter
 
 

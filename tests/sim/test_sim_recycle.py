@@ -10,6 +10,7 @@ from reference.worlds import DOUBLE, environment, step, vehicles
 
 from ganlane import keys
 from ganlane.agents.drivers import MobilDriver
+from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
@@ -252,3 +253,32 @@ def test_an_environment_that_recycles_is_the_same_in_every_batch():
             td = env.step(driver(td))["next"]
         states.append(td[keys.VEHICLES, "x"])
     assert torch.equal(states[0][2], states[1][0])
+
+
+# A share of the episodes
+
+
+def far_behind(share: float, num_envs: int = 32, first_episode: int = 0) -> torch.Tensor:
+    """Whether somebody is far more than 200 m behind the ego after 60 decisions at up to 35 m/s, bool [N]."""
+    spawn = SpawnParameters(ego_desired_speed_mps=35.0)
+    env = environment(num_envs=num_envs, spawn=spawn, first_episode=first_episode, recycle=True, recycle_share=share)
+    state = env.reset()
+    for _ in range(60):
+        state = step(env, state, 0)
+    x = state[keys.VEHICLES, "x"]
+    return ((x[:, :1] - x) > RANGE_M + 40.0).any(1)
+
+
+def test_only_a_share_of_the_episodes_is_recycled_and_the_same_ones_in_any_batch():
+    never = far_behind(0.0)
+    half = far_behind(0.5)
+    assert never.sum() > 16
+    assert far_behind(1.0).sum() < 0.1 * never.sum()  # who finds no room waits
+    assert 0.2 < half.sum() / never.sum() < 0.8
+    assert torch.equal(half[8:12], far_behind(0.5, num_envs=4, first_episode=8))
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_a_share_outside_0_to_1_is_refused(share):
+    with pytest.raises(UserError, match="recycle_share"):
+        environment(num_envs=2, recycle=True, recycle_share=share)

@@ -272,8 +272,8 @@ def far_behind(share: float, num_envs: int = 32, first_episode: int = 0) -> torc
 def test_only_a_share_of_the_episodes_is_recycled_and_the_same_ones_in_any_batch():
     never = far_behind(0.0)
     half = far_behind(0.5)
-    assert never.sum() > 16
-    assert far_behind(1.0).sum() < 0.1 * never.sum()  # who finds no room waits
+    assert never.sum() > 8
+    assert far_behind(1.0).sum() < 0.2 * never.sum()  # who finds no room waits
     assert 0.2 < half.sum() / never.sum() < 0.8
     assert torch.equal(half[8:12], far_behind(0.5, num_envs=4, first_episode=8))
 

@@ -5,8 +5,8 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
 from ganlane.env import EpisodeParameters, HighwayEnv
-from ganlane.sim.road import Road
-from ganlane.sim.scenes import RandomScenes
+from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import ObservationTransform, RewardTransform
 

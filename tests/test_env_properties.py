@@ -15,11 +15,10 @@ from torchrl.envs import Compose, TransformedEnv
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardParameters, RewardTransform
-from ganlane.transforms.fixed_order import places
+from ganlane.transforms.observation import places
 
 FIXED = ("length", "width", "desired_speed", "visibility", "valid")
 

@@ -6,10 +6,9 @@ import pytest
 import torch
 from reference.worlds import DOUBLE, vehicles
 
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import desired_gap, equilibrium_gap, idm_acceleration
+from ganlane.sim.idm import desired_gap, equilibrium_gap, following_acceleration, idm_acceleration
 from ganlane.sim.neighbours import FREE_GAP_M, perceive
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 # 2 sqrt(a b) = 2 sqrt(0.7 * 1.7) = 2.181742423; (20 / 25)^4 = 0.4096

@@ -12,16 +12,14 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.scenarios import CutInEnvConfig
 from ganlane.errors import UserError
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.braking import can_brake
 from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.feasibility import can_brake
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import safe_change
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import Purpose, episode_key, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.scenes import RandomScenes
-from ganlane.sim.spawn import check_start, draw_lanes, ego_first, place_in_lanes, spawn
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.spawn import RandomScenes, check_start, draw_lanes, ego_first, place_in_lanes, spawn
+from ganlane.sim.state import Road, Vehicles
 
 LORRIES = SpawnParameters(truck_share=0.3)
 

@@ -16,7 +16,7 @@ from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.random import episode_key
 from ganlane.sim.spawn import check_start, draw_lanes, spawn
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 
 def keys(count: int, seed: int = 0) -> torch.Tensor:

@@ -4,9 +4,9 @@ import torch
 
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Stream, episode_key
-from ganlane.sim.road import Road
-from ganlane.sim.scenes import RandomScenes
-from ganlane.traffic.foreign.lorries import LorryScenes
+from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.state import Road
+from ganlane.traffic.foreign.sumo import LorryScenes
 
 CARS = RandomScenes(Road(), 9, others_visibility=Visibility.SIGNALLED)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ganlane.sim import Road, Vehicles
 from ganlane.transforms import ObservationTransform, observation_size
-from ganlane.transforms.fixed_order import places
+from ganlane.transforms.observation import places
 
 EMPTY = [1.0, 0.0, 0.0]
 

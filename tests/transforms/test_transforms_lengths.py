@@ -12,9 +12,8 @@ from ganlane.config.env import EnvConfig
 from ganlane.gym.rows import Rows
 from ganlane.sim import Road, Vehicles
 from ganlane.transforms import ObservationTransform, SensorParameters, largest_number
-from ganlane.transforms.lane_view import lane_offset, lane_view
-from ganlane.transforms.measurement import Measurement, measure
-from ganlane.transforms.table3 import ObservationScale, Others, other_vehicles
+from ganlane.transforms.observation import ObservationScale, Others, lane_offset, lane_view, other_vehicles
+from ganlane.transforms.sensors import Measurement, measure
 
 LORRY = {"length": 12.0}
 SCALE = ObservationScale()

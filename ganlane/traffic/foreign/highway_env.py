@@ -12,8 +12,7 @@ from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.foreign.packages import require
 

@@ -239,24 +239,24 @@ def _lane_change(view: View) -> Tensor:
     return torch.stack((view.progress, view.direction.to(view.progress.dtype)), dim=1)
 
 
-_OWN = Part(lambda others: 3, _own)
-_LIST = Part(lambda others: 3 * others, _listed)
-_PLACES = Part(lambda others: 3 * places(others), _placed)
-_VIEW = Part(lambda others: LANE_VIEW_SIZE, _lane_view)
-_DRIFT_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True))
-_OVERLAP_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True, overlap=True))
+OWN = Part(lambda others: 3, _own)
+LIST = Part(lambda others: 3 * others, _listed)
+PLACES = Part(lambda others: 3 * places(others), _placed)
+VIEW = Part(lambda others: LANE_VIEW_SIZE, _lane_view)
+DRIFT_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True))
+OVERLAP_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True, overlap=True))
 #: The ego's own lane change: progress 0 to 1, direction -1, 0 or 1.
-_CHANGE = Part(lambda others: 2, _lane_change)
+CHANGE = Part(lambda others: 2, _lane_change)
 
 #: The forms by name; ``table3`` is the paper's literal 3 + 3 (M - 1) numbers.
 OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
-    "table3": (_OWN, _LIST),
-    "table3_progress": (_OWN, _LIST, _CHANGE),
-    "lane_view": (_OWN, _VIEW, _CHANGE),
-    "table3_lane_view": (_OWN, _LIST, _VIEW, _CHANGE),
-    "lane_view_drift": (_OWN, _DRIFT_VIEW, _CHANGE),
-    "lane_view_overlap": (_OWN, _OVERLAP_VIEW, _CHANGE),
-    "fixed_order": (_OWN, _PLACES, _CHANGE),
+    "table3": (OWN, LIST),
+    "table3_progress": (OWN, LIST, CHANGE),
+    "lane_view": (OWN, VIEW, CHANGE),
+    "table3_lane_view": (OWN, LIST, VIEW, CHANGE),
+    "lane_view_drift": (OWN, DRIFT_VIEW, CHANGE),
+    "lane_view_overlap": (OWN, OVERLAP_VIEW, CHANGE),
+    "fixed_order": (OWN, PLACES, CHANGE),
 }
 
 
@@ -271,7 +271,7 @@ def largest_number(name: str, longest_m: float = 4.5) -> float:
     ``longest_m`` is the length of the longest vehicle, m (:attr:`ganlane.sim.scenes.Scenes.longest_m`): with
     ``lane_view_overlap`` the nearness counts metres of overlap.
     """
-    return 1.0 + longest_m / OVERLAP_M if _OVERLAP_VIEW in OBSERVATIONS[name] else 1.0
+    return 1.0 + longest_m / OVERLAP_M if OVERLAP_VIEW in OBSERVATIONS[name] else 1.0
 
 
 class ObservationTransform(PerceptionTransform):

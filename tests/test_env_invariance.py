@@ -1,4 +1,4 @@
-"""An episode is the same bit for bit in any batch and slot and when it is replayed; episodes are asked for by number."""
+"""An episode is the same bit for bit in any batch, in any slot and when it is replayed by its number."""
 
 from __future__ import annotations
 

@@ -49,17 +49,17 @@ LEAST_DESIRED_SPEED_MPS = 10.0
 
 @dataclass(frozen=True)
 class Recordings:
-    """R samples of S scenes and K places where an episode may start.
+    """Recorded scenes as tensors: R samples of S scenes, and K possible starts of episodes.
 
     Attributes:
         names: of the S scenes.
-        samples: [R, 8] float64, the float fields of ``vehicles`` in the order of ``ganlane.keys.VEHICLE_FLOATS``.
+        samples: [R, 8] float64, the float fields of ``vehicles`` ordered as in ``ganlane.keys.VEHICLE_FLOATS``.
         last: [R] the last sample of each sample's track.
-        starts: [K, P] samples at an episode's first frame: the vehicle that the ego replaces, then the others,
-            nearest first, :data:`MOST_VEHICLES` at most; -1 where there are fewer than P.
+        starts: [K, P] samples in an episode's first frame: the vehicle that the ego replaces, then the others,
+            nearest first, at most :data:`MOST_VEHICLES`; -1 if there are fewer than P.
         steps: [K] frames from there to the end of the scene.
         scene: [K] number of the scene.
-        first_start, starts_in: [S] number of a scene's first start, and how many it has.
+        first_start, starts_in: [S] number of a scene's first start, and its number of starts.
         lanes, lane_width_m: [S].
     """
 
@@ -81,10 +81,10 @@ class Recordings:
         Args:
             frame: recorded tracks.
             source: name of the recordings, for messages.
-            least_s: an episode starts only where its ego is recorded for so long, s.
+            least_s: minimum time that the ego of an episode is recorded, s.
 
         Raises:
-            UserError: nobody is recorded for so long.
+            UserError: no vehicle is recorded for that time.
         """
         widths, counts, tracks = scene_lane_widths(frame), scene_lane_counts(frame), tracks_of_frame(frame)
         begin = _starts(frame, tracks, round(least_s / FRAME_S))
@@ -132,7 +132,7 @@ def _motion(frame: pl.DataFrame, tracks: Tracks) -> Floats:
 
 
 def _starts(frame: pl.DataFrame, tracks: Tracks, least: int) -> _Starts:
-    """Every frame in which somebody can be replaced; scene by scene, since a scene may be long and busy."""
+    """Every frame with a vehicle that can be replaced; scene by scene, which bounds the memory."""
     last, offset, parts = tracks.last, 0, []
     for rows in frame.partition_by("scene", maintain_order=True):
         starts, steps = _starts_of_scene(rows, last[offset : offset + rows.height] - offset, least)
@@ -176,22 +176,22 @@ def _by_frame(frame: Integers) -> tuple[Integers, Integers]:
 class ReplayTraffic(TrafficModule):
     """Plays recorded tracks as they were driven: **nobody reacts to the ego**.
 
-    The ego takes the place of the recorded vehicle nearest the middle of the frame in which the episode starts, with
-    its position, speed and size; the M - 1 nearest to it are its neighbours for the whole episode, fewer where fewer
-    were recorded. A neighbour whose track ends is no longer valid; the episode ends where the scene ends. Lanes and
-    lane width are the scene's, so they differ from row to row (:meth:`road_of`).
+    The ego replaces the recorded vehicle nearest the middle of the episode's first frame, with its position, speed
+    and size; the M - 1 nearest to it (or fewer) are its neighbours for the whole episode. A neighbour whose track
+    ends is no longer valid; the episode ends with the scene. Lanes and lane width are the scene's, so they differ
+    between rows (:meth:`road_of`).
 
-    Which scene and which start an episode takes follows from its key, that is from (stream, seed, episode), and so
-    does everything else: there is no memory. Scenes are equally likely, whatever their length.
+    Scene and start of an episode follow from its key, that is from (stream, seed, episode), so there is no memory.
+    Scenes are equally likely, whatever their length.
 
     Args:
         stream: as for every traffic module.
-        path: what :func:`ganlane.data.read_scenes` reads; by default the US-101 scenes of the recordings' folder.
-        least_s: the replaced vehicle is recorded at least so long from the start on, s, so an episode can last.
-        recordings: tensors in place of a file.
+        path: input of :func:`ganlane.data.read_scenes`; by default the US-101 scenes of the recordings' folder.
+        least_s: minimum time that the replaced vehicle is recorded from the start on, s.
+        recordings: tensors instead of a file.
 
     Raises:
-        UserError: no recordings, a damaged file, or nobody is recorded for ``least_s``.
+        UserError: no recordings, a damaged file, or no vehicle is recorded for ``least_s``.
     """
 
     visibility = Visibility.BODY
@@ -207,7 +207,7 @@ class ReplayTraffic(TrafficModule):
     ) -> None:
         self.source = "recordings" if recordings else str(path or _found())
         recorded = recordings or Recordings.of(read_scenes(self.source), self.source, least_s)
-        # Sizes for all rows together; the road of a row is road_of's.
+        # For sizes only; the road of a row is road_of's.
         super().__init__(Road(int(recorded.lanes.max()), float(recorded.lane_width_m.mean())), stream)
         self.scene_names = recorded.names
         for name, value in vars(recorded).items():
@@ -245,10 +245,10 @@ class ReplayTraffic(TrafficModule):
         return Road(self._lanes[scene], self._lane_width_m[scene].to(dtype))
 
     def recorded(self, key: Tensor, step: Tensor, vehicles: int, dtype: torch.dtype) -> Vehicles:
-        """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x is 0 where the ego began.
+        """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is the ego's start.
 
-        One whose track has ended stays where it was last seen, and is not valid. Entries without a vehicle are copies
-        of the ego's place, not valid either.
+        A vehicle whose track has ended stays at its last position and is invalid. Entries without a vehicle are
+        invalid copies of the ego's start.
         """
         start = self.start_of(key)
         first = self._starts[start, :vehicles]
@@ -268,7 +268,7 @@ class ReplayTraffic(TrafficModule):
     def scenes(
         self, vehicles: int, ego_visibility: int = Visibility.BODY, ego_desired_speed_mps: float = 25.0
     ) -> RecordedScenes:
-        """Where episodes of this traffic start."""
+        """The initial scenes of this traffic."""
         return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
 
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
@@ -279,10 +279,10 @@ class ReplayTraffic(TrafficModule):
 
 @dataclass(frozen=True)
 class RecordedScenes:
-    """The first scenes of replayed episodes, as the environment asks for them (:class:`ganlane.sim.scenes.Scenes`).
+    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`).
 
     Attributes:
-        traffic: whose recordings.
+        traffic: with the recordings.
         vehicles: M, the ego included.
         ego_visibility, ego_desired_speed_mps: of the ego; the recorded driver's are not known.
     """
@@ -298,7 +298,7 @@ class RecordedScenes:
         return self.traffic.longest_m
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Anything that was recorded will do."""
+        """Recorded scenes are not checked."""
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """Vehicles [N, M] at the start of the episodes with ``key`` [N]; the ego at index 0 and x = 0."""
@@ -311,12 +311,12 @@ class RecordedScenes:
 
 
 def _one_of(u: Tensor, count: Tensor) -> Tensor:
-    """A number from 0 to ``count`` - 1, int64, by a uniform ``u`` in [0, 1)."""
+    """A number from 0 to ``count`` - 1, int64, from a uniform ``u`` in [0, 1)."""
     return torch.minimum((u * count).long(), count - 1)
 
 
 def _found() -> Path:
-    """The recordings where no path is given."""
+    """The default recordings."""
     try:
         return default_scenes()
     except UserError as missing:

@@ -22,8 +22,7 @@ from ganlane.env import HighwayEnv
 from ganlane.native import EgoState, Kernel, Outcome
 from ganlane.native.library import VARIANTS, best_variant
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 STEPS = 10

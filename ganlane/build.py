@@ -31,9 +31,9 @@ from ganlane.errors import ParameterError, UserError
 from ganlane.parameters.observation import MASKS, MaskParameters
 from ganlane.parameters.reward import RewardParameters
 from ganlane.paths import CHECKPOINTS
+from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
-from ganlane.sim.steering import STEERING
+from ganlane.sim.state import Road
 from ganlane.traffic import BlindTraffic, TrafficModule
 from ganlane.transforms import (
     ActionMaskTransform,
@@ -121,6 +121,7 @@ def make_env(
         scenes=env.scenes(traffic.visibility),
         recycle=env.recycle,
         recycle_share=env.recycle_share,
+        kernel=env.kernel,
     )
     seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
     masks = _mask_transforms(mask or MaskParameters(), base, env)

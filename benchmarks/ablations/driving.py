@@ -9,7 +9,7 @@ from typing import Any
 from benchmarks.ablations.variants import Variant
 from ganlane.realism.counters import EventCounter, GuardMeter, watched
 from ganlane.realism.long_runs import LongRunParameters, Trajectories, batch_statistics, drive_spawned, summary
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 
 

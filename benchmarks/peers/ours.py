@@ -9,8 +9,7 @@ from torch import Tensor
 from benchmarks.peers.scene import DESIRED_SPEED_MPS, LENGTH_M, Scene, Trace
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.lanes import Visibility
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 

@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 from ganlane import keys
 from ganlane.gym.window import FilmWindow
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.road import road_in
+from ganlane.sim.state import road_in
 from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
 from ganlane.view.frames import Picture
 

@@ -10,15 +10,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.native.library import load
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.parameters.episode import EpisodeParameters
-from ganlane.sim.road import Road
-from ganlane.sim.steering import STEERING, SteeringParameters
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.dynamics import STEERING, SteeringParameters
+from ganlane.sim.state import Road, Vehicles
 
 #: Rows per thread from which on a second thread pays.
 ROWS_PER_THREAD = 64
@@ -115,6 +113,9 @@ OUTCOME: dict[str, tuple[str, torch.dtype]] = {
     **dict.fromkeys(("done", "terminated", "truncated"), ("column", _FLAG)),
 }
 assert tuple(OUTCOME) == Outcome._fields
+_EGO = (_FLOAT, *(_INTEGER,) * 3, *(_FLAG,) * 2)
+#: Dtypes of what goes in: action, the vehicles' fields, steering, the ego, step, recycles.
+INPUTS = (_INTEGER, *(_FLOAT,) * 8, *(_INTEGER,) * 2, _FLAG, _FLOAT, *_EGO, _INTEGER, _FLAG)
 
 
 class Kernel:
@@ -207,8 +208,11 @@ class Kernel:
         rows = action.shape[0]
         out = Outcome.empty(rows, self.vehicles) if out is None else out
         given = [action, *vehicles, steering, *ego, step, *([] if recycles is None else [recycles])]
+        for number, wanted in zip(given, INPUTS):
+            if number.dtype is not wanted or number.shape[0] != rows:
+                raise TypeError(f"the kernel takes {rows} rows of {wanted} here, not {number.dtype} {number.shape}")
         given = [each.contiguous() for each in given]  # referred to until the call is over
-        inputs = _addresses(given, len(keys.VEHICLE_FIELDS) + 10)
+        inputs = _addresses(given, len(INPUTS))
         outputs = _addresses(out, len(out))
         settings = ctypes.byref(self._settings)
 

@@ -13,8 +13,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.sim.neighbours import leader, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import Guard, TrafficModule
 
 #: A body further beyond the edge than this is off the road, m; less is rounding.

@@ -22,9 +22,8 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.realism.counters import EventCounter, GuardMeter, watched
 from ganlane.realism.replay_starts import Factory, step_traffic
 from ganlane.sim.random import absorb, episode_key
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
@@ -143,7 +142,7 @@ def drive_spawned(
     counters = _counters(parameters, first, rows)
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
-    memory = traffic.init_memory(state, torch.ones_like(state.valid), absorb(key, 0))
+    memory = traffic.init_memory(state, absorb(key, 0))
     trajectories, start = [_snapshot(state)], state.x
     events.begin()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):

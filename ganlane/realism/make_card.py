@@ -24,7 +24,7 @@ from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
 from ganlane.realism.replay_starts import Factory, StartOptions
 from ganlane.realism.starts import Fold, Starts, check_folds_cover, fold_weights, recorded_starts, spawned_starts
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 
 #: Preset of the weights that a traffic drives with.

@@ -23,13 +23,12 @@ from ganlane.generator.rollout import headway_from_uniform
 from ganlane.paths import CHECKPOINTS
 from ganlane.realism.distances import Array, ceiling
 from ganlane.realism.quantities import QUANTITIES, Measured
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.hazard import random_side
+from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.lane_change import random_side
 
 #: The file that ships.
 SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"

@@ -33,8 +33,8 @@ from ganlane.realism.quantities import QUANTITIES, Measured, measure
 from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference, quantiles_of, rate, reference_of
 from ganlane.realism.replay_starts import Factory, StartOptions
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import SpawnParameters
+from ganlane.sim.state import Road
 
 #: Vehicles of an episode, its seconds, and episodes per repeat.
 _SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8

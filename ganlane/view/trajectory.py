@@ -14,7 +14,7 @@ from ganlane import keys
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE
 from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

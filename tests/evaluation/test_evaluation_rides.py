@@ -4,7 +4,7 @@ import pytest
 from reference.worlds import vehicles
 
 from ganlane.evaluation.rides import SIDES, contact_side
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.native import EgoState, Kernel, Outcome
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
 FLAGS = ("goal", "hard_crash", "out_of_road", "timeout", "soft_crash", "soft_crash_behind")

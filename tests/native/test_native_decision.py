@@ -24,8 +24,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.native import Kernel, Outcome, why_not
 from ganlane.native.library import VARIANTS, best_variant
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
 RUNNABLE = {"AVX512": ("AVX512", "AVX2", "default"), "AVX2": ("AVX2", "default")}.get(best_variant(), ("default",))

@@ -6,7 +6,7 @@ import torch
 from ganlane.realism.counters import EventCounter, GuardMeter, watched
 from ganlane.realism.long_runs import LongRunParameters, spawned_vehicles
 from ganlane.sim.random import episode_key
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import Guard, IdmTraffic, TrafficModule
 
 

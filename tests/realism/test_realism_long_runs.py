@@ -6,7 +6,7 @@ import torch
 from ganlane.realism.long_runs import LongRunParameters, long_run, spawned_vehicles, totals
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.sim.random import episode_key
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 

@@ -4,7 +4,7 @@ from ganlane.realism.card import card_checks
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
 from ganlane.realism.output import checks_text, long_table
 from ganlane.realism.references import ConstantVelocity
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 
 ROWS = {

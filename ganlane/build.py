@@ -123,7 +123,9 @@ def make_env(
         recycle_share=env.recycle_share,
         kernel=env.kernel,
     )
-    seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
+    seen = ObservationTransform(
+        base.road, env.vehicles, observation.form, observation.scale(), native=base.kernel is not None
+    )
     masks = _mask_transforms(mask or MaskParameters(), base, env)
     if env.compile:
         base.compile()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -12,16 +10,12 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.native.calls import addresses, in_threads
 from ganlane.native.library import load
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.parameters.episode import EpisodeParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.state import Road, Vehicles
-
-#: Rows per thread from which on a second thread pays.
-ROWS_PER_THREAD = 64
-#: The largest number of environments in a vector; threads take a multiple of it.
-BLOCK = 16
 
 
 class _Settings(ctypes.Structure):
@@ -212,29 +206,10 @@ class Kernel:
             if number.dtype is not wanted or number.shape[0] != rows:
                 raise TypeError(f"the kernel takes {rows} rows of {wanted} here, not {number.dtype} {number.shape}")
         given = [each.contiguous() for each in given]  # referred to until the call is over
-        inputs = _addresses(given, len(INPUTS))
-        outputs = _addresses(out, len(out))
-        settings = ctypes.byref(self._settings)
-
-        def drive(first: int, last: int) -> None:
-            if self._decide(settings, inputs, outputs, first, last):
-                raise MemoryError("the kernel's scratch memory")
-
-        threads = min(torch.get_num_threads(), rows // ROWS_PER_THREAD)
-        if threads <= 1:
-            drive(0, rows)
-        else:
-            share = -(-rows // (threads * BLOCK)) * BLOCK
-            starts = range(0, rows, share)
-            list(_pool(threads).map(drive, starts, (min(start + share, rows) for start in starts)))
+        settings, inputs, outputs = (
+            ctypes.byref(self._settings),
+            addresses(given, len(INPUTS)),
+            addresses(out, len(out)),
+        )
+        in_threads(rows, lambda first, last: self._decide(settings, inputs, outputs, first, last))
         return out
-
-
-def _addresses(tensors: list[Tensor] | tuple[Tensor, ...], count: int) -> ctypes.Array[ctypes.c_void_p]:
-    """A struct of ``count`` pointers; those beyond the tensors are null."""
-    return (ctypes.c_void_p * count)(*(tensor.data_ptr() for tensor in tensors))
-
-
-@lru_cache(maxsize=1)
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="ganlane-native")

@@ -1,4 +1,4 @@
-"""Builds ``kernel.cpp`` at its first use and loads it.
+"""Builds the C++ sources at their first use and loads them.
 
 The library goes into the user's cache folder, under a name that follows from the source, the flags and the compiler,
 so that another version of any of them builds anew. Processes that build at once do so each for itself; the last one
@@ -25,8 +25,8 @@ import torch
 
 from ganlane.errors import UserError
 
-#: The source to compile, and what it includes.
-SOURCES = tuple(Path(__file__).with_name(name) for name in ("kernel.cpp", "vectors.hpp"))
+#: The sources to compile, and what they include.
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("kernel.cpp", "observation.cpp", "vectors.hpp"))
 #: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives the same bits.
 FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared")
 #: The kernel needs no C++ library; zig would compile one first, which takes minutes.
@@ -112,7 +112,8 @@ def _load(variant: str, compiler: tuple[str, ...] | None, folder: Path) -> ctype
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     library = folder / f"kernel-{variant.lower()}-{name}.so"
     if not library.is_file():
-        _build((*compiler, *arguments, str(SOURCES[0])), library)
+        sources = (str(source) for source in SOURCES if source.suffix == ".cpp")
+        _build((*compiler, *arguments, *sources), library)
     return _declared(ctypes.CDLL(str(library)))
 
 
@@ -139,8 +140,9 @@ def _build(command: tuple[str, ...], library: Path) -> None:
 
 
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
-    """With the types of its one function; a call through ctypes releases the interpreter's lock."""
+    """With the types of its functions; a call through ctypes releases the interpreter's lock."""
     pointer, number = ctypes.c_void_p, ctypes.c_long
-    library.ganlane_decide.argtypes = [pointer, pointer, pointer, number, number]
-    library.ganlane_decide.restype = ctypes.c_int
+    for function in (library.ganlane_decide, library.ganlane_lane_view):
+        function.argtypes = [pointer, pointer, pointer, number, number]
+        function.restype = ctypes.c_int
     return library

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from ganlane.benchmarks.script import parser_of
-from ganlane.evaluation.statistics import TAIL_LEVELS, Estimate, resample_counts
-from ganlane.realism.distances import Array, distance, distance_difference, jensen_shannon
+from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, resample_counts
+from ganlane.realism.distances import distance, distance_difference, jensen_shannon
 
 #: Spread of the scenes' means, and of the logarithm of their sizes; independent samples of a scene of median size.
 _BETWEEN, _SIZES, _MEDIAN = 0.7, 0.8, 20.0

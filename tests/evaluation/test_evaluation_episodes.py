@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from tensordict.nn import TensorDictModule
 from torchrl.envs import StepCounter
-from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
@@ -29,10 +29,6 @@ from ganlane.traffic import IdmTraffic
 SEED = 4
 #: Short and of different lengths: who drives at random also leaves the road and crashes.
 SHORT = EnvConfig(goal_m=90.0)
-
-
-def test_the_toy_environment_is_a_proper_one():
-    check_env_specs(ToyEnv(3))
 
 
 def test_each_row_tells_what_the_episode_was():

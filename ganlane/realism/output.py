@@ -88,12 +88,7 @@ def markers(card: str) -> tuple[str, str]:
 
 
 def card_text(numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """The card's tables, as they are printed.
-
-    Args:
-        numbers: what ``results.json`` holds.
-        long_runs: by traffic; those that drove none are left out.
-    """
+    """The card's tables: of the ``numbers`` in ``results.json``, and of the long runs of all traffics."""
     traffic = numbers["traffic"]
     tables = [quantities_table(numbers["quantities"], traffic)]
     if numbers["quantities_held_out"] is not None:
@@ -170,7 +165,7 @@ def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
 
 def checks_text(checks: Mapping[str, Any]) -> str:
     """The card's checks, a line each."""
-    words = {True: "yes", False: "no", None: "not told"}
+    words = {True: "yes", False: "no", None: "unknown"}
     near = "acceleration_quantiles_within_30_percent"
     lines = [f"{near.replace('_', ' ')}: {words[checks[near]]}"]
     for other, verdicts in checks["compared_with"].items():
@@ -194,23 +189,18 @@ def short_name(traffic: str) -> str:
 
 @rc_context(STYLE)
 def draw_distributions(
-    edges: Mapping[str, FloatArray],
-    recorded: Mapping[str, FloatArray],
-    simulated: Mapping[str, Mapping[str, FloatArray]],
-    units: Mapping[str, str],
+    recorded: Mapping[str, FloatArray], simulated: Mapping[str, Mapping[str, FloatArray]]
 ) -> Figure:
     """One panel per quantity: the recorded density, and each traffic's; none where nothing was counted.
 
     Args:
-        edges: by quantity, of its bins [B + 1].
-        recorded: by quantity, counts [B].
+        recorded: by quantity, counts [bins].
         simulated: by traffic, then quantity.
-        units: by quantity.
     """
-    figure, grid = panel_grid(len(edges))
+    figure, grid = panel_grid(len(recorded))
     colours = {**palette(list(simulated)), "recorded": RECORDED}
-    for axes, (name, bounds) in zip(grid, edges.items()):
-        unit = _pretty(units[name])
+    for axes, name in zip(grid, recorded):
+        bounds, unit = QUANTITIES[name].edges, UNITS[name].replace("s2", "s²").replace("s3", "s³")
         axes.set(title=name.replace("_", " "), xlabel=unit, ylabel=f"density, per {unit}")
         axes.set_xlim(bounds[0], bounds[-1])
         for driver, counts in {**simulated, "recorded": recorded}.items():
@@ -223,13 +213,9 @@ def draw_distributions(
 
 @rc_context(STYLE)
 def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
-    """Distances to recorded driving: a block of rows per quantity with each traffic's value and interval.
+    """The rows of :func:`ganlane.realism.card.quantity_rows`: a block per quantity, a line per traffic.
 
-    Upright lines are the ends of the scale: recordings against each other, and random driving.
-
-    Args:
-        quantities: rows of :func:`ganlane.realism.card.quantity_rows`.
-        traffic: the card's own.
+    Vertical lines are the ends of the scale: recordings against each other, and random driving.
     """
     others = list(next(iter(quantities.values()))["against"])
     colours = palette([traffic, *others])
@@ -260,13 +246,8 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
 
 
 @rc_context(STYLE)
-def draw_drift(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
-    """Mean and spread of the speeds of long runs over time; the recorded spread as a level.
-
-    Args:
-        runs: as :func:`ganlane.realism.long_runs.summary` gives them.
-        spread_mps: the recorded mean spread within a frame.
-    """
+def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
+    """Mean and spread of the speeds of long runs over time; the recorded mean spread within a frame as a level."""
     figure, grid = panel_grid(2)
     colours = palette([f"{run['vehicles']} vehicles" for run in runs])
     for axes, (key, title) in zip(grid, {"mean_speed_mps": "mean speed", "spread_mps": "spread of speeds"}.items()):
@@ -288,17 +269,11 @@ def draw(card: Card, to: Path) -> list[Path]:
         for name, driven in starts.driven.items()
         if name not in FLOORS
     }
-    edges = {name: bins.edges for name, bins in QUANTITIES.items()}
     recorded = {name: counts.sum(0) for name, counts in starts.recorded.items()}
     figures = {
-        "distributions": draw_distributions(edges, recorded, simulated, UNITS),
+        "distributions": draw_distributions(recorded, simulated),
         "distances": draw_distances(card.quantities, card.traffic),
     }
     if card.runs:
-        figures["drift"] = draw_drift(card.runs, starts.reference.spread_mps)
+        figures["drift"] = draw_speeds_over_time(card.runs, starts.reference.spread_mps)
     return [save_figure(figure, to / f"{name}.png") for name, figure in figures.items()]
-
-
-def _pretty(unit: str) -> str:
-    """A unit with its exponent raised: m/s² for m/s2."""
-    return unit.replace("s2", "s²").replace("s3", "s³")

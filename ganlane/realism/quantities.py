@@ -34,27 +34,19 @@ FEWEST_IN_FRAME: Final = 3
 #: Levels of the quantiles.
 LEVELS: Final = (0.05, 0.5, 0.95)
 
-#: Name to bins; what lies beyond counts in the outermost ones. m, s, m/s, m/s2, m/s3.
-QUANTITIES: Final[dict[str, Bins]] = {
-    "speed": Bins(0.0, 40.0, 40),
-    "speed_spread": Bins(0.0, 10.0, 20),
-    "acceleration": Bins(-5.0, 5.0, 50),
-    "jerk": Bins(-5.0, 5.0, 50),
-    "time_headway": Bins(0.0, 8.0, 40),
-    "gap": Bins(0.0, 100.0, 40),
-    "time_to_collision": Bins(0.0, 30.0, 30),
-    "lane_change_duration": Bins(0.0, 10.0, 10),
+_QUANTITIES: Final = {
+    "speed": ("m/s", Bins(0.0, 40.0, 40)),
+    "speed_spread": ("m/s", Bins(0.0, 10.0, 20)),
+    "acceleration": ("m/s2", Bins(-5.0, 5.0, 50)),
+    "jerk": ("m/s3", Bins(-5.0, 5.0, 50)),
+    "time_headway": ("s", Bins(0.0, 8.0, 40)),
+    "gap": ("m", Bins(0.0, 100.0, 40)),
+    "time_to_collision": ("s", Bins(0.0, 30.0, 30)),
+    "lane_change_duration": ("s", Bins(0.0, 10.0, 10)),
 }
-UNITS: Final = {
-    "speed": "m/s",
-    "speed_spread": "m/s",
-    "acceleration": "m/s2",
-    "jerk": "m/s3",
-    "time_headway": "s",
-    "gap": "m",
-    "time_to_collision": "s",
-    "lane_change_duration": "s",
-}
+#: By quantity, its unit, and its bins; values beyond count in the outermost ones.
+UNITS: Final = {name: unit for name, (unit, _) in _QUANTITIES.items()}
+QUANTITIES: Final = {name: bins for name, (_, bins) in _QUANTITIES.items()}
 
 
 @dataclass(frozen=True)
@@ -85,7 +77,7 @@ class Measured:
         return {name: {f"{level:g}": self.quantile(name, level) for level in LEVELS} for name in QUANTITIES}
 
     def restricted_to(self, rows: Sequence[int]) -> Measured:
-        """The same with the counts of some units only."""
+        """The same with the counts of some units only; samples and totals remain those of all."""
         return replace(self, counts={name: counts[rows] for name, counts in self.counts.items()})
 
     @staticmethod

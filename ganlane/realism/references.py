@@ -26,8 +26,7 @@ from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate
 from ganlane.sim.following import following_acceleration
 from ganlane.sim.hazard import random_side
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.road import Road
+from ganlane.sim.random import Purpose, uniform
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule
 
@@ -120,26 +119,11 @@ class ConstantVelocity(TrafficModule):
 class RandomDriving(TrafficModule):
     """Drivers that ignore all others: the far end of the scale.
 
-    An acceleration is drawn every second, uniform up to ``hardest`` either way; a lane change to a random side starts
-    at a constant hazard and takes ``change_s`` seconds. Speeds are never negative.
-
-    Args:
-        road, stream: as for every traffic module.
-        hardest: m/s2.
-        every_s: mean time between two lane changes of a vehicle, s.
-        change_s: how long a change takes, s.
+    An acceleration is drawn every second, uniform up to 3 m/s2 either way; a lane change to a random side starts at a
+    constant hazard, every 20 s on average, and takes 4 s. Speeds are never negative.
     """
 
-    def __init__(
-        self,
-        road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        hardest: float = 3.0,
-        every_s: float = 20.0,
-        change_s: float = 4.0,
-    ) -> None:
-        super().__init__(road, stream)
-        self.hardest, self.every_s, self.change_s = hardest, every_s, change_s
+    hardest, every_s, change_s = 3.0, 20.0, 4.0
 
     def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
         """One step: the second's acceleration, and towards the target lane."""

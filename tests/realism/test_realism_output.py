@@ -6,7 +6,8 @@ from matplotlib.colors import to_hex
 
 from ganlane.realism.card import card_checks
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
-from ganlane.realism.output import checks_text, draw_distances, draw_distributions, draw_drift, long_table
+from ganlane.realism.output import checks_text, draw_distances, draw_distributions, draw_speeds_over_time, long_table
+from ganlane.realism.quantities import QUANTITIES
 from ganlane.realism.references import ConstantVelocity
 from ganlane.sim.road import Road
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
@@ -47,7 +48,7 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
     assert checks["lane_changes_inside_recorded_interval"] is None
     assert checks["overlaps_under_1_per_1000_vehicle_km"] is None
     assert checks["nobody_standing_in_free_flow"] is False
-    assert "lane changes inside recorded interval: not told" in checks_text(checked(run))
+    assert "lane changes inside recorded interval: unknown" in checks_text(checked(run))
 
 
 def test_a_traffic_without_a_guard_has_none_in_its_card():
@@ -63,26 +64,21 @@ def in_colour(axes, colour):
     return [line for line in axes.lines if to_hex(line.get_color()) == colour]
 
 
-def test_densities_have_area_one_and_the_quantity_s_unit():
-    edges = {"jerk": np.array([-1.0, 0.0, 1.0, 3.0])}
-    figure = draw_distributions(edges, {"jerk": np.array([1, 2, 1])}, {"idm": {"jerk": np.array([4, 0, 0])}},
-                                {"jerk": "m/s3"})  # fmt: skip
+def test_densities_have_area_one_and_the_quantitys_unit():
+    counts = np.zeros(QUANTITIES["jerk"].number)
+    counts[[0, 1, 49]] = 1, 2, 1
+    rule = np.eye(len(counts))[0] * 4
+    figure = draw_distributions({"jerk": counts}, {"idm": {"jerk": rule}, "nobody": {"jerk": 0 * rule}})
     (axes,) = figure.axes
     assert (axes.get_title("left"), axes.get_xlabel(), axes.get_ylabel()) == ("jerk", "m/s³", "density, per m/s³")
     (recorded,), (simulated,) = in_colour(axes, INK), in_colour(axes, COLOURS[0])
-    assert recorded.get_xdata().tolist() == [-0.5, 0.5, 2.0]
-    assert recorded.get_ydata().tolist() == [0.25, 0.5, 0.125]
-    assert simulated.get_ydata().tolist() == [1.0, 0.0, 0.0]
-    assert axes.get_xlim() == (-1.0, 3.0)
-
-
-def test_where_nothing_was_counted_there_is_no_line():
-    edges = {"lane_change_duration": np.array([0.0, 1.0, 2.0])}
-    counts = {"lane_change_duration": np.array([3, 1])}
-    nothing = {"lane_change_duration": np.array([0, 0])}
-    figure = draw_distributions(edges, counts, {"idm": nothing}, {"lane_change_duration": "s"})
-    assert in_colour(figure.axes[0], COLOURS[0]) == []
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["recorded", "idm"]
+    assert recorded.get_xdata()[[0, -1]] == pytest.approx([-4.9, 4.9])
+    # A quarter of the samples in a bin of 0.2 m/s3.
+    assert recorded.get_ydata()[[0, 1, 2, 49]] == pytest.approx([1.25, 2.5, 0.0, 1.25])
+    assert simulated.get_ydata()[:2] == pytest.approx([5.0, 0.0])
+    assert in_colour(axes, COLOURS[1]) == []
+    assert axes.get_xlim() == (-5.0, 5.0)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["recorded", "idm", "nobody"]
 
 
 def row(distance, **against):
@@ -124,7 +120,7 @@ def test_drift_is_drawn_over_time_with_a_gap_where_nobody_was_left():
         "300 s": {"mean_speed_mps": 22.0, "spread_mps": 3.0},
         "5000 m": {"mean_speed_mps": 21.0, "spread_mps": 2.5},
     }
-    figure = draw_drift([{"vehicles": 9, "speeds": speeds}], spread_mps=2.8)
+    figure = draw_speeds_over_time([{"vehicles": 9, "speeds": speeds}], spread_mps=2.8)
     mean, spread = figure.axes
     assert (mean.get_title("left"), mean.get_xlabel(), mean.get_ylabel()) == ("mean speed", "time, s", "m/s")
     (line,) = in_colour(mean, COLOURS[0])

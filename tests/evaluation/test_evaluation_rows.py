@@ -105,27 +105,20 @@ def test_the_score_is_computed_on_shared_episodes_whatever_their_order():
     assert straight["normalized_percent_ci"] == pytest.approx([50.0, 50.0])
 
 
-def test_without_the_drivers_of_the_scale_there_is_a_reason_in_place_of_a_score():
-    row = evaluation_rows(pl.concat([episodes("a", [1, 2, 3]), episodes("mobil", [1, 2, 3])]))[0]
-    assert row["normalized_percent"] is None
-    assert "random_legal" in row["normalized_percent_reason"]
+def test_without_the_drivers_of_the_scale_a_reason_replaces_the_score_and_nobody_leads_mobil():
+    rows = evaluation_rows(pl.concat([episodes("a", [1, 2, 3], traffic=name) for name in ("idm", "gan")]))
+    assert [row["traffic"] for row in rows] == ["idm", "gan"]
+    assert rows[0]["normalized_percent"] is rows[0]["minus_mobil"] is None
+    assert "mobil is missing" in rows[0]["normalized_percent_reason"]
+    text = text_table(rows)
+    assert text.splitlines()[-1].startswith("% of MOBIL on idm, gan: none, needs mobil")
+    assert "minus MOBIL" not in text
 
 
 def test_a_scale_without_length_gives_no_score():
     score = normalized_percent([5.0, 6.0, 7.0, 8.0], [1.0, -2.0, 3.0, -1.0], [0.0, 0.0, 0.0, 0.0])
     assert score.percent is None
     assert "includes 0" in score.reason
-
-
-def test_rows_keep_the_order_in_which_agents_and_traffics_came():
-    frames = [episodes(agent, [1, 2], traffic=t) for t in ("idm", "gan") for agent in ("b", "a")]
-    rows = evaluation_rows(pl.concat(frames))
-    assert [(row["agent"], row["traffic"]) for row in rows] == [
-        ("b", "idm"),
-        ("a", "idm"),
-        ("b", "gan"),
-        ("a", "gan"),
-    ]
 
 
 def test_the_text_table_is_aligned_and_leaves_out_what_never_happened(rows):
@@ -137,11 +130,6 @@ def test_the_text_table_is_aligned_and_leaves_out_what_never_happened(rows):
     assert "-2.5 [" in lines[2]
 
 
-def test_a_missing_score_is_explained_below_the_table():
-    rows = evaluation_rows(pl.concat([episodes("a", [1, 2, 3]), episodes("a", [1, 2, 3], traffic="gan")]))
-    assert text_table(rows).splitlines()[-1].startswith("% of MOBIL on idm, gan: none, needs mobil")
-
-
 def test_the_lead_over_mobil_is_paired_by_episode_whatever_their_order():
     mobil = episodes("mobil", [10, 200, 30, 400, 50])
     agent = episodes("agent", [13, 203, 33, 403, 53]).reverse()
@@ -149,12 +137,6 @@ def test_the_lead_over_mobil_is_paired_by_episode_whatever_their_order():
     assert agent_row["minus_mobil"] == pytest.approx(3.0)
     assert agent_row["minus_mobil_ci"] == pytest.approx([3.0, 3.0])
     assert mobil_row["minus_mobil"] is None
-
-
-def test_without_mobil_nobody_has_a_lead_over_it():
-    row = evaluation_rows(episodes("agent", [1, 2]))[0]
-    assert row["minus_mobil"] is None
-    assert "minus MOBIL" not in text_table([row])
 
 
 def test_resamples_without_a_lead_do_not_spoil_the_interval():

@@ -16,7 +16,7 @@ from ganlane.evaluation.counts import clopper_pearson, poisson_interval, rate_pe
 from ganlane.evaluation.episodes import run_episodes
 from ganlane.evaluation.layout import paired_table, text_table
 from ganlane.evaluation.paired import paired_rows
-from ganlane.evaluation.provenance import code_version, machine
+from ganlane.evaluation.provenance import code_version, machine, machine_sentence
 from ganlane.evaluation.results import results_record, write_episodes, write_results
 from ganlane.evaluation.rides import Ride, drive, replay
 from ganlane.evaluation.score import NormalizedScore, normalized_percent
@@ -41,6 +41,7 @@ __all__ = [
     "evaluation_rows",
     "interquartile_mean",
     "machine",
+    "machine_sentence",
     "mean_interval",
     "normalized_percent",
     "paired_difference",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,3 +62,15 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": torch.__version__,
     }
+
+
+def machine_sentence(threads: Sequence[int]) -> str:
+    """Where and on which code the figures were taken, without host names or paths; ``threads`` are torch's."""
+    here, code = machine(), code_version()
+    usable = f"{here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
+    accelerator = f", {here['accelerator']}" if here["accelerator"] else ""
+    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    return (
+        f"{here['cpu']}, {usable}{accelerator}; Python {here['python']}, torch {here['torch']} (threads: "
+        f"{', '.join(map(str, threads))}); ganlane {code['version']}{revision}."
+    )

@@ -21,8 +21,8 @@ import polars as pl
 from benchmarks.script import ReportSection, make_parser, run_script
 from ganlane.errors import UserError
 from ganlane.evaluation import evaluation_rows
-from ganlane.evaluation.paired import paired_lead
-from ganlane.evaluation.printing import Table
+from ganlane.evaluation.rows import paired_lead
+from ganlane.evaluation.table import Table
 
 BASELINE = "mobil"
 KEY = ["agent", "traffic", "seed", "episode"]

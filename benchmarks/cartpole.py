@@ -26,7 +26,7 @@ from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
-from ganlane.evaluation.printing import Table
+from ganlane.evaluation.table import Table
 from ganlane.training import TrainingConfig, train
 
 BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"

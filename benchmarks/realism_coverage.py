@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from benchmarks.script import make_parser
-from ganlane.evaluation.statistics import Estimate, percentile_levels, resample_counts
+from ganlane.evaluation.statistics import TAIL_LEVELS, Estimate, resample_counts
 from ganlane.realism.distances import Array, distance, distance_difference, jensen_shannon
 
 #: Spread of the scenes' means, and of the logarithm of their sizes; independent samples of a scene of median size.
@@ -72,7 +72,7 @@ def percentile(models: tuple[Array, ...], recorded: Array, resamples: int) -> Es
         return np.sum([sign * each for sign, each in zip(signs, every)], axis=0)
 
     drawn = np.concatenate([value(counts) for counts in resample_counts(len(recorded), resamples, 0)])
-    low, high = np.quantile(drawn, percentile_levels())
+    low, high = np.quantile(drawn, TAIL_LEVELS)
     return Estimate(float(value(np.ones(len(recorded)))), float(low), float(high))
 
 

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.errors import UserError, as_typed
-from ganlane.evaluation.printing import Table
+from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 from ganlane.training.log import read_rows
 from ganlane.training.run import flat

@@ -26,7 +26,7 @@ from ganlane.bench.measure import EAGER, Case, Row, Runner, measure
 from ganlane.bench.traffic import SYSTEM, TrafficSuite
 from ganlane.config.bench import BenchConfig
 from ganlane.evaluation import machine_sentence
-from ganlane.evaluation.printing import Table, significant
+from ganlane.evaluation.table import Table, significant
 from ganlane.generator import GeneratorSizes
 
 BEGIN, END = "<!-- begin social gan -->", "<!-- end social gan -->"

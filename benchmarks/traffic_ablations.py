@@ -30,7 +30,7 @@ import torch
 from benchmarks.ablation_variants import Variant, calibrated_variants, fitted_variant, gan_variants
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.evaluation import machine_sentence
-from ganlane.evaluation.printing import Table
+from ganlane.evaluation.table import Table
 from ganlane.files import write_json
 from ganlane.memory import keep_freed_memory
 from ganlane.realism.counters import EventCounter, GuardMeter, watched

@@ -32,7 +32,7 @@ from ganlane.bench.systems import Scenario
 from ganlane.bench.train import Training, TrainSuite, advance, filled_run, make_agent, repeat, with_gradients
 from ganlane.config.bench import BenchConfig
 from ganlane.evaluation import machine_sentence
-from ganlane.evaluation.printing import Table, count, percent
+from ganlane.evaluation.table import Table, count, percent
 from ganlane.training.run import Run
 
 BEGIN, END = "<!-- begin train profile -->", "<!-- end train profile -->"

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.peers.scene import OBSTACLE, SLOW_AND_GO, Scheme, Trace, equilibrium_gap
 from benchmarks.peers.tolerance import difference
-from ganlane.evaluation.printing import Table
+from ganlane.evaluation.table import Table
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V
 from ganlane.view.figures import COLOURS, INK, STYLE, save_figure

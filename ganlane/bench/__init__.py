@@ -33,7 +33,7 @@ from ganlane.config.bench import BenchConfig
 
 if TYPE_CHECKING:
     from ganlane.bench.measure import Suite
-    from ganlane.evaluation.printing import Table
+    from ganlane.evaluation.table import Table
 
 
 def bench(asked: BenchConfig, folder: Path) -> str:

@@ -21,7 +21,7 @@ from ganlane.bench.systems import (
 from ganlane.build import make_traffic
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
-from ganlane.evaluation.printing import NOTHING, Table, significant
+from ganlane.evaluation.table import NOTHING, Table, significant
 
 PHYSICS, ENVIRONMENT = "ganlane physics", "ganlane environment"
 _START: dict[str, Any] = {PHYSICS: start_physics, ENVIRONMENT: start_environment}

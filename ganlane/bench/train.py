@@ -19,7 +19,7 @@ from ganlane.bench.measure import COLUMNS, EAGER, Case, Group, Row, Runner, Suit
 from ganlane.bench.systems import HighwayEnvRunner, Scenario, highway_env_settings, installed_version
 from ganlane.build import make_road
 from ganlane.config.bench import BenchConfig
-from ganlane.evaluation.printing import Table, significant
+from ganlane.evaluation.table import Table, significant
 from ganlane.training.loop import collect, learn
 from ganlane.training.run import Run
 from ganlane.transforms import observation_size

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-from ganlane.evaluation.statistics import Estimate, percentile_levels, resample_counts
+from ganlane.evaluation.statistics import TAIL_LEVELS, Estimate, resample_counts
 
 Array = npt.NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def distance(
     known = drawn[np.isfinite(drawn)]
     if not np.isfinite(value) or len(known) < 2:
         return Estimate(value, None, None)
-    tails = np.quantile(known**2, percentile_levels())
+    tails = np.quantile(known**2, TAIL_LEVELS)
     low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
     return Estimate(value, min(value, float(low)), min(1.0, max(value, float(high))))
 
@@ -86,7 +86,7 @@ def distance_difference(
     if not np.isfinite(value) or len(known) < 2:
         return Estimate(value, None, None)
     error = float(known.std()) * np.sqrt(units / (units - 1))
-    reach = float(stdtrit(units - 1, percentile_levels()[1])) * error / max(one + other, _TINY)
+    reach = float(stdtrit(units - 1, TAIL_LEVELS[1])) * error / max(one + other, _TINY)
     return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 

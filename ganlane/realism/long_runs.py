@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.data import lane_changes_of_arrays
-from ganlane.evaluation.counts import poisson_interval
+from ganlane.evaluation.statistics import poisson_interval
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.realism.counters import EventCounter, GuardMeter, watched
 from ganlane.realism.replay_starts import Factory, step_traffic

@@ -12,7 +12,7 @@ from typing import Any
 from ganlane.config.folders import OVERRIDES
 from ganlane.config.realism import RealismConfig
 from ganlane.errors import UserError
-from ganlane.evaluation.provenance import code_version, machine
+from ganlane.evaluation import code_version, machine
 from ganlane.files import split_at_markers, write_between_markers, write_bytes
 from ganlane.realism import references
 from ganlane.realism.card import Card, floors_of

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.evaluation.counts import poisson_interval
+from ganlane.evaluation.statistics import poisson_interval
 from ganlane.files import write_json
 from ganlane.generator.rollout import headway_from_uniform
 from ganlane.paths import CHECKPOINTS

@@ -17,19 +17,6 @@ def test_the_tables_of_a_run_go_into_the_document(tmp_path, capsys):
     numbers = {"batches": 2, "threads": 1, "repetitions": 2, "seconds": 0.001}
     tiny = [part for name, value in numbers.items() for part in (f"--{name}", str(value))]
     tiny += ["--traffics", "gan", "--modes", "eager"]
-        "--traffics",
-        "gan",
-        "--batches",
-        "2",
-        "--threads",
-        "1",
-        "--modes",
-        "eager",
-        "--repetitions",
-        "2",
-        "--seconds",
-        "0.001",
-    ]
     assert social_gan.main([*tiny, "--report", str(document)]) == 0
     text = document.read_text()
     assert "| ganlane traffic | gan | eager | 1 | 2 |" in text

@@ -74,7 +74,10 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     Returns:
         The numbers of a long run, mean speed and its spread at the end, physics steps per CPU second.
     """
-    events, meter, parts, ends, seconds = EventCounter(Road()), GuardMeter(), [], [], list[float]()
+    events, meter = EventCounter(Road()), GuardMeter()
+    parts: list[dict[str, Any]] = []
+    ends: list[tuple[float, float]] = []
+    seconds: list[float] = []
     while sum(part["vehicle_km"] for part in parts) < parameters.vehicle_km:
         traffic = variant.make()
         clock = StepClock(traffic)

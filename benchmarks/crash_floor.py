@@ -31,7 +31,7 @@ from ganlane.api import load_agent, make_env
 from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
 from ganlane.evaluation import clopper_pearson, write_results
 from ganlane.evaluation.rides import SIDES, Ride, drive, replay
-from ganlane.memory import keep_freed_memory
+from ganlane.runtime import keep_freed_memory
 
 DRIVERS = ("mobil", "agent_idm", "keep_lane")
 #: The first stage: rides of ordinary drivers. The others are named after their beams.

@@ -28,8 +28,8 @@ import torch
 from ganlane.benchmarks.report import machine_sentence
 from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
 from ganlane.files import write_json
-from ganlane.memory import keep_freed_memory
 from ganlane.realism.long_runs import LongRunParameters
+from ganlane.runtime import keep_freed_memory
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.ablations.driving import drive

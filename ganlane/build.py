@@ -28,9 +28,9 @@ from ganlane.config.targets import call_with, import_target
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
+from ganlane.files import CHECKPOINTS
 from ganlane.parameters.observation import MASKS, MaskParameters
 from ganlane.parameters.reward import RewardParameters
-from ganlane.paths import CHECKPOINTS
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.steering import STEERING
@@ -42,11 +42,6 @@ from ganlane.transforms import (
     SensorTransform,
     observation_size,
 )
-
-
-def set_threads(threads: int) -> None:
-    """Let torch use so many threads; 0 takes one, which is fastest for batches of the sizes used here."""
-    torch.set_num_threads(threads or 1)
 
 
 def make_road(env: EnvConfig) -> Road:

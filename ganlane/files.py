@@ -1,4 +1,7 @@
-"""Files that are either whole or absent, documents with a part to rewrite, and weights that cannot execute code."""
+"""The package's own folders, files written whole or not at all, and weights that cannot execute code.
+
+It imports no torch, so that the command line answers quickly.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,35 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
 from ganlane.errors import UserError
 
+if TYPE_CHECKING:
+    import torch
+
+PACKAGE = Path(__file__).resolve().parent
+#: Weights that ship: ``agent_*.safetensors`` and ``generator_*.safetensors``.
+CHECKPOINTS = PACKAGE / "checkpoints"
 #: Bytes that are written to find out whether there is room; libraries leave smaller rests unused.
 _PROBE_BYTES = 2**20
+
+
+def conf_folder() -> Path:
+    """Folder of the YAML files: beside the package in a checkout, inside it in a wheel.
+
+    The one beside comes first, since an editable install can leave a stale copy behind.
+
+    Raises:
+        UserError: neither is there.
+    """
+    for folder in (PACKAGE.parent / "conf", PACKAGE / "conf"):
+        # A folder 'conf' of another project may lie beside an installed package.
+        if (folder / "train.yaml").is_file() and (folder / "traffic" / "gan.yaml").is_file():
+            return folder
+    raise UserError(f"{PACKAGE}: the folder conf/ is missing beside and inside it; install ganlane again.")
 
 
 @contextmanager
@@ -131,6 +153,8 @@ def save_weights(
         tensors: flat name to tensor.
         metadata: JSON-serialisable description (config, data, metrics, code version).
     """
+    from safetensors.torch import save  # imports torch
+
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = {"ganlane": json.dumps({"kind": kind, **metadata})}
     write_bytes(path, save(flat, metadata=header))

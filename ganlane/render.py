@@ -28,7 +28,7 @@ def render(config: RenderConfig, folder: Path) -> str:
     """Draw what is asked for; the line that names the file."""
     if config.run is not None:
         return _curves(config, config.run, folder)
-    from ganlane.build import set_threads
+    from ganlane.runtime import set_threads
     from ganlane.view import write_player, write_tracks
 
     set_threads(config.threads)

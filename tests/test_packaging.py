@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import ganlane
-from ganlane.paths import PACKAGE, conf_folder
+from ganlane.files import PACKAGE, conf_folder
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -41,7 +41,7 @@ def test_a_conf_folder_of_somebody_else_is_not_ours(tmp_path, monkeypatch):
     inside.mkdir(parents=True)
     for file in (inside.parent / "train.yaml", inside / "gan.yaml"):
         file.touch()
-    monkeypatch.setattr("ganlane.paths.PACKAGE", tmp_path / "package")
+    monkeypatch.setattr("ganlane.files.PACKAGE", tmp_path / "package")
     assert conf_folder() == inside.parent
 
 

@@ -25,8 +25,8 @@ from ganlane.benchmarks.traffic_tables import traffic_tables
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
+from ganlane.files import PACKAGE
 from ganlane.parameters.reward import RewardParameters
-from ganlane.paths import PACKAGE
 
 #: File under ``benchmarks/`` and further arguments of its ``start`` of each baseline.
 BASELINES: dict[str, tuple[str, dict[str, Any]]] = {

@@ -25,7 +25,7 @@ def configuration() -> Finding:
     """The YAML files of the commands."""
 
     def look() -> Finding:
-        from ganlane.paths import conf_folder
+        from ganlane.files import conf_folder
 
         return Finding("configuration", State.OK, str(conf_folder()))
 
@@ -34,7 +34,7 @@ def configuration() -> Finding:
 
 def checkpoints() -> list[Finding]:
     """The weights that ship, each of them loaded."""
-    from ganlane.paths import CHECKPOINTS
+    from ganlane.files import CHECKPOINTS
 
     names = sorted({*NEEDED, *(path.stem for path in CHECKPOINTS.glob("*.safetensors"))})
     return [guarded(name, _loaded(name, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL) for name in names]

@@ -41,7 +41,7 @@ def _devices() -> Finding:
 
 def _compiler() -> Finding:
     """The C++ compiler that ``env.compile=true`` needs, and nothing else; ``CXX`` names another one."""
-    from ganlane.compiling import COMPILERS
+    from ganlane.runtime import COMPILERS
 
     named = os.environ.get("CXX")
     looked_for = (named,) if named else COMPILERS

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ganlane._version import __version__
-from ganlane.paths import PACKAGE
+from ganlane.files import PACKAGE
 
 
 def _git(*arguments: str) -> str | None:

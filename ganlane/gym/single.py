@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 from torchrl.envs import Transform, TransformedEnv
 
-from ganlane.api.options import Option, option
-from ganlane.api.parts import make_env
+from ganlane.api import make_env
 from ganlane.errors import UserError
 from ganlane.gym.arguments import ACTIONS, SEEDS, actions_of, episode_numbers, known_options, seed_number
 from ganlane.gym.pictures import LiveView, real_time_fps
 from ganlane.gym.rows import Floats, Rows, row_of
 from ganlane.gym.window import FilmWindow, has_display
+from ganlane.options import Option, option
 
 RENDER_MODES = ("human", "rgb_array")
 

@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torchrl.envs import Transform
 
-from ganlane.api.options import Option, option
-from ganlane.api.parts import make_env
+from ganlane.api import make_env
 from ganlane.errors import UserError
 from ganlane.gym.arguments import (
     ACTIONS,
@@ -26,6 +25,7 @@ from ganlane.gym.arguments import (
 )
 from ganlane.gym.pictures import BatchView, real_time_fps
 from ganlane.gym.rows import Floats, Rows
+from ganlane.options import Option, option
 
 Flags = npt.NDArray[np.bool_]
 

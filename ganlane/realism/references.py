@@ -18,9 +18,8 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.evaluation.counts import poisson_interval
-from ganlane.files import write_json
+from ganlane.files import CHECKPOINTS, write_json
 from ganlane.generator.rollout import headway_from_uniform
-from ganlane.paths import CHECKPOINTS
 from ganlane.realism.distances import Array, ceiling
 from ganlane.realism.quantities import QUANTITIES, Measured
 from ganlane.sim.following import following_acceleration

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 
 import ganlane
 from ganlane.errors import UserError
-from ganlane.gym.window import FilmWindow
+from ganlane.gym.rendering import FilmWindow
 
 ID = "ganlane/Highway-v0"
 KEEP, LEFT, RIGHT = 0, 1, 2

@@ -51,7 +51,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     Raises:
         OSError: the file system refuses. It names ``path`` and has an ``errno``, whatever the library that wrote
             made of it.
-        UserError: a folder or a device stands there.
+        UserError: the path is a folder or a device.
     """
     path = Path(path)
     _refuse_all_but_files(path)
@@ -72,7 +72,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def _refuse_all_but_files(path: Path) -> None:
-    """Renaming onto ``/dev/null`` would replace it, where one may."""
+    """Refuse folders and devices: renaming onto ``/dev/null`` would replace it."""
     if path.exists() and not path.is_file():
         what = "a folder" if path.is_dir() else "a device or a pipe"
         raise UserError(f"{path}: {what}, where a file was to be written; give the name of a file.")
@@ -90,9 +90,9 @@ def _new_part(path: Path) -> Path:
 
 
 def _refusal(error: Exception, part: Path) -> OSError | None:
-    """What the file system said when ``part`` was written; None where the error is about something else.
+    """The file system's error when ``part`` was written; None where ``error`` has another cause.
 
-    Libraries tell of a full disk in words of their own (torch: "unexpected pos 576 vs 534"), so it is asked again.
+    Libraries report a full disk in messages of their own (torch: "unexpected pos 576 vs 534"), so a write is tried.
     """
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.filename in (None, str(part)) else None
@@ -116,8 +116,8 @@ def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
     """The text of the document ``path`` up to the marker ``begin``, and from ``end`` on, markers included.
 
     Raises:
-        UserError: there is no such file, or it does not hold the two markers once each and in order. Its sentence
-            names the key of the entry points that update a document, ``report``.
+        UserError: there is no such file, or it does not hold the two markers once each and in order. The sentence
+            names the commands' key ``report``.
     """
     if not path.is_file():
         raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")

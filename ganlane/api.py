@@ -174,12 +174,11 @@ def evaluate(
         seed: of the episodes.
         per_episode: one row per episode instead (:func:`ganlane.evaluation.run_episodes`).
         folder: write ``results.json`` and ``episodes.parquet`` there, as the command does.
-        keys: ``env``, ``observation``, ``reward``, ``mask``; keys of the command (``num_envs``, ``device``,
-            ``stream``) or of the environment. Observation and mask are for policies that name none.
+        keys: further options (``env``, ``reward``; ``observation`` and ``mask`` for policies that name none), keys of
+            the command (``num_envs``, ``device``, ``stream``) or of the environment.
 
     Returns:
-        The columns of the command's ``rows`` (:func:`ganlane.evaluation.evaluation_rows`); null where there is no
-        number.
+        The columns of :func:`ganlane.evaluation.evaluation_rows`; null where there is no number.
 
     Raises:
         UserError: an unknown name, a wrong value, or a policy that does not fit.
@@ -217,8 +216,7 @@ def train(
 
     Args:
         traffic: as in :func:`make_env`.
-        init: ``idm_ckpt`` (the agent that ships), ``none``, or ``{"name": "idm_ckpt", "path": FILE}``; ``support``
-            and ``optimizer`` are further keys (docs/training.md, 'Transfer').
+        init: ``idm_ckpt`` (the agent that ships), ``none``, or ``{"path": FILE}`` (docs/training.md, 'Transfer').
         total_decisions: of all environments together.
         seed: of everything.
         num_envs: environments side by side.
@@ -226,10 +224,8 @@ def train(
         pretrain: a first phase, ``{"traffic": "idm_mobil", "total_decisions": 10_000_000}``.
         folder: the run's; None: a new one below ``outputs/train``.
         resume: go on with the run in ``folder``; the other arguments must be those that it was started with.
-        keys: ``env``, ``observation``, ``reward``, ``mask`` (by default ``safe``); ``agent`` (``transfer``,
-            ``rainbow`` to train from nothing, ``dqn``); ``logger`` (``csv``, ``tensorboard``, or a mapping such as
-            ``{"progress": False}``); keys of the command (``evaluate_every``, ``log_every``, ``device``, ...) or of
-            the environment.
+        keys: further options (``env``, ``observation``, ``reward``, ``mask``, ``agent``, ``logger``), keys of the
+            command (``evaluate_every``, ``log_every``, ``device``, ...) or of the environment.
 
     Raises:
         UserError: a wrong value, an agent or checkpoint that does not fit.
@@ -267,9 +263,8 @@ def render(
         out: file to write; None: into a new folder below ``outputs/render``.
         run: folders of training runs; their learning curves are drawn instead of an episode.
         film: keys of the film: ``fps, speedup, start_s, end_s, width, height, ...``.
-        keys: ``format`` (``gif``, ``mp4``, ``png``, ``html``, ``csv``, ``parquet``; by default the ending of ``out``,
-            else ``gif``); ``seed``; ``env``, ``observation``, ``reward``, ``mask``; keys of the command or of the
-            environment.
+        keys: further options (``env``, ``observation``, ``reward``, ``mask``), keys of the command (``seed``;
+            ``format``, by default the ending of ``out``, else ``gif``) or of the environment.
 
     Raises:
         UserError: a wrong value.
@@ -315,7 +310,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
 
 
 def _function(command: str) -> Callable[[Any, Path], str]:
-    """What the command does with its config in its run folder; it returns the line that names its result."""
+    """The command itself: it takes its config and run folder, and returns the line that names its result."""
     return getattr(importlib.import_module(f"ganlane.{command}"), command)
 
 
@@ -395,7 +390,7 @@ def _stream(name: str) -> Stream:
 
 
 def _whole(name: str, value: Any) -> int:
-    """``value`` as a whole number (NumPy's are, too)."""
+    """``value`` as an int; NumPy's integers are allowed."""
     if isinstance(value, bool) or not hasattr(value, "__index__"):
         raise UserError(f"{name}={value!r}: expected a whole number; give for instance {name}=1.")
     return int(value)

@@ -22,7 +22,7 @@ from ganlane.parameters.observation import MASKS
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
-#: What None, or a mapping without a name, stands for outside a command; a command's YAML names its own defaults.
+#: Meaning of None, and of a mapping without a name, outside a command; a command's YAML has defaults of its own.
 DEFAULTS = {
     "env": "highway",
     "traffic": "idm_mobil",

@@ -6,6 +6,7 @@ without pyplot: they need no display, and no global list keeps them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,9 @@ from polars.exceptions import PolarsError
 from ganlane.data import Histogram, PooledStatistics, survival_curve
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
+
+# It reports every table of a font that a PDF leaves out.
+logging.getLogger("fontTools").setLevel(logging.WARNING)
 
 FloatArray = npt.NDArray[np.float64]
 #: Number of decisions so far: the horizontal axis of every learning curve.

@@ -32,7 +32,7 @@ from ganlane.api import load_agent, make_env
 from ganlane.evaluation import clopper_pearson, write_results
 from ganlane.evaluation.rollouts import SIDES, Rollout, replay, roll_out
 from ganlane.evaluation.table import Table
-from ganlane.memory import keep_freed_memory
+from ganlane.runtime import keep_freed_memory
 
 DRIVERS = ("mobil", "agent_idm", "keep_lane")
 #: The first stage: rides of ordinary drivers. The others are named after their beams.

@@ -32,7 +32,6 @@ from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table
 from ganlane.files import write_json
-from ganlane.memory import keep_freed_memory
 from ganlane.realism.long_runs import (
     EventCounter,
     GuardMeter,
@@ -43,6 +42,7 @@ from ganlane.realism.long_runs import (
     summary,
     watched,
 )
+from ganlane.runtime import keep_freed_memory
 from ganlane.sim.road import Road
 from ganlane.traffic import TrafficModule
 

@@ -252,7 +252,7 @@ def _devices() -> Finding:
 
 def _compiler() -> Finding:
     """The C++ compiler that only ``env.compile=true`` needs; ``CXX`` names another one."""
-    from ganlane.compiling import COMPILERS
+    from ganlane.runtime import COMPILERS
 
     named = os.environ.get("CXX")
     looked_for = (named,) if named else COMPILERS
@@ -266,14 +266,14 @@ def _compiler() -> Finding:
 
 def _configuration() -> Finding:
     """The YAML files of the commands."""
-    from ganlane.paths import conf_folder
+    from ganlane.files import conf_folder
 
     return Finding("configuration", State.OK, str(conf_folder()))
 
 
 def checkpoints() -> list[Finding]:
     """The weights that ship, each of them loaded."""
-    from ganlane.paths import CHECKPOINTS
+    from ganlane.files import CHECKPOINTS
 
     names = sorted({*NEEDED_WEIGHTS, *(path.stem for path in CHECKPOINTS.glob("*.safetensors"))})
     return [guarded(name, _loader(name, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL) for name in names]

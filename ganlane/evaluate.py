@@ -20,8 +20,9 @@ from ganlane.config.evaluate import EvaluateConfig
 
 def evaluate(config: EvaluateConfig, folder: Path) -> str:
     """Run, print and keep the table."""
-    from ganlane.build import make_driver, set_threads
+    from ganlane.build import make_driver
     from ganlane.compare import compare_configured, publish
+    from ganlane.runtime import set_threads
 
     set_threads(config.threads)
     drivers = [make_driver(name, config.env, device=config.device) for name in config.agents]

@@ -20,7 +20,7 @@ import torch
 from ganlane.config.bench import BenchConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.table import NOTHING, Table, count, percent, significant
-from ganlane.memory import peak_resident_bytes
+from ganlane.runtime import peak_resident_bytes
 
 #: Makes so many decisions in every environment; returns the physics steps simulated in all of them together.
 Runner = Callable[[int], int]

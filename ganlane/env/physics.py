@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.compiling import check_compiler, compiled
 from ganlane.env.rules import Rules, scene_over
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
+from ganlane.runtime import check_compiler, compiled
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.sim.ego import (
     Command,

@@ -17,8 +17,7 @@ import polars as pl
 import torch
 
 from ganlane._version import __version__
-from ganlane.files import atomic_path, write_json
-from ganlane.paths import PACKAGE
+from ganlane.files import PACKAGE, atomic_path, write_json
 
 
 def write_results(

@@ -40,10 +40,10 @@ from ganlane.config.realism import RealismConfig
 
 def realism(config: RealismConfig, folder: Path) -> str:
     """Make a card: drive, measure, print and save; the line that names its results."""
-    from ganlane.build import set_threads
     from ganlane.evaluation import write_results
     from ganlane.realism.card import drive_card, scenes_path
     from ganlane.realism.output import card_text, check_targets, draw, publish, show
+    from ganlane.runtime import set_threads
 
     config = config.shortened()
     set_threads(config.threads)

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array
-from ganlane.files import write_json
+from ganlane.files import CHECKPOINTS, write_json
 from ganlane.generator.rollout import headway_from_uniform
-from ganlane.paths import CHECKPOINTS
 from ganlane.realism.distances import ceiling
 from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate
 from ganlane.sim.following import following_acceleration

@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
+from ganlane.runtime import compiled
 from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.road import Road
 from ganlane.sim.scenes import Scenes

@@ -9,8 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.errors import UserError
+from ganlane.runtime import compiled
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.base import TrafficModule, memory_of
 

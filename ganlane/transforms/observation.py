@@ -11,8 +11,8 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.errors import UserError
+from ganlane.runtime import compiled
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
 from ganlane.transforms.fixed_order import fixed_order, places

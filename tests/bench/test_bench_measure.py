@@ -20,7 +20,7 @@ from ganlane.bench.measure import (
     take_turns,
     torch_threads,
 )
-from ganlane.memory import peak_resident_bytes
+from ganlane.runtime import peak_resident_bytes
 
 LABELS = Labels("sim", "speed", "mine", "idm", "eager", "float32", "cpu", 1, 9, 3, 4)
 CASE = Case(LABELS, lambda: lambda decisions: 0)

@@ -2,7 +2,7 @@ import sys
 
 import pytest
 
-from ganlane import memory
+from ganlane import runtime
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator is on Linux alone")
@@ -18,7 +18,7 @@ def test_a_process_that_keeps_its_memory_is_not_given_new_pages_at_every_step():
         return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
     without = faults()
-    if not memory.keep_freed_memory():
+    if not runtime.keep_freed_memory():
         pytest.skip("this libc has no mallopt")
     faults()
     assert faults() < max(without, 1) / 10
@@ -26,16 +26,16 @@ def test_a_process_that_keeps_its_memory_is_not_given_new_pages_at_every_step():
 
 def test_elsewhere_nothing_happens(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert not memory.keep_freed_memory()
+    assert not runtime.keep_freed_memory()
 
 
 def test_the_peak_stays_when_memory_is_given_back():
     torch = pytest.importorskip("torch")
-    before = memory.peak_resident_bytes()
+    before = runtime.peak_resident_bytes()
     if before is None:
         pytest.skip("this system does not report a process's peak memory")
     size = before + 50_000_000
     held = torch.ones(size, dtype=torch.uint8)
-    assert memory.peak_resident_bytes() >= size
+    assert runtime.peak_resident_bytes() >= size
     del held
-    assert memory.peak_resident_bytes() >= size
+    assert runtime.peak_resident_bytes() >= size

@@ -22,12 +22,11 @@ from ganlane.generator.layers import MotionLSTM, PairPooling, motion_features
 from ganlane.generator.networks import Observation
 from ganlane.generator.rollout import COMMON_SPEED_MPS
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import TABLE_II, SpawnParameters
+from ganlane.sim.state import Road
 from ganlane.traffic import CalibratedLaneChange, TrafficSequential
-from ganlane.traffic.calibrated_gan import AnchoredGanTraffic
-from ganlane.traffic.generated import GeneratedTraffic
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
+from ganlane.traffic.social_gan import AnchoredGanTraffic, GeneratedTraffic
 
 #: Steps of a plan that are driven before predicting again.
 PLANS = (2, 4, 8)

@@ -30,7 +30,7 @@ from ganlane.generator import Discriminator, Generator, load_generator, shipped_
 from ganlane.realism.recordings import recorded_frame, recordings_of
 from ganlane.realism.replay_starts import StartOptions, drive_recordings
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 from ganlane.traffic.presets import gan_calibrated_traffic
 from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, palette, save_figure

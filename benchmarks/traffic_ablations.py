@@ -43,7 +43,7 @@ from ganlane.realism.long_runs import (
     watched,
 )
 from ganlane.runtime import keep_freed_memory
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 
 BEGIN, END = "<!-- begin traffic ablations -->", "<!-- end traffic ablations -->"

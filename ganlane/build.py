@@ -31,9 +31,9 @@ from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.parameters.observation import MASKS, MaskParameters
 from ganlane.parameters.reward import RewardParameters
+from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
-from ganlane.sim.steering import STEERING
+from ganlane.sim.state import Road
 from ganlane.traffic import BlindTraffic, TrafficModule
 from ganlane.transforms import (
     ActionMaskTransform,

@@ -43,8 +43,7 @@ from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V, IdmParameters
 from ganlane.sim.lanes import Visibility
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 

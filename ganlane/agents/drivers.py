@@ -17,8 +17,7 @@ from ganlane.sim.ego import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
-from ganlane.sim.road import Road, road_in
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
 from ganlane.transforms.mask import on_road_actions
 

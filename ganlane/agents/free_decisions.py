@@ -1,6 +1,6 @@
 """Returns over the decisions at which the ego is free to act: a lane change counts as one decision, however long.
 
-While a lane change is under way commands are ignored (:func:`ganlane.sim.ego.obey`), so nothing is learnt there: a
+During a lane change commands are ignored (:func:`ganlane.sim.ego.apply_action`), so nothing is learnt there: a
 transition starts where the ego is free, and leads to the first observation at least n decisions later at which it is
 free again. This makes the literal Table III, which does not tell of a change under way, Markov where it is asked.
 """

@@ -22,10 +22,10 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.decision import Decision
+from ganlane.env.decision import run_decision
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import episode_key
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 #: Random actions are drawn before the clock starts and used again after so many decisions.
 _DRAWN = 64
@@ -80,7 +80,7 @@ def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehi
     keep = torch.full_like(state.get(keys.STEP), keys.KEEP)
     start, _ = env.physics.begin(rules, keep, vehicles, ego, state.get(keys.STEP))
     key = episode_key(env.stream, state.get(keys.SEED), state.get(keys.EPISODE))
-    end, _ = Decision(env.traffic, env.physics, rules).drive(state, start, key, substeps=steps)
+    end, _ = run_decision(env.traffic, env.physics, rules, state, start, key, substeps=steps)
     return end.vehicles, end.step
 
 

@@ -14,7 +14,7 @@ from ganlane.config.scene_file import FileSceneEnvConfig, FileSceneOptions
 from ganlane.parameters.checks import above, between, check
 
 if TYPE_CHECKING:
-    from ganlane.sim.fixed_scene import SceneVehicle
+    from ganlane.sim.scenes import SceneVehicle
 
 __all__ = [
     "BlockedLaneEnvConfig",

@@ -12,8 +12,8 @@ from ganlane.parameters.driving import Visibility
 from ganlane.parameters.records import assign, lists_to_tuples
 
 if TYPE_CHECKING:
-    from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
-    from ganlane.sim.road import Road
+    from ganlane.sim.scenes import FixedScene, SceneVehicle
+    from ganlane.sim.state import Road
 
 #: Keys of Table II, which a scene set by hand does not have.
 TABLE_II_KEYS = (
@@ -84,7 +84,7 @@ class SceneEnvConfig(EnvConfig):
 
     def fixed_scene(self, others_visibility: int | None = None) -> FixedScene:
         """The scene; ``others_visibility`` is the traffic's."""
-        from ganlane.sim.fixed_scene import FixedScene
+        from ganlane.sim.scenes import FixedScene
 
         return FixedScene(self.rows(), self._road(), name=self.name(), **self._scene_options(others_visibility))
 
@@ -97,7 +97,7 @@ class SceneEnvConfig(EnvConfig):
         }
 
     def _road(self) -> Road:
-        from ganlane.sim.road import Road
+        from ganlane.sim.state import Road
 
         return Road(self.lanes, self.lane_width_m)
 

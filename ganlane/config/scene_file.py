@@ -11,7 +11,7 @@ from ganlane.parameters.checks import at_least, between, check, optional, text
 from ganlane.parameters.records import assign
 
 if TYPE_CHECKING:
-    from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
+    from ganlane.sim.scenes import FixedScene, SceneVehicle
 
 
 @dataclass

@@ -21,8 +21,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import OTHER, start_of
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.road import Road, road_in
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles, road_in
 
 #: Where the other vehicle of a crash was, by the numbers that :func:`contact_side` gives.
 SIDES = ("none", "ahead", "side", "behind")

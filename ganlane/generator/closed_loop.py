@@ -27,11 +27,9 @@ from torch import Tensor
 
 from ganlane.generator.networks import Generator, Observation
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import IdmParameters
+from ganlane.sim.idm import IdmParameters, following_acceleration
 from ganlane.sim.neighbours import Scene, leader, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3

@@ -31,10 +31,9 @@ from ganlane.generator.scores import SAMPLES, Forecasts
 from ganlane.generator.segments import Segments, SegmentSource, constant_velocity
 from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 #: Groups, and segments times samples, in one pass; bounds the memory.
 _GROUPS, _ROLLOUTS = 128, 160

@@ -17,8 +17,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import ENTRY_M, Visibility
 from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 #: Levels of the headway quantiles.
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)

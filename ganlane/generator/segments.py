@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 
 #: In fitting, a recorded driver's target lane is its lane after this time, s.
 INTENTION_S = 2.0

@@ -19,7 +19,7 @@ from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
-from ganlane.sim.road import road_in
+from ganlane.sim.state import road_in
 from ganlane.transforms import ObservationTransform, largest_number
 from ganlane.transforms.mask import ACTIONS
 

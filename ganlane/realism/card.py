@@ -36,7 +36,7 @@ from ganlane.realism.starts import (
     spawned_starts,
 )
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 
 #: Preset of the weights that a traffic drives with.

@@ -25,9 +25,8 @@ from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import Guard, TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
@@ -224,7 +223,7 @@ def drive_spawned(
     counters = {keys.SEED: torch.full((rows,), parameters.seed), keys.EPISODE: first + torch.arange(rows)}
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
-    memory = traffic.init_memory(state, torch.ones_like(state.valid), absorb(key, 0))
+    memory = traffic.init_memory(state, absorb(key, 0))
     snapshots, start = [_snapshot(state)], state.x
     sizes = (state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
     events.begin()

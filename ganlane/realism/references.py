@@ -22,12 +22,12 @@ from ganlane.files import CHECKPOINTS, write_json
 from ganlane.generator.rollout import headway_from_uniform
 from ganlane.realism.distances import ceiling
 from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.hazard import random_side
+from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, uniform
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.lane_change import random_side
 
 #: The file that ships.
 SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"

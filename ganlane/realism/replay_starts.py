@@ -31,8 +31,7 @@ from ganlane.generator.rollout import balanced_headway
 from ganlane.realism.recordings import Recording, frame_of
 from ganlane.sim.lanes import ENTRY_M
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 
 #: Makes a traffic model for a road.
@@ -148,7 +147,7 @@ def _updated_memory(
     """The traffic's memory, initialised for the vehicles that enter, with their recorded headways."""
     if memory is not None and not bool(enters.any()):
         return memory
-    fresh = with_recorded_headways(traffic.init_memory(state, enters, key), state, traffic.road, enters)
+    fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
     if memory is None:
         return fresh
 

@@ -26,8 +26,8 @@ from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate, m
 from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of, units_of
 from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
 from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import SpawnParameters
+from ganlane.sim.state import Road
 
 #: Reference drivers at the ends of the scale.
 FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}

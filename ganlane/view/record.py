@@ -19,8 +19,7 @@ from ganlane import keys
 from ganlane.agents.policy import GreedyPolicy
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
-from ganlane.sim.road import Road, road_in
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.view.trajectory import EpisodeLabel, Trajectory
 
 #: Fields of ``vehicles`` that a trajectory keeps, with their types.

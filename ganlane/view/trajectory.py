@@ -12,7 +12,7 @@ import torch
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -14,9 +14,9 @@ from ganlane.errors import UserError
 from ganlane.evaluation import clopper_pearson, replay, roll_out
 from ganlane.keys import KEEP, LEFT, RIGHT
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.scenes import FixedScene, SceneVehicle
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic, TrafficModule
 from ganlane.transforms import RewardTransform
 

@@ -10,7 +10,7 @@ from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import replay, roll_out, run_episodes
 from ganlane.evaluation.rollouts import SIDES, contact_side
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 
 
 def test_a_rollout_is_the_evaluated_episode_and_comes_back_from_its_actions():

@@ -23,8 +23,7 @@ from ganlane.generator.networks import Generator, GeneratorSizes
 from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.lanes import Visibility
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 ROAD = Road(3, 4.0)

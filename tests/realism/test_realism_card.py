@@ -9,7 +9,7 @@ from ganlane.realism.recordings import recordings_of
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.realism.replay_starts import StartOptions
 from ganlane.realism.starts import simulate
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"]

@@ -14,7 +14,7 @@ from ganlane.realism.long_runs import (
 )
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.sim.random import episode_key
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import Guard, IdmTraffic, TrafficModule
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 

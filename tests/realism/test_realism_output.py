@@ -9,7 +9,7 @@ from ganlane.realism.long_runs import LongRunParameters, long_run, totals
 from ganlane.realism.output import checks_text, draw_distances, draw_distributions, draw_speeds_over_time, long_table
 from ganlane.realism.quantities import QUANTITIES
 from ganlane.realism.references import ConstantVelocity
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.view.figures import COLOURS, INK
 

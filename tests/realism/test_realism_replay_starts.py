@@ -16,10 +16,9 @@ from ganlane.realism.recordings import Recording, recorded_frame, recordings_of
 from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
 from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways
 from ganlane.realism.starts import simulate
-from ganlane.sim.following import following_acceleration
+from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmMobilTraffic, TrafficModule
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 

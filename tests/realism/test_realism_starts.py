@@ -12,7 +12,7 @@ from ganlane.realism.recordings import Recording
 from ganlane.realism.references import ConstantVelocity
 from ganlane.realism.replay_starts import StartOptions
 from ganlane.realism.starts import Fold, fit_excess, recorded_starts, spawned_frame
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 NAMES = [f"synthetic-{number}" for number in range(4)]

@@ -16,7 +16,7 @@ from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import Recordings, ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import record_episode

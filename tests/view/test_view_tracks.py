@@ -16,7 +16,7 @@ from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
 from ganlane.view.tracks import scene_names

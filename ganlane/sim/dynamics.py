@@ -1,6 +1,8 @@
-"""Two-point visual control of steering (Salvucci and Gray 2004).
+"""Motion of a vehicle: the kinematic bicycle model, and steering towards the centre of a lane.
 
-The driver looks at a near and a far point on the centre of the lane it wants to be in, and turns the wheel at
+The bicycle has a slip angle and its centre of gravity in the middle (section IV.C). Steering is two-point visual
+control (Salvucci and Gray 2004): the driver looks at a near and a far point on the centre of the lane it wants to be
+in, and turns the wheel at
 
     d(delta)/dt = k_f d(theta_far)/dt + k_n d(theta_near)/dt + k_I theta_near .
 
@@ -11,11 +13,51 @@ proportional to speed a lane change takes about 4 s at every speed, without over
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ganlane.sim.bicycle import WHEELBASE_M, slip_angle
+#: Distance between the axles, m.
+WHEELBASE_M = 2.7
+
+
+class Pose(NamedTuple):
+    """Position x, y (m), heading (rad), speed (m/s) and realised acceleration (m/s2) of a vehicle."""
+
+    x: Tensor
+    y: Tensor
+    heading: Tensor
+    speed: Tensor
+    acceleration: Tensor
+
+
+def slip_angle(steering: Tensor) -> Tensor:
+    """Angle between heading and motion at the centre, ``atan(l_r / (l_f + l_r) tan(delta))``, rad."""
+    return torch.atan(0.5 * torch.tan(steering))
+
+
+def advance(
+    x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, acceleration: Tensor, steering: Tensor, dt: float
+) -> Pose:
+    """One step of ``dt`` seconds.
+
+    The distance is the mean of old and new speed times ``dt`` (exact for constant acceleration), so it never
+    exceeds ``max(v_old, v_new) dt``; a vehicle that brakes to a stop does not roll back. The direction is the mean
+    heading of the step, so a constant steering angle gives a circle, accurate to second order.
+    """
+    new_speed = (speed + acceleration * dt).clamp_min(0.0)
+    distance = 0.5 * (speed + new_speed) * dt
+    slip = slip_angle(steering)
+    turn = distance / (0.5 * WHEELBASE_M) * torch.sin(slip)
+    direction = heading + slip + 0.5 * turn
+    return Pose(
+        x + distance * torch.cos(direction),
+        y + distance * torch.sin(direction),
+        heading + turn,
+        new_speed,
+        (new_speed - speed) / dt,
+    )
 
 
 @dataclass(frozen=True)

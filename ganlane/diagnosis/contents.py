@@ -57,25 +57,25 @@ def _loaded(name: str, path: Path) -> Callable[[], Finding]:
 
 def recordings() -> Finding:
     """The recordings that ``data.path=null`` means; needed for fitting and realism, not for training or driving."""
-    from ganlane.data.find import SCENES, VARIABLE, default_scenes
+    from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
 
     try:
         path = default_scenes()
     except UserError as error:
-        mend = f"export {VARIABLE}=FOLDER   (one that holds {SCENES}), or give data.path=FILE (docs/own_data.md)"
+        mend = f"export {DATA_VARIABLE}=FOLDER   (one that holds {SCENES}), or give data.path=FILE (docs/own_data.md)"
         return Finding("recordings", State.ABSENT, str(error).partition("; ")[0], mend)
     return Finding("recordings", State.OK, f"{path} ({_megabytes(path)})")
 
 
 def cache() -> Finding:
     """Where groups of windows are kept between fits."""
-    from ganlane.generator.groups import VARIABLE, cache_folder
+    from ganlane.generator.windows import CACHE_VARIABLE, cache_folder
 
     folder = cache_folder()
     if folder is None:
-        return Finding("cache", State.OK, f"off ({VARIABLE} is empty)")
+        return Finding("cache", State.OK, f"off ({CACHE_VARIABLE} is empty)")
     if not _can_write(folder):
-        return Finding("cache", State.ABSENT, f"{folder} cannot be written to", f"export {VARIABLE}=FOLDER")
+        return Finding("cache", State.ABSENT, f"{folder} cannot be written to", f"export {CACHE_VARIABLE}=FOLDER")
     kept = list(folder.glob("*.npz")) if folder.is_dir() else []
     size = sum(path.stat().st_size for path in kept) / 2**20
     return Finding("cache", State.OK, f"{folder} ({len(kept)} files, {size:.1f} MB)")

@@ -13,21 +13,20 @@ from ganlane.data import (
     PooledStatistics,
     Scene,
     SyntheticTraffic,
-    cut_into_scenes,
     driving_statistics,
-    long_report,
     prepare_recordings,
     read_recordings,
     read_scenes,
     scene_lane_widths,
-    short_report,
     synthetic_scenes,
     write_prepared,
     write_scene_csv,
 )
 from ganlane.data.prepare import whole_folder
+from ganlane.data.scenes import cut_into_scenes
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
+from ganlane.prepare import long_report, short_report
 
 TOO_LONG = "s" * 300
 

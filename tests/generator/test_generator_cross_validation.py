@@ -4,7 +4,8 @@ from dataclasses import asdict, replace
 import polars as pl
 import pytest
 
-from ganlane.data import SyntheticTraffic, measure_exposure, synthetic_scenes
+from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.data.statistics import measure_exposure
 from ganlane.fit_report import ablation_table, fold_tables
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.cross_validation import ablate, cross_validate, variants

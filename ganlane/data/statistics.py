@@ -62,8 +62,7 @@ class Durations:
     Attributes:
         complete: the complete ones; their mean is too low, since long durations are censored more often.
         censored: number of censored ones.
-        survival_mean_s: area under Kaplan and Meier's survival curve, up to the longest duration; None
-            without any complete one.
+        survival_mean_s: area under :func:`survival_curve`, up to the longest duration; None without complete ones.
         survival_median_s: where that curve falls to one half; None if it never does.
     """
 
@@ -108,7 +107,7 @@ class Bins:
 
     @property
     def edges(self) -> np.ndarray:
-        """[number + 1]."""
+        """The bins' limits [number + 1]."""
         return np.linspace(self.low, self.high, self.number + 1)
 
 

@@ -1,4 +1,4 @@
-"""Downloads from a server on this machine that breaks off, ignores Range, changes its file or sends rubbish."""
+"""Where recordings are, and downloads from a server that breaks off, ignores Range or changes its file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from reference.file_server import CONTENT, SHA256, Server
 
-from ganlane.data import ByteProgress, download
+from ganlane.data import ByteProgress, data_folder, default_scenes, download
 from ganlane.errors import UserError
 
 QUICK = {"timeout_s": 5.0, "attempts": 3, "wait_s": 0.01}
@@ -139,3 +139,28 @@ def test_progress_tells_share_and_time_left():
     assert progress.line(2_000_000, 4_000_000).startswith("read: 2 of 4 MB, ")
     assert progress.line(2_000_000, 4_000_000).endswith(" s left")
     assert "left" not in progress.line(2_000_000, None)
+
+
+def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
+    monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
+    assert data_folder() == tmp_path
+    with pytest.raises(UserError, match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"):
+        default_scenes()
+    (tmp_path / "ngsim").mkdir()
+    deep = tmp_path / "ngsim" / "us101_scenes.csv"
+    deep.write_text("scene,vehicle")
+    assert default_scenes() == deep
+    monkeypatch.setenv("GANLANE_DATA", str(tmp_path / "nowhere"))
+    with pytest.raises(UserError, match="no such folder"):
+        data_folder()
+
+
+def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.delenv("GANLANE_DATA", raising=False)
+    monkeypatch.setattr("ganlane.data.download.__file__", str(tmp_path / "site" / "ganlane" / "data" / "download.py"))
+    work = tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    assert data_folder() is None
+    (tmp_path / "shared" / "data").mkdir(parents=True)
+    assert data_folder() == tmp_path / "shared" / "data"

@@ -176,10 +176,6 @@ def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
         assert low - 0.1 - 1e-9 <= value <= high + 0.1 + 1e-9
 
 
-def test_a_histogram_of_nothing_says_nothing():
-    assert Histogram(Bins(0.0, 1.0, 10)).describe() == describe([])
-
-
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one ends at 3 (2/3 of
     # 4/5), one is cut off at 4, the last ends at 5.
@@ -216,5 +212,6 @@ def test_a_sample_is_summed_up():
     assert (summary.count, summary.mean) == (101, 50.0)
     assert summary.quantile(0.05) == pytest.approx(5.0)
     assert summary.quantile(0.5) == pytest.approx(50.0)
+    assert Histogram(Bins(0.0, 1.0, 10)).describe() == describe([])
     assert describe([]).quantiles == ()
     assert describe([2.0]).sd is None

@@ -60,11 +60,6 @@ def drive(generator, state, seconds, headway=1.27, noise=0.0):
     return state, memory
 
 
-def test_without_a_residual_a_lone_driver_reaches_its_desired_speed():
-    state, _ = drive(silent_generator(), vehicles([0.0], speed=15.0, desired=22.0), 50)
-    assert state.speed.item() == pytest.approx(22.0, abs=0.3)
-
-
 def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
     state = vehicles([0.0, 36.0], speed=18.0, desired=18.0)
     state = state.with_(desired_speed=torch.tensor([[25.0, 18.0]]).double())

@@ -36,6 +36,12 @@ def generator():
     return Generator(GeneratorSizes(**SMALL, extra_inputs=EXTRA_INPUTS))
 
 
+def typical_rollout(generator, segments):
+    """Positions when every driver is typical and z = 0."""
+    headway, desired = typical_driver_params(segments)
+    return rollout(generator, segments, headway, desired, torch.zeros(*headway.shape, 4))
+
+
 def test_tracks_go_on_at_constant_velocity_beyond_their_ends():
     present = np.array([False, False, True, True, True, False])[:, None]
     positions = np.zeros((6, 1, 2))
@@ -71,44 +77,30 @@ def test_mirroring_twice_changes_nothing_and_once_swaps_the_lanes(recorded_scene
 
 
 def test_a_rollout_is_the_same_with_more_padding(recorded_scenes, generator):
-    scenes = cut_segments([(recorded_scenes[0], 0)], horizon=5)
-    headway, desired = typical_driver_params(scenes)
-    course = rollout(generator, scenes, headway, desired, torch.zeros(1, 7, 4))
-    wide = cut_segments([(recorded_scenes[0], 0)], horizon=5)
-    wide = type(wide)(
-        positions=torch.nn.functional.pad(wide.positions, (0, 0, 0, 4)),
-        present=torch.nn.functional.pad(wide.present, (0, 4)),
-        target_lane=torch.nn.functional.pad(wide.target_lane, (0, 4)),
-        length=torch.nn.functional.pad(wide.length, (0, 4), value=1.0),
-        width=torch.nn.functional.pad(wide.width, (0, 4), value=1.0),
-        lanes=wide.lanes,
-        lane_width=wide.lane_width,
+    segments = cut_segments([(recorded_scenes[0], 0)], horizon=5)
+    pad = torch.nn.functional.pad
+    wide = replace(
+        segments,
+        positions=pad(segments.positions, (0, 0, 0, 4)),
+        present=pad(segments.present, (0, 4)),
+        target_lane=pad(segments.target_lane, (0, 4)),
+        length=pad(segments.length, (0, 4), value=1.0),
+        width=pad(segments.width, (0, 4), value=1.0),
     )
-    headway, desired = typical_driver_params(wide)
-    padded = rollout(generator, wide, headway, desired, torch.zeros(1, 11, 4))
-    torch.testing.assert_close(padded[:, :, :7], course)
+    torch.testing.assert_close(typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments))
 
 
 def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(recorded_scenes, generator):
-    scenes = cut_segments([(recorded_scenes[0], 0)], horizon=9)
-    scenes.present[:, :12, 2] = False
-    headway, desired = typical_driver_params(scenes)
-    course = rollout(generator, scenes, headway, desired, torch.zeros(1, 7, 4))
-    torch.testing.assert_close(course[:, :4, 2], scenes.future[:, :4, 2])
-    assert not torch.allclose(course[:, 4:, 2], scenes.future[:, 4:, 2], atol=1e-5)
-    assert not scenes.scored[0, :, 2].any()
-
-
-def test_where_a_later_vehicle_goes_is_not_told(recorded_scenes, generator):
-    scenes = cut_segments([(recorded_scenes[0], 0)], horizon=9)
-    scenes.present[:, :12, 2] = False
-    altered = type(scenes)(**{name: value.clone() for name, value in vars(scenes).items()})
+    segments = cut_segments([(recorded_scenes[0], 0)], horizon=9)
+    segments.present[:, :12, 2] = False
+    positions = typical_rollout(generator, segments)
+    torch.testing.assert_close(positions[:, :4, 2], segments.future[:, :4, 2])
+    assert not torch.allclose(positions[:, 4:, 2], segments.future[:, 4:, 2], atol=1e-5)
+    assert not segments.scored[0, :, 2].any()
+    # Where it goes later does not matter.
+    altered = replace(segments, positions=segments.positions.clone())
     altered.positions[:, 14:, 2] += 5.0
-    courses = []
-    for stretch in (scenes, altered):
-        headway, desired = typical_driver_params(stretch)
-        courses.append(rollout(generator, stretch, headway, desired, torch.zeros(1, 7, 4)))
-    torch.testing.assert_close(courses[0], courses[1])
+    torch.testing.assert_close(typical_rollout(generator, altered), positions)
 
 
 def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(recorded_scenes, generator):
@@ -123,15 +115,12 @@ def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(recorded_sc
 
 
 def test_nothing_of_the_future_enters_an_evaluation(recorded_scenes, generator):
-    scenes = cut_segments([(recorded_scenes[0], 0)], horizon=5)
+    segments = cut_segments([(recorded_scenes[0], 0)], horizon=5)
     altered = cut_segments([(recorded_scenes[0], 0)], horizon=5)
     altered.positions[:, 9:] += 7.0
     altered.target_lane[:, 9:] = 0
-    courses = []
-    for stretch in (scenes.without_intentions(), altered.without_intentions()):
-        headway, desired = typical_driver_params(stretch)
-        courses.append(rollout(generator, stretch, headway, desired, torch.zeros(1, 7, 4)))
-    torch.testing.assert_close(courses[0], courses[1])
+    one, other = (typical_rollout(generator, each.without_intentions()) for each in (segments, altered))
+    torch.testing.assert_close(one, other)
 
 
 def test_a_balanced_driver_neither_brakes_nor_speeds_up(recorded_scenes):

@@ -40,19 +40,12 @@ def distance(one: Tensor, other: Tensor) -> Tensor:
 
 def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
     """``{"all" or scene: {"ade_m/KIND", "fde_m/KIND", ..., "windows"}}`` of the forecasts, in m."""
-    errors = errors_of(forecasts, windows.future)
-    rows = {"all": np.ones(len(windows), dtype=bool)}
-    rows |= {windows.scene_names[index]: windows.scene == index for index in np.unique(windows.scene)}
-    return {name: _means(errors, chosen) for name, chosen in rows.items()}
-
-
-def _means(errors: Forecasts, rows: np.ndarray) -> dict[str, float]:
-    """ADE, FDE and number of the chosen windows."""
-    means = {}
-    for kind, values in errors.items():
-        means[f"ade_m/{kind}"] = float(values[rows].mean())
-        means[f"fde_m/{kind}"] = float(values[rows, -1].mean())
-    return means | {"windows": float(rows.sum())}
+    errors, metrics = errors_of(forecasts, windows.future), {}
+    for name, rows in {"all": np.ones(len(windows), dtype=bool), **windows.by_scene}.items():
+        row = displacement_errors(errors, rows)
+        metrics[name] = {f"{error}/{kind}": row[error][kind] for error in ("ade_m", "fde_m") for kind in forecasts}
+        metrics[name]["windows"] = float(row["windows"])
+    return metrics
 
 
 def errors_of(forecasts: Forecasts, recorded: np.ndarray) -> Forecasts:
@@ -142,9 +135,7 @@ def open_loop_scores(windows: Windows, forecasts: Forecasts, fold: np.ndarray, l
     return {
         **displacement_errors(errors),
         "folds": by({str(number): fold == number for number in range(int(fold.max()) + 1)}),
-        "scenes": by(
-            {name: windows.scene == windows.scene_names.index(name) for name in sorted(windows.scene_names)}
-        ),
+        "scenes": by(windows.by_scene),
         "parts": by(parts_of(windows, least_part)),
         "direction": direction,
         "direction_whole_window": direction_scores(forecasts, windows.future, windows.past[..., 1].sum(1)),

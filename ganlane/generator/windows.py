@@ -39,12 +39,10 @@ class Windows:
     Attributes:
         positions: [W, frames, 2] float64, m.
         scene: [W] int64, index into ``scene_names``.
-        start: [W] int64, row of the scene at which the window starts.
-        vehicle: [W] int64, column of the vehicle in the scene.
+        start, vehicle: [W] int64, row of the scene at which the window starts, and column of its vehicle.
         lane: [W] int64, its lane at the last observed position, 0 the rightmost.
         lane_from_left: [W] int64, the same counted from the scene's leftmost lane, which is 1.
-        length: [W] float64, its length, m.
-        scene_names: names of the scenes.
+        length: [W] float64, m.
     """
 
     positions: np.ndarray
@@ -58,6 +56,12 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.start)
+
+    @property
+    def by_scene(self) -> dict[str, np.ndarray]:
+        """Masks [W] of the windows of each scene that has any, by name."""
+        numbers = sorted(np.unique(self.scene), key=lambda number: self.scene_names[number])
+        return {self.scene_names[number]: self.scene == number for number in numbers}
 
     @property
     def future(self) -> np.ndarray:
@@ -135,7 +139,7 @@ def cache_folder() -> Path | None:
 
 
 def content_hash(settings: Any, *arrays: np.ndarray) -> str:
-    """Hash of plain ``settings`` and of the arrays' types, shapes and bytes."""
+    """Hash of plain settings and of the arrays' types, shapes and bytes."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for array in arrays:
         digest.update(f"{array.dtype.str}{array.shape}".encode())
@@ -179,17 +183,13 @@ class Groups:
         displacements: [B, G, frames - 1, 2] float32, m per 0.1 s.
         position: [B, G, 2] float32, the last observed position relative to the group's mean, m.
         mask: [B, G] bool, false is padding.
-        scene: [B] int64, index of the group's scene.
         window: [B, G] int64, row in :class:`Windows`; -1 is padding.
-        scene_names: names of the scenes.
     """
 
     displacements: Tensor
     position: Tensor
     mask: Tensor
-    scene: Tensor
     window: Tensor
-    scene_names: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -197,14 +197,7 @@ class Groups:
     def select(self, rows: Tensor) -> Groups:
         """The groups of the given rows, without padding that none of them needs."""
         width = int(self.mask[rows].sum(1).max())
-        return replace(
-            self,
-            displacements=self.displacements[rows, :width],
-            position=self.position[rows, :width],
-            mask=self.mask[rows, :width],
-            scene=self.scene[rows],
-            window=self.window[rows, :width],
-        )
+        return Groups(*(value[rows, :width] for value in vars(self).values()))
 
     def mirrored(self, flip: Tensor) -> Groups:
         """The same groups, left and right swapped where ``flip`` [B] is true."""
@@ -262,12 +255,9 @@ def _pad(windows: Windows, now: np.ndarray, labels: np.ndarray) -> Groups:
     mask = window >= 0
     displacements = np.where(mask[..., None, None], np.diff(windows.positions, axis=1)[window], 0.0)
     position = np.where(mask[..., None], now[window] - mean[:, None], 0.0)
-    scene = windows.scene[window[:, 0]]
     return Groups(
         torch.from_numpy(displacements).float(),
         torch.from_numpy(position).float(),
         torch.from_numpy(mask),
-        torch.from_numpy(scene),
         torch.from_numpy(window),
-        windows.scene_names,
     )

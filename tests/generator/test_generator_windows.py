@@ -3,6 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
+import torch
 
 from ganlane.data import SCHEMA
 from ganlane.errors import UserError
@@ -164,7 +165,6 @@ def test_groups_never_mix_scenes_or_frames_and_lose_nobody():
     for row in range(len(groups)):
         inside = groups.window[row][groups.mask[row]].numpy()
         assert len(set(zip(windows.scene[inside], windows.start[inside]))) == 1
-        assert (windows.scene[inside] == groups.scene[row].item()).all()
 
 
 def test_groups_hold_the_displacements_of_their_windows():
@@ -186,9 +186,9 @@ def test_kmeans_puts_two_distant_platoons_into_two_groups():
 
 def test_mirroring_turns_only_the_chosen_groups_round():
     groups = group_windows(cut_windows(scene_tracks(recording())), size=4).select(slice(0, 2))
-    flipped = groups.mirrored(groups.scene == -1)
+    flipped = groups.mirrored(torch.tensor([False, False]))
     assert (flipped.displacements == groups.displacements).all()
-    flipped = groups.mirrored((groups.scene >= 0) & (groups.scene.cumsum(0) >= 0))
+    flipped = groups.mirrored(torch.tensor([True, True]))
     assert (flipped.displacements[..., 1] == -groups.displacements[..., 1]).all()
     assert (flipped.displacements[..., 0] == groups.displacements[..., 0]).all()
     assert (flipped.position[..., 1] == -groups.position[..., 1]).all()

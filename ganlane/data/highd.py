@@ -112,7 +112,7 @@ def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
         found = ()
     if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
         raise UserError(
-            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; expected two or more growing numbers parted by ;"
+            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; expected two or more growing numbers, separated by ;"
         )
     return found
 
@@ -150,7 +150,7 @@ def _read_rows(path: Path, direction_of: dict[int, int], count: RowCount) -> pl.
 def _scene(
     rows: pl.DataFrame, direction: _Direction, rate_hz: float, name: str, path: Path, count: RowCount
 ) -> Scene | None:
-    """One direction in the schema; None where nobody drives in it."""
+    """One direction in the schema; None where it has no vehicles."""
     rows = rows.filter(pl.col("direction") == direction.number)
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
     count.drop("off the lanes of its direction", int((~on_road).sum()))

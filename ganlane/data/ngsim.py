@@ -241,7 +241,7 @@ def _check_size(period: _Period, source: str) -> None:
         raise UserError(
             f"{source}, line {first[LINE]}, columns frame_id and global_time: frame {first['frame_id']} at "
             f"{first['global_time']} ms fits no recording period of {period.location} ({rows.height} rows alone); "
-            "mend or remove the row."
+            "correct or remove the row."
         )
 
 

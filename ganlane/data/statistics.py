@@ -74,15 +74,15 @@ class Durations:
 
 def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
     """Summarise durations [C], of which those not ``complete`` [C] are lower bounds."""
-    times, seen = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
+    times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
     mean = median = None
-    if seen.any():
-        ends, survival = survival_curve(times, seen)
+    if is_complete.any():
+        ends, survival = survival_curve(times, is_complete)
         edges = np.concatenate(([0.0], ends, [max(times.max(), ends[-1])]))
         mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
         halved = np.flatnonzero(survival <= 0.5)
         median = float(ends[halved[0]]) if len(halved) else None
-    return Durations(describe(times[seen]), int(np.count_nonzero(~seen)), mean, median)
+    return Durations(describe(times[is_complete]), int(np.count_nonzero(~is_complete)), mean, median)
 
 
 def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -91,8 +91,8 @@ def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarr
     Returns:
         [E] the distinct complete durations, growing, and [E] the shares of longer durations, falling.
     """
-    times, seen = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
-    ends, ending = np.unique(times[seen], return_counts=True)
+    times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
+    ends, ending = np.unique(times[is_complete], return_counts=True)
     at_risk = len(times) - np.searchsorted(np.sort(times), ends)
     return ends, np.cumprod(1.0 - ending / at_risk)
 

@@ -139,7 +139,7 @@ def raise_where(bad: pl.Series, values: pl.Series, path: Path, what: str, lines:
     value = values[row]
     field = "the field" if value in (None, "") else repr(value)
     line = row + FIRST_LINE if lines is None else lines[row]
-    raise UserError(f"{path}, line {line}, column {values.name}: {field} {what}; mend or remove the row.")
+    raise UserError(f"{path}, line {line}, column {values.name}: {field} {what}; correct or remove the row.")
 
 
 def read_blocks(
@@ -239,14 +239,14 @@ def _raise_at_bad_line(table: TextTable, block: bytes, number: int) -> None:
         except UnicodeDecodeError as error:
             raise UserError(f"{place}: the line is not text; copy or download the file again.") from error
         if raw.count(b'"') % 2:
-            raise UserError(f"{place}: a quotation mark without its counterpart; mend or remove the row.")
+            raise UserError(f"{place}: a quotation mark without its counterpart; correct or remove the row.")
         found = len(_fields(table, raw))
         if found > expected:
-            raise UserError(f"{place}: {found} fields, expected {expected}; mend or remove the row.")
+            raise UserError(f"{place}: {found} fields, expected {expected}; correct or remove the row.")
         if found < expected:
             column = table.names[found - 1]
             raise UserError(
-                f"{place}, column {column}: the row ends after {found} of {expected} fields; mend or remove it."
+                f"{place}, column {column}: the row ends after {found} of {expected} fields; correct or remove it."
             )
 
 

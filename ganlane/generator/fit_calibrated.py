@@ -22,7 +22,6 @@ from ganlane.generator.rollout import (
     common_driver_params,
     rollout,
     sampled_driver_params,
-    sampled_rollouts,
     typical_driver_params,
 )
 from ganlane.generator.scores import BASELINE, Metrics, distance
@@ -123,7 +122,7 @@ def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: Cali
             headway, desired = config.evaluation_params(segments)
             fresh = torch.randn(1 + horizon, 2, *headway.shape, generator.sizes.noise, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            mean, one, other = sampled_rollouts(
+            mean, one, other = rollout(
                 generator, segments, headway, desired, noise, config.noise_period_s, config.anchor
             )
             future = segments.future
@@ -187,17 +186,14 @@ class CalibratedTask:
         headway, desired = (
             sampled_driver_params(segments, self.random) if config.traits else common_driver_params(segments)
         )
-        if number % 2:
-            shape = (1 + segments.future.shape[1], 2, *headway.shape, config.sizes.noise)
-            noise = torch.randn(shape, generator=self.random)
-            one, other = sampled_rollouts(
-                self.generator, segments, headway, desired, noise, config.noise_period_s, config.anchor
-            )
-            name, losses = "energy", energy_score(one, other, segments.future)
+        sampled = number % 2 == 1
+        shape = (1 + segments.future.shape[1], 2 if sampled else 1, *headway.shape, config.sizes.noise)
+        noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
+        positions = rollout(self.generator, segments, headway, desired, noise, config.noise_period_s, config.anchor)
+        if sampled:
+            name, losses = "energy", energy_score(positions[0], positions[1], segments.future)
         else:
-            zero = headway.new_zeros(*headway.shape, config.sizes.noise)
-            positions = rollout(self.generator, segments, headway, desired, zero, parameters=config.anchor)
-            name, losses = "mean", distance(positions, segments.future)
+            name, losses = "mean", distance(positions[0], segments.future)
         loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
         descend(self.optimisers["generator"], loss, config.loop.largest_gradient)
         return {name: float(loss.detach())}

@@ -23,7 +23,7 @@ from ganlane.generator.rollout import (
     DriverParams,
     common_driver_params,
     driven_positions,
-    sampled_rollouts,
+    rollout,
     typical_driver_params,
 )
 from ganlane.generator.scores import BASELINE, SAMPLES, Forecasts
@@ -109,7 +109,7 @@ def calibrated_forecasts(
         headway, desired = config.evaluation_params(segments)
         noise = torch.randn(1 + horizon, 1 + samples, *headway.shape, generator.sizes.noise, generator=random)
         noise[:, 0] = 0.0
-        return sampled_rollouts(generator, segments, headway, desired, noise, config.noise_period_s, config.anchor)
+        return rollout(generator, segments, headway, desired, noise, config.noise_period_s, config.anchor)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -89,52 +89,32 @@ def rollout(
     headway: Tensor,
     desired_speed: Tensor,
     noise: Tensor,
-    fresh: Sequence[Tensor] = (),
     noise_period_s: float = 5.0,
     parameters: AnchorParameters = ANCHOR,
 ) -> Tensor:
-    """Positions [B, H, V, 2] in m when the calibrated preset drives all vehicles (:func:`driven_positions`).
+    """Positions [K, B, H, V, 2] in m of K joint rollouts (:func:`driven_positions`) by the calibrated preset.
 
     Args:
         segments: their number of frames gives H.
         headway, desired_speed: of each driver, [B, V], s and m/s.
-        noise: latent vectors [B, V, Z] at the start.
-        fresh: H standard normal tensors [B, V, Z] that change them (:func:`wander`); with none they are constant.
+        noise: [1 + H, K, B, V, Z], latent vectors at the start, then the numbers that change them (:func:`wander`).
         noise_period_s: time constant of this change.
     """
+    samples = noise.shape[1]
+    segments = segments.repeated(samples)
+    headway, desired_speed = headway.repeat(samples, 1), desired_speed.repeat(samples, 1)
+    latent, *fresh = noise.flatten(1, 2)
     past = segments.positions[:, :OBSERVED_POSITIONS].diff(dim=1).transpose(1, 2)
     history = recorded(generator, past[..., :-1, :])
     memory, road = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway), segments.road
 
     def move(vehicles: Vehicles, step: int) -> Vehicles:
-        nonlocal memory, noise
-        moved, memory = anchored_step(generator, vehicles, road, memory, noise, parameters)
-        if len(fresh):
-            noise = wander(noise, fresh[step], noise_period_s)
+        nonlocal memory, latent
+        moved, memory = anchored_step(generator, vehicles, road, memory, latent, parameters)
+        latent = wander(latent, fresh[step], noise_period_s)
         return moved
 
-    return driven_positions(segments, desired_speed, move)
-
-
-def sampled_rollouts(
-    generator: Generator,
-    segments: Segments,
-    headway: Tensor,
-    desired_speed: Tensor,
-    noise: Tensor,
-    noise_period_s: float,
-    parameters: AnchorParameters = ANCHOR,
-) -> Tensor:
-    """K rollouts [K, B, H, V, 2] of the same drivers in one pass.
-
-    ``noise`` [1 + H, K, B, V, Z] holds the latent vectors at the start, then those by which they change.
-    """
-    samples = noise.shape[1]
-    many = segments.repeated(samples)
-    headway, desired_speed = headway.repeat(samples, 1), desired_speed.repeat(samples, 1)
-    start, *fresh = noise.flatten(1, 2).unbind(0)
-    positions = rollout(generator, many, headway, desired_speed, start, fresh, noise_period_s, parameters)
-    return positions.unflatten(0, (samples, -1))
+    return driven_positions(segments, desired_speed, move).unflatten(0, (samples, -1))
 
 
 def headway_quantiles(statistics: Mapping[str, Any]) -> tuple[float, ...]:

@@ -39,7 +39,8 @@ def generator():
 def typical_rollout(generator, segments):
     """Positions when every driver is typical and z = 0."""
     headway, desired = typical_driver_params(segments)
-    return rollout(generator, segments, headway, desired, torch.zeros(*headway.shape, 4))
+    noise = torch.zeros(1 + segments.future.shape[1], 1, *headway.shape, 4)
+    return rollout(generator, segments, headway, desired, noise)[0]
 
 
 def test_tracks_go_on_at_constant_velocity_beyond_their_ends():
@@ -104,10 +105,10 @@ def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(reco
 
 
 def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(recorded_scenes, generator):
-    scenes = cut_segments([(recorded_scenes[0], 0), (recorded_scenes[1], 9)], horizon=6)
-    headway, desired = typical_driver_params(scenes)
-    course = rollout(generator, scenes, headway, desired, torch.randn(2, 7, 4), torch.randn(6, 2, 7, 4))
-    (course - scenes.future).abs()[scenes.scored].sum().backward()
+    segments = cut_segments([(recorded_scenes[0], 0), (recorded_scenes[1], 9)], horizon=6)
+    headway, desired = typical_driver_params(segments)
+    positions = rollout(generator, segments, headway, desired, torch.randn(7, 3, 2, 7, 4))
+    (positions - segments.future).abs()[:, segments.scored].sum().backward()
     for name, parameter in generator.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name

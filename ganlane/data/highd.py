@@ -112,7 +112,8 @@ def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
         found = ()
     if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
         raise UserError(
-            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; expected two or more growing numbers, separated by ;"
+            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; "
+            "expected two or more growing numbers separated by ;"
         )
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import sys
 from pathlib import Path
 
 import pytest
@@ -157,7 +158,8 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
 
 def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("GANLANE_DATA", raising=False)
-    monkeypatch.setattr("ganlane.data.download.__file__", str(tmp_path / "site" / "ganlane" / "data" / "download.py"))
+    module = sys.modules["ganlane.data.download"]
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "download.py"))
     work = tmp_path / "work"
     work.mkdir()
     monkeypatch.chdir(work)

@@ -59,12 +59,16 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
     assert by_kind(samples[:2], recorded).keys() == {"mean", "single"}
 
 
-def test_forecasts_of_the_papers_preset_score_as_the_groups_do(scenes):
+def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scenes):
     generator, windows = small_generator(0), cut_windows(scenes, STRIDE)
     forecasts = paper_forecasts(generator, windows, group_windows(windows, 4))
-    row = displacement_errors(errors_of({**forecasts, "constant_velocity": forecasts["mean"]}, windows.future))
-    metrics = scene_metrics(windows, forecasts)["all"]
-    assert (row["ade_m"]["mean"], row["fde_m"]["mean"]) == (metrics["ade_m/mean"], metrics["fde_m/mean"])
+    forecasts["constant_velocity"] = repeated(windows.past[:, -1], 8)
+    row, metrics = displacement_errors(errors_of(forecasts, windows.future)), scene_metrics(windows, forecasts)
+    for kind in forecasts:
+        assert metrics["all"][f"ade_m/{kind}"] == row["ade_m"][kind]
+        assert metrics["all"][f"fde_m/{kind}"] == row["fde_m"][kind]
+    assert metrics.keys() == {"all", "synthetic-0", "synthetic-1"}
+    assert sum(metrics[scene.name]["windows"] for scene in scenes) == metrics["all"]["windows"] == len(windows)
     assert row["ade_m"]["best_of_20"] < row["ade_m"]["mean"] < 1.5 * row["ade_m"]["single"]
 
 

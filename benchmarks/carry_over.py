@@ -20,7 +20,7 @@ import polars as pl
 
 from ganlane.errors import UserError
 from ganlane.evaluation import evaluation_rows
-from ganlane.evaluation.paired import paired_lead
+from ganlane.evaluation.rows import paired_lead
 from ganlane.files import write_between_markers
 
 BASELINE = "mobil"

@@ -30,7 +30,7 @@ from benchmarks.beam_search import beam_search
 from ganlane.api import load_agent, make_env
 from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
 from ganlane.evaluation import clopper_pearson, write_results
-from ganlane.evaluation.rides import SIDES, Ride, drive, replay
+from ganlane.evaluation.rollouts import SIDES, Rollout, replay, roll_out
 from ganlane.memory import keep_freed_memory
 
 DRIVERS = ("mobil", "agent_idm", "keep_lane")
@@ -51,7 +51,7 @@ class Way:
 
     episode: int
     stage: str | None = None
-    ride: Ride | None = None
+    ride: Rollout | None = None
     widest: int = 0
 
 
@@ -60,9 +60,9 @@ def stage_of(beam: int) -> str:
     return f"beam {beam}"
 
 
-def ways_of_drivers(driven: Iterable[Sequence[Ride]], episodes: Sequence[int]) -> list[Way]:
+def ways_of_drivers(driven: Iterable[Sequence[Rollout]], episodes: Sequence[int]) -> list[Way]:
     """Which of ``episodes`` ordinary drivers came through, by the ride with the highest return; one way each."""
-    best: dict[int, Ride] = {}
+    best: dict[int, Rollout] = {}
     for ride in sorted((ride for rides in driven for ride in rides), key=lambda ride: (ride.safe, ride.reward)):
         best[ride.episode] = ride
     rides = [(number, best.get(number)) for number in episodes]
@@ -92,7 +92,7 @@ def floor_rows(ways: Sequence[Way], beams: Sequence[int]) -> list[dict[str, Any]
     return rows
 
 
-def driver_row(name: str, rides: Sequence[Ride], ways: Sequence[Way]) -> dict[str, Any]:
+def driver_row(name: str, rides: Sequence[Rollout], ways: Sequence[Way]) -> dict[str, Any]:
     """A driver's crashes: how many, which of them were avoidable, what they hit and whether the ego kept its lane."""
     crashes = [ride for ride in rides if ride.end == "hard_crash"]
     avoidable = {way.episode for way in ways if way.stage is not None}
@@ -113,11 +113,11 @@ def driver_row(name: str, rides: Sequence[Ride], ways: Sequence[Way]) -> dict[st
     }
 
 
-def rides_of(name: str, told: argparse.Namespace) -> list[Ride]:
+def rides_of(name: str, told: argparse.Namespace) -> list[Rollout]:
     """The rides of one driver."""
     driver, begun = load_agent(name, vehicles=told.vehicles), time.monotonic()
     env = environment(told, driver.observation)
-    rides = drive(env, driver.policy, range(told.episodes), told.seed)
+    rides = roll_out(env, driver.policy, range(told.episodes), told.seed)
     print(f"{name}: {told.episodes} episodes driven in {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
     return rides
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from ganlane.benchmarks.script import parser_of
-from ganlane.evaluation.statistics import Estimate, percentile_levels, resample_counts
-from ganlane.realism.distances import Array, distance, distance_difference, jensen_shannon
+from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, resample_counts
+from ganlane.realism.distances import distance, distance_difference, jensen_shannon
 
 #: Spread of the scenes' means, and of the logarithm of their sizes; independent samples of a scene of median size.
 _BETWEEN, _SIZES, _MEDIAN = 0.7, 0.8, 20.0
@@ -72,7 +72,7 @@ def percentile(models: tuple[Array, ...], recorded: Array, resamples: int) -> Es
         return np.sum([sign * each for sign, each in zip(signs, every)], axis=0)
 
     drawn = np.concatenate([value(counts) for counts in resample_counts(len(recorded), resamples, 0)])
-    low, high = np.quantile(drawn, percentile_levels())
+    low, high = np.quantile(drawn, TAIL_LEVELS)
     return Estimate(float(value(np.ones(len(recorded)))), float(low), float(high))
 
 

@@ -37,8 +37,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     # Imported here, so that a mistake on the command line is reported before torch is loaded.
     from ganlane import generator
     from ganlane.build import set_threads
-    from ganlane.evaluation import write_results
-    from ganlane.evaluation.provenance import code_version
+    from ganlane.evaluation import code_version, write_results
     from ganlane.fit_report import FitProgress, ablation_table, fold_tables, metrics_table, results_of
 
     set_threads(config.threads)

@@ -9,10 +9,22 @@ from pathlib import Path
 import pytest
 
 from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
-from ganlane.diagnosis import Finding, State, missing, report
-from ganlane.diagnosis.contents import cache, checkpoints, outputs, recordings
-from ganlane.diagnosis.machine import machine
-from ganlane.diagnosis.software import EXTRAS, REQUIRED, extra, parsed, required
+from ganlane.doctor import (
+    EXTRAS,
+    REQUIRED,
+    Finding,
+    Requirement,
+    State,
+    cache,
+    checkpoints,
+    extra,
+    machine,
+    missing,
+    outputs,
+    recordings,
+    report,
+    required,
+)
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -69,7 +81,7 @@ def test_it_asks_for_what_the_package_asks_for():
     [("2.11", True), ("2.11.0", True), ("2.13.0+cpu", True), ("2.10.9", False), ("2.14.0", False), ("10.0", False)],
 )
 def test_versions_are_compared_as_numbers(version, allowed):
-    assert parsed("torch>=2.11,<2.14").allows(version) is allowed
+    assert Requirement.parsed("torch>=2.11,<2.14").allows(version) is allowed
 
 
 def test_a_package_that_is_not_there_comes_with_its_command():
@@ -84,7 +96,7 @@ def test_a_package_that_cannot_be_imported_is_missing(monkeypatch):
     def broken(name):
         raise OSError("lib.so:\n undefined symbol")
 
-    monkeypatch.setattr("ganlane.diagnosis.software.importlib.import_module", broken)
+    monkeypatch.setattr("ganlane.doctor.importlib.import_module", broken)
     found = required("numpy>=1.26")
     assert (found.state, found.found) == (State.MISSING, "lib.so: undefined symbol")
     assert "--force-reinstall" in found.mend

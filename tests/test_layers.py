@@ -25,7 +25,7 @@ ORDER = [
     {"view"},
     {"config"},
     {"build"},
-    {"compare", "phases", "fit_report", "benchmarks", "diagnosis"},
+    {"compare", "phases", "fit_report", "benchmarks"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
     # The typed calls run the commands' own functions.
     {"api"},

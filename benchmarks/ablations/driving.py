@@ -7,8 +7,16 @@ from statistics import median
 from typing import Any
 
 from benchmarks.ablations.variants import Variant
-from ganlane.realism.counters import EventCounter, GuardMeter, watched
-from ganlane.realism.long_runs import LongRunParameters, Trajectories, batch_statistics, drive_spawned, summary
+from ganlane.realism.long_runs import (
+    EventCounter,
+    GuardMeter,
+    LongRunParameters,
+    Trajectories,
+    batch_statistics,
+    drive_spawned,
+    summary,
+    watched,
+)
 from ganlane.sim.road import Road
 from ganlane.traffic import TrafficModule
 

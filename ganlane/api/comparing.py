@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from ganlane.api.folders import torch_threads
 from ganlane.api.options import Option, command_config, option
 from ganlane.build import Driver, make_driver
-from ganlane.compare import compare_as_told
+from ganlane.compare import compare_configured
 from ganlane.config.evaluate import EvaluateConfig, all_traffics
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
@@ -78,7 +78,7 @@ def evaluate(
     config = command_config(EvaluateConfig, parts, {**overrides, **told, **lists})
     with torch_threads(config.threads):
         drivers = [_driver(agent, name, config) for agent, name in zip(agents, named)]
-        table = compare_as_told(drivers, config)
+        table = compare_configured(drivers, config)
     rows = plain(evaluation_rows(table))
     if folder is not None:
         _keep(Path(folder), table, rows, config)

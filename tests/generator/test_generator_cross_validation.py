@@ -115,7 +115,7 @@ def test_ablations_of_the_papers_preset_stand_side_by_side(tmp_path):
     assert rows["p_l = 4"]["windows"] > rows["p_l = 12"]["windows"]
     short = rows["p_l = 4"]
     assert short["ade_change_percent"] == short["ade_change_percent_0.4_s"]
-    assert len(ablation_table(rows).splitlines()) == 1 + len(rows)
+    assert len(ablation_table(rows).splitlines()) == 2 + len(rows)
 
 
 def test_ablations_of_the_calibrated_preset_are_rolled_out_too(tmp_path):

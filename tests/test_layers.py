@@ -25,7 +25,7 @@ ORDER = [
     {"view"},
     {"config"},
     {"build"},
-    {"compare", "phases", "fit_report", "benchmarks"},
+    {"compare", "phases", "fit_report"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
     # The typed calls run the commands' own functions.
     {"api"},

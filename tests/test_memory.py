@@ -27,3 +27,15 @@ def test_a_process_that_keeps_its_memory_is_not_given_new_pages_at_every_step():
 def test_elsewhere_nothing_happens(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
     assert not memory.keep_freed_memory()
+
+
+def test_the_peak_stays_when_memory_is_given_back():
+    torch = pytest.importorskip("torch")
+    before = memory.peak_resident_bytes()
+    if before is None:
+        pytest.skip("this system does not report a process's peak memory")
+    size = before + 50_000_000
+    held = torch.ones(size, dtype=torch.uint8)
+    assert memory.peak_resident_bytes() >= size
+    del held
+    assert memory.peak_resident_bytes() >= size

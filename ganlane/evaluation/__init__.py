@@ -9,7 +9,7 @@ Traffics are compared with recorded driving in :mod:`ganlane.realism`.
 """
 
 from ganlane.evaluation.episodes import run_episodes
-from ganlane.evaluation.results import code_version, machine, write_episodes, write_results
+from ganlane.evaluation.results import code_version, machine, machine_sentence, write_episodes, write_results
 from ganlane.evaluation.rollouts import Rollout, replay, roll_out
 from ganlane.evaluation.rows import (
     CrashesByScene,
@@ -38,6 +38,7 @@ __all__ = [
     "crashes_by_scene",
     "evaluation_rows",
     "machine",
+    "machine_sentence",
     "mean_interval",
     "normalized_percent",
     "paired_difference",

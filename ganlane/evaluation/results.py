@@ -6,7 +6,7 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -96,6 +96,18 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": torch.__version__,
     }
+
+
+def machine_sentence(threads: Sequence[int]) -> str:
+    """Where and on which code the figures were taken, without host names or paths; ``threads`` are torch's."""
+    here, code = machine(), code_version()
+    usable = f"{here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
+    accelerator = f", {here['accelerator']}" if here["accelerator"] else ""
+    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    return (
+        f"{here['cpu']}, {usable}{accelerator}; Python {here['python']}, torch {here['torch']} (threads: "
+        f"{', '.join(map(str, threads))}); ganlane {code['version']}{revision}."
+    )
 
 
 def _cpu_name() -> str:

@@ -1,8 +1,9 @@
-"""Tables as text: columns aligned for a terminal, and the tables of an evaluation."""
+"""Tables as text, aligned for a terminal or in Markdown, and the tables of an evaluation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 Row = Mapping[str, Any]
@@ -33,6 +34,69 @@ def with_interval(row: Row, key: str, digits: int = 3) -> str:
     """A cell with ``row[key]``, followed by ``[low, high]`` where the row has an interval for it (``key_ci``)."""
     text, interval = number(row.get(key), digits), row.get(f"{key}_ci")
     return text if not interval else f"{text} [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, headings, lines of cells, and notes.
+
+    The first ``names`` columns hold words and are set to the left, the others hold numbers and are set to the right.
+    """
+
+    title: str
+    headings: Sequence[str]
+    lines: Sequence[Sequence[str]]
+    names: int = 1
+    notes: Sequence[str] = ()
+
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        rows: Sequence[Mapping[str, Any]],
+        columns: Mapping[str, Callable[[Any], str]],
+        names: int = 1,
+        notes: Sequence[str] = (),
+    ) -> Table:
+        """One line per row; ``columns`` maps each heading to the function that makes a cell of a row."""
+        lines = [[cell(row) for cell in columns.values()] for row in rows]
+        return cls(title, list(columns), lines, names, notes)
+
+    def text(self) -> str:
+        """Aligned columns, with the notes below."""
+        table = aligned([self.headings, *self.lines], self.names)
+        return "\n".join([self.title, "", table, *self.notes])
+
+    def markdown(self, heading: bool = True) -> str:
+        """The title as a heading (unless turned off), the table, and the notes below."""
+        rulers = ["---" if i < self.names else "---:" for i in range(len(self.headings))]
+        lines = ["| " + " | ".join(line) + " |" for line in [self.headings, rulers, *self.lines]]
+        parts = [*([f"### {self.title}"] if heading else []), "\n".join(lines)]
+        return "\n\n".join([*parts, "\n".join(self.notes)] if self.notes else parts)
+
+
+def significant(value: float | None) -> str:
+    """Three significant digits, without exponent."""
+    if value is None:
+        return NOTHING
+    rounded = float(f"{value:.3g}")
+    whole = len(str(int(abs(rounded))))
+    return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
+
+
+def count(value: float | None) -> str:
+    """Three significant digits, with k, M and G: ``612``, ``54.3 k``, ``1.23 M``."""
+    if value is None:
+        return NOTHING
+    for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if abs(value) >= limit * 0.9995:
+            return f"{significant(value / limit)}{unit}"
+    return significant(value)
+
+
+def percent(share: float | None, digits: int = 0) -> str:
+    """A share as per cent."""
+    return NOTHING if share is None else f"{100 * share:.{digits}f} %"
 
 
 def _plain(key: str) -> Callable[[Row], str]:

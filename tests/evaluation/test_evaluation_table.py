@@ -1,0 +1,34 @@
+"""Numbers and tables as a reader sees them."""
+
+import pytest
+
+from ganlane.evaluation.table import Table, count, percent, significant
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(None, "-"), (612.4, "612"), (1234, "1.23 k"), (54321, "54.3 k"), (999_600, "1.00 M"), (2.5e9, "2.50 G")],
+)
+def test_counts_have_three_digits_and_a_unit(value, shown):
+    assert count(value) == shown
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(1.0, "1.00"), (0.9134, "0.913"), (12.345, "12.3"), (1234.5, "1230"), (0.0, "0"), (None, "-")],
+)
+def test_numbers_have_three_digits(value, shown):
+    assert significant(value) == shown
+
+
+def test_shares_are_per_cent():
+    assert (percent(0.126), percent(0.126, 1), percent(None)) == ("13 %", "12.6 %", "-")
+
+
+def test_a_table_aligns_words_left_and_numbers_right():
+    table = Table.of(
+        "Speed", [("a", 10), ("long", 2)], {"who": lambda r: r[0], "n": lambda r: str(r[1])}, 1, ["Said."]
+    )
+    assert table.text().splitlines()[2:] == ["who    n", "----  --", "a     10", "long   2", "Said."]
+    assert table.markdown() == "### Speed\n\n| who | n |\n| --- | ---: |\n| a | 10 |\n| long | 2 |\n\nSaid."
+    assert table.markdown(heading=False).startswith("| who | n |")

@@ -18,8 +18,7 @@ from torch import Tensor, nn
 
 from ganlane.errors import UserError
 from ganlane.generator import Generator, load_generator
-from ganlane.generator.layers import MotionLSTM, PairPooling, motion_features
-from ganlane.generator.networks import Observation
+from ganlane.generator.networks import MotionLSTM, Observation, PairPooling, motion_features
 from ganlane.generator.rollout import COMMON_SPEED_MPS
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.spawn import TABLE_II, SpawnParameters
@@ -65,13 +64,13 @@ class Bfloat16Generator(Generator):
         self.load_state_dict(generator.state_dict())
         self.bfloat16().eval().requires_grad_(False)
 
-    def summarise(self, seen: Observation) -> Tensor:
+    def summarise(self, now: Observation) -> Tensor:
         """See :meth:`Generator.summarise`."""
-        return super().summarise(seen._replace(extra=seen.extra.bfloat16()))
+        return super().summarise(now._replace(extra=now.extra.bfloat16()))
 
-    def decode(self, context: Tensor, noise: Tensor, seen: Observation, steps: int) -> Tensor:
+    def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
         """See :meth:`Generator.decode`."""
-        return super().decode(context, noise.bfloat16(), seen, steps).float()
+        return super().decode(context, noise.bfloat16(), now, steps).float()
 
 
 class PlanningGenerator(Generator):
@@ -83,14 +82,14 @@ class PlanningGenerator(Generator):
         self.eval().requires_grad_(False)
         self.steps, self.ahead = steps, list[Tensor]()
 
-    def summarise(self, seen: Observation) -> Tensor:
+    def summarise(self, now: Observation) -> Tensor:
         """The context; nothing while the plan lasts."""
-        return seen.displacement if self.ahead else super().summarise(seen)
+        return now.displacement if self.ahead else super().summarise(now)
 
-    def decode(self, context: Tensor, noise: Tensor, seen: Observation, steps: int) -> Tensor:
+    def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
         """The next step of the plan [..., 1, 2]; all rows began together, so all look at the same time."""
         if not self.ahead:
-            self.ahead = list(super().decode(context, noise, seen, self.steps).unbind(-2))
+            self.ahead = list(super().decode(context, noise, now, self.steps).unbind(-2))
         return self.ahead.pop(0)[..., None, :]
 
 

@@ -296,26 +296,26 @@ def _loader(name: str, path: Path) -> Callable[[], Finding]:
 
 def recordings() -> Finding:
     """The recordings that ``data.path=null`` means; needed for fitting and realism, not for training or driving."""
-    from ganlane.data.find import SCENES, VARIABLE, default_scenes
+    from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
     from ganlane.errors import UserError
 
     try:
         path = default_scenes()
     except UserError as error:
-        mend = f"export {VARIABLE}=FOLDER   (one that holds {SCENES}), or give data.path=FILE (docs/own_data.md)"
+        mend = f"export {DATA_VARIABLE}=FOLDER   (one that holds {SCENES}), or give data.path=FILE (docs/own_data.md)"
         return Finding("recordings", State.ABSENT, str(error).partition("; ")[0], mend)
     return Finding("recordings", State.OK, f"{path} ({_megabytes(path)})")
 
 
 def cache() -> Finding:
     """The folder with groups of windows between fits."""
-    from ganlane.generator.groups import VARIABLE, cache_folder
+    from ganlane.generator.windows import CACHE_VARIABLE, cache_folder
 
     folder = cache_folder()
     if folder is None:
-        return Finding("cache", State.OK, f"off ({VARIABLE} is empty)")
+        return Finding("cache", State.OK, f"off ({CACHE_VARIABLE} is empty)")
     if not _can_write(folder):
-        return Finding("cache", State.ABSENT, f"{folder} cannot be written to", f"export {VARIABLE}=FOLDER")
+        return Finding("cache", State.ABSENT, f"{folder} cannot be written to", f"export {CACHE_VARIABLE}=FOLDER")
     files = list(folder.glob("*.npz")) if folder.is_dir() else []
     size = sum(path.stat().st_size for path in files) / 2**20
     return Finding("cache", State.OK, f"{folder} ({len(files)} files, {size:.1f} MB)")

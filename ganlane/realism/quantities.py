@@ -14,9 +14,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from ganlane.data import FRAME_S, find_lane_changes, leader_gaps, tracks_of_frame
-from ganlane.data.distributions import Bins
-from ganlane.data.schema import TRACK
+from ganlane.data import FRAME_S, TRACK, Bins, find_lane_changes, leader_gaps, tracks_of_frame
 from ganlane.evaluation.statistics import Array, entries, poisson_interval
 from ganlane.realism.recordings import Recording, recorded_frame, units_of
 

@@ -27,9 +27,10 @@ TRAINED = "trained"
 
 def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate what came out."""
-    from ganlane.build import make_driver, make_traffic, set_threads
+    from ganlane.build import make_driver, make_traffic
     from ganlane.compare import compare, publish
     from ganlane.phases import AGENT_FILE, check_finished, checkpoint_of, length_of, phases_of, run_phase
+    from ganlane.runtime import set_threads
 
     set_threads(config.threads)
     for traffic in config.all_traffic():  # a mistake in any of them shows before hours of training, not after

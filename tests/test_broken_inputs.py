@@ -28,8 +28,7 @@ from ganlane.config.compose import typed
 from ganlane.config.store import SCHEMAS
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
-from ganlane.files import load_weights, save_weights
-from ganlane.paths import CHECKPOINTS, conf_folder
+from ganlane.files import CHECKPOINTS, conf_folder, load_weights, save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 AGENT, GENERATOR = CHECKPOINTS / "agent_idm.safetensors", CHECKPOINTS / "generator_paper.safetensors"

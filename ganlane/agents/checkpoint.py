@@ -15,8 +15,7 @@ from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
 from ganlane.agents.policy import GreedyPolicy
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError
-from ganlane.files import load_weights, save_weights
-from ganlane.paths import CHECKPOINTS
+from ganlane.files import CHECKPOINTS, load_weights, save_weights
 
 #: Agents that come with the package; others are given by their path.
 SHIPPED = ("agent_general", "agent_idm", "agent_gan")

@@ -15,7 +15,7 @@ from ganlane.config.nodes import made
 from ganlane.config.overrides import parse, single_runs
 from ganlane.config.store import register
 from ganlane.errors import UserError
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
 
 VERSION_BASE = "1.3"
 

@@ -7,7 +7,7 @@ import inspect
 import re
 from pathlib import Path
 
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
 
 _FLAGS = """flags
   -m, --multirun       a sweep over values with commas, each run in its own folder: ganlane {command} -m seed=0,1

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType, Quote, QuotedString
 
 from ganlane.errors import UserError
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
 
 #: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
 ALIASES = {"render": {"agent": "driver"}}

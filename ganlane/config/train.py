@@ -57,7 +57,7 @@ class TrainConfig(RunConfig):
     """Everything that ``ganlane train`` can be told.
 
     ``compile``: whether the training is compiled (the final evaluation is with ``env.compile=true`` alone). ``auto``:
-    where compiling is known to work (:func:`ganlane.compiling.can_compile`) and the training is long enough to gain
+    where compiling is known to work (:func:`ganlane.runtime.can_compile`) and the training is long enough to gain
     by it (:data:`WORTH_COMPILING`).
     """
 
@@ -99,7 +99,7 @@ class TrainConfig(RunConfig):
 
     def compiled(self) -> TrainConfig:
         """The same with ``env.compile`` as ``compile`` says."""
-        from ganlane.compiling import can_compile
+        from ganlane.runtime import can_compile
 
         worth = self.total_decisions >= WORTH_COMPILING and can_compile()
         if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):

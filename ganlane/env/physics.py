@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.compiling import check_compiler, compiled
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.parameters.driving import EgoParameters, IdmParameters
 from ganlane.parameters.episode import EpisodeParameters
+from ganlane.runtime import check_compiler, compiled
 from ganlane.sim.collisions import ego_overlaps
 from ganlane.sim.dynamics import SteeringParameters
 from ganlane.sim.ego import Command, apply_action, change_progress, ego_scene, ego_surroundings, move_ego

@@ -6,11 +6,11 @@ from functools import partial
 
 from torchrl.envs import EnvBase
 
-from ganlane.build import make_env, make_traffic, set_threads
+from ganlane.build import make_env, make_traffic
 from ganlane.config.collector import MultiCollectorConfig, RayCollectorConfig
 from ganlane.config.train import TrainConfig
-from ganlane.memory import keep_freed_memory
 from ganlane.phases.phase import Phase
+from ganlane.runtime import keep_freed_memory, set_threads
 from ganlane.sim.random import Stream
 from ganlane.training.collectors import MultiSource, RaySource, SingleSource, Source, Team
 

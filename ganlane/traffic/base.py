@@ -11,10 +11,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
+from ganlane.runtime import compiled
 from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.state import Road, Vehicles

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.compiling import compiled
 from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.runtime import compiled
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.mobil import TABLE_IV, mobil_changes

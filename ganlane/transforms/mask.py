@@ -21,11 +21,11 @@ from torchrl.data import Composite, TensorSpec
 from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters
 from ganlane.parameters.observation import MASKS
+from ganlane.runtime import compiled
 from ganlane.sim.ego import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations

@@ -20,10 +20,10 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.native import LaneView
 from ganlane.parameters.observation import ObservationScale
+from ganlane.runtime import compiled
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.transforms.sensors import PerceptionTransform
 

@@ -36,6 +36,7 @@ from ganlane.config.traffic_faults import (
 from ganlane.config.train import check_agent
 from ganlane.data import NgsimParameters
 from ganlane.errors import UserError
+from ganlane.files import conf_folder
 from ganlane.generator import (
     CalibratedConfig,
     LoopConfig,
@@ -47,7 +48,6 @@ from ganlane.generator import (
 from ganlane.parameters.driving import EgoParameters
 from ganlane.parameters.observation import MASKS, SensorParameters
 from ganlane.parameters.reward import RewardParameters
-from ganlane.paths import conf_folder
 from ganlane.phases.description import describe
 from ganlane.phases.phase import phases_of
 from ganlane.traffic import AbortFaults, BrakingFaults, HesitationFaults, ReactionFaults
@@ -281,5 +281,5 @@ def test_a_training_is_told_whether_to_compile(value):
 @pytest.mark.parametrize(("version", "compiles"), [("2.11.0+cu130", False), ("2.13.0+cpu", True)])
 def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compiles, monkeypatch):
     monkeypatch.setattr("torch.__version__", version)
-    monkeypatch.setattr("ganlane.compiling.has_compiler", lambda: True)
+    monkeypatch.setattr("ganlane.runtime.has_compiler", lambda: True)
     assert config_of("train", "total_decisions=1000000").compiled().env.compile is compiles

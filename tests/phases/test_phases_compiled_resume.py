@@ -16,8 +16,8 @@ import torch
 
 import ganlane
 from ganlane.agents import read_agent
-from ganlane.compiling import COMPILERS
 from ganlane.phases import AGENT_FILE
+from ganlane.runtime import COMPILERS
 from ganlane.training.checkpoints import LAST, load_checkpoint
 
 #: A phase alone, without the evaluation that a command makes at its end: that would compile as much again.

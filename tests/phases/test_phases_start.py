@@ -7,7 +7,7 @@ import pytest
 from ganlane.agents import save_agent
 from ganlane.config.compose import check
 from ganlane.errors import UserError
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
 from ganlane.phases import AGENT_FILE, check_finished, check_observation, describe, make_agent, phases_of, read_start
 
 EXPERIMENTS = sorted(

@@ -2,9 +2,13 @@
 
     python benchmarks/native.py
     python benchmarks/native.py --vehicles 9 30 60 --batches 1 16 256 1024 4096 --repeats 5
+    python benchmarks/native.py --environment --vehicles 9
 
 Bare physics of ``idm_mobil`` on 3 lanes: no observation, no reward, no resets; the ego keeps its lane. Printed is the
 median over the repeats. ``--kernel-only`` leaves the tensor code out, ``--variants`` compares instruction sets.
+
+``--environment``: everything, through TorchRL: observation (``lane_view``), reward and automatic resets, in episodes
+of 1 km (about 45 decisions), so that about every 45th row is reset in each decision.
 """
 
 from __future__ import annotations
@@ -16,8 +20,12 @@ from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
 
 from ganlane import keys
+from ganlane.build import make_env
+from ganlane.config.env import EnvConfig
+from ganlane.config.observation import ObservationConfig
 from ganlane.env import HighwayEnv
 from ganlane.native import EgoState, Kernel, Outcome
 from ganlane.native.library import VARIANTS, best_variant
@@ -65,6 +73,25 @@ def contenders(env: HighwayEnv, td: TensorDictBase, variants: list[str], tensor:
     return made
 
 
+def whole_environments(rows: int, vehicles: int, lanes: int, tensor: bool) -> dict[str, Callable]:
+    """Name to a decision through TorchRL, automatic resets included, of rows in all parts of their episodes."""
+    made: dict[str, Callable] = {}
+    room = SpawnParameters().min_spacing_m * (vehicles / lanes + 2)
+    for kernel in ("native", "torch") if tensor else ("native",):
+        config = EnvConfig(vehicles=vehicles, lanes=lanes, spread_m=max(200.0, room), goal_m=1000.0, kernel=kernel)
+        env = make_env(IdmMobilTraffic(Road(lanes)), config, ObservationConfig(form="lane_view"), num_envs=rows)
+        state = {"td": env.reset()}
+
+        def decide(env: TransformedEnv = env, state: dict[str, TensorDictBase] = state) -> None:
+            state["td"][keys.ACTION] = torch.zeros(rows, dtype=torch.int64)
+            state["td"] = env.step_and_maybe_reset(state["td"])[1]
+
+        for _ in range(100 if kernel == "native" else 60):
+            decide()
+        made[kernel] = decide
+    return made
+
+
 def main() -> None:
     """Print one line per number of vehicles and batch."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -73,6 +100,7 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, default=3)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--environment", action="store_true")
     parser.add_argument("--kernel-only", action="store_true")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=[best_variant()])
     wanted = parser.parse_args()
@@ -81,8 +109,11 @@ def main() -> None:
     with torch.inference_mode():
         for vehicles in wanted.vehicles:
             for rows in wanted.batches:
-                env, td = scene(rows, vehicles, wanted.lanes)
-                decisions = contenders(env, td, wanted.variants, not wanted.kernel_only)
+                if wanted.environment:
+                    decisions = whole_environments(rows, vehicles, wanted.lanes, not wanted.kernel_only)
+                else:
+                    env, td = scene(rows, vehicles, wanted.lanes)
+                    decisions = contenders(env, td, wanted.variants, not wanted.kernel_only)
                 rates: dict[str, list[float]] = {name: [] for name in decisions}
                 for _ in range(wanted.repeats):
                     for name, decide in decisions.items():

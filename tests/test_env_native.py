@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import pytest
 import torch
 from reference.worlds import environment, leaves
 from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
+from ganlane.build import make_env
+from ganlane.config.env import EnvConfig
+from ganlane.config.observation import ObservationConfig
 from ganlane.errors import UserError
 from ganlane.native import why_not
 from ganlane.parameters.driving import IdmParameters
+from ganlane.parameters.observation import SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
+from ganlane.transforms import ObservationTransform
+from ganlane.transforms.observation import NATIVE
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
 
@@ -106,3 +115,37 @@ def test_a_recorder_of_physics_steps_is_refused():
     env.recorder = lambda vehicles, running: None
     with pytest.raises(UserError, match=r"env\.kernel=native shows no physics steps"):
         env.rand_step(env.reset())
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
+def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
+    env = make_env(
+        IdmMobilTraffic(Road()), EnvConfig(kernel="native"), ObservationConfig(form="lane_view"), num_envs=4
+    )
+    td = env.rand_action(env.reset())
+    assert (copied(env).step(td.clone())["next"] == env.step(td)["next"]).all()
+
+
+@pytest.mark.parametrize("form", sorted(NATIVE))
+@pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+def test_the_lane_view_is_that_of_the_tensor_code(form, sensors):
+    """Up to the rounding of the exponential function; with lorries, and with what the sensors deliver."""
+    config = EnvConfig(kernel="native", vehicles=20, spread_m=300.0, min_spacing_m=25.0, truck_share=0.3)
+    env = make_env(IdmMobilTraffic(Road()), config, ObservationConfig(form=form, sensors=sensors), num_envs=64)
+    plain = ObservationTransform(Road(), 20, form)
+    td = env.reset()
+    for decision in range(40):
+        assert torch.allclose(td["observation"], plain(td.clone())["observation"], atol=1e-6)
+        td["action"] = (torch.arange(64) + decision) % 20 % 3 * (torch.arange(64) % 3 == decision % 3)
+        td = env.step_and_maybe_reset(td)[1]
+
+
+def test_rows_that_are_reset_alone_start_as_all_do():
+    some, whole = native(64, kernel="torch", seed=4), native(128, kernel="torch", seed=4)
+    td = some.reset()
+    mask = torch.zeros(64, dtype=torch.bool)
+    mask[[3, 17, 40]] = True
+    after = some.reset(td.clone().set("_reset", mask))
+    expected = whole.reset()
+    assert (after[mask] == expected[[67, 81, 104]]).all()
+    assert (after[~mask] == td[~mask]).all()

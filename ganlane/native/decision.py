@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -145,7 +145,7 @@ class Kernel:
             )
         episode, ego = episode or EpisodeParameters(), ego or EgoParameters()
         idm, lane_changes = idm or IdmParameters(), mobil or MobilParameters()
-        self.vehicles = vehicles
+        self.vehicles, self.variant = vehicles, variant
         self._decide = load(variant).ganlane_decide
         self._settings = _Settings(
             min_gap=idm.min_gap_m,
@@ -177,6 +177,14 @@ class Kernel:
             mobil=mobil is not None,
             abort_lane_change=ego.abort_lane_change,
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the library, which another process loads for itself."""
+        return {name: value for name, value in self.__dict__.items() if name != "_decide"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._decide = load(self.variant).ganlane_decide
 
     def decide(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -46,11 +47,20 @@ class LaneView:
         variant: str | None = None,
     ) -> None:
         self.size = 5 + 6 * (4 if drift else 3)
+        self.variant = variant
         self._look = load(variant).ganlane_lane_view
         self._view = _View(
             scale.range_m, scale.speed_mps, road.lane_width_m, nearness_m, overlap_m,
             road.lanes, vehicles, drift, overlap,
         )  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the library, which another process loads for itself."""
+        return {name: value for name, value in self.__dict__.items() if name != "_look"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._look = load(self.variant).ganlane_lane_view
 
     def observe(self, vehicles: Vehicles, progress: Tensor, direction: Tensor, seen: Vehicles) -> Tensor:
         """The observation [N, size]; arguments as :meth:`ganlane.transforms.ObservationTransform.observe`."""

@@ -16,12 +16,12 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
 from ganlane.errors import UserError
 from ganlane.native import why_not
-from ganlane.parameters.driving import IdmParameters
-from ganlane.parameters.observation import SensorParameters
+from ganlane.parameters.driving import EgoParameters, IdmParameters
+from ganlane.parameters.observation import MaskParameters, SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
-from ganlane.transforms import ObservationTransform
+from ganlane.transforms import ActionMaskTransform, ObservationTransform
 from ganlane.transforms.observation import NATIVE
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
@@ -149,3 +149,25 @@ def test_rows_that_are_reset_alone_start_as_all_do():
     expected = whole.reset()
     assert (after[mask] == expected[[67, 81, 104]]).all()
     assert (after[~mask] == td[~mask]).all()
+
+
+@pytest.mark.parametrize("abort", [False, True])
+@pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+def test_the_safe_actions_are_those_of_the_tensor_code(abort, sensors):
+    config = EnvConfig(kernel="native", vehicles=20, spread_m=150.0, ego=EgoParameters(abort_lane_change=abort))
+    form = ObservationConfig(form="lane_view", sensors=sensors)
+    env = make_env(IdmMobilTraffic(Road()), config, form, num_envs=128, mask=MaskParameters(form="safe"))
+    plain = ActionMaskTransform(Road(), "safe", abort=abort)
+    td, refused, hopeless = env.reset(), 0, 0
+    for decision in range(40):
+        expected = plain(td.clone())
+        assert torch.equal(td[keys.ACTION_MASK], expected[keys.ACTION_MASK])
+        assert torch.equal(td[keys.NO_SAFE_ACTION], expected[keys.NO_SAFE_ACTION])
+        refused, hopeless = (
+            refused + int((~td[keys.ACTION_MASK]).sum()),
+            hopeless + int(td[keys.NO_SAFE_ACTION].sum()),
+        )
+        td["action"] = (torch.arange(128) + decision) % 20 % 3 * (torch.arange(128) % 3 == decision % 3)
+        td = env.step_and_maybe_reset(td)[1]
+    assert refused > 1000
+    assert hopeless > 0

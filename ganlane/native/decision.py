@@ -18,8 +18,8 @@ from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.state import Road, Vehicles
 
 
-class _Settings(ctypes.Structure):
-    """``Settings`` of kernel.cpp."""
+class Settings(ctypes.Structure):
+    """``Settings`` of model.hpp."""
 
     _fields_ = [
         *((name, ctypes.c_float) for name in (
@@ -32,6 +32,58 @@ class _Settings(ctypes.Structure):
             "lanes", "vehicles", "substeps", "timeout_steps", "mobil", "abort_lane_change",
         )),
     ]  # fmt: skip
+
+
+def settings_of(
+    road: Road,
+    vehicles: int,
+    episode: EpisodeParameters | None = None,
+    ego: EgoParameters | None = None,
+    idm: IdmParameters | None = None,
+    steering: SteeringParameters = STEERING,
+    mobil: MobilParameters | None = None,
+) -> Settings:
+    """The numbers as the kernel takes them; arguments as :class:`Kernel`'s.
+
+    Raises:
+        UserError: the road is a ring or differs from row to row.
+    """
+    if road.ring_m is not None or isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
+        raise UserError(
+            "env.kernel=native: the road must be straight and the same in all rows; set env.kernel=torch."
+        )
+    episode, ego = episode or EpisodeParameters(), ego or EgoParameters()
+    idm, lane_changes = idm or IdmParameters(), mobil or MobilParameters()
+    return Settings(
+        min_gap=idm.min_gap_m,
+        headway=idm.headway_s,
+        per_brake_scale=1.0 / idm.brake_scale(),
+        min_acceleration=idm.min_acceleration,
+        max_acceleration=idm.max_acceleration,
+        threshold=lane_changes.threshold,
+        politeness_rear=lane_changes.politeness_rear,
+        politeness_side=lane_changes.politeness_side,
+        safe_deceleration=lane_changes.safe_deceleration,
+        exclusive=lane_changes.exclusive_m,
+        per_near_s=1.0 / steering.near_s,
+        per_far_s=1.0 / steering.far_s,
+        gain_far=steering.gain_far,
+        gain_near=steering.gain_near,
+        gain_integral=steering.gain_integral,
+        slow=steering.slow_mps,
+        max_angle=steering.max_angle_rad,
+        soft_crash_ttc=ego.soft_crash_ttc_s,
+        soft_crash_gap=ego.soft_crash_gap_m,
+        goal=episode.goal_m,
+        lane_width=road.lane_width_m,
+        per_lane_width=1.0 / road.lane_width_m,
+        lanes=road.lanes,
+        vehicles=vehicles,
+        substeps=episode.substeps(),
+        timeout_steps=round(episode.timeout_s / PHYSICS_STEP_S),
+        mobil=mobil is not None,
+        abort_lane_change=ego.abort_lane_change,
+    )
 
 
 class EgoState(NamedTuple):
@@ -139,44 +191,9 @@ class Kernel:
         mobil: MobilParameters | None = None,
         variant: str | None = None,
     ) -> None:
-        if road.ring_m is not None or isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
-            raise UserError(
-                "env.kernel=native: the road must be straight and the same in all rows; set env.kernel=torch."
-            )
-        episode, ego = episode or EpisodeParameters(), ego or EgoParameters()
-        idm, lane_changes = idm or IdmParameters(), mobil or MobilParameters()
         self.vehicles, self.variant = vehicles, variant
         self._decide = load(variant).ganlane_decide
-        self._settings = _Settings(
-            min_gap=idm.min_gap_m,
-            headway=idm.headway_s,
-            per_brake_scale=1.0 / idm.brake_scale(),
-            min_acceleration=idm.min_acceleration,
-            max_acceleration=idm.max_acceleration,
-            threshold=lane_changes.threshold,
-            politeness_rear=lane_changes.politeness_rear,
-            politeness_side=lane_changes.politeness_side,
-            safe_deceleration=lane_changes.safe_deceleration,
-            exclusive=lane_changes.exclusive_m,
-            per_near_s=1.0 / steering.near_s,
-            per_far_s=1.0 / steering.far_s,
-            gain_far=steering.gain_far,
-            gain_near=steering.gain_near,
-            gain_integral=steering.gain_integral,
-            slow=steering.slow_mps,
-            max_angle=steering.max_angle_rad,
-            soft_crash_ttc=ego.soft_crash_ttc_s,
-            soft_crash_gap=ego.soft_crash_gap_m,
-            goal=episode.goal_m,
-            lane_width=road.lane_width_m,
-            per_lane_width=1.0 / road.lane_width_m,
-            lanes=road.lanes,
-            vehicles=vehicles,
-            substeps=episode.substeps(),
-            timeout_steps=round(episode.timeout_s / PHYSICS_STEP_S),
-            mobil=mobil is not None,
-            abort_lane_change=ego.abort_lane_change,
-        )
+        self._settings = settings_of(road, vehicles, episode, ego, idm, steering, mobil)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the library, which another process loads for itself."""

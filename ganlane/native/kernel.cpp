@@ -14,23 +14,9 @@
 #include <stdint.h>
 #include <stdlib.h>
 
-#include "vectors.hpp"
+#include "model.hpp"
 
-// ---- Parameters and arrays, as ganlane/native/decision.py declares them
-
-struct Settings {
-    // IDM, Table V
-    float min_gap, headway, per_brake_scale, min_acceleration, max_acceleration;
-    // MOBIL, Table IV
-    float threshold, politeness_rear, politeness_side, safe_deceleration, exclusive;
-    // two-point steering
-    float per_near_s, per_far_s, gain_far, gain_near, gain_integral, slow, max_angle;
-    // ego and episode
-    float soft_crash_ttc, soft_crash_gap, goal;
-    // road
-    float lane_width, per_lane_width;
-    int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change;
-};
+// ---- Arrays, as ganlane/native/decision.py declares them
 
 struct Inputs {  // [rows] or [rows, vehicles]
     const int64_t* action;
@@ -58,16 +44,9 @@ struct Outputs {
     uint8_t *done, *terminated, *truncated;
 };
 
-// ---- Constants of the model (ganlane.sim)
-
-const float PHYSICS_STEP = 0.1f, WHEELBASE = 2.7f;
-const float NOBODY_M = 1e9f;  // stands for the position of nobody
-const float FREE_GAP = 10000.0f, SMALLEST_GAP = 0.1f;
-const float ENTRY = 0.1f, ARRIVED = 0.3f;
 const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f;
 const int MOBIL_PERIOD = 10;
 enum { KEEP, LEFT, RIGHT };
-enum { CENTRE, BODY, SIGNALLED };
 
 // ---- The vehicles of LANES rows, foremost first
 
@@ -141,53 +120,16 @@ static inline void put_in_order(Rows& r) {
     }
 }
 
-// ---- Equations
-
-// IDM: a (1 - (v/v0)^4 - (s*/s)^2) with s* = s0 + max(0, v T + v dv / (2 sqrt(a b))).
-INLINE Float interaction(const Settings& s, Float speed, Float gap, Float leader_speed) {
-    Float dynamic = speed * s.headway + speed * (speed - leader_speed) * s.per_brake_scale;
-    return (s.min_gap + larger(dynamic, filled(0.0f))) / larger(gap, filled(SMALLEST_GAP));
-}
-
-INLINE Float free_road(Float speed, Float per_desired) {
-    Float ratio = speed * per_desired, square = ratio * ratio;
-    return 1.0f - square * square;
-}
-
-INLINE Float limited(const Settings& s, Float free, Float interaction) {
-    return between(s.max_acceleration * (free - interaction * interaction), s.min_acceleration, s.max_acceleration);
-}
-
-INLINE Float idm(const Settings& s, Float speed, Float per_desired, Float gap, Float leader_speed) {
-    return limited(s, free_road(speed, per_desired), interaction(s, speed, gap, leader_speed));
-}
-
-INLINE Float slip_of(Float steering) {
-    Float sine, cosine;
-    sincos_of(steering, sine, cosine);
-    return arctangent(0.5f * (sine / cosine));
-}
-
-INLINE Float lane_of(const Settings& s, Float y) {
-    return between(rounded(y * s.per_lane_width), 0.0f, (float)(s.lanes - 1));
-}
-
 // ---- Who is in which lane
 
 static inline void find_lanes(const Settings& s, Rows& r) {
     for (int i = 0; i < r.vehicles; i++) {
         sincos_of(r.heading[i], r.sine[i], r.cosine[i]);
-        Float y = r.y[i], target = r.target[i];
-        Float extent = r.half_width[i] * r.cosine[i] + r.half_length[i] * absolute(r.sine[i]);
-        Float reach = extent - ENTRY;
-        Float body_low = lane_of(s, y - reach), body_high = lane_of(s, y + reach), centre = lane_of(s, y);
-        Float low = smaller(body_low, target), high = larger(body_high, target);
-        Mask signalled = r.visibility[i] == (float)SIGNALLED, by_body = r.visibility[i] == (float)BODY;
-        Mask there = r.valid[i] != 0.0f;
-        r.extent[i] = extent;
-        r.body_low[i] = body_low, r.body_high[i] = body_high, r.low[i] = low, r.high[i] = high;
-        r.seen_low[i] = choose(there, choose(signalled, low, choose(by_body, body_low, centre)), filled(1e9f));
-        r.seen_high[i] = choose(there, choose(signalled, high, choose(by_body, body_high, centre)), filled(-1e9f));
+        LanesOf l = lanes_of(s, r.y[i], r.sine[i], r.cosine[i], r.half_length[i], r.half_width[i], r.target[i],
+                             r.visibility[i], r.valid[i] != 0.0f);
+        r.extent[i] = l.extent;
+        r.body_low[i] = l.body_low, r.body_high[i] = l.body_high, r.low[i] = l.low, r.high[i] = l.high;
+        r.seen_low[i] = l.seen_low, r.seen_high[i] = l.seen_high;
     }
 }
 

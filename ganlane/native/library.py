@@ -25,8 +25,9 @@ import torch
 
 from ganlane.errors import UserError
 
+FILES = ("kernel.cpp", "observation.cpp", "mask.cpp", "model.hpp", "vectors.hpp")
 #: The sources to compile, and what they include.
-SOURCES = tuple(Path(__file__).with_name(name) for name in ("kernel.cpp", "observation.cpp", "vectors.hpp"))
+SOURCES = tuple(Path(__file__).with_name(name) for name in FILES)
 #: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives the same bits.
 FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared")
 #: The kernel needs no C++ library; zig would compile one first, which takes minutes.
@@ -142,7 +143,7 @@ def _build(command: tuple[str, ...], library: Path) -> None:
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
     """With the types of its functions; a call through ctypes releases the interpreter's lock."""
     pointer, number = ctypes.c_void_p, ctypes.c_long
-    for function in (library.ganlane_decide, library.ganlane_lane_view):
+    for function in (library.ganlane_decide, library.ganlane_lane_view, library.ganlane_mask):
         function.argtypes = [pointer, pointer, pointer, number, number]
         function.restype = ctypes.c_int
     return library

@@ -23,8 +23,8 @@ from omegaconf import OmegaConf
 
 from ganlane.errors import UserError, as_typed
 from ganlane.files import write_between_markers, write_bytes
-from ganlane.training.log import read_rows
-from ganlane.training.run import flat
+from ganlane.training.checkpoint import flat
+from ganlane.training.logs import read_rows
 
 BEGIN, END = "<!-- search: begin -->", "<!-- search: end -->"
 #: Options that change nothing in what is learned.

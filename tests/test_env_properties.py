@@ -19,7 +19,6 @@ from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardParameters, RewardTransform
-from ganlane.transforms.fixed_order import places
 
 FIXED = ("length", "width", "desired_speed", "visibility", "valid")
 
@@ -211,12 +210,11 @@ def check_observations(env: HighwayEnv, plan: list[list[int]], form: str) -> Non
 
 def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Lowest and highest value of every entry of an observation (Table III and what was added to it)."""
-    listed, viewed, progress, placed, drift, overlap = OBSERVATIONS[form]
+    listed, viewed, progress, drift, overlap = OBSERVATIONS[form]
     # Speed over desired speed (25 m/s at the least; nobody drives at twice that), a lane to the left, to the right.
     low, high = [0.0, 0.0, 0.0], [2.0, 1.0, 1.0]
-    if listed or placed:
-        count = vehicles - 1 if listed else places(vehicles - 1)
-        low, high = low + [-1.0] * 3 * count, high + [1.0] * 3 * count
+    if listed:
+        low, high = low + [-1.0] * 3 * (vehicles - 1), high + [1.0] * 3 * (vehicles - 1)
     if viewed:  # six times gap, nearness, relative speed, and place in the lane; bodies overlap by 4.5 m at the most
         gap, nearness = (-4.5 / 200.0, 5.5) if overlap else (0.0, 1.0)
         low += [gap, 0.0, -1.0, -1.0][: 3 + drift] * 6

@@ -21,11 +21,11 @@ ORDER = [
     {"transforms"},
     {"agents"},
     {"evaluation"},
-    {"training"},
     {"view"},
     {"config"},
     {"build"},
-    {"compare", "phases", "fit_report", "benchmarks", "diagnosis"},
+    {"training"},
+    {"compare", "fit_report", "benchmarks", "diagnosis"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
     # The typed calls run the commands' own functions.
     {"api"},

@@ -49,7 +49,7 @@ def make_env(
         num_envs: N, environments side by side.
         env: an option of the group ``env``: ``highway``, ``dense``, or a scenario such as ``cut_in``.
         observation: ``table3``, ``table3_progress``, ``lane_view``, ``lane_view_drift``, ``lane_view_overlap``,
-            ``table3_lane_view``, ``fixed_order``, or a mapping.
+            ``table3_lane_view``, or a mapping.
         reward: ``paper``, ``considerate``, or a mapping of what differs from it, ``{"hard_crash": -200}``.
         mask: ``none``, ``legal`` or ``safe`` (writes ``action_mask`` [N, 3] bool), or a mapping such as
             ``{"name": "safe", "safe_deceleration": 3.0}``.

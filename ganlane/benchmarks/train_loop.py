@@ -16,8 +16,8 @@ from ganlane.agents.replay import TRANSITION_KEYS
 from ganlane.benchmarks.case import Runner
 from ganlane.benchmarks.systems import Scenario, build
 from ganlane.build import make_road
+from ganlane.training.checkpoint import TrainingState
 from ganlane.training.loop import collect, learn
-from ganlane.training.run import Run
 from ganlane.transforms import observation_size
 
 #: Priorities set in one go.
@@ -39,10 +39,10 @@ def start_training(training: Training, mode: str, device: str, batch: int) -> Ru
     return with_gradients(partial(advance, run))
 
 
-def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[Run, TransformedEnv]:
+def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[TrainingState, TransformedEnv]:
     """A run that learns from its next decision on, and the environment that it steps."""
     env = build(training.scenario, mode, device, batch)
-    run = Run(env, make_agent(training, device))
+    run = TrainingState(env, make_agent(training, device))
     fill(run, training.stored)
     return run, env
 
@@ -56,7 +56,7 @@ def make_agent(training: Training, device: str = "cpu") -> Rainbow:
     return Rainbow(config, size, seed=training.scenario.seed, device=device, legal=legal)
 
 
-def advance(run: Run, decisions: int) -> int:
+def advance(run: TrainingState, decisions: int) -> int:
     """The body of :func:`ganlane.training.train`, so many times; the physics steps simulated, as in a runner."""
     simulated = torch.zeros((), dtype=torch.int64, device=run.agent.device)
     for _ in range(decisions):
@@ -77,7 +77,7 @@ def with_gradients(run: Runner) -> Runner:
     return learning
 
 
-def fill(run: Run, stored: int) -> None:
+def fill(run: TrainingState, stored: int) -> None:
     """Store driven transitions until the agent is warm, and the same again until there are ``stored``.
 
     A full buffer is what most of a long run has: its memory is in use, and every row of the sampler.

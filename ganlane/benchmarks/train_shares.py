@@ -12,7 +12,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from ganlane.benchmarks.train_loop import advance
-from ganlane.training.run import Run
+from ganlane.training.checkpoint import TrainingState
 
 SIMULATOR, TRAFFIC = "simulator", "traffic"
 OBSERVATION, SHELL = "observation and reward", "TorchRL's environment"
@@ -91,7 +91,7 @@ def _put(owner: Any, name: str, function: Callable[..., Any] | None) -> None:
         vars(owner)[name] = function
 
 
-def calls_of(run: Run, env: TransformedEnv) -> list[tuple[Any, str, str]]:
+def calls_of(run: TrainingState, env: TransformedEnv) -> list[tuple[Any, str, str]]:
     """What is timed of a run in ``env``: owner, name, part."""
     agent, replay = run.agent, run.agent.replay
     base, transform = env.base_env, env.transform
@@ -115,7 +115,9 @@ def calls_of(run: Run, env: TransformedEnv) -> list[tuple[Any, str, str]]:
     ]
 
 
-def take_shares(run: Run, env: TransformedEnv, decisions: int, device: str = "cpu") -> tuple[dict[str, float], float]:
+def take_shares(
+    run: TrainingState, env: TransformedEnv, decisions: int, device: str = "cpu"
+) -> tuple[dict[str, float], float]:
     """Shares of the parts in ``decisions`` of every environment, and how many all together made per second."""
     clock, began = Clock(device), time.perf_counter()
     with instrumented(calls_of(run, env), clock):

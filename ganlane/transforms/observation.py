@@ -15,7 +15,6 @@ from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.sim.road import Road, road_in
 from ganlane.sim.vehicles import Vehicles
-from ganlane.transforms.fixed_order import fixed_order, places
 from ganlane.transforms.lane_view import DRIFT_SIZE, LANE_VIEW_SIZE, lane_view, largest_nearness
 from ganlane.transforms.sensors import perceived
 from ganlane.transforms.table3 import (
@@ -29,7 +28,7 @@ from ganlane.transforms.table3 import (
 
 
 class Form(NamedTuple):
-    """What follows the own state: the list, nearest first; the lane view; own lane change; a place for every role.
+    """What follows the own state: the list, nearest first; the lane view; own lane change.
 
     ``drift`` adds to the lane view where in their lanes the others are, ``overlap`` lets its gaps go below 0.
     """
@@ -37,7 +36,6 @@ class Form(NamedTuple):
     listed: bool = False
     viewed: bool = False
     progress: bool = False
-    placed: bool = False
     drift: bool = False
     overlap: bool = False
 
@@ -49,15 +47,13 @@ OBSERVATIONS: Final = {
     "table3_lane_view": Form(listed=True, viewed=True, progress=True),
     "lane_view_drift": Form(viewed=True, progress=True, drift=True),
     "lane_view_overlap": Form(viewed=True, progress=True, drift=True, overlap=True),
-    "fixed_order": Form(placed=True, progress=True),
 }
 
 
 def observation_size(name: str, vehicles: int) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
     form, others = OBSERVATIONS[name], vehicles - 1
-    listed = 3 * (form.listed * others + form.placed * places(others))
-    return 3 + listed + form.viewed * LANE_VIEW_SIZE + form.drift * DRIFT_SIZE + form.progress * 2
+    return 3 + 3 * form.listed * others + form.viewed * LANE_VIEW_SIZE + form.drift * DRIFT_SIZE + form.progress * 2
 
 
 def largest_number(name: str, longest_m: float = 4.5) -> float:
@@ -78,8 +74,7 @@ class ObservationTransform(Transform):
         form: ``table3`` (the paper's literal 3 + 3 (M - 1) numbers), ``table3_progress`` (and the ego's own
             lane change: progress 0 to 1, direction -1, 0 or 1), ``lane_view`` (own state, lane view, lane
             change), ``lane_view_drift`` (and where in their lanes the others are), ``lane_view_overlap`` (and how far
-            those beside the ego overlap it), ``table3_lane_view`` (list and lane view), ``fixed_order`` (as
-            ``table3_progress``, with a place for every lane and role in the list's stead).
+            those beside the ego overlap it), ``table3_lane_view`` (list and lane view).
         scale: normalisers.
 
     Raises:
@@ -114,8 +109,6 @@ class ObservationTransform(Transform):
         parts = [own_state(vehicles, road)]
         if form.listed:
             parts.append(as_list(nearest_first(others, distance_to_ego(seen, road))))
-        if form.placed:
-            parts.append(as_list(fixed_order(others, distance_to_ego(seen, road), road.lanes)))
         if form.viewed:
             parts.append(lane_view(others, road.lanes, self.scale, form.drift, form.overlap))
         if form.progress:

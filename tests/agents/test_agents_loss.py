@@ -6,10 +6,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss
-from ganlane.agents.network import NetworkConfig, QNetwork
-from ganlane.agents.noise import redraw_noise
-from ganlane.agents.projection import outside_support, project
+from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, outside_support, project
+from ganlane.agents.network import NetworkConfig, QNetwork, redraw_noise
 
 SIZE = 5
 

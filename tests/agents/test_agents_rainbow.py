@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from agents_transitions import transitions
+from agents_small import same_weights, transitions
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -26,11 +26,6 @@ def trained(updates=5, **options):
     for _ in range(updates):
         result.update()
     return result
-
-
-def weights_equal(first, second):
-    pairs = zip(first.weights().values(), second.weights().values())
-    return all(torch.equal(a, b) for a, b in pairs)
 
 
 def observations(rows=2000):
@@ -261,8 +256,8 @@ def test_the_seed_decides_everything_and_the_global_one_nothing():
     torch.manual_seed(1)
     first = trained()
     torch.manual_seed(2)
-    assert weights_equal(first, trained())
-    assert not weights_equal(first, trained(seed=1))
+    assert same_weights(first, trained())
+    assert not same_weights(first, trained(seed=1))
 
 
 @pytest.mark.parametrize("options", [{}, {name: False for name in SWITCHES}])
@@ -273,7 +268,7 @@ def test_a_restored_agent_goes_on_to_the_same_weights(options, tmp_path):
     restored.load_state_dict(torch.load(tmp_path / "agent.pt", weights_only=True))
     for _ in range(3):
         restored.update()
-    assert weights_equal(restored, whole)
+    assert same_weights(restored, whole)
     data = observations()
     assert torch.equal(restored.policy(data.clone())["action"], whole.policy(data.clone())["action"])
 
@@ -316,10 +311,10 @@ def test_impossible_hyperparameters_are_refused(options, name):
 
 def test_a_state_saved_before_there_was_an_option_is_that_of_its_default():
     state = agent().state_dict()
-    del state["config"]["encoder"]
+    del state["config"]["kl_priority"]
     agent().load_state_dict(state)
-    with pytest.raises(UserError, match=r"agent.encoder=shared: the saved agent has none"):
-        Rainbow(RainbowConfig(**SMALL, encoder="shared"), 6).load_state_dict(state)
+    with pytest.raises(UserError, match=r"agent.kl_priority=False: the saved agent has True"):
+        agent(kl_priority=False).load_state_dict(state)
 
 
 def test_the_state_of_an_agent_with_other_hyperparameters_is_refused():

@@ -10,12 +10,8 @@ from tensordict import TensorDict
 
 from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
 from ganlane.errors import UserError
-from ganlane.training.further import make_logs
-from ganlane.training.log import COLUMNS
-from ganlane.training.meter import Meter
-from ganlane.training.progress import Progress
-from ganlane.training.tensorboard import TensorBoardLog
-from ganlane.training.wandb import WandbLog
+from ganlane.training.logs import COLUMNS, Progress, TensorBoardLog, WandbLog, make_logs
+from ganlane.training.stats import EpisodeStats
 
 # --- Weights & Biases
 
@@ -158,7 +154,7 @@ def step(reward, done, value=None):
 
 
 def test_the_return_to_go_is_averaged_over_the_decisions_of_finished_episodes():
-    meter = Meter(2, 2, gamma=0.5)
+    meter = EpisodeStats(2, 2, gamma=0.5)
     meter.step(step([1.0, 9.0], [False, False], [2.0, 0.0]))
     meter.step(step([2.0, 9.0], [False, False], [4.0, 0.0]))
     meter.step(step([4.0, 9.0], [True, False], [6.0, 0.0]))
@@ -172,7 +168,7 @@ def test_the_return_to_go_agrees_with_a_sum_over_every_decision():
     generator, gamma, rows = torch.Generator().manual_seed(0), 0.9, 5
     rewards = torch.randn(60, rows, generator=generator)
     ends = torch.rand(60, rows, generator=generator) < 0.15
-    meter, total, count = Meter(rows, 2, gamma), 0.0, 0
+    meter, total, count = EpisodeStats(rows, 2, gamma), 0.0, 0
     for reward, done in zip(rewards, ends):
         meter.step(step(reward.tolist(), done.tolist()))
     for row in range(rows):
@@ -185,7 +181,7 @@ def test_the_return_to_go_agrees_with_a_sum_over_every_decision():
 
 
 def test_a_policy_that_does_not_tell_its_values_leaves_their_column_empty():
-    meter = Meter(1, 2, gamma=0.5)
+    meter = EpisodeStats(1, 2, gamma=0.5)
     meter.step(step([1.0], [True]))
     assert "mean_value" not in meter.read()
 

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import os
 import sys
 
 import pytest
@@ -10,12 +9,11 @@ import torch
 from tensordict import TensorDict
 
 from ganlane.errors import UserError
-from ganlane.training.checkpoints import LAST, find_checkpoint, load_checkpoint, pack, save_checkpoint, unpack
-from ganlane.training.config import TrainingConfig
-from ganlane.training.log import CsvLog, read_rows
-from ganlane.training.meter import Meter
-from ganlane.training.progress import Progress, duration
-from ganlane.training.tensorboard import TensorBoardLog
+from ganlane.training.checkpoint import load_checkpoint, save_checkpoint
+from ganlane.training.collectors import pack, unpack
+from ganlane.training.logs import CsvLog, Progress, TensorBoardLog, duration, read_rows
+from ganlane.training.loop import TrainingConfig
+from ganlane.training.stats import EpisodeStats
 
 
 def step(reward, done, crash=None, goal=None, distance=0.0, lane_changes=0, action=0):
@@ -37,7 +35,7 @@ def step(reward, done, crash=None, goal=None, distance=0.0, lane_changes=0, acti
 
 
 def test_returns_and_rates_are_those_of_the_finished_episodes():
-    meter = Meter(2, 3, gamma=0.5)
+    meter = EpisodeStats(2, 3, gamma=0.5)
     meter.step(step([1.0, 10.0], [False, False], distance=500.0))
     meter.step(step([2.0, 20.0], [True, False], crash=[True, False], distance=1000.0, lane_changes=3, action=2))
     meter.step(step([4.0, 40.0], [True, True], goal=[False, True], distance=1000.0, lane_changes=1))
@@ -52,7 +50,7 @@ def test_returns_and_rates_are_those_of_the_finished_episodes():
 
 
 def test_an_interval_starts_afresh_but_a_running_episode_goes_on():
-    meter = Meter(1, 3, gamma=1.0)
+    meter = EpisodeStats(1, 3, gamma=1.0)
     meter.step(step([5.0], [False]))
     assert "mean_return" not in meter.read()
     meter.step(step([2.0], [True]))
@@ -60,7 +58,7 @@ def test_an_interval_starts_afresh_but_a_running_episode_goes_on():
 
 
 def test_update_figures_are_averaged():
-    meter = Meter(1, 3, gamma=1.0)
+    meter = EpisodeStats(1, 3, gamma=1.0)
     for value in (1.0, 2.0, 6.0):
         meter.update({"loss": torch.tensor(value)})
     assert meter.read()["loss"] == pytest.approx(3.0)
@@ -68,7 +66,7 @@ def test_update_figures_are_averaged():
 
 
 def test_environments_without_events_are_metered_too():
-    meter = Meter(1, 2, gamma=1.0)
+    meter = EpisodeStats(1, 2, gamma=1.0)
     after = {"reward": torch.ones(1, 1), "done": torch.ones(1, 1, dtype=torch.bool)}
     meter.step(TensorDict({"action": torch.zeros(1, dtype=torch.int64), "next": after}, [1]))
     assert set(meter.read()) == {
@@ -199,20 +197,6 @@ def test_a_file_that_would_run_code_is_refused(tmp_path):
     with pytest.raises(UserError, match="not a readable checkpoint"):
         load_checkpoint(tmp_path / "sly.pt")
     assert not (tmp_path / "made").exists()
-
-
-def test_resume_means_a_file_a_folder_or_the_newest_run(tmp_path):
-    for number, name in enumerate(("old", "new")):
-        path = tmp_path / name / LAST
-        save_checkpoint(path, {})
-        os.utime(path, (number + 1e9, number + 1e9))
-    assert find_checkpoint(None, tmp_path) is None
-    assert find_checkpoint("auto", tmp_path) == tmp_path / "new" / LAST
-    assert find_checkpoint("auto", tmp_path / "nothing") is None
-    assert find_checkpoint(tmp_path / "old", tmp_path) == tmp_path / "old" / LAST
-    assert find_checkpoint(tmp_path / "old" / LAST, tmp_path) == tmp_path / "old" / LAST
-    with pytest.raises(UserError, match="no checkpoint there"):
-        find_checkpoint(tmp_path / "absent", tmp_path)
 
 
 def test_a_tensordict_is_packed_with_its_nested_batch_sizes():

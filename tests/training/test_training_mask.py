@@ -12,8 +12,8 @@ from ganlane.config.compose import check
 from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.parameters.observation import MaskParameters
-from ganlane.phases import AGENT_FILE, phases_of, run_phase
-from ganlane.training.checkpoints import LAST, load_checkpoint, save_checkpoint
+from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
+from ganlane.training.phases import AGENT_FILE, phases_of, run_phase
 
 OPTIONS = [*entry_tiny.TINY, "logger.progress=false", "traffic=idm_mobil"]
 SAFE = "mask=safe"

@@ -17,15 +17,15 @@ import torch
 import ganlane
 from ganlane.agents import read_agent
 from ganlane.compiling import COMPILERS
-from ganlane.phases import AGENT_FILE
-from ganlane.training.checkpoints import LAST, load_checkpoint
+from ganlane.training.checkpoint import LAST, load_checkpoint
+from ganlane.training.phases import AGENT_FILE
 
 #: A phase alone, without the evaluation that a command makes at its end: that would compile as much again.
 SCRIPT = """
 import sys
 from pathlib import Path
 from ganlane.config.compose import check
-from ganlane.phases import phases_of, run_phase
+from ganlane.training.phases import phases_of, run_phase
 
 if __name__ == "__main__":
     folder, resume, *told = sys.argv[1:]

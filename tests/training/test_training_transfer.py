@@ -10,9 +10,8 @@ from ganlane.agents import read_agent
 from ganlane.config.compose import check
 from ganlane.config.init import InitConfig, NoInitConfig
 from ganlane.errors import UserError
-from ganlane.phases import AGENT_FILE, phases_of, read_start, run_phase
-from ganlane.phases.agent import begin
-from ganlane.training.checkpoints import LAST, load_checkpoint, save_checkpoint
+from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
+from ganlane.training.phases import AGENT_FILE, make_initial_agent, phases_of, read_start, run_phase
 
 WITHOUT_INIT = [option for option in entry_tiny.TINY if option != "init=none"]
 QUIET = ["logger.progress=false"]
@@ -29,7 +28,7 @@ def start(folder, path, *options, resume=None):
     """Config and agent of a run in ``folder`` that is about to begin, from the agent at ``path``."""
     given = [*WITHOUT_INIT, "init=idm_ckpt", f"init.path={path}", *options]
     config = check("train", given).config
-    return begin(config, phases_of(config, folder)[0], resume)
+    return make_initial_agent(config, phases_of(config, folder)[0], resume)
 
 
 def equal(one, other):
@@ -138,9 +137,9 @@ def test_a_second_phase_begins_with_a_fresh_optimiser(trained, tmp_path):
     given += ["traffic@pretrain.traffic=idm_mobil", "pretrain.total_decisions=16"]
     config = check("train", given).config
     first, second = phases_of(config, tmp_path)
-    assert begin(config, first, None)[1].optimizer.state_dict()["state"]
+    assert make_initial_agent(config, first, None)[1].optimizer.state_dict()["state"]
     run_phase(config, first)
-    _, agent = begin(config, second, None)
+    _, agent = make_initial_agent(config, second, None)
     assert equal(agent.weights(), read_agent(first.folder / AGENT_FILE)[0])
     assert agent.optimizer.state_dict()["state"] == {}
 

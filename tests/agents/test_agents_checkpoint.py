@@ -80,6 +80,8 @@ def test_a_warm_start_takes_the_saved_weights(saved):
     fresh = agent(seed=3)
     start_from(fresh, saved)
     assert same_weights(fresh, agent())
+    pairs = zip(fresh.network.parameters(), fresh.loss.target_network.parameters())
+    assert all(torch.equal(online, target) for online, target in pairs)
 
 
 @pytest.mark.parametrize(

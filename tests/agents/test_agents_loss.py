@@ -161,18 +161,6 @@ def test_the_targets_noise_can_be_drawn_anew_and_matters():
     assert not torch.equal(*seen)
 
 
-def test_the_target_follows_only_when_told():
-    net = network()
-    loss = LeanDistributionalLoss(net, gamma=0.97)
-    before = [value.clone() for value in loss.target_network.parameters()]
-    with torch.no_grad():
-        for value in net.parameters():
-            value.add_(1.0)
-    assert all(torch.equal(a, b) for a, b in zip(before, loss.target_network.parameters()))
-    loss.update_target()
-    assert all(torch.equal(a, b) for a, b in zip(net.parameters(), loss.target_network.parameters()))
-
-
 def test_the_target_network_is_torchrls_target_parameters():
     """So that TorchRL's own updaters and forward see the same target as the lean forward."""
     loss = LeanDistributionalLoss(network(), gamma=0.97)

@@ -8,7 +8,7 @@ from agents_small import same_weights, transitions
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ganlane.agents import NStepWindow, Rainbow, RainbowConfig
+from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.agents.network import NetworkConfig, QNetwork, duel
 from ganlane.errors import UserError
 
@@ -48,13 +48,6 @@ def test_the_network_gives_what_torchrl_expects(dueling, distributional):
     assert output.shape == ((2, 5, 7, 3) if distributional else (2, 5, 3))
     if distributional:
         torch.testing.assert_close(output.exp().sum(-2), torch.ones(2, 5, 3))
-
-
-def test_the_value_is_the_mean_of_the_distribution():
-    network = QNetwork(NetworkConfig(SIZE, 3, hidden=(8,), atoms=7))
-    observation = torch.randn(5, SIZE)
-    expected = (network(observation).exp() * network.support[:, None]).sum(-2)
-    torch.testing.assert_close(network.values(observation), expected)
 
 
 # --- exploration
@@ -136,14 +129,6 @@ def test_a_falling_learning_rate_falls_in_the_whole_phase_unless_it_has_a_time_o
     assert falling.for_phase(500).learning_rate_decisions == 500
     assert replace(falling, learning_rate_decisions=100).for_phase(500).learning_rate_decisions == 100
     assert RainbowConfig().for_phase(500) == RainbowConfig()
-
-
-def test_noisy_agents_draw_random_actions_too_unless_epsilon_is_0():
-    noisy = Rainbow(RainbowConfig(**SMALL), SIZE)
-    assert noisy.policy.epsilon == RainbowConfig().epsilon_start
-    silent = Rainbow(RainbowConfig(**SMALL, epsilon_start=0.0, epsilon=0.0), SIZE)
-    silent.anneal(10**9)
-    assert silent.policy.epsilon == 0.0
 
 
 # --- updates
@@ -271,33 +256,6 @@ def test_a_restored_agent_goes_on_to_the_same_weights(options, tmp_path):
     assert same_weights(restored, whole)
     data = observations()
     assert torch.equal(restored.policy(data.clone())["action"], whole.policy(data.clone())["action"])
-
-
-def test_a_light_state_empties_the_buffer():
-    restored = trained()
-    restored.load_state_dict(trained().state_dict(with_replay=False))
-    assert len(restored.replay) == 0
-    assert not restored.ready
-
-
-def test_the_target_follows_transferred_weights():
-    taught, fresh = trained(), agent(seed=5)
-    fresh.load_weights(taught.weights())
-    data = torch.randn(7, SIZE)
-    assert torch.equal(fresh.network.values(data), taught.network.values(data))
-    assert torch.equal(fresh.loss.target_network.values(data), taught.network.values(data))
-
-
-def test_weights_of_another_shape_are_refused():
-    other = Rainbow(RainbowConfig(**SMALL), SIZE + 1)
-    with pytest.raises(UserError, match=r"\(16, 5\) in the checkpoint and \(16, 4\) in the network"):
-        agent().load_weights(other.weights())
-
-
-def test_the_window_takes_n_and_gamma_from_the_agent():
-    window = agent(n_step=2, gamma=0.9).window()
-    assert isinstance(window, NStepWindow)
-    assert (window.n, window.gamma) == (2, 0.9)
 
 
 @pytest.mark.parametrize(

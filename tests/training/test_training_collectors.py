@@ -27,7 +27,7 @@ from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.training import TrainingConfig, train
 from ganlane.training.checkpoint import TrainingState
-from ganlane.training.collectors import ClusterCollector, ProcessCollector, SingleCollector, WorkerPool, source_of
+from ganlane.training.collectors import ClusterCollector, ProcessCollector, WorkerPool
 from ganlane.training.loop import collect
 from ganlane.training.phases import identity, make_collector, phases_of
 from ganlane.training.signals import shielded_children
@@ -60,7 +60,9 @@ class Here:
 
     def __init__(self, environments, policies, frames):
         self.workers = [
-            Collector(env, policy_factory=policy, frames_per_batch=frames, trust_policy=True, **QUIET)
+            Collector(
+                env, policy_factory=policy, frames_per_batch=frames // len(policies), trust_policy=True, **QUIET
+            )
             for env, policy in zip(environments, policies)
         ]
         self.handed_over = []
@@ -187,14 +189,6 @@ def test_another_number_of_workers_is_refused_on_resume(tmp_path):
     for other in (HereCollector(toy, WorkerPool(3, 4, 8)), ToyRoad(4)):
         with pytest.raises(UserError, match=r"shape \[8\], this run has"):
             train(other, agent(4), TrainingConfig(160, progress=False), tmp_path, resume=first.checkpoint)
-
-
-def test_an_environment_is_a_source_of_its_own():
-    env = ToyRoad(4)
-    source = source_of(env)
-    assert isinstance(source, SingleCollector)
-    assert source.env is env
-    assert source_of(source) is source
 
 
 # --- options

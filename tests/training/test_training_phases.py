@@ -335,7 +335,7 @@ def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(n
 
 @pytest.mark.parametrize("stored", ["agent.encoder=shared", "agent.decide_when_free=true", "observation=fixed_order"])
 def test_a_command_line_with_a_removed_option_names_the_revision_that_had_it(stored):
-    with pytest.raises(UserError, match=f"^run: .*{stored}.* was removed after revision {LAST_REVISION}|fixed_order"):
+    with pytest.raises(UserError, match=f"^run: {stored} was removed after revision {LAST_REVISION}"):
         without_removed_overrides(["seed=1", stored], "run")
     with pytest.raises(UserError, match=LAST_REVISION):
         without_removed_overrides(["experiment=search/base"], "run")

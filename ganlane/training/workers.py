@@ -32,6 +32,8 @@ from ganlane.transforms.sensors import PERCEIVED, SENSORS
 #: Makes the environments of a worker from their number and their first episode. It travels to the worker: a function
 #: of a module, or a ``functools.partial`` of one.
 MakeEnv = Callable[[int, int], EnvBase]
+#: Functions that make the environments, or the policies, of one worker each.
+Factories = Sequence[Callable[[], Any]]
 #: A worker's first episodes are so far from the next one's that no two workers ever drive the same.
 EPISODES_PER_WORKER = 2**40
 #: State of the simulation, most of a step's bytes: the workers need it, the loop does not.
@@ -111,14 +113,8 @@ class WorkerCollector(Collector):
         self._last: TensorDictBase = TensorDict({}, [self.environments])
 
     @abstractmethod
-    def start(
-        self, environments: Sequence[Callable[[], EnvBase]], policies: Sequence[Callable[[], Any]], frames: int
-    ) -> BaseCollector:
+    def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
         """A collector that makes these environments and policies; ``frames`` decisions of all workers at a time."""
-
-    @abstractmethod
-    def arranged(self, batch: TensorDictBase) -> TensorDictBase:
-        """A batch of the collector as [rows, steps]."""
 
     @abstractmethod
     def failure(self, error: Exception) -> str | None:
@@ -143,7 +139,9 @@ class WorkerCollector(Collector):
             self.open(agent)
             with self._failures_as_user_errors():
                 self._send_weights(agent)
-                batch = read_by_loop(self.arranged(next(self._batches)))
+                batch = read_by_loop(next(self._batches))
+            # [workers * environments, steps]; from Ray [workers, environments, steps].
+            batch = batch.flatten(0, 1) if batch.dim() == 3 else batch
             self._last = batch[:, -1].get("next").select(keys.SEED, keys.EPISODE, strict=False)
             self._steps.extend(batch.to(agent.device).unbind(1))
         return self._steps.popleft()
@@ -201,9 +199,7 @@ class ProcessCollector(WorkerCollector):
 
     name = "multi"
 
-    def start(
-        self, environments: Sequence[Callable[[], EnvBase]], policies: Sequence[Callable[[], Any]], frames: int
-    ) -> BaseCollector:
+    def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
         """One process per worker, with one thread each."""
         return MultiSyncCollector(
             list(environments),
@@ -216,10 +212,6 @@ class ProcessCollector(WorkerCollector):
             num_sub_threads=1,
             auto_register_policy_transforms=False,
         )
-
-    def arranged(self, batch: TensorDictBase) -> TensorDictBase:
-        """Already concatenated by TorchRL."""
-        return batch
 
     def failure(self, error: Exception) -> str | None:
         """A dead worker shows as a closed pipe or as TorchRL's complaint; its exit code tells of what it died."""
@@ -261,9 +253,7 @@ class ClusterCollector(WorkerCollector):
         except ImportError as error:
             raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
 
-    def start(
-        self, environments: Sequence[Callable[[], EnvBase]], policies: Sequence[Callable[[], Any]], frames: int
-    ) -> BaseCollector:
+    def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
         """An actor per worker; a Ray of our own has a CPU for each, however few the machine has."""
         from torchrl.collectors.distributed import RayCollector
 
@@ -291,10 +281,6 @@ class ClusterCollector(WorkerCollector):
                 trust_policy=True,
                 weight_sync_schemes={},
             )
-
-    def arranged(self, batch: TensorDictBase) -> TensorDictBase:
-        """TorchRL gives [workers, environments, steps]."""
-        return batch.flatten(0, 1)
 
     def failure(self, error: Exception) -> str | None:
         """No cluster, an actor that is gone, or no Ray."""

@@ -27,11 +27,18 @@ from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.training import TrainingConfig, train
 from ganlane.training.checkpoint import TrainingState
-from ganlane.training.collectors import ClusterCollector, ProcessCollector, WorkerPool
 from ganlane.training.loop import collect
 from ganlane.training.phases import identity, make_collector, phases_of
 from ganlane.training.signals import shielded_children
-from ganlane.training.workers import EPISODES_PER_WORKER, WorkerCollector, check_reachable, noise_seed
+from ganlane.training.workers import (
+    EPISODES_PER_WORKER,
+    ClusterCollector,
+    ProcessCollector,
+    WorkerCollector,
+    WorkerPool,
+    check_reachable,
+    noise_seed,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)")
@@ -86,9 +93,6 @@ class HereCollector(WorkerCollector):
 
     def start(self, environments, policies, frames):
         return Here(environments, policies, frames)
-
-    def arranged(self, batch):
-        return batch
 
     def failure(self, error):
         return None

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, outside_support, project
+from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, project
 from ganlane.agents.network import NetworkConfig, QNetwork, redraw_noise
 
 SIZE = 5
@@ -109,13 +109,6 @@ def test_the_projection_is_that_of_the_paper():
     torch.testing.assert_close(projected, reference_projection(values, probabilities, support))
     torch.testing.assert_close(projected[0], probabilities[0])
     torch.testing.assert_close(projected.sum(-1), torch.ones(20))
-
-
-def test_the_clamped_fraction_is_the_mass_outside_the_support():
-    support = torch.tensor([0.0, 1.0, 2.0])
-    values = torch.tensor([[-1.0, 1.0, 3.0], [0.0, 1.0, 2.0]])
-    probabilities = torch.tensor([[0.25, 0.5, 0.25], [0.3, 0.3, 0.4]])
-    assert torch.isclose(outside_support(values, probabilities, support), torch.tensor(0.25))
 
 
 def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():

@@ -97,16 +97,6 @@ def test_moments_are_taken_over_where_asked(trained, last, tmp_path):
     assert agent.updates == 0
 
 
-def test_the_learning_rate_begins_anew(trained, tmp_path):
-    fall = ["agent.learning_rate=1e-3", "agent.learning_rate_end=1e-5"]
-    source = run(tmp_path / "falling", *fall)
-    assert load_checkpoint(source / LAST)["agent"]["optimizer"]["param_groups"][0]["lr"] < 1e-4
-    config, agent = start(tmp_path / "next", source, "init.optimizer=true", *fall)
-    assert agent.optimizer.param_groups[0]["lr"] == 1e-3
-    agent.anneal(config.total_decisions)
-    assert agent.optimizer.param_groups[0]["lr"] == 1e-5
-
-
 def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
     fall = ["agent.learning_rate_end=1e-5"]
     folder = run(tmp_path, *fall, "total_decisions=160")
@@ -294,10 +284,6 @@ def test_the_mask_of_the_next_state_is_kept_with_every_transition(masked):
     assert mask.shape == (len(rows["action"]), 3)
     assert bool(mask[:, 0].all())
     assert not bool(mask[:, 1:].all())
-
-
-def test_it_learns_something_else_without_the_mask(masked, tmp_path):
-    assert not same_agent(masked, run(tmp_path, MOBIL, "mask=none"))
 
 
 def test_a_masked_run_stopped_and_resumed_ends_with_the_same_bits(masked, tmp_path):

@@ -257,33 +257,39 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
 
 
 def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | None) -> tuple[TrainConfig, Rainbow]:
-    """``config`` with the support of returns that holds, and the agent with which ``phase`` begins.
+    """The agent with which ``phase`` begins, and ``config`` with the support of returns that it has.
 
-    With ``resume`` it is an agent ready to be restored: what the run once started from may be gone.
+    With ``resume``, an agent ready to be restored: what the run once started from may be gone.
 
     Raises:
         UserError: the agent to start from does not fit.
     """
     if phase.init is None:
         return config, make_agent(config, phase)
-    adopt = config.init.support == "trained"
-    start = read_start(phase.init) if resume is None else read_start(str(resume), "resume") if adopt else None
-    if start is not None and resume is None:
-        check_observation(start, config)
-    if start is not None and adopt:
-        support = {name: getattr(start.network, name) for name in SUPPORT}
-        config = replace(config, agent=replace(config.agent, **support))
+    if resume is not None:
+        if config.init.support == "trained":
+            config = with_support(config, read_start(str(resume), "resume"))
+        return config, make_agent(config, phase)
+    start = read_start(phase.init)
+    check_observation(start, config)
+    if config.init.support == "trained":
+        config = with_support(config, start)
     agent = make_agent(config, phase)
-    if start is not None and resume is None:
-        # A second phase starts from the best agent of the first, whose moments are not kept.
-        wanted = config.init.optimizer and phase.init == config.init.path
-        if wanted and not start.moments:
-            raise UserError(
-                f"init.optimizer=true: {start.name} holds no moments of the optimiser; give init.path a training "
-                f"run's folder or its {LAST}, saved after its first update, or init.optimizer=false."
-            )
-        warm_start(agent, start.name, start.weights, start.network, start.moments if wanted else None)
+    # A second phase starts from the best agent of the first, whose moments are not kept.
+    with_moments = config.init.optimizer and phase.init == config.init.path
+    if with_moments and not start.moments:
+        raise UserError(
+            f"init.optimizer=true: {start.name} holds no moments of the optimiser; give init.path a training run's "
+            f"folder or its {LAST}, saved after its first update, or init.optimizer=false."
+        )
+    warm_start(agent, start.name, start.weights, start.network, start.moments if with_moments else None)
     return config, agent
+
+
+def with_support(config: TrainConfig, start: Start) -> TrainConfig:
+    """``config`` with the atoms, v_min and v_max of ``start``."""
+    support = {name: getattr(start.network, name) for name in SUPPORT}
+    return replace(config, agent=replace(config.agent, **support))
 
 
 def check_observation(start: Start, config: TrainConfig) -> None:

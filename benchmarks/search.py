@@ -25,8 +25,8 @@ from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.errors import UserError, as_typed
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
-from ganlane.training.log import read_rows
-from ganlane.training.run import flat
+from ganlane.training.checkpoint import flat
+from ganlane.training.logs import read_rows
 
 BEGIN, END = "<!-- search: begin -->", "<!-- search: end -->"
 #: Options that change nothing in what is learned.

@@ -33,7 +33,7 @@ from ganlane.bench.train import Training, TrainSuite, advance, filled_run, make_
 from ganlane.config.bench import BenchConfig
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, count, percent
-from ganlane.training.run import Run
+from ganlane.training.checkpoint import TrainingState
 
 BEGIN, END = "<!-- begin train profile -->", "<!-- end train profile -->"
 REST = "rest"
@@ -106,7 +106,7 @@ def instrumented(calls: Sequence[tuple[Any, str, str]], clock: Clock) -> Iterato
                 vars(owner)[name] = own
 
 
-def timed_calls(run: Run, env: TransformedEnv) -> list[tuple[Any, str, str]]:
+def timed_calls(run: TrainingState, env: TransformedEnv) -> list[tuple[Any, str, str]]:
     """What is timed of a run in ``env``: owner, name, part."""
     agent, replay = run.agent, run.agent.replay
     base, transform = env.base_env, env.transform
@@ -130,7 +130,9 @@ def timed_calls(run: Run, env: TransformedEnv) -> list[tuple[Any, str, str]]:
     ]
 
 
-def take_shares(run: Run, env: TransformedEnv, decisions: int, device: str = "cpu") -> tuple[dict[str, float], float]:
+def take_shares(
+    run: TrainingState, env: TransformedEnv, decisions: int, device: str = "cpu"
+) -> tuple[dict[str, float], float]:
     """Shares of the parts in ``decisions`` of every environment, and how many all together made per second."""
     clock, begun = Clock(device), time.perf_counter()
     with instrumented(timed_calls(run, env), clock):

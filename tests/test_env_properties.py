@@ -216,7 +216,6 @@ def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
         # Speed over desired speed (at least 25 m/s; nobody drives twice that), a lane to the left, to the right.
         observation.OWN: [(0.0, 2.0), (0.0, 1.0), (0.0, 1.0)],
         observation.LIST: [(-1.0, 1.0)] * 3 * others,
-        observation.PLACES: [(-1.0, 1.0)] * 3 * observation.places(others),
         observation.VIEW: gap * 6,
         observation.DRIFT_VIEW: [*gap, drift] * 6,
         observation.OVERLAP_VIEW: [*overlap, (-1.0, 1.0), drift] * 6,

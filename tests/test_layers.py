@@ -22,11 +22,11 @@ ORDER = [
     {"transforms"},
     {"agents"},
     {"evaluation"},
-    {"training"},
     {"view"},
     {"config"},
     {"build"},
-    {"compare", "phases", "fit_report"},
+    {"training"},
+    {"compare", "fit_report"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
     {"options"},
     # The typed calls run the commands' own functions.

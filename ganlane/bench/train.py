@@ -20,8 +20,8 @@ from ganlane.bench.systems import HighwayEnvRunner, Scenario, highway_env_settin
 from ganlane.build import make_road
 from ganlane.config.bench import BenchConfig
 from ganlane.evaluation.table import Table, significant
+from ganlane.training.checkpoint import TrainingState
 from ganlane.training.loop import collect, learn
-from ganlane.training.run import Run
 from ganlane.transforms import observation_size
 
 SYSTEM = "ganlane training"
@@ -111,14 +111,14 @@ def start_training(training: Training, mode: str, device: str, batch: int) -> Ru
     return with_gradients(partial(advance, run))
 
 
-def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[Run, TransformedEnv]:
+def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[TrainingState, TransformedEnv]:
     """A run that learns from its next decision on, and the environment that it steps.
 
     Driven transitions are stored until the agent is warm, and the same again until there are ``training.stored``:
     most of a long run has a full buffer, with all of its memory in use.
     """
     env = training.scenario.build(mode, device, batch)
-    run = Run(env, make_agent(training, device))
+    run = TrainingState(env, make_agent(training, device))
     while not run.agent.ready:
         run.agent.store(run.window.push(collect(run)))
     repeat(run.agent, run.agent.replay[:].select(*TRANSITION_KEYS), training.stored)
@@ -145,7 +145,7 @@ def repeat(agent: Rainbow, transitions: TensorDict, stored: int) -> None:
             agent.replay.update_priority(index, priority)
 
 
-def advance(run: Run, decisions: int) -> int:
+def advance(run: TrainingState, decisions: int) -> int:
     """The body of :func:`ganlane.training.train`, so many times; the physics steps simulated, as in a runner."""
     simulated = torch.zeros((), dtype=torch.int64, device=run.agent.device)
     for _ in range(decisions):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from ganlane.parameters.checks import check, one_of
 from ganlane.parameters.observation import ObservationScale, SensorParameters
 from ganlane.parameters.records import assign, part_of
+from ganlane.parameters.removed import refuse_removed_observation
 
 #: As in :data:`ganlane.transforms.OBSERVATIONS`; repeated here so that a wrong name is found without loading torch.
 FORMS = (
@@ -16,10 +17,7 @@ FORMS = (
     "lane_view_drift",
     "lane_view_overlap",
     "table3_lane_view",
-    "fixed_order",
 )
-#: Those laid out as Table III is, from one vehicle to the next: what ``agent.encoder=shared`` can read.
-LISTS = ("table3", "table3_progress", "fixed_order")
 
 
 @dataclass(frozen=True)
@@ -39,6 +37,7 @@ class ObservationConfig(ObservationScale):
         # Errors of 0 everywhere are no errors: one way to say so, which is also that of configs without the key.
         if self.sensors == SensorParameters():
             assign(self, sensors=None)
+        refuse_removed_observation(self.form)
         check(self, form=one_of(FORMS))
 
     def scale(self) -> ObservationScale:

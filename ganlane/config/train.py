@@ -9,7 +9,7 @@ from ganlane.config.env import EnvConfig, check_pay
 from ganlane.config.evaluate import NAMES
 from ganlane.config.init import InitConfig
 from ganlane.config.logger import LoggerConfig
-from ganlane.config.observation import LISTS, ObservationConfig
+from ganlane.config.observation import ObservationConfig
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
@@ -95,7 +95,6 @@ class TrainConfig(RunConfig):
             checkpoint_every_s=at_least(0),
         )
         check_pay(self.env, self.reward)
-        check_agent(self.agent, self.observation, self.env)
 
     def compiled(self) -> TrainConfig:
         """The same with ``env.compile`` as ``compile`` says."""
@@ -115,21 +114,3 @@ class TrainConfig(RunConfig):
         """The traffic of the final evaluation by its name: training's, unless another one was chosen."""
         chosen = self.evaluation.traffic or self.traffic
         return {chosen.label(): chosen}
-
-
-def check_agent(agent: RainbowConfig, observation: ObservationConfig, env: EnvConfig) -> None:
-    """Refuse an agent that could not read the observation, or would not learn what it is asked in ``env``.
-
-    Raises:
-        UserError: an encoder over vehicles without a list of them, or turning back while nothing is learnt.
-    """
-    if agent.encoder != "none" and observation.form not in LISTS:
-        raise UserError(
-            f"agent.encoder={agent.encoder} with observation={observation.form}: the encoder reads vehicles in Table "
-            f"III's layout; give one of {', '.join(LISTS)}, or agent.encoder=none."
-        )
-    if agent.decide_when_free and env.ego.abort_lane_change:
-        raise UserError(
-            "agent.decide_when_free=true with env.ego.abort_lane_change=true: commands are then obeyed during a lane "
-            "change, but nothing would be learnt from them; switch one of the two off."
-        )

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import Rule, above, at_least, between, check, every, number, one_of, optional
+from ganlane.parameters.checks import Rule, above, at_least, between, check, every, number, optional
 from ganlane.parameters.records import lists_to_tuples
 
-#: What may stand before the noisy layers (:mod:`ganlane.agents.encoder`).
-ENCODERS = ("none", "shared")
 _DISCOUNT = Rule(lambda value: 0.0 < value <= 1.0, "a number above 0, at most 1")
 
 
@@ -18,8 +16,6 @@ class RainbowConfig:
     """Hyperparameters of Rainbow (Hessel et al. 2018); the values are for one update of 256 per 64 decisions.
 
     Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
-    ``encoder, encoder_width, encoder_layers``: see :class:`~ganlane.agents.encoder.VehicleEncoder`;
-    ``decide_when_free``: see :class:`~ganlane.agents.free_decisions.FreeDecisionWindow`.
     ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is the share of
     random legal actions, drawn beside the noise (docs/agent.md). ``adam_eps=None`` stands for
     0.005 / ``batch_size``. The learning rate falls to ``learning_rate_end``, if one is given, within
@@ -28,16 +24,12 @@ class RainbowConfig:
     """
 
     hidden: tuple[int, ...] = (256, 256)
-    encoder: str = "none"
-    encoder_width: int = 64
-    encoder_layers: int = 2
     noisy: bool = True
     dueling: bool = True
     distributional: bool = True
     double: bool = True
     prioritised: bool = True
     n_step: int = 3
-    decide_when_free: bool = False
     gamma: float = 0.98
     atoms: int = 101
     v_min: float = -120.0
@@ -64,12 +56,10 @@ class RainbowConfig:
     def __post_init__(self) -> None:
         lists_to_tuples(self)
         counts = ["n_step", "batch_size", "capacity", "warmup", "decisions_per_update", "target_period", "atoms"]
-        counts += ["encoder_width", "encoder_layers"]
         shares = ("alpha", "beta_start", "epsilon_start", "epsilon")
         check(
             self,
             hidden=every(at_least(1)),
-            encoder=one_of(ENCODERS),
             gamma=_DISCOUNT,
             v_min=number(),
             v_max=number(),

@@ -171,48 +171,6 @@ def lane_view(
     return torch.cat(numbers, dim=-1).flatten(1)
 
 
-def places(others: int) -> int:
-    """Number of places of :func:`fixed_order` for ``others`` vehicles: whole groups of three."""
-    return LANES * -(-others // LANES)
-
-
-def fixed_order(others: Others, distance: Tensor, lanes: int | Tensor) -> Others:
-    """``others`` [N, M - 1] in places with a fixed meaning, [N, :func:`places`]; an empty place is (1, 0, 0).
-
-    In groups of three (lane to the left, own, to the right): the nearest ahead, the nearest behind, the second
-    ahead, the second behind and so on. Vehicles two or more lanes away, or without a place, are left out.
-
-    Args:
-        others: in any order.
-        distance: of each to the ego, m, [N, M - 1]; gives the ranks.
-        lanes: of the road.
-    """
-    others = nearest_first(others, distance)
-    count = places(others.position.shape[1])
-    place = place_of(others, lanes)
-    # Those without a place share one behind the last, which is cut off.
-    place = torch.where(place < count, place, count)
-    fields = (
-        torch.full((len(place), count + 1), empty, dtype=field.dtype, device=field.device).scatter(1, place, field)
-        for field, empty in zip(others, (1.0, 0.0, 0.0, False, 0.0, 0.0))
-    )
-    return Others(*(field[:, :count] for field in fields))
-
-
-def place_of(others: Others, lanes: int | Tensor) -> Tensor:
-    """Place of each of the ``others``, nearest first, [N, M - 1] int64; the largest int64 without a place.
-
-    A vehicle exactly beside the ego counts as behind, as in the lane view.
-    """
-    column = 1 - lane_offset(others, lanes).long()
-    behind = (others.position <= 0).long()
-    has_place = others.valid & (column >= 0) & (column < LANES)
-    role = torch.where(has_place, behind * LANES + column, -1)
-    same = role[:, :, None] == torch.arange(2 * LANES, device=role.device)
-    rank = (same.cumsum(1) * same).sum(-1) - 1
-    return torch.where(has_place, rank * 2 * LANES + role, torch.iinfo(torch.int64).max)
-
-
 class Part(NamedTuple):
     """A part of an observation: its size for a number of other vehicles, and its numbers [N, size]."""
 
@@ -228,10 +186,6 @@ def _listed(view: View) -> Tensor:
     return as_list(nearest_first(view.others, distance_to_ego(view.seen, view.road)))
 
 
-def _placed(view: View) -> Tensor:
-    return as_list(fixed_order(view.others, distance_to_ego(view.seen, view.road), view.road.lanes))
-
-
 def _lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     return lane_view(view.others, view.road.lanes, view.scale, drift, overlap)
 
@@ -242,7 +196,6 @@ def _lane_change(view: View) -> Tensor:
 
 OWN = Part(lambda others: 3, _own)
 LIST = Part(lambda others: 3 * others, _listed)
-PLACES = Part(lambda others: 3 * places(others), _placed)
 VIEW = Part(lambda others: LANE_VIEW_SIZE, _lane_view)
 DRIFT_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True))
 OVERLAP_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True, overlap=True))
@@ -257,7 +210,6 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
     "table3_lane_view": (OWN, LIST, VIEW, CHANGE),
     "lane_view_drift": (OWN, DRIFT_VIEW, CHANGE),
     "lane_view_overlap": (OWN, OVERLAP_VIEW, CHANGE),
-    "fixed_order": (OWN, PLACES, CHANGE),
 }
 
 #: The forms that the native kernel computes: drift, overlap.

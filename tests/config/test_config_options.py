@@ -12,10 +12,9 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from ganlane.__main__ import COMMANDS
-from ganlane.agents import RainbowConfig, read_agent
+from ganlane.agents import read_agent
 from ganlane.config.compose import check
 from ganlane.config.data import NgsimDataConfig
-from ganlane.config.env import EnvConfig
 from ganlane.config.generator import (
     CalibratedGeneratorConfig,
     CalibratedLoopOptions,
@@ -23,7 +22,7 @@ from ganlane.config.generator import (
     PaperGeneratorConfig,
     WeightOptions,
 )
-from ganlane.config.observation import FORMS, LISTS, ObservationConfig
+from ganlane.config.observation import FORMS, ObservationConfig
 from ganlane.config.plain import plain_copy
 from ganlane.config.store import SCHEMAS, SUFFIX, register
 from ganlane.config.traffic_faults import (
@@ -33,7 +32,6 @@ from ganlane.config.traffic_faults import (
     IdmFaultsTrafficConfig,
     ReactionFaultsConfig,
 )
-from ganlane.config.train import check_agent
 from ganlane.data import NgsimParameters
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
@@ -45,13 +43,11 @@ from ganlane.generator import (
     load_generator,
     shipped_generator,
 )
-from ganlane.parameters.driving import EgoParameters
 from ganlane.parameters.observation import MASKS, SensorParameters
 from ganlane.parameters.reward import RewardParameters
-from ganlane.phases.description import describe
-from ganlane.phases.phase import phases_of
 from ganlane.traffic import AbortFaults, BrakingFaults, HesitationFaults, ReactionFaults
 from ganlane.traffic.presets import DriverFaults
+from ganlane.training.phases import describe, phases_of
 from ganlane.transforms import OBSERVATIONS
 
 #: Group to a command that has it.
@@ -160,28 +156,6 @@ def test_faults_of_the_command_line_reach_the_traffic():
 
 def test_observation_forms_are_those_of_the_transform():
     assert set(FORMS) == set(OBSERVATIONS)
-
-
-def test_the_shared_encoder_can_be_chosen():
-    assert config_of("train", "agent.encoder=shared", "observation=table3").agent.encoder == "shared"
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_the_encoder_is_for_lists_of_vehicles_alone(form):
-    given = RainbowConfig(encoder="shared"), ObservationConfig(form=form), EnvConfig()
-    check_agent(RainbowConfig(), *given[1:])
-    if form in LISTS:
-        check_agent(*given)
-    else:
-        with pytest.raises(UserError, match=f"agent.encoder=shared with observation={form}"):
-            check_agent(*given)
-
-
-def test_who_learns_only_when_free_cannot_turn_back():
-    agent, observation = RainbowConfig(decide_when_free=True), ObservationConfig()
-    check_agent(agent, observation, EnvConfig())
-    with pytest.raises(UserError, match=r"env\.ego\.abort_lane_change=true"):
-        check_agent(agent, observation, EnvConfig(ego=EgoParameters(abort_lane_change=True)))
 
 
 @pytest.mark.parametrize("form", FORMS)

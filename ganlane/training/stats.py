@@ -22,11 +22,10 @@ RATES = {
 RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
 
 
-class Meter:
-    """Episode and update statistics since the last :meth:`read`.
+class EpisodeStats:
+    """Statistics of the finished episodes and of the updates since the last :meth:`read`.
 
-    Keys that an environment or a policy does not write (``events``, ``ego``, ``chosen_action_value``) are left out,
-    so the meter serves any of them.
+    Keys that an environment or a policy does not write (``events``, ``ego``, ``chosen_action_value``) are left out.
 
     **Q-values against realised returns.** ``mean_return_to_go`` is the discounted return from a decision to the end
     of its episode, averaged over all decisions of the finished episodes; ``mean_value`` is the mean of the values
@@ -75,11 +74,9 @@ class Meter:
         self._add("episodes", done.sum())
         for name in RUNNING if has_values else RUNNING[:-1]:
             self._add(name, (getattr(self, name) * done).sum())
-        events = after.get(keys.EVENTS, None)
-        if events is not None:
-            for name in RATES.keys() & events.keys():
-                self._add(name, (events.get(name).squeeze(-1) & done).sum())
-        ego = after.get(keys.EGO, None)
+        events, ego = after.get(keys.EVENTS, {}), after.get(keys.EGO, None)
+        for name in RATES.keys() & events.keys():
+            self._add(name, (events.get(name).squeeze(-1) & done).sum())
         if ego is not None:
             for name in ("distance", "lane_changes"):
                 self._add(name, (ego.get(name) * done).sum())

@@ -6,7 +6,9 @@ import torch
 from scipy import stats  # scikit-learn, a dependency, brings it along
 from tensordict import TensorDict
 
-from ganlane.agents.replay import annealed, load_replay_state, make_replay, replay_state
+from ganlane.agents import RainbowConfig
+from ganlane.agents.rainbow import annealed
+from ganlane.agents.replay import load_replay_state, make_replay, replay_state
 
 
 def transitions(rows, first=0):
@@ -17,8 +19,12 @@ def transitions(rows, first=0):
     return TensorDict({**content, "steps_to_next_obs": torch.ones(rows, 1)}, [rows])
 
 
-def buffer(rows=200, capacity=256, batch=128, seed=0, **options):
-    result = make_replay(capacity, batch, torch.Generator().manual_seed(seed), **options)
+def config(capacity=256, **options):
+    return RainbowConfig(capacity=capacity, batch_size=128, warmup=128, **options)
+
+
+def buffer(rows=200, seed=0, **options):
+    result = make_replay(config(**options), torch.Generator().manual_seed(seed))
     result.extend(transitions(rows))
     return result
 
@@ -48,7 +54,7 @@ def test_without_priorities_all_items_are_drawn_alike():
 
 
 def test_importance_weights_are_those_of_schaul_over_the_largest_of_the_batch():
-    replay = buffer(alpha=0.5, beta=0.7)
+    replay = buffer(alpha=0.5, beta_start=0.7)
     priority = torch.linspace(0.1, 9.0, 200)
     replay.update_priority(torch.arange(200), priority)
     drawn = replay.sample()
@@ -102,22 +108,13 @@ def test_a_restored_buffer_draws_what_the_saved_one_would_have(prioritised, tmp_
     torch.save(replay_state(saved), tmp_path / "replay.pt")
     generator = torch.Generator()
     generator.set_state(saved._rng.get_state())
-    restored = make_replay(256, 128, generator, prioritised)
+    restored = make_replay(config(prioritised=prioritised), generator)
     load_replay_state(restored, torch.load(tmp_path / "replay.pt", weights_only=True))
     saved.extend(transitions(10, first=500))
     restored.extend(transitions(10, first=500))
     for _ in range(3):
         ours, theirs = restored.sample(), saved.sample()
         assert (ours.select(*theirs.keys()) == theirs).all()
-
-
-def test_the_sampler_dumps_and_loads(tmp_path):
-    saved, other = buffer(), buffer()
-    saved.update_priority(torch.arange(200), torch.rand(200))
-    saved.sampler.dumps(tmp_path)
-    other.sampler.loads(tmp_path)
-    assert torch.equal(other.sampler.priorities, saved.sampler.priorities)
-    assert torch.equal(other.sampler.row_sums, saved.sampler.row_sums)
 
 
 def test_annealing_ends_at_its_end():

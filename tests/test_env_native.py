@@ -14,6 +14,7 @@ from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.config.observation import ObservationConfig
+from ganlane.env import native_step
 from ganlane.errors import UserError
 from ganlane.native import why_not
 from ganlane.parameters.driving import EgoParameters, IdmParameters
@@ -105,9 +106,14 @@ def test_what_the_kernel_cannot_do_it_refuses_in_one_sentence(settings, sentence
         environment(**{"dtype": torch.float32, "kernel": "native", **settings})
 
 
-def test_auto_takes_the_tensor_code_where_the_kernel_cannot():
+def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_so_once(capsys):
+    native_step._say_once.cache_clear()
     assert environment(kernel="auto").kernel is None
     assert environment(kernel="auto", dtype=torch.float32).kernel is not None
+    assert environment(kernel="auto", dtype=torch.float32).kernel is not None
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("env.kernel=auto: the tensor code, since the native kernel runs on a CPU in float32")
+    assert said[1:] == ["env.kernel=auto: the native kernel"]
 
 
 def test_a_recorder_of_physics_steps_is_refused():

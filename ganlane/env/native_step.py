@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from functools import lru_cache
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -14,6 +17,13 @@ from ganlane.parameters.episode import KERNELS
 from ganlane.sim.state import Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
+
+NATIVE_TAKEN = "env.kernel=auto: the native kernel"
+
+
+@lru_cache(maxsize=8)
+def _say_once(line: str) -> None:
+    print(line, file=sys.stderr)
 
 
 def make_kernel(
@@ -29,6 +39,8 @@ def make_kernel(
     reason = None if wanted == "torch" else _why_not(traffic, rules, device, dtype)
     if wanted == "native" and reason:
         raise UserError(f"env.kernel=native {reason}; set env.kernel=torch.")
+    if wanted == "auto":
+        _say_once(f"env.kernel=auto: the tensor code, since the native kernel {reason}" if reason else NATIVE_TAKEN)
     if wanted == "torch" or reason:
         return None
     assert isinstance(traffic, IdmTraffic)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -41,3 +42,8 @@ def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
 @lru_cache(maxsize=1)
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="ganlane-native")
+
+
+if hasattr(os, "register_at_fork"):
+    # A forked child has the pool's object but none of its threads.
+    os.register_at_fork(after_in_child=_pool.cache_clear)

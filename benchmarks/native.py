@@ -9,6 +9,7 @@ median over the repeats. ``--kernel-only`` leaves the tensor code out, ``--varia
 
 ``--environment``: everything, through TorchRL: observation (``lane_view``), reward and automatic resets, in episodes
 of 1 km (about 45 decisions), so that about every 45th row is reset in each decision.
+``--goal-m 5000`` makes them the paper's.
 """
 
 from __future__ import annotations
@@ -73,12 +74,12 @@ def contenders(env: HighwayEnv, td: TensorDictBase, variants: list[str], tensor:
     return made
 
 
-def whole_environments(rows: int, vehicles: int, lanes: int, tensor: bool) -> dict[str, Callable]:
+def whole_environments(rows: int, vehicles: int, lanes: int, tensor: bool, goal_m: float) -> dict[str, Callable]:
     """Name to a decision through TorchRL, automatic resets included, of rows in all parts of their episodes."""
     made: dict[str, Callable] = {}
     room = SpawnParameters().min_spacing_m * (vehicles / lanes + 2)
     for kernel in ("native", "torch") if tensor else ("native",):
-        config = EnvConfig(vehicles=vehicles, lanes=lanes, spread_m=max(200.0, room), goal_m=1000.0, kernel=kernel)
+        config = EnvConfig(vehicles=vehicles, lanes=lanes, spread_m=max(200.0, room), goal_m=goal_m, kernel=kernel)
         env = make_env(IdmMobilTraffic(Road(lanes)), config, ObservationConfig(form="lane_view"), num_envs=rows)
         state = {"td": env.reset()}
 
@@ -86,7 +87,7 @@ def whole_environments(rows: int, vehicles: int, lanes: int, tensor: bool) -> di
             state["td"][keys.ACTION] = torch.zeros(rows, dtype=torch.int64)
             state["td"] = env.step_and_maybe_reset(state["td"])[1]
 
-        for _ in range(100 if kernel == "native" else 60):
+        for _ in range(round(goal_m / 20.0) + 10):  # until the rows are in all parts of their episodes
             decide()
         made[kernel] = decide
     return made
@@ -101,6 +102,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--environment", action="store_true")
+    parser.add_argument("--goal-m", type=float, default=1000.0)
     parser.add_argument("--kernel-only", action="store_true")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=[best_variant()])
     wanted = parser.parse_args()
@@ -110,7 +112,9 @@ def main() -> None:
         for vehicles in wanted.vehicles:
             for rows in wanted.batches:
                 if wanted.environment:
-                    decisions = whole_environments(rows, vehicles, wanted.lanes, not wanted.kernel_only)
+                    decisions = whole_environments(
+                        rows, vehicles, wanted.lanes, not wanted.kernel_only, wanted.goal_m
+                    )
                 else:
                     env, td = scene(rows, vehicles, wanted.lanes)
                     decisions = contenders(env, td, wanted.variants, not wanted.kernel_only)

@@ -116,13 +116,16 @@ def make_env(
         scenes=env.scenes(traffic.visibility),
         recycle=env.recycle,
         recycle_share=env.recycle_share,
+        kernel=env.kernel,
     )
+    kernel = base.kernel
     transforms: list[ObservationTransform | ActionMaskTransform] = [
-        ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
+        ObservationTransform(base.road, env.vehicles, observation.form, observation.scale(), kernel is not None)
     ]
     if mask is not None and mask.form != "none":
         abort = env.ego.abort_lane_change
-        transforms.append(ActionMaskTransform(base.road, mask.form, mask.safe_deceleration, env.idm, abort))
+        braking, of = mask.safe_deceleration, None if kernel is None else kernel.vehicles
+        transforms.append(ActionMaskTransform(base.road, mask.form, braking, env.idm, abort, of))
     if env.compile:
         base.compile()
         for each in transforms:

@@ -16,6 +16,7 @@ ORDER = [
     {"parameters"},
     {"data", "sim"},
     {"generator"},
+    {"native"},
     {"traffic"},
     {"env"},
     {"transforms"},

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from ganlane.errors import UserError
-from ganlane.parameters.checks import above, between, check
+from ganlane.parameters.checks import above, between, check, one_of
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
-from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
+from ganlane.parameters.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.parameters.records import assign, part_of
 from ganlane.parameters.reward import RewardParameters
 
@@ -29,6 +29,8 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         recycle: whether vehicles that the ego leaves behind return ahead of it, and the reverse.
         recycle_share: share of the episodes in which they do, 0 to 1.
         compile: whether physics and traffic run as compiled graphs.
+        kernel: drives a decision: the tensor code (``torch``), the native kernel (``native``), which does the same
+            up to rounding for ``traffic=idm`` and ``idm_mobil`` on a CPU, or the kernel where it can (``auto``).
         ego, idm, mobil: how the ego drives, how all follow, and how the others change lanes.
     """
 
@@ -38,13 +40,14 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     recycle: bool = False
     recycle_share: float = 1.0
     compile: bool = False
+    kernel: str = "torch"
     ego: EgoParameters = field(default_factory=EgoParameters)
     idm: IdmParameters = field(default_factory=IdmParameters)
     mobil: MobilParameters = field(default_factory=MobilParameters)
 
     def __post_init__(self) -> None:
         check(self, vehicles=between(2, 1000), lanes=between(1, 20), lane_width_m=above(0))
-        check(self, recycle_share=between(0, 1))
+        check(self, recycle_share=between(0, 1), kernel=one_of(KERNELS))
         SpawnParameters.__post_init__(self)
         EpisodeParameters.__post_init__(self)
         self._check_together()

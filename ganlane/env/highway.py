@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.env.decision import Recorder, known_false, run_decision
+from ganlane.env.native_step import ego_memory, events_of, make_kernel, native_decision, traffic_memory
 from ganlane.env.physics import Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
@@ -25,6 +26,9 @@ from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.base import TrafficModule
+
+#: An automatic reset draws the scenes of the ended rows alone where they are at most one in so many.
+FEW_ROWS = 4
 
 
 class HighwayEnv(EnvBase):
@@ -47,6 +51,8 @@ class HighwayEnv(EnvBase):
             (:mod:`ganlane.sim.recycle`), so that the road never empties.
         recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their numbers: a mixture
             of roads that empty and roads that do not.
+        kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel (:mod:`ganlane.native`),
+            which does the same up to rounding, for rule-driven traffic on a CPU; ``auto``, the kernel where it can.
 
     An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with ``seed`` and
     ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With a mask the masked rows continue
@@ -55,7 +61,8 @@ class HighwayEnv(EnvBase):
 
     Raises:
         UserError: the vehicles do not fit on the road or could not brake in time, the decision period is not a
-            multiple of 0.1 s, the traffic belongs to another stream, or ``recycle_share`` is no share.
+            multiple of 0.1 s, the traffic belongs to another stream, ``recycle_share`` is no share, or the native
+            kernel cannot do what is asked.
     """
 
     batch_locked = True
@@ -78,6 +85,7 @@ class HighwayEnv(EnvBase):
         scenes: Scenes | None = None,
         recycle: bool = False,
         recycle_share: float = 1.0,
+        kernel: str = "torch",
     ) -> None:
         super().__init__(device=device or torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.traffic = traffic.to(self.device)
@@ -96,6 +104,8 @@ class HighwayEnv(EnvBase):
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
         self._check_parts(vehicles, stream)
+        #: The native kernel; None: the tensor code drives.
+        self.kernel = make_kernel(kernel, traffic, self.rules, self.vehicles, self.device, dtype)
         self._make_specs()
 
     def _check_parts(self, vehicles: int | None, stream: int | None) -> None:
@@ -181,19 +191,40 @@ class HighwayEnv(EnvBase):
     ) -> TensorDictBase:
         """All rows at the start of their episodes; EnvBase keeps the rows that are not to be reset."""
         seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
+        rows = self._rows_to_draw(tensordict)
+        if rows is None:
+            return self._start(seed, episode)
+        # The other rows keep what they have: here they repeat one of those drawn, which is quicker than their own.
+        place = torch.zeros_like(seed)
+        place[rows] = torch.arange(len(rows))
+        started = self._start(seed[rows], episode[rows])[place]
+        return started.set(keys.SEED, seed).set(keys.EPISODE, episode)
+
+    def _rows_to_draw(self, tensordict: TensorDictBase | None) -> Tensor | None:
+        """The rows to be reset, where to draw them alone saves time; None: draw all."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
+            return None
+        rows = mask.reshape(-1).nonzero()[:, 0]
+        return rows if 0 < len(rows) <= self.batch_size[0] // FEW_ROWS else None
+
+    def _start(self, seed: Tensor, episode: Tensor) -> TensorDictBase:
+        """The first states of episodes [K]."""
         key = episode_key(self.stream, seed, episode)
         vehicles, memory = self.traffic.enter(self.scenes(key, self.dtype).with_finite_padding(), key, episode)
-        zero = torch.zeros(self.batch_size, dtype=self.dtype, device=self.device)
+        zero = torch.zeros(seed.shape, dtype=self.dtype, device=self.device)
         rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
         rest |= {name: zero[:, None].bool() for name in DONE_FLAGS}
         if self.traffic.own_roads:
             road = self.traffic.road_of(key, self.dtype)
-            rest[keys.ROAD] = TensorDict({"lanes": road.lanes, "lane_width_m": road.lane_width_m}, self.batch_size)
+            rest[keys.ROAD] = TensorDict({"lanes": road.lanes, "lane_width_m": road.lane_width_m}, seed.shape)
         return pack(vehicles, fresh_ego(zero), memory, no_events(zero), rest)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One decision."""
         self.last_episodes = (tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        if self.kernel is not None:
+            return self._native_step(tensordict)
         key = episode_key(self.stream, *self.last_episodes)
         rules = self._rules_of(tensordict, key)
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(tensordict.get(keys.EGO).items())
@@ -213,6 +244,21 @@ class HighwayEnv(EnvBase):
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
         return pack(self._recycled(rules, end, key), ego, memory, events, rest)
 
+    def _native_step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """One decision by the kernel."""
+        assert self.kernel is not None
+        if self.recorder is not None:
+            raise UserError("env.kernel=native shows no physics steps to a recorder; set env.kernel=torch.")
+        seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
+        recycles = None
+        if self.recycle:
+            recycles = self._recycling_rows(episode_key(self.stream, seed, episode))
+        out, vehicles = native_decision(self.kernel, tensordict, recycles)
+        events, flags = events_of(out)
+        reward = torch.zeros_like(out.distance)[:, None]
+        rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: out.step, keys.REWARD: reward, **flags}
+        return pack(vehicles, ego_memory(out), traffic_memory(out), events, rest)
+
     def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
         """The rules of every row: replayed scenes have their own roads and ends."""
         if not self.traffic.own_roads:
@@ -223,8 +269,12 @@ class HighwayEnv(EnvBase):
         """The vehicles after a decision; in running rows with recycling those left behind are moved."""
         if not self.recycle or known_false(out_of_range(end.vehicles, rules.road).any()):
             return end.vehicles
-        recycled = end.running
-        if self.recycle_share < 1.0:
-            chosen = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)[..., 0].reshape(recycled.shape)
-            recycled = recycled & (chosen < self.recycle_share)
+        recycled = end.running & self._recycling_rows(key)
         return self.physics.recycle(end.vehicles, rules.road, rules.idm).where(recycled, end.vehicles)
+
+    def _recycling_rows(self, key: Tensor) -> Tensor:
+        """The rows [N] bool whose episodes, with ``key`` [N], recycle."""
+        if self.recycle_share >= 1.0:
+            return torch.ones_like(key, dtype=torch.bool)
+        chosen = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)[..., 0].reshape(key.shape)
+        return chosen < self.recycle_share

@@ -9,6 +9,9 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.checks import above, between, check, positive_range, speed_range
 from ganlane.parameters.records import lists_to_tuples
 
+#: What drives a decision: the tensor code, the native kernel, or the latter where it can.
+KERNELS = ("torch", "native", "auto")
+
 
 @dataclass(frozen=True)
 class EpisodeParameters:

@@ -23,6 +23,7 @@ from torchrl.data.tensor_specs import Binary
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
+from ganlane.native import SafeActions
 from ganlane.parameters.driving import IdmParameters
 from ganlane.parameters.observation import MASKS
 from ganlane.runtime import compiled
@@ -78,6 +79,7 @@ class ActionMaskTransform(PerceptionTransform):
         safe_deceleration: m/s2, above 0; MOBIL's ``b_safe`` (Table IV: 4).
         idm: by which braking is judged (Table V).
         abort: whether the ego may turn back during a lane change (``env.ego.abort_lane_change``).
+        native_vehicles: M, where the native kernel computes ``safe`` (float32, CPU); None: the tensor code does.
 
     Raises:
         UserError: an unknown form, or a deceleration that is not above 0.
@@ -90,6 +92,7 @@ class ActionMaskTransform(PerceptionTransform):
         safe_deceleration: float = 4.0,
         idm: IdmParameters = TABLE_V,
         abort: bool = False,
+        native_vehicles: int | None = None,
     ) -> None:
         if form not in MASKS[1:]:
             raise UserError(f"mask.form={form!r}: expected one of {', '.join(MASKS[1:])}; choose one of them.")
@@ -99,6 +102,9 @@ class ActionMaskTransform(PerceptionTransform):
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
         self.road, self.form, self.idm, self.abort = road, form, idm, abort
         self.safe_deceleration = safe_deceleration
+        self.native: SafeActions | None = None
+        if native_vehicles is not None and form == "safe":
+            self.native = SafeActions(road, native_vehicles, idm, safe_deceleration, abort)
 
     def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
@@ -123,7 +129,11 @@ class ActionMaskTransform(PerceptionTransform):
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write ``action_mask``, and with ``safe`` ``no_safe_action``."""
-        mask, none = self.allowed(seen, state.get(keys.EGO).get("change_direction"), road_in(state, self.road))
+        direction = state.get(keys.EGO).get("change_direction")
+        if self.native is not None:
+            mask, none = self.native.allowed(seen, direction)
+        else:
+            mask, none = self.allowed(seen, direction, road_in(state, self.road))
         state.set(keys.ACTION_MASK, mask)
         return state.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form == "safe" else state
 

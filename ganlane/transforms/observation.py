@@ -21,6 +21,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ganlane import keys
 from ganlane.errors import UserError
+from ganlane.native import LaneView
 from ganlane.parameters.observation import ObservationScale
 from ganlane.runtime import compiled
 from ganlane.sim.state import Road, Vehicles, road_in
@@ -211,6 +212,9 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
     "lane_view_overlap": (OWN, OVERLAP_VIEW, CHANGE),
 }
 
+#: The forms that the native kernel computes: drift, overlap.
+NATIVE: Final = {"lane_view": (False, False), "lane_view_drift": (True, False), "lane_view_overlap": (True, True)}
+
 
 def observation_size(name: str, vehicles: int) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
@@ -234,13 +238,19 @@ class ObservationTransform(PerceptionTransform):
         vehicles: M, the ego included.
         form: a key of :data:`OBSERVATIONS`.
         scale: normalisers.
+        native: the native kernel computes the forms in :data:`NATIVE`, for float32 on a CPU.
 
     Raises:
         UserError: an unknown form, or fewer than two vehicles.
     """
 
     def __init__(
-        self, road: Road, vehicles: int = 9, form: str = "table3_progress", scale: ObservationScale | None = None
+        self,
+        road: Road,
+        vehicles: int = 9,
+        form: str = "table3_progress",
+        scale: ObservationScale | None = None,
+        native: bool = False,
     ) -> None:
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=[keys.OBSERVATION])
         if form not in OBSERVATIONS:
@@ -249,6 +259,9 @@ class ObservationTransform(PerceptionTransform):
             raise UserError(f"vehicles={vehicles}: an observation is of at least one other vehicle; give 2 or more.")
         self.road, self.vehicles, self.form = road, vehicles, form
         self.scale = scale or ObservationScale()
+        self.native: LaneView | None = None
+        if native and form in NATIVE:
+            self.native = LaneView(road, vehicles, self.scale, NEARNESS_M, OVERLAP_M, *NATIVE[form])
 
     def observe(
         self, vehicles: Vehicles, progress: Tensor, direction: Tensor, road: Road, seen: Vehicles | None = None
@@ -266,7 +279,10 @@ class ObservationTransform(PerceptionTransform):
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
         """Write ``observation``."""
         ego, road = state.get(keys.EGO), road_in(state, self.road)
-        observation = self.observe(vehicles, ego.get("change_progress"), ego.get("change_direction"), road, seen)
+        progress, direction = ego.get("change_progress"), ego.get("change_direction")
+        if self.native is not None:
+            return state.set(keys.OBSERVATION, self.native.observe(vehicles, progress, direction, seen))
+        observation = self.observe(vehicles, progress, direction, road, seen)
         return state.set(keys.OBSERVATION, observation)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

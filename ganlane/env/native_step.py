@@ -1,0 +1,105 @@
+"""A decision of :class:`~ganlane.env.HighwayEnv` by the native kernel, where that can drive its traffic."""
+
+from __future__ import annotations
+
+import sys
+from functools import lru_cache
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from ganlane import keys
+from ganlane.env.physics import Rules
+from ganlane.errors import UserError
+from ganlane.native import EgoState, Kernel, Outcome, why_not
+from ganlane.parameters.episode import KERNELS
+from ganlane.sim.state import Vehicles
+from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
+
+NATIVE_TAKEN = "env.kernel=auto: the native kernel"
+
+
+@lru_cache(maxsize=8)
+def _say_once(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def make_kernel(
+    wanted: str, traffic: TrafficModule, rules: Rules, vehicles: int, device: torch.device, dtype: torch.dtype
+) -> Kernel | None:
+    """The kernel for ``wanted`` (``torch``, ``native`` or ``auto``); None: the tensor code drives.
+
+    Raises:
+        UserError: an unknown name, or ``native`` where the kernel cannot do what is asked or cannot be built.
+    """
+    if wanted not in KERNELS:
+        raise UserError(f"env.kernel={wanted}: expected one of {', '.join(KERNELS)}; choose one of them.")
+    reason = None if wanted == "torch" else _why_not(traffic, rules, device, dtype)
+    if wanted == "native" and reason:
+        raise UserError(f"env.kernel=native {reason}; set env.kernel=torch.")
+    if wanted == "auto":
+        _say_once(f"env.kernel=auto: the tensor code, since the native kernel {reason}" if reason else NATIVE_TAKEN)
+    if wanted == "torch" or reason:
+        return None
+    assert isinstance(traffic, IdmTraffic)
+    mobil = traffic.mobil if isinstance(traffic, IdmMobilTraffic) else None
+    return Kernel(rules.road, vehicles, rules.episode, rules.ego, rules.idm, rules.steering, mobil)
+
+
+def _why_not(traffic: TrafficModule, rules: Rules, device: torch.device, dtype: torch.dtype) -> str | None:
+    """What the kernel cannot do of this, as the end of a sentence; None: it can do all."""
+    if type(traffic) not in (IdmTraffic, IdmMobilTraffic):
+        return f"drives the traffics idm and idm_mobil alone, not {type(traffic).__name__}"
+    assert isinstance(traffic, IdmTraffic)
+    if device.type != "cpu" or dtype != torch.float32:
+        return f"runs on a CPU in float32, not on {device} in {dtype}"
+    if rules.road.ring_m is not None:
+        return "has no ring"
+    if (traffic.idm, traffic.steering) != (rules.idm, rules.steering):
+        return "has one set of parameters of car following and steering for the ego and the others"
+    return why_not()
+
+
+def native_decision(kernel: Kernel, state: TensorDictBase, recycles: Tensor | None) -> tuple[Outcome, Vehicles]:
+    """The decision ``action`` from ``state``, and the vehicles after it; ``recycles`` [N] bool or None."""
+    vehicles, ego = Vehicles.of(state.get(keys.VEHICLES)), state.get(keys.EGO)
+    out = kernel.decide(
+        state.get(keys.ACTION),
+        vehicles,
+        state.get(keys.TRAFFIC).get("steering"),
+        EgoState(*(ego.get(name) for name in EgoState._fields)),
+        state.get(keys.STEP),
+        recycles,
+    )
+    return out, out.moved(vehicles)
+
+
+def ego_memory(out: Outcome) -> dict[str, Tensor]:
+    """The ego's fields after the decision (:mod:`ganlane.env.state`)."""
+    return {
+        "steering": out.ego_steering,
+        "mean_acceleration": out.mean_acceleration,
+        "change_progress": out.change_progress,
+        "distance": out.distance,
+        "change_direction": out.change_direction,
+        "decisions": out.decisions,
+        "lane_changes": out.lane_changes,
+        "soft_crash": out.ego_soft_crash,
+        "soft_crash_behind": out.ego_soft_crash_behind,
+        "started_change": out.started_change,
+    }
+
+
+def traffic_memory(out: Outcome) -> TensorDictBase:
+    """The traffic's memory after the decision: the wheels, the ego's too."""
+    return TensorDict._new_unsafe({"steering": out.steering}, batch_size=out.step.shape)
+
+
+def events_of(out: Outcome) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Events and done flags of the decision, each [N, 1]; recorded scenes, which end, the kernel does not drive."""
+    events = {name: getattr(out, name) for name in ("goal", "hard_crash", "out_of_road", "timeout")}
+    events["scene_end"] = torch.zeros_like(out.timeout)
+    events |= {keys.SOFT_CRASH: out.soft_crash, keys.SOFT_CRASH_BEHIND: out.soft_crash_behind}
+    return events, {"terminated": out.terminated, "truncated": out.truncated, "done": out.done}

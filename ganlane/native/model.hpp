@@ -1,0 +1,77 @@
+// The parameters, constants and equations of the model; SI units. ganlane.sim says where each comes from.
+
+#pragma once
+
+#include "vectors.hpp"
+
+struct Settings {
+    // IDM, Table V
+    float min_gap, headway, per_brake_scale, min_acceleration, max_acceleration;
+    // MOBIL, Table IV
+    float threshold, politeness_rear, politeness_side, safe_deceleration, exclusive;
+    // two-point steering
+    float per_near_s, per_far_s, gain_far, gain_near, gain_integral, slow, max_angle;
+    // ego and episode
+    float soft_crash_ttc, soft_crash_gap, goal;
+    // road
+    float lane_width, per_lane_width;
+    int32_t lanes, vehicles, substeps, timeout_steps, mobil, abort_lane_change;
+};
+
+// ---- Constants of the model (ganlane.sim)
+
+const float PHYSICS_STEP = 0.1f, WHEELBASE = 2.7f;
+const float NOBODY_M = 1e9f;  // stands for the position of nobody
+const float FREE_GAP = 10000.0f, SMALLEST_GAP = 0.1f;
+const float ENTRY = 0.1f, ARRIVED = 0.3f;
+enum { CENTRE, BODY, SIGNALLED };
+
+// ---- Equations
+
+// IDM: a (1 - (v/v0)^4 - (s*/s)^2) with s* = s0 + max(0, v T + v dv / (2 sqrt(a b))).
+INLINE Float interaction(const Settings& s, Float speed, Float gap, Float leader_speed) {
+    Float dynamic = speed * s.headway + speed * (speed - leader_speed) * s.per_brake_scale;
+    return (s.min_gap + larger(dynamic, filled(0.0f))) / larger(gap, filled(SMALLEST_GAP));
+}
+
+INLINE Float free_road(Float speed, Float per_desired) {
+    Float ratio = speed * per_desired, square = ratio * ratio;
+    return 1.0f - square * square;
+}
+
+INLINE Float limited(const Settings& s, Float free, Float interaction) {
+    return between(s.max_acceleration * (free - interaction * interaction), s.min_acceleration, s.max_acceleration);
+}
+
+INLINE Float idm(const Settings& s, Float speed, Float per_desired, Float gap, Float leader_speed) {
+    return limited(s, free_road(speed, per_desired), interaction(s, speed, gap, leader_speed));
+}
+
+INLINE Float slip_of(Float steering) {
+    Float sine, cosine;
+    sincos_of(steering, sine, cosine);
+    return arctangent(0.5f * (sine / cosine));
+}
+
+INLINE Float lane_of(const Settings& s, Float y) {
+    return between(rounded(y * s.per_lane_width), 0.0f, (float)(s.lanes - 1));
+}
+
+// The lanes that a body at `y` is in, that its driver attends to, and in which the others see it: the lowest and the
+// highest of each; and half of the lateral space that it takes.
+struct LanesOf {
+    Float extent, body_low, body_high, low, high, seen_low, seen_high;
+};
+
+INLINE LanesOf lanes_of(const Settings& s, Float y, Float sine, Float cosine, Float half_length, Float half_width,
+                        Float target, Float visibility, Mask valid) {
+    LanesOf l;
+    l.extent = half_width * cosine + half_length * absolute(sine);
+    Float reach = l.extent - ENTRY, centre = lane_of(s, y);
+    l.body_low = lane_of(s, y - reach), l.body_high = lane_of(s, y + reach);
+    l.low = smaller(l.body_low, target), l.high = larger(l.body_high, target);
+    Mask signalled = visibility == (float)SIGNALLED, by_body = visibility == (float)BODY;
+    l.seen_low = choose(valid, choose(signalled, l.low, choose(by_body, l.body_low, centre)), filled(1e9f));
+    l.seen_high = choose(valid, choose(signalled, l.high, choose(by_body, l.body_high, centre)), filled(-1e9f));
+    return l;
+}

@@ -1,0 +1,101 @@
+// A vector of LANES numbers, one of each of LANES environments, and the functions of it that the kernel needs.
+//
+// GCC's and Clang's vector extensions: + - * / and comparisons work number by number.
+
+#pragma once
+
+#include <stdint.h>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#endif
+
+#ifndef LANES
+#define LANES 4
+#endif
+
+typedef float Float __attribute__((vector_size(4 * LANES)));
+typedef int32_t Mask __attribute__((vector_size(4 * LANES)));  // -1 true, 0 false
+
+#define INLINE static inline __attribute__((always_inline))
+
+INLINE Float filled(float number) { return number - Float{}; }
+INLINE Mask none() { return Mask{}; }
+INLINE Float choose(Mask mask, Float yes, Float no) { return mask ? yes : no; }
+INLINE Float smaller(Float a, Float b) { return a < b ? a : b; }
+INLINE Float larger(Float a, Float b) { return a > b ? a : b; }
+INLINE Float between(Float a, float low, float high) { return smaller(larger(a, filled(low)), filled(high)); }
+INLINE Float absolute(Float a) { return (Float)((Mask)a & 0x7fffffff); }
+// To the nearest integer, half to even, below 2^22: the sum has no bits left for a fraction.
+INLINE Float rounded(Float a) { return (a + 12582912.0f) - 12582912.0f; }
+
+INLINE bool any(Mask mask) {
+#if defined(__AVX512F__) && LANES == 16
+    return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask) != 0;
+#elif defined(__AVX__) && LANES == 8
+    return _mm256_movemask_ps((__m256)mask) != 0;
+#elif defined(__SSE2__) && LANES == 4
+    return _mm_movemask_ps((__m128)mask) != 0;
+#else
+    int32_t found = 0;
+    for (int lane = 0; lane < LANES; lane++) found |= mask[lane];
+    return found != 0;
+#endif
+}
+
+// Sine and cosine: the angle less the nearest multiple of pi/2 (in three parts), then Cephes' polynomials.
+// Below pi/4, where nearly all angles are, nothing is subtracted and nothing exchanged: that is left out.
+INLINE Float sine_series(Float r) {
+    Float z = r * r;
+    return ((z * -1.9515295891e-4f + 8.3321608736e-3f) * z - 1.6666654611e-1f) * z * r + r;
+}
+
+INLINE Float cosine_series(Float r) {
+    Float z = r * r;
+    return ((z * 2.443315711809948e-5f - 1.388731625493765e-3f) * z + 4.166664568298827e-2f) * z * z - 0.5f * z + 1.0f;
+}
+
+static __attribute__((noinline)) void sincos_of_large(Float angle, Float& sine, Float& cosine) {
+    Float quarter = rounded(angle * 0.636619772367581f);
+    Float r = ((angle - quarter * 1.5703125f) - quarter * 4.837512969970703125e-4f) - quarter * 7.54978995489188e-8f;
+    Float s = sine_series(r), c = cosine_series(r);
+    Mask k = __builtin_convertvector(quarter, Mask);
+    Mask odd = (k & 1) != 0;
+    sine = (Float)((Mask)choose(odd, c, s) ^ ((k & 2) << 30));
+    cosine = (Float)((Mask)choose(odd, s, c) ^ (((k + 1) & 2) << 30));
+}
+
+INLINE Mask is_large(Float angle) { return rounded(angle * 0.636619772367581f) != 0.0f; }
+
+INLINE void sincos_of(Float angle, Float& sine, Float& cosine) {
+    if (any(is_large(angle))) return sincos_of_large(angle, sine, cosine);
+    sine = sine_series(angle), cosine = cosine_series(angle);
+}
+
+INLINE Float sine_of(Float angle) {
+    if (!any(is_large(angle))) return sine_series(angle);
+    Float sine, cosine;
+    sincos_of_large(angle, sine, cosine);
+    return sine;
+}
+
+// Arctangent: Cephes' polynomial below tan(pi/8), by atan x = pi/4 + atan((x-1)/(x+1)) and pi/2 - atan(1/x) above.
+INLINE Float arctangent_series(Float r) {
+    Float z = r * r;
+    return (((z * 8.05374449538e-2f - 1.38776856032e-1f) * z + 1.99777106478e-1f) * z - 3.33329491539e-1f) * z * r + r;
+}
+
+static __attribute__((noinline)) Float arctangent_of_large(Float number) {
+    Float a = absolute(number);
+    Mask large = a > 2.414213562373095f, middle = (a > 0.4142135623730950f) & ~large;
+    Float top = choose(large, filled(-1.0f), choose(middle, a - 1.0f, a));
+    Float bottom = choose(large, a, choose(middle, a + 1.0f, filled(1.0f)));
+    Float start = choose(large, filled(1.5707963267948966f), choose(middle, filled(0.7853981633974483f), filled(0.0f)));
+    Float angle = start + arctangent_series(top / bottom);
+    return (Float)((Mask)angle ^ ((Mask)number & (Mask)filled(-0.0f)));
+}
+
+INLINE Float arctangent(Float number) {
+    if (any(absolute(number) > 0.4142135623730950f)) return arctangent_of_large(number);
+    return arctangent_series(number);
+}

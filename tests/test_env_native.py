@@ -1,0 +1,179 @@
+"""``env.kernel=native``: the same environment, driven by the native kernel."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from reference.worlds import environment, leaves
+from torchrl.envs.utils import check_env_specs
+
+from ganlane import keys
+from ganlane.build import make_env
+from ganlane.config.env import EnvConfig
+from ganlane.config.observation import ObservationConfig
+from ganlane.env import native_step
+from ganlane.errors import UserError
+from ganlane.native import why_not
+from ganlane.parameters.driving import EgoParameters, IdmParameters
+from ganlane.parameters.observation import MaskParameters, SensorParameters
+from ganlane.sim.state import Road
+from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.idm_mobil import IdmMobilTraffic
+from ganlane.transforms import ActionMaskTransform, ObservationTransform
+from ganlane.transforms.observation import NATIVE
+
+pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
+
+
+def native(num_envs: int = 8, **others):
+    return environment(num_envs=num_envs, dtype=torch.float32, **{"kernel": "native", **others})
+
+
+def test_it_meets_the_specs():
+    check_env_specs(native(3))
+
+
+def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():
+    ours, theirs = native(), native(kernel="torch")
+    for name in ("observation_spec", "action_spec", "reward_spec", "done_spec", "state_spec"):
+        assert getattr(ours, name) == getattr(theirs, name)
+    assert (ours.reset() == theirs.reset()).all()
+    after = [set(env.rand_step(env.reset())["next"].keys(True, True)) for env in (ours, theirs)]
+    assert after[0] == after[1]
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("mobil", [True, False])
+def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share):
+    """From every state of the tensor code's run the kernel reaches the same, up to rounding."""
+    settings = dict(num_envs=16, mobil=mobil, goal_m=140.0, timeout_s=9.5, seed=3, recycle=True, recycle_share=share)
+    ours, theirs = native(**settings), native(**settings, kernel="torch")
+    td, ended = theirs.reset(), 0
+    for decision in range(30):
+        td["action"] = (td[keys.EPISODE] * 7 + decision * 5) % 11 % 3 * (decision % 3 == 0)
+        stepped, following = theirs.step_and_maybe_reset(td.clone())
+        same, also_following = ours.step_and_maybe_reset(td.clone())
+        for name, value in leaves(stepped["next"]):
+            assert torch.allclose(value.double(), same["next", name].double(), atol=1e-3), name
+        assert torch.equal(following[keys.EPISODE], also_following[keys.EPISODE])
+        ended += int(stepped["next", "done"].sum())
+        td = following
+    assert ended > 16
+
+
+def test_a_rollout_is_the_same_bit_for_bit_in_another_batch():
+    whole, part = native(24, seed=5), native(5, seed=5)
+    actions = torch.arange(12)[:, None] * 0 + torch.tensor([0, 1, 0, 0, 2] * 5)[:24]
+    states = []
+    for env in (whole, part):
+        td = env.reset()
+        for row in actions:
+            td["action"] = row[: env.batch_size[0]].clone()
+            td = env.step(td)["next"].exclude("reward")
+        states.append(td[:5])
+    assert (states[0] == states[1]).all()
+
+
+def test_what_goes_into_a_step_stays_as_it_is():
+    env = native()
+    td = env.reset()
+    td["action"] = torch.ones(8, dtype=torch.int64)
+    before = td.clone()
+    env.step_and_maybe_reset(td.clone(recurse=False))
+    assert (td == before).all()
+
+
+class Cruise(TrafficModule):
+    def move(self, vehicles, memory, key, step):
+        return vehicles.with_(x=vehicles.x + vehicles.speed * self.dt), memory
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"traffic": Cruise(Road())}, "drives the traffics idm and idm_mobil alone, not Cruise"),
+        ({"dtype": torch.float64}, "in float32"),
+        ({"ring_m": 500.0}, "has no ring"),
+        ({"traffic": IdmMobilTraffic(Road(), idm=IdmParameters(headway_s=1.0))}, "one set of parameters"),
+        ({"kernel": "fast"}, "expected one of torch, native, auto"),
+    ],
+)
+def test_what_the_kernel_cannot_do_it_refuses_in_one_sentence(settings, sentence):
+    with pytest.raises(UserError, match=sentence):
+        environment(**{"dtype": torch.float32, "kernel": "native", **settings})
+
+
+def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_so_once(capsys):
+    native_step._say_once.cache_clear()
+    assert environment(kernel="auto").kernel is None
+    assert environment(kernel="auto", dtype=torch.float32).kernel is not None
+    assert environment(kernel="auto", dtype=torch.float32).kernel is not None
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("env.kernel=auto: the tensor code, since the native kernel runs on a CPU in float32")
+    assert said[1:] == ["env.kernel=auto: the native kernel"]
+
+
+def test_a_recorder_of_physics_steps_is_refused():
+    env = native()
+    env.recorder = lambda vehicles, running: None
+    with pytest.raises(UserError, match=r"env\.kernel=native shows no physics steps"):
+        env.rand_step(env.reset())
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
+def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
+    env = make_env(
+        IdmMobilTraffic(Road()), EnvConfig(kernel="native"), ObservationConfig(form="lane_view"), num_envs=4
+    )
+    td = env.rand_action(env.reset())
+    assert (copied(env).step(td.clone())["next"] == env.step(td)["next"]).all()
+
+
+@pytest.mark.parametrize("form", sorted(NATIVE))
+@pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+def test_the_lane_view_is_that_of_the_tensor_code(form, sensors):
+    """Up to the rounding of the exponential function; with lorries, and with what the sensors deliver."""
+    config = EnvConfig(kernel="native", vehicles=20, spread_m=300.0, min_spacing_m=25.0, truck_share=0.3)
+    env = make_env(IdmMobilTraffic(Road()), config, ObservationConfig(form=form, sensors=sensors), num_envs=64)
+    plain = ObservationTransform(Road(), 20, form)
+    td = env.reset()
+    for decision in range(40):
+        assert torch.allclose(td["observation"], plain(td.clone())["observation"], atol=1e-6)
+        td["action"] = (torch.arange(64) + decision) % 20 % 3 * (torch.arange(64) % 3 == decision % 3)
+        td = env.step_and_maybe_reset(td)[1]
+
+
+def test_rows_that_are_reset_alone_start_as_all_do():
+    some, whole = native(64, kernel="torch", seed=4), native(128, kernel="torch", seed=4)
+    td = some.reset()
+    mask = torch.zeros(64, dtype=torch.bool)
+    mask[[3, 17, 40]] = True
+    after = some.reset(td.clone().set("_reset", mask))
+    expected = whole.reset()
+    assert (after[mask] == expected[[67, 81, 104]]).all()
+    assert (after[~mask] == td[~mask]).all()
+
+
+@pytest.mark.parametrize("abort", [False, True])
+@pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+def test_the_safe_actions_are_those_of_the_tensor_code(abort, sensors):
+    config = EnvConfig(kernel="native", vehicles=20, spread_m=150.0, ego=EgoParameters(abort_lane_change=abort))
+    form = ObservationConfig(form="lane_view", sensors=sensors)
+    env = make_env(IdmMobilTraffic(Road()), config, form, num_envs=128, mask=MaskParameters(form="safe"))
+    plain = ActionMaskTransform(Road(), "safe", abort=abort)
+    td, refused, hopeless = env.reset(), 0, 0
+    for decision in range(40):
+        expected = plain(td.clone())
+        assert torch.equal(td[keys.ACTION_MASK], expected[keys.ACTION_MASK])
+        assert torch.equal(td[keys.NO_SAFE_ACTION], expected[keys.NO_SAFE_ACTION])
+        refused, hopeless = (
+            refused + int((~td[keys.ACTION_MASK]).sum()),
+            hopeless + int(td[keys.NO_SAFE_ACTION].sum()),
+        )
+        td["action"] = (torch.arange(128) + decision) % 20 % 3 * (torch.arange(128) % 3 == decision % 3)
+        td = env.step_and_maybe_reset(td)[1]
+    assert refused > 1000
+    assert hopeless > 0

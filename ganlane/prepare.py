@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
-from ganlane.config.prepare import PrepareConfig
+from ganlane.config.recordings import PrepareConfig
 
 if TYPE_CHECKING:
     from ganlane.data import SceneSummary
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 def prepare(config: PrepareConfig, folder: Path) -> str:
     """Fetch where asked to, read, write, measure, report."""
-    from ganlane.config.data import NgsimDataConfig
     from ganlane.data import ByteProgress, default_scenes, download, long_report, prepare_recordings, short_report
     from ganlane.evaluation import write_results
     from ganlane.files import write_bytes
+    from ganlane.parameters.data import NgsimDataConfig
     from ganlane.view.figures import draw_recordings, save_figure
 
     begun = time.perf_counter()

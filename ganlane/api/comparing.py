@@ -14,8 +14,8 @@ from ganlane.api.folders import torch_threads
 from ganlane.api.options import Option, command_config, option
 from ganlane.build import Driver, make_driver
 from ganlane.compare import compare_as_told
-from ganlane.config.evaluate import EvaluateConfig, all_traffics
-from ganlane.config.traffic import TrafficConfig
+from ganlane.config.evaluate import EvaluateConfig
+from ganlane.config.traffic import TrafficConfig, all_traffics
 from ganlane.errors import UserError
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import plain

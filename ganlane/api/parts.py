@@ -10,7 +10,7 @@ from torchrl.envs import Transform, TransformedEnv
 from ganlane import build
 from ganlane.api.options import Option, option
 from ganlane.build import Driver
-from ganlane.config.env import check_pay
+from ganlane.config.env import check_reward
 from ganlane.config.run import RunConfig
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
@@ -63,7 +63,7 @@ def make_env(
         UserError: an unknown name or key, a value of the wrong type or out of range.
     """
     config, pay, seen = option("env", env, overrides), option("reward", reward), option("observation", observation)
-    check_pay(config, pay)
+    check_reward(config, pay)
     run = RunConfig(seed=whole("seed", seed), device=device)
     module = build.make_traffic(option("traffic", traffic), config, stream_of(stream))
     made = build.make_env(

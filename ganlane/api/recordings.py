@@ -8,8 +8,7 @@ from typing import Any
 
 from ganlane.api.folders import Run, results_of, run_in
 from ganlane.api.options import Option, command_config
-from ganlane.config.prepare import PrepareConfig
-from ganlane.config.train_generator import TrainGeneratorConfig
+from ganlane.config.recordings import PrepareConfig, TrainGeneratorConfig
 
 
 @dataclass(frozen=True)

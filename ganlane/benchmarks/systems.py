@@ -13,10 +13,10 @@ from ganlane import keys
 from ganlane.benchmarks.case import COMPILED, Runner
 from ganlane.build import make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.decision import Decision
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.vehicles import Vehicles

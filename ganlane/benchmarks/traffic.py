@@ -23,8 +23,8 @@ from ganlane.benchmarks.tables import Table
 from ganlane.benchmarks.traffic_findings import PADDED, SCENE_LOOP, SCENE_LOOP_ONCE, SYSTEM, ratios, speeds
 from ganlane.benchmarks.traffic_tables import traffic_tables
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.paths import PACKAGE
 

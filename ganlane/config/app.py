@@ -7,22 +7,27 @@ stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the 
 from __future__ import annotations
 
 import os
+import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from ganlane.config.compose import VERSION_BASE, check, typed
-from ganlane.config.disk import is_users_matter, numbered_refusals
+from ganlane.config.command_line import (
+    VERSION_BASE,
+    check,
+    parse_arguments,
+    quoted,
+    typed,
+    without_repetitions,
+)
 from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
 from ganlane.config.help import print_help
-from ganlane.config.messages import CONFIG_ERRORS, sentence
-from ganlane.config.overrides import parse_arguments, quoted, without_repetitions
+from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
 from ganlane.config.resume import with_resumed
-from ganlane.config.store import register
-from ganlane.config.streams import let_go_of_streams
+from ganlane.config.schemas import register
 from ganlane.errors import UserError
 from ganlane.memory import keep_freed_memory
 from ganlane.paths import conf_folder
@@ -162,3 +167,35 @@ def _sigterm_as_exception() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def let_go_of_streams() -> bool:
+    """Send nowhere what can no longer be written; whether a reader has left.
+
+    Python would try again when it ends, complain, and end with a status of its own.
+    """
+    left = [_has_no_reader(stream) for stream in (sys.stdout, sys.stderr)]
+    for stream, gone in zip((sys.stdout, sys.stderr), left):
+        if gone or not _takes_what_is_left(stream):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+    return any(left)
+
+
+def _has_no_reader(stream: TextIO) -> bool:
+    """Whether the stream is a pipe that nobody reads; there is no telling on Windows."""
+    try:
+        looked = select.poll()
+        looked.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # no such call, or no file behind the stream, as in a notebook
+        return False
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in looked.poll(0))
+
+
+def _takes_what_is_left(stream: TextIO) -> bool:
+    try:
+        stream.flush()
+    except OSError:
+        return False
+    return True

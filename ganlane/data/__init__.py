@@ -27,7 +27,7 @@ from ganlane.data.find import data_folder, default_scenes
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lane_changes import LaneChanges, find_lane_changes, lane_changes_of_arrays
 from ganlane.data.lane_widths import lane_grid, lane_width, scene_lane_counts, scene_lane_widths
-from ganlane.data.ngsim import NgsimParameters, ngsim_scenes
+from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.prepare import (
     PooledStatistics,
     Preparation,
@@ -55,6 +55,7 @@ from ganlane.data.statistics import (
 )
 from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.data.tracks import Tracks, tracks_of_arrays, tracks_of_frame
+from ganlane.parameters.data import NgsimParameters
 
 __all__ = [
     "FRAME_S",

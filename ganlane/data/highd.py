@@ -20,7 +20,6 @@ import polars as pl
 
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, number_tracks, sort, validate
 from ganlane.data.tables import (
-    BLOCK_BYTES,
     FIRST_LINE,
     LINE,
     convert,
@@ -31,6 +30,7 @@ from ganlane.data.tables import (
 )
 from ganlane.data.tracks import Flags, Floats, Integers
 from ganlane.errors import UserError
+from ganlane.parameters.data import BLOCK_BYTES
 
 _TRACKS: Final = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.

@@ -13,17 +13,15 @@ Read in this order:
 from ganlane.generator.checkpoint import FitResult, Preset, load_generator, shipped_generator
 from ganlane.generator.closed_loop import ANCHOR, AnchorParameters, DriverMemory, anchored_step, paper_step
 from ganlane.generator.cross_validation import ablate, cross_validate
-from ganlane.generator.fit import HELD_OUT, fit_generator, fit_key
-from ganlane.generator.fit_calibrated import CalibratedConfig
-from ganlane.generator.fit_paper import PaperConfig
+from ganlane.generator.fit import HELD_OUT, fit_generator, fit_key, preset_of
 from ganlane.generator.groups import Groups, group_windows
-from ganlane.generator.loop import LoopConfig, Progress
-from ganlane.generator.losses import LossWeights
-from ganlane.generator.networks import Discriminator, Generator, GeneratorSizes
+from ganlane.generator.loop import Progress
+from ganlane.generator.networks import Discriminator, Generator
 from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_quantiles
 from ganlane.generator.scores import rollout_errors, window_errors
 from ganlane.generator.splits import Split, assign_folds, split_for_fit, split_scenes
 from ganlane.generator.windows import SceneTracks, Windows, cut_windows, scene_tracks
+from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 
 __all__ = [
     "ANCHOR",
@@ -56,6 +54,7 @@ __all__ = [
     "headway_quantiles",
     "load_generator",
     "paper_step",
+    "preset_of",
     "rollout_errors",
     "scene_tracks",
     "shipped_generator",

@@ -13,9 +13,9 @@ from torch import Tensor
 from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.files import load_weights, save_weights
-from ganlane.generator.closed_loop import EXTRA_INPUTS
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.networks import Generator
 from ganlane.generator.scores import Metrics
+from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.paths import CHECKPOINTS
 
 KIND = "generator"

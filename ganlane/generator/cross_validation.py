@@ -19,10 +19,10 @@ from ganlane.data import scene_lane_widths
 from ganlane.files import atomic_path
 from ganlane.generator.checkpoint import FitResult
 from ganlane.generator.fit import Config, Task, fit_key, fit_result, fit_task, preset_of
-from ganlane.generator.fit_calibrated import CalibratedConfig, CalibratedTask
+from ganlane.generator.fit_calibrated import CalibratedTask
 from ganlane.generator.forecasts import baseline_forecasts, calibrated_forecasts, idm_forecasts, paper_forecasts
 from ganlane.generator.groups import save_arrays
-from ganlane.generator.loop import FitLoop, LoopConfig, OnProgress
+from ganlane.generator.loop import FitLoop, OnProgress
 from ganlane.generator.scores import (
     BASELINE,
     SAMPLES,
@@ -35,6 +35,7 @@ from ganlane.generator.scores import (
 from ganlane.generator.segments import segment_sources
 from ganlane.generator.splits import Split, assign_folds, split_for_fit
 from ganlane.generator.windows import OBSERVED_POSITIONS, Windows, cut_windows, join_windows, scene_tracks
+from ganlane.parameters.generator import CalibratedConfig, LoopConfig
 
 #: Frames between the starts of two scored windows, the same for both presets.
 STRIDE = 3

@@ -6,16 +6,15 @@ both are divided, step by step, by the error of constant velocity.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
 from torch import nn
 
-from ganlane.errors import UserError
-from ganlane.generator.closed_loop import ANCHOR, EXTRA_INPUTS, AnchorParameters
-from ganlane.generator.loop import LoopConfig, descend
+from ganlane.generator.closed_loop import ANCHOR, AnchorParameters
+from ganlane.generator.loop import descend
 from ganlane.generator.losses import distance, energy_score, masked_mean
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
     DriverParams,
     common_driver_params,
@@ -27,59 +26,17 @@ from ganlane.generator.rollout import (
 from ganlane.generator.scores import Metrics, mean_by_step, rollout_errors
 from ganlane.generator.segments import Segments, SegmentSource, cut_segments, segment_sources
 from ganlane.generator.windows import SceneTracks
+from ganlane.parameters.generator import CalibratedConfig
 
 
-@dataclass(frozen=True)
-class CalibratedConfig:
-    """Settings of the calibrated fit.
+def fit_anchor(config: CalibratedConfig) -> AnchorParameters:
+    """The anchor with a fit's washout and inputs."""
+    return replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
 
-    Attributes:
-        sizes: of the generator.
-        loop: the schedule.
-        horizons: steps rolled out; every update draws one of them.
-        shares: relative frequency of each horizon.
-        held_out_horizon: steps rolled out in evaluation.
-        batch: segments per update.
-        held_out_stride: frames between the starts of the segments in evaluation.
-        noise_period_s: time constant of each driver's latent vector.
-        mirror: swap left and right in half of the updates.
-        washout_s: time constant of the residual's mean, which is subtracted; infinite is without washout. The
-            simulation uses the value stored with the weights.
-        further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane offset.
-        traits: whether every driver has its own headway and desired speed.
-        seed: of weights, batches, traits and noise.
-    """
 
-    sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS))
-    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40))
-    horizons: tuple[int, ...] = (8, 16, 29)
-    shares: tuple[float, ...] = (3.0, 1.0, 1.0)
-    held_out_horizon: int = 29
-    batch: int = 6
-    held_out_stride: int = 3
-    noise_period_s: float = 5.0
-    mirror: bool = True
-    washout_s: float = ANCHOR.washout_s
-    further_inputs: bool = True
-    traits: bool = True
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if len(self.shares) != len(self.horizons) or sum(self.shares) <= 0:
-            raise UserError(
-                f"shares={list(self.shares)}: give one share of the updates for each of the horizons "
-                f"{list(self.horizons)}, not all 0."
-            )
-
-    @property
-    def anchor(self) -> AnchorParameters:
-        """The anchor with this fit's washout and inputs."""
-        return replace(ANCHOR, washout_s=self.washout_s, further_inputs=self.further_inputs)
-
-    @property
-    def evaluation_params(self) -> DriverParams:
-        """Headways and desired speeds for evaluation."""
-        return typical_driver_params if self.traits else common_driver_params
+def evaluation_params(config: CalibratedConfig) -> DriverParams:
+    """Headways and desired speeds for evaluation."""
+    return typical_driver_params if config.traits else common_driver_params
 
 
 class CalibratedTask:
@@ -125,12 +82,12 @@ class CalibratedTask:
             shape = (1 + segments.future.shape[1], 2, *headway.shape, config.sizes.noise)
             noise = torch.randn(shape, generator=self.random)
             one, other = sampled_rollouts(
-                self.generator, segments, headway, desired, noise, config.noise_period_s, config.anchor
+                self.generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config)
             )
             name, losses = "energy", energy_score(one, other, segments.future)
         else:
             zero = headway.new_zeros(*headway.shape, config.sizes.noise)
-            positions = rollout(self.generator, segments, headway, desired, zero, parameters=config.anchor)
+            positions = rollout(self.generator, segments, headway, desired, zero, parameters=fit_anchor(config))
             name, losses = "mean", distance(positions, segments.future)
         loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
         descend(self.optimisers["generator"], loss, self.generator, config.loop.largest_gradient)
@@ -150,8 +107,8 @@ class CalibratedTask:
             config.held_out_horizon,
             config.held_out_stride,
             config.noise_period_s,
-            parameters=config.anchor,
-            driver_params=config.evaluation_params,
+            parameters=fit_anchor(config),
+            driver_params=evaluation_params(config),
         )
 
     def _cuts_by_size(self, horizon: int) -> list[tuple[SegmentSource, int]]:

@@ -2,57 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import torch
 from torch import Tensor, nn
 
 from ganlane.generator.groups import Groups, group_windows
 from ganlane.generator.layers import DIFFERENCE_SCALE_M
-from ganlane.generator.loop import LoopConfig, descend
+from ganlane.generator.loop import descend
 from ganlane.generator.losses import (
-    LossWeights,
     adversarial_loss,
     discriminator_accuracy,
     discriminator_loss,
     distances,
     variety_loss,
 )
-from ganlane.generator.networks import Discriminator, Generator, GeneratorSizes, displacements_of
+from ganlane.generator.networks import Discriminator, Generator, displacements_of
 from ganlane.generator.scores import Metrics, window_errors
 from ganlane.generator.windows import SceneTracks, cut_windows
-
-
-@dataclass(frozen=True)
-class PaperConfig:
-    """Settings of the paper's fit.
-
-    Attributes:
-        sizes: of the generator.
-        weights: of the loss terms.
-        loop: the schedule.
-        group_size: approximate number of vehicles per k-means group.
-        stride: frames between the starts of two windows, in fitting.
-        held_out_stride: the same on validation and held-out scenes.
-        history_noise: in fitting, standard deviation of noise on the observed displacements, in units of a typical
-            difference (0.04 m along and 0.02 m across the road); 0 is no noise.
-        samples: samples per update; the best counts in the variety term.
-        batch: groups per update.
-        mirror: swap left and right in half of the groups.
-        seed: of weights, batches, noise and k-means.
-    """
-
-    sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
-    weights: LossWeights = field(default_factory=LossWeights)
-    loop: LoopConfig = field(default_factory=LoopConfig)
-    group_size: int = 9
-    stride: int = 1
-    held_out_stride: int = 3
-    samples: int = 6
-    history_noise: float = 0.0
-    batch: int = 48
-    mirror: bool = True
-    seed: int = 0
+from ganlane.parameters.generator import PaperConfig
 
 
 class PaperTask:

@@ -17,7 +17,7 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from ganlane.generator.closed_loop import displacement_of, moved_by
-from ganlane.generator.fit_calibrated import CalibratedConfig
+from ganlane.generator.fit_calibrated import evaluation_params, fit_anchor
 from ganlane.generator.groups import group_windows
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
@@ -31,6 +31,7 @@ from ganlane.generator.scores import SAMPLES, Forecasts
 from ganlane.generator.segments import Segments, SegmentSource, constant_velocity
 from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.following import following_acceleration
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.neighbours import perceive
@@ -104,10 +105,12 @@ def calibrated_forecasts(
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        headway, desired = config.evaluation_params(segments)
+        headway, desired = evaluation_params(config)(segments)
         noise = torch.randn(1 + horizon, 1 + samples, *headway.shape, generator.sizes.noise, generator=random)
         noise[:, 0] = 0.0
-        return sampled_rollouts(generator, segments, headway, desired, noise, config.noise_period_s, config.anchor)
+        return sampled_rollouts(
+            generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config)
+        )
 
     forecasts = driven_windows(driver, sources, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], sources, horizon, stride)[0]

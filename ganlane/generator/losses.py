@@ -2,31 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 #: Keeps the gradient of a distance of 0 finite; 0.1 mm.
 _SMALLEST_DISTANCE_M = 1e-4
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Weights of the generator's terms; a weight of 0 switches a term off.
-
-    Attributes:
-        variety: the best of the samples (variety alone makes a single sample worse than constant velocity).
-        single: the mean over the samples.
-        mean: the prediction for z = 0.
-        adversarial: cross-entropy of the discriminator's logits.
-    """
-
-    variety: float = 1.6
-    single: float = 1.0
-    mean: float = 1.0
-    adversarial: float = 0.02
 
 
 def distance(one: Tensor, other: Tensor) -> Tensor:

@@ -5,8 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import Rule, above, at_least, between, check, every, number, one_of, optional
-from ganlane.parameters.records import lists_to_tuples
+from ganlane.parameters.checks import (
+    Rule,
+    above,
+    at_least,
+    between,
+    check,
+    every,
+    lists_to_tuples,
+    number,
+    one_of,
+    optional,
+)
 
 #: What may stand before the noisy layers (:mod:`ganlane.agents.encoder`).
 ENCODERS = ("none", "shared")

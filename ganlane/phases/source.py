@@ -7,8 +7,7 @@ from functools import partial
 from torchrl.envs import EnvBase
 
 from ganlane.build import make_env, make_traffic, set_threads
-from ganlane.config.collector import MultiCollectorConfig, RayCollectorConfig
-from ganlane.config.train import TrainConfig
+from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
 from ganlane.memory import keep_freed_memory
 from ganlane.phases.phase import Phase
 from ganlane.sim.random import Stream

@@ -13,9 +13,9 @@ from ganlane.agents import NetworkConfig, Rainbow, RainbowConfig, read_agent
 from ganlane.agents.checkpoint import SHIPPED
 from ganlane.agents.handover import SUPPORT, check_network, load_moments
 from ganlane.build import observation_of
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.training.checkpoints import LAST, load_checkpoint
 from ganlane.transforms import observation_size
 

@@ -16,7 +16,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import HELD_OUT
-from ganlane.parameters.records import assign
+from ganlane.parameters.checks import assign
 from ganlane.realism.card import Card, quantity_rows
 from ganlane.realism.fit_speeds import Report, drive_all, measure_recordings, units_of
 from ganlane.realism.long_runs import LongRunParameters, long_run

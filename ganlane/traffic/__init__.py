@@ -13,26 +13,22 @@ each other, :mod:`~ganlane.traffic.mixed` gives every episode to one of several 
 (:mod:`~ganlane.traffic.fitted`), and :mod:`~ganlane.traffic.driver_faults` the one of drivers who err.
 """
 
+from ganlane.parameters.traffic import AbortFaults, BrakingFaults, HesitationFaults, RandomDrivers, ReactionFaults
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.blind import BlindTraffic
-from ganlane.traffic.faults import BrakingFaults, LateReaction, PhantomBraking, ReactionFaults
+from ganlane.traffic.faults import LateReaction, PhantomBraking
 from ganlane.traffic.foreign import HighwayEnvTraffic, SumoTraffic
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
-from ganlane.traffic.idm_random import IdmRandomTraffic, RandomDrivers
+from ganlane.traffic.idm_random import IdmRandomTraffic
 from ganlane.traffic.lane_change import (
     CalibratedChanges,
     CalibratedLaneChange,
     LiteralChanges,
     LiteralLaneChange,
 )
-from ganlane.traffic.lane_change_faults import (
-    AbortedLaneChange,
-    AbortFaults,
-    HesitantLaneChange,
-    HesitationFaults,
-)
+from ganlane.traffic.lane_change_faults import AbortedLaneChange, HesitantLaneChange
 from ganlane.traffic.mixed import MixedTraffic
 from ganlane.traffic.recordings import Recordings
 from ganlane.traffic.replay import RecordedScenes, ReplayTraffic

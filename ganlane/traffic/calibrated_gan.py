@@ -8,9 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.generator.closed_loop import ANCHOR, EXTRA_INPUTS, AnchorParameters, DriverMemory, anchored_step
+from ganlane.generator.closed_loop import ANCHOR, AnchorParameters, DriverMemory, anchored_step
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
+from ganlane.parameters.generator import EXTRA_INPUTS
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles

@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.parameters.traffic import DriverFaults
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.sim.steering import STEERING, SteeringParameters
 from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.faults import BrakingFaults, LateReaction, PhantomBraking, ReactionFaults
+from ganlane.traffic.faults import LateReaction, PhantomBraking
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
-from ganlane.traffic.lane_change_faults import (
-    AbortedLaneChange,
-    AbortFaults,
-    HesitantLaneChange,
-    HesitationFaults,
-)
+from ganlane.traffic.lane_change_faults import AbortedLaneChange, HesitantLaneChange
 from ganlane.traffic.sequential import TrafficSequential
-
-
-@dataclass(frozen=True)
-class DriverFaults:
-    """How often drivers make which faults; a rate or share of 0 switches one off."""
-
-    phantom_braking: BrakingFaults = field(default_factory=BrakingFaults)
-    late_reaction: ReactionFaults = field(default_factory=ReactionFaults)
-    hesitant_change: HesitationFaults = field(default_factory=HesitationFaults)
-    aborted_change: AbortFaults = field(default_factory=AbortFaults)
 
 
 def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> TrafficSequential:

@@ -7,13 +7,12 @@ at random to one driver at a time (never to the ego), and leaves the others bitw
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
+from ganlane.parameters.traffic import BrakingFaults, ReactionFaults
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.road import Road
 from ganlane.sim.vehicles import Vehicles
@@ -73,21 +72,6 @@ def steps_left(
     return torch.where(begins, round(faults.lasts_s / dt), left)
 
 
-@dataclass(frozen=True)
-class BrakingFaults:
-    """Phantom braking.
-
-    Attributes:
-        per_hour: how often, per hour of driving without it.
-        deceleration: how hard, m/s2; a driver who brakes harder anyway goes on doing so.
-        lasts_s: how long, s.
-    """
-
-    per_hour: float = 6.0
-    deceleration: float = 4.0
-    lasts_s: float = 1.0
-
-
 class PhantomBraking(Overlay):
     """Now and then a driver brakes for nothing. Memory: the steps of braking that are left."""
 
@@ -115,21 +99,6 @@ class PhantomBraking(Overlay):
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
-@dataclass(frozen=True)
-class ReactionFaults:
-    """Late reactions.
-
-    Attributes:
-        per_hour: how often a driver's attention lapses, per hour of driving with attention.
-        delay_s: how late he reacts meanwhile, s, at least one physics step.
-        lasts_s: how long a lapse lasts, s.
-    """
-
-    per_hour: float = 12.0
-    delay_s: float = 0.8
-    lasts_s: float = 5.0
-
-
 class LateReaction(Overlay):
     """For a while a driver accelerates and brakes as he should have done ``delay_s`` before.
 
@@ -140,9 +109,6 @@ class LateReaction(Overlay):
 
     Memory: ``past`` [N, M, D], the accelerations decided on in the last ``delay_s``, m/s2, oldest first (one who
     enters has always accelerated as at present), and the steps that are ``left`` of the lapse.
-
-    Raises:
-        UserError: the delay is less than a physics step.
     """
 
     def __init__(
@@ -151,8 +117,6 @@ class LateReaction(Overlay):
         super().__init__(road, stream)
         self.faults = faults or ReactionFaults()
         self.delay_steps = round(self.faults.delay_s / self.dt)
-        if self.delay_steps < 1:
-            raise UserError(f"delay_s={self.faults.delay_s:g}: expected at least one physics step, {self.dt:g} s.")
 
     @property
     def memory_fields(self) -> MemoryFields:  # type: ignore[override]

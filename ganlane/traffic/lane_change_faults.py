@@ -6,11 +6,10 @@ Both look at the target lane that the model below sets, and need one that moves 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
+from ganlane.parameters.traffic import AbortFaults, HesitationFaults
 from ganlane.sim.lanes import settled
 from ganlane.sim.random import Purpose, Stream
 from ganlane.sim.road import Road
@@ -25,19 +24,6 @@ _NOWHERE = -1
 def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
     """Whose lane change the model below has just begun, bool [N, M]."""
     return (moved.target_lane != vehicles.target_lane) & drivers(vehicles)
-
-
-@dataclass(frozen=True)
-class HesitationFaults:
-    """Hesitant lane changes.
-
-    Attributes:
-        share: of the changes, 0 to 1.
-        pace: lateral speed of such a change over the usual one, above 0 to 1.
-    """
-
-    share: float = 0.2
-    pace: float = 0.5
 
 
 class HesitantLaneChange(Overlay):
@@ -67,19 +53,6 @@ class HesitantLaneChange(Overlay):
         slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
         moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
         return moved, {"hesitant": hesitant & ~settled(moved, self.road)}
-
-
-@dataclass(frozen=True)
-class AbortFaults:
-    """Aborted lane changes.
-
-    Attributes:
-        share: of the changes, 0 to 1.
-        at: how far the change has come when the driver turns back, 0 to 1; 0.5 is the line between the lanes.
-    """
-
-    share: float = 0.1
-    at: float = 0.5
 
 
 class AbortedLaneChange(Overlay):

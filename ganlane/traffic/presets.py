@@ -9,13 +9,14 @@ from typing import Any
 from ganlane.data import DrivingStatistics
 from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
 from ganlane.parameters.driving import IdmParameters
+from ganlane.parameters.traffic import CalibratedGanParameters, DriverFaults, GanParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream
 from ganlane.sim.road import Road
 from ganlane.traffic.acceleration import AccelerationOverlay
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.calibrated_gan import AnchoredGanTraffic
-from ganlane.traffic.driver_faults import DriverFaults, idm_faults_traffic, with_faults
+from ganlane.traffic.driver_faults import idm_faults_traffic, with_faults
 from ganlane.traffic.fitted import fitted_anchor, literal_changes, sudden_accelerations
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.lane_change import CalibratedChanges, CalibratedLaneChange, LiteralLaneChange
@@ -23,8 +24,6 @@ from ganlane.traffic.sequential import TrafficSequential
 from ganlane.traffic.social_gan import SocialGanTraffic
 
 __all__ = [
-    "NOISE_PERIOD_S",
-    "NOISE_SCALE",
     "SIMULATED_ANCHOR",
     "WISH_PER_CHANGE",
     "DriverFaults",
@@ -34,10 +33,8 @@ __all__ = [
     "with_faults",
 ]
 
-#: Latent vectors of the calibrated traffic: so many times as large as in fitting, and forgotten so fast, s. Both were
-#: chosen on the scenes that the generator is fitted to: as fitted (1 and 5 s) too few drivers accelerate.
-NOISE_SCALE, NOISE_PERIOD_S = 1.4, 3.0
-#: Its anchor: the fitted one, but drivers pull away more briskly and move over as fast as recorded ones do.
+#: Anchor of the calibrated traffic: the fitted one, but drivers pull away more briskly and move over as fast as
+#: recorded ones do.
 SIMULATED_ANCHOR: AnchorParameters = replace(
     ANCHOR, idm=replace(ANCHOR.idm, max_acceleration=1.0), lane_stiffness=0.6, lane_damping=1.55
 )
@@ -50,9 +47,9 @@ def gan_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    guard: bool = True,
-    noise_scale: float = 1.0,
-    execute_k: int = 1,
+    guard: bool = GanParameters.guard,
+    noise_scale: float = GanParameters.noise_scale,
+    execute_k: int = GanParameters.execute_k,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan``, the paper's: positions only, literal lane changes that are blind, sudden accelerations.
@@ -85,9 +82,9 @@ def gan_calibrated_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    noise_scale: float = NOISE_SCALE,
+    noise_scale: float = CalibratedGanParameters.noise_scale,
     changes_per_km: float | None = None,
-    noise_period_s: float = NOISE_PERIOD_S,
+    noise_period_s: float = CalibratedGanParameters.noise_period_s,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, traits, lane changes behind a gap check at the recorded rate.

@@ -12,10 +12,10 @@ from ganlane.benchmarks import sim as sim_module
 from ganlane.benchmarks.sim_findings import ENVIRONMENT, PHYSICS, ratios, scaling
 from ganlane.benchmarks.systems import Scenario
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmTrafficConfig, TrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SCENARIO = Scenario(EnvConfig(), IdmTrafficConfig(), ObservationConfig(), RewardParameters())

@@ -15,8 +15,8 @@ from ganlane.benchmarks.systems import (
     start_physics,
 )
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 

@@ -17,10 +17,10 @@ from ganlane.benchmarks.train_findings import AIM, MISSED, MUST, SYSTEM, best_ro
 from ganlane.benchmarks.train_loop import Training, advance, filled_run, with_gradients
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())

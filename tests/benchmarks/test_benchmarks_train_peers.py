@@ -12,9 +12,9 @@ from ganlane.benchmarks.train_loop import Training, make_agent
 from ganlane.benchmarks.train_losses import OURS, THEIRS, WHOLE, compare_losses, random_transitions, start_update
 from ganlane.benchmarks.train_peer import baselines_case, start_baselines
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())

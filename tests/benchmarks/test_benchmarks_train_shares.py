@@ -20,9 +20,9 @@ from ganlane.benchmarks.train_shares import (
     totals,
 )
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 

@@ -8,10 +8,7 @@ from ganlane.data import SyntheticTraffic, measure_exposure, synthetic_scenes
 from ganlane.fit_report import ablation_table, fold_tables
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.cross_validation import ablate, cross_validate, variants
-from ganlane.generator.fit_calibrated import CalibratedConfig
-from ganlane.generator.fit_paper import PaperConfig
-from ganlane.generator.loop import LoopConfig
-from ganlane.generator.networks import GeneratorSizes
+from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)

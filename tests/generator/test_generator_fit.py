@@ -9,11 +9,9 @@ from ganlane.errors import UserError
 from ganlane.files import save_weights
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import fit_generator
-from ganlane.generator.fit_calibrated import CalibratedConfig
-from ganlane.generator.fit_paper import PaperConfig
-from ganlane.generator.loop import LoopConfig, learning_rate
-from ganlane.generator.losses import LossWeights
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.loop import learning_rate
+from ganlane.generator.networks import Generator
+from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 HELD_OUT = ("synthetic-1",)

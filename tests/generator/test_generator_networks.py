@@ -3,7 +3,8 @@ import torch
 from torch import nn
 
 from ganlane.generator.closed_loop import push, recorded, start
-from ganlane.generator.networks import Discriminator, Generator, GeneratorSizes
+from ganlane.generator.networks import Discriminator, Generator
+from ganlane.parameters.generator import GeneratorSizes
 
 SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14, noise=4)
 

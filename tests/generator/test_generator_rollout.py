@@ -3,9 +3,8 @@ import pytest
 import torch
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.closed_loop import EXTRA_INPUTS
 from ganlane.generator.losses import distance
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
     balanced_headway,
     recorded_vehicles,
@@ -16,6 +15,7 @@ from ganlane.generator.rollout import (
 from ganlane.generator.scores import rollout_errors
 from ganlane.generator.segments import cut_segments, extrapolate, intended_lanes, segment_sources
 from ganlane.generator.windows import PRESENT, scene_tracks
+from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 WIDTH = 3.5

@@ -7,13 +7,12 @@ import pytest
 from ganlane.data import default_scenes, read_scenes, scene_lane_widths
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import load_generator, shipped_generator
-from ganlane.generator.fit_calibrated import CalibratedConfig
-from ganlane.generator.fit_paper import PaperConfig
 from ganlane.generator.groups import group_windows
 from ganlane.generator.scores import rollout_errors, window_errors
 from ganlane.generator.segments import segment_sources
 from ganlane.generator.splits import split_scenes
 from ganlane.generator.windows import cut_windows, scene_tracks
+from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 
 CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}
 

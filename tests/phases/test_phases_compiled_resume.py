@@ -24,7 +24,7 @@ from ganlane.training.checkpoints import LAST, load_checkpoint
 SCRIPT = """
 import sys
 from pathlib import Path
-from ganlane.config.compose import check
+from ganlane.config.command_line import check
 from ganlane.phases import phases_of, run_phase
 
 if __name__ == "__main__":

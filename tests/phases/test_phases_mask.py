@@ -8,7 +8,7 @@ import torch
 
 from ganlane.agents import read_agent
 from ganlane.build import make_driver
-from ganlane.config.compose import check
+from ganlane.config.command_line import check
 from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.parameters.observation import MaskParameters

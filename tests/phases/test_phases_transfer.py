@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from ganlane.agents import read_agent
-from ganlane.config.compose import check
-from ganlane.config.init import InitConfig, NoInitConfig
+from ganlane.config.command_line import check
+from ganlane.config.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.phases import AGENT_FILE, phases_of, read_start, run_phase
 from ganlane.phases.agent import begin

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
+from ganlane.config.train import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
 from ganlane.errors import UserError
 from ganlane.training.further import make_logs
 from ganlane.training.log import COLUMNS

@@ -85,46 +85,56 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     flags = parse_arguments(command, arguments)
     if flags.help:
         print_help(command)
-    elif flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
+        return
+    if flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
         as_given = parse_arguments("", arguments).overrides
         hydras = dict(zip(as_given, flags.overrides))
         _hydra(command, task, [hydras.get(argument, argument) for argument in arguments])
-    else:
-        overrides = with_resumed(command, flags.overrides, flags.multirun)
-        checked = check(command, overrides, flags.multirun)
-        folder = checked.sweep_folder if flags.multirun else checked.run_folder
-        mode = "sweep" if flags.multirun else "run"
-        # The folder's name holds the time: given here, so that it is the one that was looked at.
-        overrides = without_repetitions([*overrides, f"hydra.{mode}.dir={quoted(folder)}"])
-        with cleared_after_mistakes(folder):
-            _hydra(command, task, [*(["-m"] if flags.multirun else []), *overrides])
+        return
+    overrides = with_resumed(command, flags.overrides, flags.multirun)
+    checked = check(command, overrides, flags.multirun)
+    folder = (checked.sweep_folder if flags.multirun else checked.run_folder).absolute()
+    with cleared_after_mistakes(folder):
+        if flags.multirun:
+            # The folder's name holds the time: given here, so that it is the one that was looked at.
+            swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
+            _hydra(command, task, ["-m", *swept])
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            asked = [each for each in without_repetitions(overrides) if not each.startswith("hydra")]
+            _do(task, checked.config, folder, checked.composed, asked)
+
+
+def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) -> None:
+    """The task in its folder, in which its configuration is written down first."""
+    with put_back_after_mistakes(folder):
+        write_down(composed, asked, folder)
+        with numbered_refusals():
+            last_line = task(config, folder)
+    if last_line:
+        print(last_line, flush=True)
 
 
 def _hydra(command: str, task: Task, arguments: list[str]) -> None:
-    """Let Hydra compose, make the folder and launch; errors come out as they are."""
+    """Let Hydra show the configuration, or sweep; errors come out as they are."""
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
-    # A run has composed once already, to be checked; --cfg and --info come here first.
     register()
     mistakes: list[Exception] = []
     here = os.getpid()
 
     def job(composed: Any) -> None:
         folder = Path(HydraConfig.get().runtime.output_dir)
+        asked = [str(override) for override in HydraConfig.get().overrides.task]
         try:
-            with cleared_after_mistakes(folder, existed=any(folder.iterdir())), put_back_after_mistakes(folder):
-                write_down(composed, folder)
-                with numbered_refusals():
-                    last_line = task(typed(composed), folder)
+            with cleared_after_mistakes(folder, existed=any(folder.iterdir())):
+                _do(task, typed(composed), folder, composed, asked)
         except (UserError, OSError) as error:
             # Kept rather than raised, since Hydra would print a line of its own; a worker process has to raise.
             mistakes.append(error)
             if os.getpid() != here:
                 raise
-            return
-        if last_line:
-            print(last_line, flush=True)
 
     application = hydra.main(version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command)(job)
     with _process([f"ganlane {command}", *arguments]):

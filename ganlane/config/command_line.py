@@ -120,6 +120,7 @@ class Checked:
     """What is known before a command runs: the config of its (first) run, and where its results will go."""
 
     config: Any
+    composed: DictConfig
     run_folder: Path
     sweep_folder: Path
 
@@ -164,4 +165,4 @@ def _check_one(command: str, overrides: Sequence[str]) -> Checked:
         composed.hydra.job.num = 0
         folders = [Path(str(composed.hydra[mode].dir)) for mode in ("run", "sweep")]
         del composed["hydra"]
-    return Checked(typed(composed), *folders)
+    return Checked(typed(composed), composed, *folders)

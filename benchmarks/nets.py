@@ -59,6 +59,7 @@ SHORT_RUN = [
     "evaluation.episodes=4",
 ]
 FROM_SCRATCH = [*SHORT_RUN, "env.goal_m=40", "init=none", "agent.hidden=[16,16]", "traffic=idm"]
+FROM_SCRATCH += ["agent.learning_rate_decisions=640"]  # prolonged below
 TWO_PHASES = ["traffic@pretrain.traffic=idm_mobil", "pretrain.total_decisions=320"]
 WARM_STARTED = [*SHORT_RUN, "traffic=gan_calibrated", "init=idm_ckpt"]
 

@@ -21,12 +21,18 @@ EXAMPLES = {
     "own_policy.py": r"(?s)mobil .*agent_idm .*random_legal .*largest_gap ",
     "stock_dqn.py": r"loss \d+\.\d+, reward per decision -?\d+\.\d+",
     "cleanrl_style.py": r"2048 decisions, \d+ episodes, loss \d+\.\d+\nmean return of the last \d+: -?\d+\.\d",
+    "sb3_ppo.py": r"(?s)ppo .*mobil ",
     "sb3_dqn.py": r"(?s)300 decisions, mean return of the last \d+ episodes -?\d+\.\d.*sb3_dqn.*mobil.*random_legal",
 }
 #: Budgets that keep a run to seconds.
-SHORT = {"stock_dqn.py": ["2048"], "cleanrl_style.py": ["2048"], "sb3_dqn.py": ["300", "4", "200"]}
+SHORT = {
+    "stock_dqn.py": ["2048"],
+    "cleanrl_style.py": ["2048"],
+    "sb3_dqn.py": ["300", "4", "200"],
+    "sb3_ppo.py": ["4096", "safe", "4", "200"],
+}
 #: What an example needs beside ganlane.
-NEEDS = {"sb3_dqn.py": "stable_baselines3"}
+NEEDS = {"sb3_dqn.py": "stable_baselines3", "sb3_ppo.py": "sb3_contrib"}
 
 
 def run(name: str, *arguments: str) -> str:

@@ -1,0 +1,188 @@
+"""The batched highway for stable-baselines3: one ``VecEnv`` whose environments are stepped together.
+
+::
+
+    from stable_baselines3 import PPO
+    import ganlane.sb3
+
+    env = ganlane.sb3.make_vec_env("gan", num_envs=64)
+    model = PPO("MlpPolicy", env).learn(200_000)
+    print(ganlane.evaluate([ganlane.sb3.driver(model), "mobil"], ["gan"], episodes=300))
+
+``SubprocVecEnv`` of single environments costs one process each; this one costs one tensor operation for all of them.
+sb3-contrib's ``MaskablePPO`` finds the action masks by itself (``mask="safe"``). Needs the extra ``sb3``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from ganlane import keys
+from ganlane.build import Driver
+from ganlane.errors import UserError
+from ganlane.gym.vector import HighwayVectorGym
+
+try:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecEnv
+except ModuleNotFoundError as error:
+    raise UserError("ganlane.sb3 needs stable-baselines3: pip install 'ganlane[sb3]'.") from error
+
+Floats = npt.NDArray[np.float32]
+Indices = int | Iterable[int] | None
+
+
+class HighwayVecEnv(VecEnv):
+    """A batch of highways behind stable-baselines3's interface; made by :func:`make_vec_env`.
+
+    A row that ends begins its next episode in the same step. Its info then holds ``terminal_observation``,
+    ``TimeLimit.truncated``, ``episode`` as SB3's ``Monitor`` gives it (``r`` return, ``l`` decisions, ``t`` seconds
+    driven), and what :mod:`ganlane.gym` reports of the final state (docs/gymnasium.md); other rows have empty infos.
+
+    ``seed(s)`` makes the next reset begin episode i of seed s in row i; ``set_options({"episode": k})`` begins k + i.
+
+    Args:
+        highways: the batch, as ``gymnasium.make_vec("ganlane/Highway-v0")`` makes it.
+    """
+
+    def __init__(self, highways: HighwayVectorGym) -> None:
+        self.highways = highways
+        self._actions: Any = None
+        self._return = np.zeros(highways.num_envs)
+        self._length = np.zeros(highways.num_envs, dtype=np.int64)
+        super().__init__(highways.num_envs, highways.single_observation_space, highways.single_action_space)
+
+    def reset(self) -> Floats:
+        """First observations [N, D] of the next episodes."""
+        observation, _ = self.highways.reset(seed=self._seeds[0], options=self._options[0] or None)
+        self._reset_seeds()
+        self._reset_options()
+        self._return[:], self._length[:] = 0.0, 0
+        return observation
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """Keep the actions [N] for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Floats, Floats, npt.NDArray[np.bool_], list[dict[str, Any]]]:
+        """One decision in every row: observations [N, D], rewards [N], ends [N], infos."""
+        observation, reward, terminated, truncated, info = self.highways.step(self._actions)
+        self._return += reward
+        self._length += 1
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for row in np.flatnonzero(done):
+            infos[row] = self._final_info(int(row), info, bool(truncated[row] and not terminated[row]))
+        self._return[done], self._length[done] = 0.0, 0
+        return observation, reward.astype(np.float32), done, infos
+
+    def _final_info(self, row: int, info: dict[str, Any], truncated: bool) -> dict[str, Any]:
+        final = {name: values[row] for name, values in info["final_info"].items() if not isinstance(values, dict)}
+        episode = {"r": float(self._return[row]), "l": int(self._length[row]), "t": float(final["time_s"])}
+        return {
+            **final,
+            "terminal_observation": info["final_obs"][row],
+            "TimeLimit.truncated": truncated,
+            "episode": episode,
+        }
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed of the next reset; one for all rows, which drive different episodes of it."""
+        self._seeds = [seed] * self.num_envs
+        return self._seeds
+
+    def action_masks(self) -> npt.NDArray[np.bool_]:
+        """Which actions are allowed now, bool [N, 3]."""
+        return self.highways.action_masks()
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """An attribute of the batch, once per row."""
+        return [getattr(self.highways, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Refused: the rows are one batch and have no attributes of their own.
+
+        Raises:
+            UserError: always.
+        """
+        raise UserError(f"set_attr({attr_name!r}): the highways are one batch; give options to make_vec_env().")
+
+    def env_method(self, method_name: str, *args: Any, indices: Indices = None, **kwargs: Any) -> list[Any]:
+        """The result of a method that gives one result per row (``action_masks``, ``render``), rows ``indices``."""
+        found = getattr(self.highways, method_name)(*args, **kwargs)
+        return [found[row] for row in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
+        """True for ``Monitor`` alone, whose episode statistics are in the infos."""
+        return [wrapper_class is Monitor for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:
+        """A picture of every row; needs ``render_mode="rgb_array"``."""
+        return list(self.highways.render() or ())
+
+    def close(self) -> None:
+        """Release what the batch holds."""
+        self.highways.close()
+
+
+def make_vec_env(
+    traffic: Any = "idm_mobil", num_envs: int = 64, seed: int | None = None, **options: Any
+) -> HighwayVecEnv:
+    """N highways for stable-baselines3.
+
+    Args:
+        traffic: ``idm``, ``idm_mobil``, ``gan``, ``mixed``, ..., or a traffic module of your own.
+        num_envs: N, highways side by side.
+        seed: of the episodes; None: drawn at random.
+        options: as in :class:`ganlane.gym.vector.HighwayVectorGym`: ``observation``, ``reward``, ``mask``,
+            ``stream``, ``render_mode``, and single keys of the environment such as ``lanes=4``.
+
+    Raises:
+        UserError: a wrong value.
+    """
+    return HighwayVecEnv(HighwayVectorGym(num_envs=num_envs, traffic=traffic, seed=seed, **options))
+
+
+class ModelPolicy(TensorDictModuleBase):
+    """The deterministic policy of a stable-baselines3 model: writes ``action`` [N] for ``observation`` [N, D].
+
+    Args:
+        model: trained on :func:`make_vec_env`; one with masks (sb3-contrib's) is given ``action_mask`` [N, 3].
+    """
+
+    out_keys = [keys.ACTION]  # noqa: RUF012
+    rows_must_stay = False
+
+    def __init__(self, model: BaseAlgorithm) -> None:
+        super().__init__()
+        self.model = model
+        self._masked = type(model).__name__.startswith("Maskable")
+        self.in_keys = [keys.OBSERVATION, keys.ACTION_MASK] if self._masked else [keys.OBSERVATION]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        masks = {"action_masks": tensordict.get(keys.ACTION_MASK).cpu().numpy()} if self._masked else {}
+        observation = tensordict.get(keys.OBSERVATION).cpu().numpy()
+        action, _ = self.model.predict(observation, deterministic=True, **masks)
+        return tensordict.set(keys.ACTION, torch.as_tensor(action, device=tensordict.device).long())
+
+
+def driver(model: BaseAlgorithm, name: str | None = None) -> Driver:
+    """A trained stable-baselines3 model as a driver for ``ganlane.evaluate`` and ``ganlane.render``.
+
+    It reads the observation of the evaluation, by default the one that :func:`make_vec_env` uses by default.
+
+    Args:
+        model: PPO, DQN, MaskablePPO, ...; behind a mask, give ``mask="safe"`` to the evaluation, too.
+        name: in tables; None: the algorithm's, in lower case.
+    """
+    return Driver(name or type(model).__name__.lower(), ModelPolicy(model))

@@ -69,9 +69,10 @@ def train_generator(
     Raises:
         UserError: a wrong value, or recordings that cannot be read.
     """
+    from ganlane.generator import preset_of
     from ganlane.train_generator import train_generator as command
 
     config = command_config(TrainGeneratorConfig, {"data": data, "generator": generator}, {**overrides, "seed": seed})
     home, _ = run_in(folder, "train_generator", command, config)
-    weights = home / f"generator_{config.generator.preset_name()}.safetensors"
+    weights = home / f"generator_{preset_of(config.generator)}.safetensors"
     return GeneratorRun(home, results_of(home), weights)

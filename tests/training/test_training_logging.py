@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ganlane.config.train import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
+from ganlane.config.train import LoggerConfig
 from ganlane.errors import UserError
 from ganlane.training.further import make_logs
 from ganlane.training.log import COLUMNS
@@ -108,11 +108,11 @@ def test_the_real_wandb_keeps_an_offline_run(tmp_path, monkeypatch):
 def test_the_option_chooses_the_logs(fake, tmp_path):
     pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
     assert make_logs(LoggerConfig(), tmp_path) == []
-    (board,) = make_logs(TensorBoardLoggerConfig(), tmp_path)
+    (board,) = make_logs(LoggerConfig(kind="tensorboard"), tmp_path)
     assert isinstance(board, TensorBoardLog)
     board.close()
     assert any((tmp_path / "tensorboard").iterdir())
-    (wandb,) = make_logs(WandbLoggerConfig(project="mine"), tmp_path, {"seed": 1})
+    (wandb,) = make_logs(LoggerConfig(kind="wandb", project="mine"), tmp_path, {"seed": 1})
     assert isinstance(wandb, WandbLog)
     assert (fake.options["project"], fake.options["config"]) == ("mine", {"seed": 1})
 

@@ -72,7 +72,7 @@ def summary(group: str, name: str) -> str:
 
 
 def key_lines(
-    kind: type, values: Mapping[str, Any], indent: int, without: set[str] | frozenset[str] = frozenset()
+    kind: Any, values: Mapping[str, Any], indent: int, without: set[str] | frozenset[str] = frozenset()
 ) -> Iterator[str]:
     """A line for every key of a dataclass: its default, or its value in ``values``, and what it means."""
     for field in fields(kind):
@@ -99,7 +99,7 @@ def _default(field: Field[Any]) -> Any:
     return field.default if field.default_factory is MISSING else field.default_factory()
 
 
-def _meaning(kind: type, name: str) -> str:
+def _meaning(kind: Any, name: str) -> str:
     """The first sentence on a field in the docstring of its class, or of the base that says something of it."""
     return next((found for base in kind.__mro__ if (found := _attributes(base).get(name))), "")
 

@@ -109,7 +109,13 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Settings of a fit: those of one preset or the other."""
+    """Settings of a fit: those of one preset or the other.
+
+    Attributes:
+        seed: of weights, batches, noise, k-means and drivers' parameters.
+    """
+
+    seed: int = field(default=0, kw_only=True, metadata=NO_KEY)
 
 
 @dataclass(frozen=True)
@@ -128,7 +134,6 @@ class PaperConfig(FitConfig):
         samples: samples per update; the best counts in the variety term.
         batch: groups per update.
         mirror: swap left and right in half of the groups.
-        seed: of weights, batches, noise and k-means.
     """
 
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
@@ -141,7 +146,6 @@ class PaperConfig(FitConfig):
     history_noise: float = 0.0
     batch: int = 48
     mirror: bool = True
-    seed: int = field(default=0, metadata=NO_KEY)
 
     def __post_init__(self) -> None:
         counts = ("batch", "group_size", "stride", "held_out_stride")
@@ -166,7 +170,6 @@ class CalibratedConfig(FitConfig):
             uses the value stored with the weights.
         further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane offset.
         traits: whether every driver has its own headway and desired speed.
-        seed: of weights, batches, traits and noise.
     """
 
     sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS), metadata=NO_KEY)
@@ -181,7 +184,6 @@ class CalibratedConfig(FitConfig):
     washout_s: float = 3.0
     further_inputs: bool = True
     traits: bool = True
-    seed: int = field(default=0, metadata=NO_KEY)
 
     def __post_init__(self) -> None:
         lists_to_tuples(self)

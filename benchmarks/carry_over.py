@@ -1,6 +1,6 @@
 """Tables of drivers on traffics from the folders of several ``ganlane evaluate`` runs, as Markdown.
 
-    python benchmarks/carry_over.py outputs/evaluate/RUN [RUN ...] --name general=agent_general \
+    python -m benchmarks.carry_over outputs/evaluate/RUN [RUN ...] --name general=agent_general \
         --report docs/carry_over.md --table seed_0
 
 Joins the ``episodes.parquet`` of the folders. The first table has every driver's paired lead over MOBIL on the same
@@ -18,10 +18,11 @@ from pathlib import Path
 
 import polars as pl
 
+from benchmarks.script import ReportSection, make_parser, run_script
 from ganlane.errors import UserError
 from ganlane.evaluation import evaluation_rows
-from ganlane.evaluation.paired import paired_lead
-from ganlane.files import write_between_markers
+from ganlane.evaluation.rows import paired_lead
+from ganlane.evaluation.table import Table
 
 BASELINE = "mobil"
 KEY = ["agent", "traffic", "seed", "episode"]
@@ -80,11 +81,11 @@ def tables(episodes: pl.DataFrame) -> str:
         [
             "Paired lead over MOBIL in reward (for MOBIL its mean reward); bold: the interval is above 0:",
             "",
-            *markdown(["driver", *traffics], [["episodes", *counts], *_headed(agents, leads)]),
+            _markdown(traffics, [["episodes", *counts], *_headed(agents, leads)]),
             "",
             "Hard crashes, departures from the road, soft crashes behind per episode:",
             "",
-            *markdown(["driver", *traffics], _headed(agents, failures)),
+            _markdown(traffics, _headed(agents, failures)),
         ]
     )
 
@@ -93,34 +94,35 @@ def _of(episodes: pl.DataFrame, agent: str, traffic: str) -> pl.DataFrame:
     return episodes.filter((pl.col("agent") == agent) & (pl.col("traffic") == traffic))
 
 
+def _markdown(traffics: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    return Table("", ["driver", *traffics], lines).markdown(heading=False)
+
+
 def _headed(agents: Sequence[str], cells: Sequence[Sequence[str]]) -> list[list[str]]:
     return [[f"`{agent}`", *line] for agent, line in zip(agents, cells)]
 
 
-def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table, the numbers to the right."""
-    ruler = ["---", *["---:"] * (len(headings) - 1)]
-    return [f"| {' | '.join(line)} |" for line in (headings, ruler, *rows)]
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables, and write them where asked; the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = make_parser(__doc__)
     parser.add_argument("folders", type=Path, nargs="+", help="of finished 'ganlane evaluate' runs")
     parser.add_argument("--name", action="append", default=[], help="NEW=OLD: another name for an agent")
     parser.add_argument("--report", type=Path, help="document with the marker lines")
     parser.add_argument("--table", default="table", help="name of the markers")
-    given = parser.parse_args(arguments)
-    try:
-        text = tables(read(given.folders, dict(name.split("=", 1) for name in given.name)))
-        if given.report:
-            begin, end = (f"<!-- {given.table}: {which} -->" for which in ("begin", "end"))
-            write_between_markers(given.report, begin, end, text)
-    except UserError as error:
-        print(f"carry_over: {error}", file=sys.stderr)
-        return 2
-    print(text)
-    return 0
+    return parser.parse_args(arguments)
+
+
+def report(options: argparse.Namespace) -> str:
+    """The tables, in the document too where one is named."""
+    section = ReportSection(options.report, *(f"<!-- {options.table}: {which} -->" for which in ("begin", "end")))
+    text = tables(read(options.folders, dict(name.split("=", 1) for name in options.name)))
+    section.write(text)
+    return text
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the tables, and write them where asked; the exit status."""
+    return run_script(report, parse(arguments))
 
 
 if __name__ == "__main__":

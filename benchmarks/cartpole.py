@@ -1,7 +1,7 @@
 """Does the agent learn? Rainbow on CartPole-v1, until 100 evaluation episodes have a mean return of 475 or more.
 
-    python benchmarks/cartpole.py --seeds 5
-    python benchmarks/cartpole.py --seeds 5 --report docs/agent.md
+    python -m benchmarks.cartpole --seeds 5
+    python -m benchmarks.cartpole --seeds 5 --report docs/agent.md
 
 Trained through TorchRL's GymEnv. Every 5,000 frames the greedy policy drives the same 100 episodes. A benchmark
 rather than a test: the median over 5 seeds should reach 475 within 300,000 frames.
@@ -24,8 +24,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
+from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.agents import GreedyPolicy, Rainbow, RainbowConfig
-from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
+from ganlane.evaluation.table import Table
 from ganlane.training import TrainingConfig, train
 
 BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"
@@ -56,9 +57,9 @@ class Solved(Exception):
 
 @dataclass
 class Outcome:
-    """What one seed came to: the best evaluation, the frames at which it reached the goal, and the time it took.
+    """Result of one seed: the best evaluation, the frames at which it reached the goal, and the time it took.
 
-    A log, too: it watches the rows of the evaluations and ends the run at the goal.
+    Also a log: it reads the rows of the evaluations and ends the run at the goal.
     """
 
     seed: int
@@ -67,7 +68,7 @@ class Outcome:
     seconds: float = 0.0
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Look at one row."""
+        """Read one row."""
         mean = row.get("evaluation/mean_reward", 0.0)
         self.best = max(self.best, mean)
         if mean >= GOAL:
@@ -93,13 +94,13 @@ def make_env(seed: int) -> EnvBase:
 def evaluate(policy: GreedyPolicy) -> dict[str, float]:
     """Mean return of ``EPISODES`` episodes side by side, the same ones in every call."""
     envs = gymnasium.make_vec("CartPole-v1", EPISODES, vectorization_mode="vector_entry_point")
-    seen, _ = envs.reset(seed=1_000_000)
-    going, returns = np.ones(EPISODES, dtype=bool), np.zeros(EPISODES)
-    while going.any():
-        chosen = policy(TensorDict({"observation": torch.from_numpy(seen)}, [EPISODES]))["action"]
-        seen, reward, terminated, truncated, _ = envs.step(chosen.numpy())
-        returns += reward * going
-        going &= ~(terminated | truncated)
+    observation, _ = envs.reset(seed=1_000_000)
+    running, returns = np.ones(EPISODES, dtype=bool), np.zeros(EPISODES)
+    while running.any():
+        chosen = policy(TensorDict({"observation": torch.from_numpy(observation)}, [EPISODES]))["action"]
+        observation, reward, terminated, truncated, _ = envs.step(chosen.numpy())
+        returns += reward * running
+        running &= ~(terminated | truncated)
     envs.close()
     return {"mean_reward": float(returns.mean())}
 
@@ -124,27 +125,25 @@ def median(outcomes: Sequence[Outcome]) -> str:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """All seeds and their median, as markdown."""
-    lines = [["seed", "frames to 475", "best mean return", "time"], ["---"] * 4]
-    lines += [outcome.cells() for outcome in outcomes]
-    lines += [["median", median(outcomes), "", ""]]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    """All seeds and their median, as Markdown."""
+    lines = [*(outcome.cells() for outcome in outcomes), ["median", median(outcomes), "", ""]]
+    return Table("", ["seed", "frames to 475", "best mean return", "time"], lines, 4).markdown(heading=False)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says."""
-    parser = parser_of(__doc__)
+    """The command line."""
+    parser = make_parser(__doc__)
     parser.add_argument("--frames", type=int, default=300_000, help="at most, per seed")
     parser.add_argument("--seeds", type=int, default=5)
     add_report(parser, BEGIN, END)
     return parser.parse_args(arguments)
 
 
-def measure(told: argparse.Namespace) -> str:
+def measure(options: argparse.Namespace) -> str:
     """Run all seeds; the table, in the document too where one is named."""
-    section, outcomes = ReportSection(told.report, BEGIN, END), []
-    for seed in range(told.seeds):
-        outcomes.append(run(seed, told.frames))
+    section, outcomes = ReportSection(options.report, BEGIN, END), []
+    for seed in range(options.seeds):
+        outcomes.append(run(seed, options.frames))
         print("seed {}: 475 at {} frames, best {}, {}".format(*outcomes[-1].cells()), flush=True)
     section.write(table(outcomes))
     return table(outcomes)

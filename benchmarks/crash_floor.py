@@ -27,11 +27,12 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from benchmarks.beam_search import beam_search
+from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.api import load_agent, make_env
-from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
 from ganlane.evaluation import clopper_pearson, write_results
-from ganlane.evaluation.rides import SIDES, Ride, drive, replay
-from ganlane.memory import keep_freed_memory
+from ganlane.evaluation.rollouts import SIDES, Rollout, replay, roll_out
+from ganlane.evaluation.table import Table
+from ganlane.runtime import keep_freed_memory
 
 DRIVERS = ("mobil", "agent_idm", "keep_lane")
 #: The first stage: rides of ordinary drivers. The others are named after their beams.
@@ -51,7 +52,7 @@ class Way:
 
     episode: int
     stage: str | None = None
-    ride: Ride | None = None
+    ride: Rollout | None = None
     widest: int = 0
 
 
@@ -60,9 +61,9 @@ def stage_of(beam: int) -> str:
     return f"beam {beam}"
 
 
-def ways_of_drivers(driven: Iterable[Sequence[Ride]], episodes: Sequence[int]) -> list[Way]:
+def ways_of_drivers(driven: Iterable[Sequence[Rollout]], episodes: Sequence[int]) -> list[Way]:
     """Which of ``episodes`` ordinary drivers came through, by the ride with the highest return; one way each."""
-    best: dict[int, Ride] = {}
+    best: dict[int, Rollout] = {}
     for ride in sorted((ride for rides in driven for ride in rides), key=lambda ride: (ride.safe, ride.reward)):
         best[ride.episode] = ride
     rides = [(number, best.get(number)) for number in episodes]
@@ -92,7 +93,7 @@ def floor_rows(ways: Sequence[Way], beams: Sequence[int]) -> list[dict[str, Any]
     return rows
 
 
-def driver_row(name: str, rides: Sequence[Ride], ways: Sequence[Way]) -> dict[str, Any]:
+def driver_row(name: str, rides: Sequence[Rollout], ways: Sequence[Way]) -> dict[str, Any]:
     """A driver's crashes: how many, which of them were avoidable, what they hit and whether the ego kept its lane."""
     crashes = [ride for ride in rides if ride.end == "hard_crash"]
     avoidable = {way.episode for way in ways if way.stage is not None}
@@ -113,19 +114,25 @@ def driver_row(name: str, rides: Sequence[Ride], ways: Sequence[Way]) -> dict[st
     }
 
 
-def rides_of(name: str, told: argparse.Namespace) -> list[Ride]:
+def rides_of(name: str, options: argparse.Namespace) -> list[Rollout]:
     """The rides of one driver."""
-    driver, begun = load_agent(name, vehicles=told.vehicles), time.monotonic()
-    env = environment(told, driver.observation)
-    rides = drive(env, driver.policy, range(told.episodes), told.seed)
-    print(f"{name}: {told.episodes} episodes driven in {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
+    driver, begun = load_agent(name, vehicles=options.vehicles), time.monotonic()
+    env = environment(options, driver.observation)
+    rides = roll_out(env, driver.policy, range(options.episodes), options.seed)
+    line = f"{name}: {options.episodes} episodes driven in {time.monotonic() - begun:.0f} s"
+    print(line, file=sys.stderr, flush=True)
     return rides
 
 
-def environment(told: argparse.Namespace, observation: Any = None) -> Any:
+def environment(options: argparse.Namespace, observation: Any = None) -> Any:
     """Rows of the same number everywhere, so that generated traffic rounds alike."""
     return make_env(
-        told.traffic, told.rows, observation=observation, seed=told.seed, stream="report", vehicles=told.vehicles
+        options.traffic,
+        options.rows,
+        observation=observation,
+        seed=options.seed,
+        stream="report",
+        vehicles=options.vehicles,
     )
 
 
@@ -135,21 +142,28 @@ def share(row: dict[str, Any]) -> str:
     return f"{100 * row['share']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def floor_table(rows: Sequence[dict[str, Any]], episodes: int) -> list[str]:
-    """Lines of Markdown: what is left after each stage."""
-    lines = ["| after | a way through found | none found | share with none [95 %] |", "| --- | ---: | ---: | ---: |"]
-    cells = ((r["searched_with"], f"{r['avoidable']} of {episodes}", r["not_avoided"], share(r)) for r in rows)
-    return lines + [f"| {a} | {b} | {c} | {d} |" for a, b, c, d in cells]
+def floor_table(rows: Sequence[dict[str, Any]], episodes: int) -> Table:
+    """What is left after each stage."""
+    columns = {
+        "after": lambda row: row["searched_with"],
+        "a way through found": lambda row: f"{row['avoidable']} of {episodes}",
+        "none found": lambda row: str(row["not_avoided"]),
+        "share with none [95 %]": share,
+    }
+    return Table.of("", rows, columns)
 
 
-def driver_table(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Lines of Markdown: whose crashes, and what they hit."""
-    columns = ("driver", "crashes [95 %]", "avoidable", "ahead", "side", "behind", "keeping its lane", "mean reward")
-    lines = ["| " + " | ".join(columns) + " |", "| --- |" + " ---: |" * (len(columns) - 1)]
-    for r in rows:
-        counts = (r["avoidable"], r["ahead"], r["side"], r["behind"], r["keeping_lane"], f"{r['mean_reward']:.1f}")
-        lines.append(f"| {r['driver']} | {r['hard_crash']}: {share(r)} | " + " | ".join(map(str, counts)) + " |")
-    return lines
+def driver_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Whose crashes, and what they hit."""
+    columns = {
+        "driver": lambda row: row["driver"],
+        "crashes [95 %]": lambda row: f"{row['hard_crash']}: {share(row)}",
+        "avoidable": lambda row: str(row["avoidable"]),
+        **{side: lambda row, side=side: str(row[side]) for side in ("ahead", "side", "behind")},
+        "keeping its lane": lambda row: str(row["keeping_lane"]),
+        "mean reward": lambda row: f"{row['mean_reward']:.1f}",
+    }
+    return Table.of("", rows, columns)
 
 
 def written(way: Way) -> dict[str, Any]:
@@ -159,8 +173,8 @@ def written(way: Way) -> dict[str, Any]:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says."""
-    parser = parser_of(__doc__)
+    """The command line."""
+    parser = make_parser(__doc__)
     parser.add_argument("--traffic", default="gan")
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--beam", type=int, nargs="+", default=[8, 32, 128], help="growing sizes")
@@ -178,32 +192,33 @@ def markers(traffic: str) -> tuple[str, str]:
     return f"<!-- begin crash floor {traffic} -->", f"<!-- end crash floor {traffic} -->"
 
 
-def publish(told: argparse.Namespace, section: ReportSection, tables: dict[str, Any], ways: Sequence[Way]) -> str:
+def publish(options: argparse.Namespace, section: ReportSection, tables: dict[str, Any], ways: Sequence[Way]) -> str:
     """Print the tables, write them, and with --report put them into the document; where the results are."""
-    text = "\n".join([*floor_table(tables["floor"], told.episodes), "", *driver_table(tables["drivers"])])
+    both = floor_table(tables["floor"], options.episodes), driver_table(tables["drivers"])
+    text = "\n\n".join(table.markdown(heading=False) for table in both)
     print(text, flush=True)
     section.write(f"\n{text}\n")
-    seeds = {"stream": "report", "seed": told.seed, "episodes": [0, told.episodes - 1]}
+    seeds = {"stream": "report", "seed": options.seed, "episodes": [0, options.episodes - 1]}
     numbers = {**tables, "ways": [written(way) for way in ways]}
-    folder = told.folder or Path("outputs/crash_floor") / told.traffic
-    return f"results: {write_results(folder, numbers, vars(told), seeds)}"
+    folder = options.folder or Path("outputs/crash_floor") / options.traffic
+    return f"results: {write_results(folder, numbers, vars(options), seeds)}"
 
 
-def measure(told: argparse.Namespace) -> str:
+def measure(options: argparse.Namespace) -> str:
     """Drive and search; the results are published after every stage, since the later ones take long."""
     keep_freed_memory()
-    section = ReportSection(told.report, *markers(told.traffic))
+    section = ReportSection(options.report, *markers(options.traffic))
     begun, line = time.monotonic(), ""
-    driven = {name: rides_of(name, told) for name in told.drivers}
-    ways, env = ways_of_drivers(driven.values(), range(told.episodes)), environment(told)
-    for number, beam in enumerate((None, *told.beam)):
-        ways = ways if beam is None else search_left(env, ways, told.seed, beam)
+    driven = {name: rides_of(name, options) for name in options.drivers}
+    ways, env = ways_of_drivers(driven.values(), range(options.episodes)), environment(options)
+    for number, beam in enumerate((None, *options.beam)):
+        ways = ways if beam is None else search_left(env, ways, options.seed, beam)
         tables = {
-            "floor": floor_rows(ways, told.beam[:number]),
+            "floor": floor_rows(ways, options.beam[:number]),
             "drivers": [driver_row(name, rides, ways) for name, rides in driven.items()],
             "seconds": time.monotonic() - begun,
         }
-        line = publish(told, section, tables, ways)
+        line = publish(options, section, tables, ways)
     return line
 
 

@@ -1,8 +1,8 @@
 """How fast frames of an episode are drawn: frames/s on one core, MOBIL with 8 others on three lanes.
 
-    OMP_NUM_THREADS=1 python benchmarks/drawing.py
-    OMP_NUM_THREADS=1 python benchmarks/drawing.py --width 1920 --height 480
-    python benchmarks/drawing.py --profile
+    OMP_NUM_THREADS=1 python -m benchmarks.drawing
+    OMP_NUM_THREADS=1 python -m benchmarks.drawing --width 1920 --height 480
+    python -m benchmarks.drawing --profile
 
 Prints the median and the best of the rounds, by the clock and by CPU time. Drawing runs in one thread: on an idle
 core the two agree; on a busy machine the clock also counts the time that others had.
@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from ganlane.benchmarks.script import parser_of, run_script
+from benchmarks.script import make_parser, run_script
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
@@ -58,8 +58,8 @@ def profile(painter: FramePainter, frames: int) -> str:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says."""
-    parser = parser_of(__doc__)
+    """The command line."""
+    parser = make_parser(__doc__)
     parser.add_argument("--width", type=int, default=1280)
     parser.add_argument("--height", type=int, default=320)
     parser.add_argument("--frames", type=int, default=80, help="per round")
@@ -68,20 +68,20 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def measure(told: argparse.Namespace) -> str:
+def measure(options: argparse.Namespace) -> str:
     """Draw all rounds; a line per clock."""
-    wanted = told.frames * told.rounds
+    wanted = options.frames * options.rounds
     trajectory = episode(0.1 * (wanted + 1))
     if len(trajectory) <= wanted:
         raise UserError(
             f"the episode has {len(trajectory)} frames, one of them for warming up; ask for fewer in all."
         )
-    painter = FramePainter(trajectory, WindowParameters(told.width, told.height))
+    painter = FramePainter(trajectory, WindowParameters(options.width, options.height))
     painter.draw(0)
-    if told.profile:
-        return profile(painter, told.frames)
-    lines = [f"{told.width} x {told.height}, {trajectory.vehicles} vehicles, {told.rounds} rounds"]
-    for unit, found in zip(("s", "CPU-s"), rounds(painter, told.frames, told.rounds)):
+    if options.profile:
+        return profile(painter, options.frames)
+    lines = [f"{options.width} x {options.height}, {trajectory.vehicles} vehicles, {options.rounds} rounds"]
+    for unit, found in zip(("s", "CPU-s"), rounds(painter, options.frames, options.rounds)):
         lines.append(f"{statistics.median(found):.0f} frames/{unit} (best {max(found):.0f})")
     return "\n".join(lines)
 

@@ -1,7 +1,7 @@
 """The figures of the docs that need no long run: the architecture, and recorded against generated courses.
 
-    python benchmarks/figures.py --folder docs/figures
-    python benchmarks/figures.py --folder docs/figures --scene us101-e --lane 1
+    python -m benchmarks.figures --folder docs/figures
+    python -m benchmarks.figures --folder docs/figures --scene us101-e --lane 1
 
 Writes generator_architecture.png (the paper's Figure 1, with the shapes of the generator that ships) and
 generator_courses.png (its Figure 2: a scene that the generator was not fitted to; needs the recordings).
@@ -24,13 +24,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 from torch import Tensor, nn
 
-from ganlane.benchmarks.script import parser_of, run_script
+from benchmarks.script import make_parser, run_script
 from ganlane.data import FRAME_S, default_scenes, read_scenes, scene_lane_widths
 from ganlane.generator import Discriminator, Generator, load_generator, shipped_generator
 from ganlane.realism.recordings import recorded_frame, recordings_of
 from ganlane.realism.replay_starts import StartOptions, drive_recordings
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 from ganlane.traffic.presets import gan_calibrated_traffic
 from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, palette, save_figure
@@ -205,19 +205,19 @@ def courses(scene: str, lane: int) -> Figure:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says."""
-    parser = parser_of(__doc__)
+    """The command line."""
+    parser = make_parser(__doc__)
     parser.add_argument("--folder", type=Path, default=Path("docs/figures"))
     parser.add_argument("--scene", default="us101-b", help="a scene that the generator was not fitted to")
     parser.add_argument("--lane", type=int, default=2, help="0 is the rightmost")
     return parser.parse_args(arguments)
 
 
-def draw(told: argparse.Namespace) -> str:
+def draw(options: argparse.Namespace) -> str:
     """Draw and write; where the figures are."""
-    written = [told.folder / f"generator_{name}.png" for name in ("architecture", "courses")]
+    written = [options.folder / f"generator_{name}.png" for name in ("architecture", "courses")]
     save_figure(architecture(), written[0])
-    save_figure(courses(told.scene, told.lane), written[1])
+    save_figure(courses(options.scene, options.lane), written[1])
     return "\n".join(map(str, written))
 
 

@@ -20,4 +20,4 @@ if [ -n "${FOLDS:-}" ]; then
     "$python" -m ganlane.realism traffic=gan_calibrated "$rivals" "fold_weights=[$FOLDS]" vehicle_km=0 i80=false \
         report=docs/realism.md
 fi
-"$python" benchmarks/figures.py --folder docs/figures
+"$python" -m benchmarks.figures --folder docs/figures

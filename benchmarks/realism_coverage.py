@@ -1,6 +1,6 @@
 """Do the realism card's intervals hold what they should? Models of which the true distance is known, many times.
 
-    python benchmarks/realism_coverage.py --scenes 11 4 --trials 200
+    python -m benchmarks.realism_coverage --scenes 11 4 --trials 200
 
 Scenes have means of their own and sizes of their own; a recording and two models are drawn from each of them, over
 and over. Printed is how often an interval holds the distance that scenes without end would show (covers), how often
@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from ganlane.benchmarks.script import parser_of
-from ganlane.evaluation.statistics import Estimate, percentile_levels, resample_counts
-from ganlane.realism.distances import Array, distance, distance_difference, jensen_shannon
+from benchmarks.script import make_parser
+from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, resample_counts
+from ganlane.realism.distances import distance, distance_difference, jensen_shannon
 
 #: Spread of the scenes' means, and of the logarithm of their sizes; independent samples of a scene of median size.
 _BETWEEN, _SIZES, _MEDIAN = 0.7, 0.8, 20.0
@@ -72,7 +72,7 @@ def percentile(models: tuple[Array, ...], recorded: Array, resamples: int) -> Es
         return np.sum([sign * each for sign, each in zip(signs, every)], axis=0)
 
     drawn = np.concatenate([value(counts) for counts in resample_counts(len(recorded), resamples, 0)])
-    low, high = np.quantile(drawn, percentile_levels())
+    low, high = np.quantile(drawn, TAIL_LEVELS)
     return Estimate(float(value(np.ones(len(recorded)))), float(low), float(high))
 
 
@@ -106,16 +106,16 @@ def shares(estimates: list[Estimate], true: float) -> str:
 
 def main() -> None:
     """Draw, and print a line per kind of interval."""
-    asked = parser_of(__doc__)
+    asked = make_parser(__doc__)
     asked.add_argument("--scenes", type=int, nargs="+", default=[11, 4])
     asked.add_argument("--trials", type=int, default=200)
     asked.add_argument("--resamples", type=int, default=500)
-    told = asked.parse_args()
+    options = asked.parse_args()
     print(f"{'scenes, models, interval':52} covers estimate  closer  farther")
-    for number in told.scenes:
+    for number in options.scenes:
         for name, pair in PAIRS.items():
             random, true = np.random.default_rng(0), [truth(model) for model in pair]
-            rows = zip(*(trial(pair, number, told.resamples, random) for _ in range(told.trials)))
+            rows = zip(*(trial(pair, number, options.resamples, random) for _ in range(options.trials)))
             kinds = ("distance", "distance, percentile", "difference", "difference, percentile")
             for kind, values, value in zip(kinds, rows, (true[0], true[0], true[0] - true[1], true[0] - true[1])):
                 print(f"{f'{number}, {name}, {kind}':52} {shares(list(values), value)}", flush=True)

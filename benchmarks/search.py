@@ -1,7 +1,7 @@
-"""The runs of a search in one table: what differed, what each scored on the stream kept for selection.
+"""The runs of a hyperparameter search in one table: their differences, and their scores on the selection stream.
 
-    python benchmarks/search.py outputs/train_sweeps/SWEEP
-    python benchmarks/search.py outputs/train_sweeps/* --report docs/search.md --csv docs/search.csv
+    python -m benchmarks.search outputs/train_sweeps/SWEEP
+    python -m benchmarks.search outputs/train_sweeps/* --report docs/search.md --csv docs/search.csv
 
 Reads config.yaml, evaluation.csv and metrics.csv of every run below the folders; runs that are not finished are
 listed with what they have. ``--report`` puts the table between the two marker lines of a document.
@@ -21,10 +21,12 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.errors import UserError, as_typed
-from ganlane.files import write_between_markers, write_bytes
-from ganlane.training.log import read_rows
-from ganlane.training.run import flat
+from ganlane.evaluation.table import Table
+from ganlane.files import write_bytes
+from ganlane.training.checkpoint import flat
+from ganlane.training.logs import read_rows
 
 BEGIN, END = "<!-- search: begin -->", "<!-- search: end -->"
 #: Options that change nothing in what is learned.
@@ -132,8 +134,8 @@ def compact(rows: Sequence[Mapping[str, str]], options: Sequence[str]) -> list[d
 
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
     """The rows as a table."""
-    lines = [list(rows[0]), ["---"] * len(rows[0]), *(list(row.values()) for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    lines = [list(row.values()) for row in rows]
+    return Table("", list(rows[0]), lines, names=len(rows[0])).markdown(heading=False)
 
 
 def as_csv(rows: Sequence[Mapping[str, str]]) -> str:
@@ -145,26 +147,30 @@ def as_csv(rows: Sequence[Mapping[str, str]]) -> str:
     return text.getvalue()
 
 
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = make_parser(__doc__)
+    parser.add_argument("folders", type=Path, nargs="+", help="of sweeps, or of single runs")
+    parser.add_argument("--csv", type=Path, help="where to write the table as CSV")
+    add_report(parser, BEGIN, END)
+    return parser.parse_args(arguments)
+
+
+def report(options: argparse.Namespace) -> str:
+    """The table, in the document and as CSV too where they are named."""
+    section = ReportSection(options.report, BEGIN, END)
+    runs = read_runs(options.folders)
+    rows = table(runs)
+    text = markdown(compact(rows, differing(runs)))
+    section.write(text)
+    if options.csv:
+        write_bytes(options.csv, as_csv(rows).encode())
+    return text
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table, and write it where asked; the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
-    parser.add_argument("folders", type=Path, nargs="+", help="of sweeps, or of single runs")
-    parser.add_argument("--report", type=Path, help=f"a document with the lines {BEGIN} and {END}")
-    parser.add_argument("--csv", type=Path, help="where to write the table as CSV")
-    given = parser.parse_args(arguments)
-    try:
-        runs = read_runs(given.folders)
-        rows = table(runs)
-        text = markdown(compact(rows, differing(runs)))
-        if given.report:
-            write_between_markers(given.report, BEGIN, END, text)
-    except UserError as error:
-        print(f"search: {error}", file=sys.stderr)
-        return 2
-    if given.csv:
-        write_bytes(given.csv, as_csv(rows).encode())
-    print(text)
-    return 0
+    return run_script(report, parse(arguments))
 
 
 if __name__ == "__main__":

@@ -1,83 +1,181 @@
 """What does each option of the generated traffics do? The closed loop, driven with one of them changed at a time.
 
-    python benchmarks/traffic_ablations.py
-    python benchmarks/traffic_ablations.py --report docs/traffic.md
+    python -m benchmarks.traffic_ablations
+    python -m benchmarks.traffic_ablations --report docs/traffic.md
 
 Vehicles start as the simulator's episodes do (Table II), without an ego, and drive ``--seconds`` an episode until a
 variant has its vehicle-km. The weights are those that ship; ``--fitted LABEL=FILE`` adds others. Every variant's
 numbers stand in a file of their own in ``--folder``, so a run that was stopped goes on where it stood.
 
 Two variants are no option of the package: the generator in bfloat16, and plans of several steps for the calibrated
-traffic (:mod:`benchmarks.ablations.networks`).
+traffic (:mod:`benchmarks.ablation_variants`).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import shlex
 import sys
 import time
 from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
 
-from ganlane.benchmarks.report import machine_sentence
-from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
+from benchmarks.ablation_variants import Variant, calibrated_variants, fitted_variant, gan_variants
+from benchmarks.script import ReportSection, add_report, make_parser, run_script
+from ganlane.evaluation import machine_sentence
+from ganlane.evaluation.table import Table
 from ganlane.files import write_json
-from ganlane.memory import keep_freed_memory
-from ganlane.realism.long_runs import LongRunParameters
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmarks.ablations.driving import drive
-from benchmarks.ablations.tables import table
-from benchmarks.ablations.variants import Variant, calibrated_variants, fitted_variant, gan_variants
+from ganlane.realism.long_runs import (
+    EventCounter,
+    GuardMeter,
+    LongRunParameters,
+    Trajectories,
+    batch_statistics,
+    drive_spawned,
+    summary,
+    watched,
+)
+from ganlane.runtime import keep_freed_memory
+from ganlane.sim.state import Road
+from ganlane.traffic import TrafficModule
 
 BEGIN, END = "<!-- begin traffic ablations -->", "<!-- end traffic ablations -->"
+HEADINGS = (
+    "variant",
+    "vehicle-km",
+    "lane changes per vehicle-km",
+    "overlaps per 1000 vehicle-km [95 %]",
+    "off road",
+    "mean speed, m/s",
+    "spread, m/s",
+    "acceleration 5 %, 95 %, m/s²",
+    "the guard's share",
+    "physics steps/CPU-s",
+)
 
 
-def settings(told: argparse.Namespace) -> dict[str, Any]:
+class StepClock:
+    """CPU seconds of every call of a traffic, all threads."""
+
+    def __init__(self, traffic: TrafficModule) -> None:
+        self.seconds, self._begun = list[float](), 0.0
+        traffic.register_forward_pre_hook(self._begin)
+        traffic.register_forward_hook(self._end)
+
+    def _begin(self, *_: Any) -> None:
+        self._begun = time.process_time()
+
+    def _end(self, *_: Any) -> None:
+        self.seconds.append(time.process_time() - self._begun)
+
+
+def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[str, Any]:
+    """Drive ``batch`` episodes at a time until the wanted vehicle-km are covered.
+
+    Returns:
+        The numbers of a long run, mean speed and its spread at the end, physics steps per CPU second.
+    """
+    events, meter = EventCounter(Road()), GuardMeter()
+    parts: list[dict[str, Any]] = []
+    ends: list[tuple[float, float]] = []
+    seconds: list[float] = []
+    while sum(part["vehicle_km"] for part in parts) < parameters.vehicle_km:
+        traffic = variant.make()
+        clock = StepClock(traffic)
+        with watched(traffic, meter):
+            course = drive_spawned(traffic, parameters, batch * len(parts), batch, events)
+        parts.append(batch_statistics(course, Road()))
+        ends.append(speeds_at_the_end(course))
+        seconds += clock.seconds
+        if parts[-1]["vehicle_km"] <= 0.0:
+            break
+    numbers = summary(parts, events, meter, batch * len(parts), parameters.vehicles)
+    mean, spread = (sum(values) / len(values) for values in zip(*ends))
+    return {
+        **numbers,
+        "mean_speed_mps": mean,
+        "spread_mps": spread,
+        "physics_steps_per_cpu_s": batch / median(seconds),
+    }
+
+
+def speeds_at_the_end(course: Trajectories) -> tuple[float, float]:
+    """Mean speed, and standard deviation within an episode, at the end of all episodes, m/s."""
+    last = course.speed[-1].astype("float64")
+    return float(last.mean()), float(last.std(axis=-1, ddof=1).mean())
+
+
+def cells(numbers: dict[str, Any]) -> list[str]:
+    """A row of the table behind its name."""
+    changes, overlaps = numbers["lane_changes_per_vehicle_km"], numbers["overlaps_per_1000_vehicle_km"]
+    low, high = numbers["overlaps_per_1000_vehicle_km_ci"] or (0.0, math.inf)
+    slow, fast = numbers["acceleration_quantiles"].values()
+    share = numbers["guard_share"]
+    return [
+        f"{numbers['vehicle_km']:.0f}",
+        "-" if changes is None else f"{changes:.2f}",
+        "-" if overlaps is None else f"{overlaps:.1f} [{low:.1f}, {high:.1f}]",
+        str(numbers["off_road"]),
+        f"{numbers['mean_speed_mps']:.1f}",
+        f"{numbers['spread_mps']:.2f}",
+        f"{slow:.2f}, {fast:.2f}",
+        "-" if share is None else f"{100 * share:.1f} %",
+        f"{numbers['physics_steps_per_cpu_s'] / 1000:.1f} k",
+    ]
+
+
+def table(rows: Sequence[tuple[Variant, dict[str, Any]]]) -> str:
+    """Markdown: the variants of each preset under its name."""
+    lines = [[f"`{variant.preset}`, {variant.name}", *cells(numbers)] for variant, numbers in rows]
+    return Table("", HEADINGS, lines).markdown(heading=False)
+
+
+def settings(options: argparse.Namespace) -> dict[str, Any]:
     """What a variant's numbers depend on."""
-    return {name: getattr(told, name) for name in ("vehicle_km", "vehicles", "batch", "seconds", "seed")}
+    return {name: getattr(options, name) for name in ("vehicle_km", "vehicles", "batch", "seconds", "seed")}
 
 
-def driven(variant: Variant, told: argparse.Namespace) -> dict[str, Any]:
+def driven(variant: Variant, options: argparse.Namespace) -> dict[str, Any]:
     """The numbers of a variant, from its file if it was driven with these settings before."""
-    path, wanted = told.folder / f"{variant.slug}.json", settings(told)
+    path, wanted = options.folder / f"{variant.slug}.json", settings(options)
     if path.is_file():
         kept = json.loads(path.read_text(encoding="utf-8"))
         if kept["settings"] == wanted:
             return kept["numbers"]
     begun = time.monotonic()
-    asked = LongRunParameters(told.vehicles, told.vehicle_km, told.seconds, told.seed, variant.spawn)
-    numbers = drive(variant, asked, told.batch)
+    asked = LongRunParameters(options.vehicles, options.vehicle_km, options.seconds, options.seed, variant.spawn)
+    numbers = drive(variant, asked, options.batch)
     write_json(path, {"settings": wanted, "numbers": numbers})
     line = f"{variant.preset}, {variant.name}: {numbers['vehicle_km']:.0f} vehicle-km"
     print(f"{line} in {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
     return numbers
 
 
-def section(told: argparse.Namespace, text: str) -> str:
+def section(options: argparse.Namespace, text: str) -> str:
     """The table with the command and the machine."""
-    given = told.given[:]
-    if told.report is not None and "--report" in given:
+    given = options.given[:]
+    if options.report is not None and "--report" in given:
         del given[given.index("--report") : given.index("--report") + 2]
-    command = shlex.join(["python", "benchmarks/traffic_ablations.py", *given])
+    command = shlex.join(["python", "-m", "benchmarks.traffic_ablations", *given])
     return "\n".join(
         [
             f"\nWritten by the command on {date.today()}:\n\n    {command}\n",
-            f"Taken on: {machine_sentence([torch.get_num_threads()])} {told.vehicles} vehicles without an ego, "
-            f"{told.batch} episodes side by side, {told.seconds:g} s each.\n\n{text}\n",
+            f"Taken on: {machine_sentence([torch.get_num_threads()])} {options.vehicles} vehicles without an ego, "
+            f"{options.batch} episodes side by side, {options.seconds:g} s each.\n\n{text}\n",
         ]
     )
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """What the command line says."""
-    parser = parser_of(__doc__)
+    """The command line."""
+    parser = make_parser(__doc__)
     parser.add_argument("--vehicle-km", type=float, default=200.0, help="at least, per variant")
     parser.add_argument("--vehicles", type=int, default=9)
     parser.add_argument("--batch", type=int, default=128, help="episodes side by side")
@@ -87,20 +185,20 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--only", nargs="*", help="variants whose name holds one of these words")
     parser.add_argument("--folder", type=Path, default=Path("outputs/traffic_ablations"))
     add_report(parser, BEGIN, END)
-    told = parser.parse_args(arguments)
-    told.given = list(arguments)
-    return told
+    options = parser.parse_args(arguments)
+    options.given = list(arguments)
+    return options
 
 
-def measure(told: argparse.Namespace) -> str:
+def measure(options: argparse.Namespace) -> str:
     """Drive all variants; the table, in the document too where one is named."""
     keep_freed_memory()
-    document = ReportSection(told.report, BEGIN, END)
-    chosen = [*gan_variants(), *calibrated_variants(), *map(fitted_variant, told.fitted)]
-    if told.only:
-        chosen = [each for each in chosen if any(word in f"{each.preset} {each.name}" for word in told.only)]
-    text = table([(variant, driven(variant, told)) for variant in chosen])
-    document.write(section(told, text))
+    document = ReportSection(options.report, BEGIN, END)
+    chosen = [*gan_variants(), *calibrated_variants(), *map(fitted_variant, options.fitted)]
+    if options.only:
+        chosen = [each for each in chosen if any(word in f"{each.preset} {each.name}" for word in options.only)]
+    text = table([(variant, driven(variant, options)) for variant in chosen])
+    document.write(section(options, text))
     return text
 
 

@@ -43,7 +43,7 @@ def main(episodes=24, goal_m=500.0):
     """Evaluate four drivers on short episodes of the stream that is kept for reports."""
     mine = ganlane.Driver("largest_gap", LargestGap(Road(lanes=3), Stream.REPORT))
     drivers = ["mobil", "agent_idm", "random_legal", mine]
-    print(text_table(ganlane.evaluate(drivers, ["idm_mobil"], episodes, goal_m=goal_m).to_dicts()))
+    print(text_table(ganlane.api.evaluate(drivers, ["idm_mobil"], episodes, goal_m=goal_m).to_dicts()))
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def main(decisions=2_000, episodes=20, goal_m=1000.0):
     print(f"{model.num_timesteps} decisions, mean return of the last {len(finished)} episodes {mean(finished):.1f}")
     policy = TensorDictModule(Greedy(model.q_net), in_keys=["observation"], out_keys=["action"])
     sb3 = ganlane.Driver("sb3_dqn", policy)
-    table = ganlane.evaluate([sb3, "mobil", "random_legal"], ["idm_mobil"], episodes, goal_m=goal_m)
+    table = ganlane.api.evaluate([sb3, "mobil", "random_legal"], ["idm_mobil"], episodes, goal_m=goal_m)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))
 
 

@@ -24,7 +24,7 @@ def main(decisions="200000", mask="none", episodes="100", goal_m="5000"):
     algorithm = PPO if mask == "none" else MaskablePPO
     model = algorithm("MlpPolicy", env, n_steps=64, batch_size=512, gamma=0.98, policy_kwargs=network, seed=0)
     model.learn(int(decisions), progress_bar=False)
-    table = ganlane.evaluate([ganlane.sb3.driver(model), "mobil"], ["idm_mobil"], int(episodes), **options)
+    table = ganlane.api.evaluate([ganlane.sb3.driver(model), "mobil"], ["idm_mobil"], int(episodes), **options)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))
 
 

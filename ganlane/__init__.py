@@ -8,118 +8,76 @@
     env = gymnasium.make("ganlane/Highway-v0", traffic="gan")                   # one highway
     envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, traffic="gan")  # a batch of them
     env = ganlane.make_env(traffic="gan", num_envs=256)                          # the same for TorchRL
-    table = ganlane.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])    # a data frame
+    table = ganlane.api.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])  # a data frame
 
-The package reads from the bottom up, and imports run only downwards:
-
-``data``, ``sim``  <-  ``generator``  <-  ``traffic``  <-  ``env``  <-  ``transforms``  <-  ``agents``  <-
-``evaluation``  <-  ``training``  <-  ``view``  <-  ``config``  <-  entry points  <-  ``api``  <-  ``gym``.
-
-Three small modules stand under all of them: ``keys`` (every TensorDict key, declared once), ``errors``
-(a user's mistake, told in one sentence) and ``files`` (atomic writes and safe checkpoints).
-
-Importing the package registers the gymnasium environments and loads nothing else: what is named here is imported
-when it is first used.
+Imports run one way: ``data``, ``sim`` <- ``generator`` <- ``traffic`` <- ``env`` <- ``transforms`` <- ``agents`` <-
+``evaluation`` <- ``training`` <- ``view`` <- ``config`` <- the commands' modules <- ``api`` <- ``gym``. Below all of
+them are ``keys`` (every TensorDict key), ``errors``, ``files`` and ``runtime``.
 """
 
 from __future__ import annotations
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ganlane._version import __version__
 from ganlane.gym import register_envs
 
-if TYPE_CHECKING:
-    from ganlane.api import (
-        bench,
-        evaluate,
-        load_agent,
-        make_env,
-        prepare,
-        realism,
-        render,
-        train,
-        train_generator,
-    )
-    from ganlane.build import Driver
-    from ganlane.env import EpisodeParameters, HighwayEnv
-    from ganlane.errors import UserError
-    from ganlane.sim import Road, Stream
-    from ganlane.traffic import IdmMobilTraffic, IdmTraffic, TrafficModule
-    from ganlane.transforms import (
-        ObservationTransform,
-        RewardParameters,
-        RewardTransform,
-        SensorParameters,
-        SensorTransform,
-    )
+if TYPE_CHECKING:  # for type checkers and editors, which do not run __getattr__
+    from ganlane import api as api
+    from ganlane.api import Driver as Driver
+    from ganlane.api import load_agent as load_agent
+    from ganlane.api import make_env as make_env
+    from ganlane.env import EpisodeParameters as EpisodeParameters
+    from ganlane.env import HighwayEnv as HighwayEnv
+    from ganlane.errors import UserError as UserError
+    from ganlane.sim import Road as Road
+    from ganlane.sim import Stream as Stream
+    from ganlane.traffic import IdmMobilTraffic as IdmMobilTraffic
+    from ganlane.traffic import IdmTraffic as IdmTraffic
+    from ganlane.traffic import TrafficModule as TrafficModule
+    from ganlane.transforms import ObservationTransform as ObservationTransform
+    from ganlane.transforms import RewardParameters as RewardParameters
+    from ganlane.transforms import RewardTransform as RewardTransform
+    from ganlane.transforms import SensorParameters as SensorParameters
+    from ganlane.transforms import SensorTransform as SensorTransform
 
-#: Where each name comes from.
-_HOMES = {
-    "ganlane.api": "bench evaluate load_agent make_env prepare realism render train train_generator",
-    "ganlane.build": "Driver",
-    "ganlane.env": "EpisodeParameters HighwayEnv",
-    "ganlane.errors": "UserError",
-    "ganlane.sim": "Road Stream",
-    "ganlane.traffic": "IdmMobilTraffic IdmTraffic TrafficModule",
-    "ganlane.transforms": "ObservationTransform RewardParameters RewardTransform SensorParameters SensorTransform",
+#: Module of each public name.
+_MODULES = {
+    "Driver": "ganlane.build",
+    "EpisodeParameters": "ganlane.env",
+    "HighwayEnv": "ganlane.env",
+    "IdmMobilTraffic": "ganlane.traffic",
+    "IdmTraffic": "ganlane.traffic",
+    "ObservationTransform": "ganlane.transforms",
+    "RewardParameters": "ganlane.transforms",
+    "RewardTransform": "ganlane.transforms",
+    "Road": "ganlane.sim",
+    "SensorParameters": "ganlane.transforms",
+    "SensorTransform": "ganlane.transforms",
+    "Stream": "ganlane.sim",
+    "TrafficModule": "ganlane.traffic",
+    "UserError": "ganlane.errors",
+    "load_agent": "ganlane.api",
+    "make_env": "ganlane.api",
 }
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
-
-__all__ = [
-    "Driver",
-    "EpisodeParameters",
-    "HighwayEnv",
-    "IdmMobilTraffic",
-    "IdmTraffic",
-    "ObservationTransform",
-    "RewardParameters",
-    "RewardTransform",
-    "Road",
-    "SensorParameters",
-    "SensorTransform",
-    "Stream",
-    "TrafficModule",
-    "UserError",
-    "__version__",
-    "bench",
-    "evaluate",
-    "load_agent",
-    "make_env",
-    "prepare",
-    "realism",
-    "render",
-    "train",
-    "train_generator",
-]
+__all__ = ["__version__", "api", *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    """A name of the package, imported now."""
-    if name not in _HOME_OF:
-        raise AttributeError(f"module 'ganlane' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOME_OF[name]), name)
+    """Import a public name when it is first used (PEP 562).
+
+    ``import ganlane`` must register the gymnasium environments without waiting seconds for torch.
+    """
+    if name == "api":
+        return importlib.import_module("ganlane.api")
+    if name in _MODULES:
+        return getattr(importlib.import_module(_MODULES[name]), name)
+    raise AttributeError(f"module 'ganlane' has no attribute {name!r}; the commands' calls are in ganlane.api")
 
 
 def __dir__() -> list[str]:
-    """What can be imported from here."""
-    return sorted({*globals(), *_HOME_OF})
+    return sorted({*globals(), *__all__})
 
 
-class _Package(ModuleType):
-    """Keeps ``ganlane.evaluate`` the call of that name once the command's module ``ganlane.evaluate`` was imported.
-
-    Importing a submodule makes it an attribute of its package, which would hide the call. The modules are reached
-    by ``from ganlane.evaluate import ...``.
-    """
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _HOME_OF and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
 register_envs()

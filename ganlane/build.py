@@ -1,4 +1,4 @@
-"""From plain config dataclasses to environments, traffic and drivers; no Hydra in here.
+"""From config dataclasses to environments, traffic and drivers, without Hydra.
 
 ::
 
@@ -27,12 +27,12 @@ from ganlane.config.targets import call_with, import_target
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
+from ganlane.files import CHECKPOINTS
 from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
-from ganlane.paths import CHECKPOINTS
+from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
-from ganlane.sim.steering import STEERING
+from ganlane.sim.state import Road
 from ganlane.traffic import BlindTraffic, TrafficModule
 from ganlane.transforms import (
     ActionMaskTransform,
@@ -43,18 +43,13 @@ from ganlane.transforms import (
 )
 
 
-def set_threads(threads: int) -> None:
-    """Let torch use so many threads; 0 takes one, which is fastest for batches of the sizes used here."""
-    torch.set_num_threads(threads or 1)
-
-
 def make_road(env: EnvConfig) -> Road:
     """The road of an environment."""
     return Road(env.lanes, env.lane_width_m)
 
 
 def _offered(env: EnvConfig, stream: int) -> dict[str, Any]:
-    """What a traffic model or a driver may ask for by name."""
+    """Arguments that the constructor of a traffic model or a driver may have, by name."""
     return {
         "road": make_road(env),
         "stream": stream,
@@ -121,39 +116,33 @@ def make_env(
         recycle=env.recycle,
         recycle_share=env.recycle_share,
     )
-    seen = ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
-    masks = _mask_transforms(mask or MaskParameters(), base, env)
+    transforms: list[ObservationTransform | ActionMaskTransform] = [
+        ObservationTransform(base.road, env.vehicles, observation.form, observation.scale())
+    ]
+    if mask is not None and mask.form != "none":
+        abort = env.ego.abort_lane_change
+        transforms.append(ActionMaskTransform(base.road, mask.form, mask.safe_deceleration, env.idm, abort))
     if env.compile:
         base.compile()
-        seen.compile_graphs()
-        for each in masks:
+        for each in transforms:
             each.compile_graphs()
     errors = observation.sensors
     try:
         sensors = [] if errors is None else [SensorTransform(errors, traffic.stream, env.decision_period_s)]
     except ParameterError as error:
         raise error.below("observation.sensors") from error
-    pay = RewardTransform(env.decision_period_s, reward)
-    return TransformedEnv(base, Compose(*sensors, seen, *masks, pay))
-
-
-def _mask_transforms(mask: MaskParameters, base: HighwayEnv, env: EnvConfig) -> list[ActionMaskTransform]:
-    """The transform that ``mask`` asks for; none for ``mask=none``."""
-    if mask.form == "none":
-        return []
-    judged_by, abort = env.idm, env.ego.abort_lane_change
-    return [ActionMaskTransform(base.road, mask.form, mask.safe_deceleration, judged_by, abort)]
+    return TransformedEnv(base, Compose(*sensors, *transforms, RewardTransform(env.decision_period_s, reward)))
 
 
 @dataclass(frozen=True)
 class Driver:
-    """Somebody who can drive the ego.
+    """A policy for the ego.
 
     Attributes:
         name: in tables.
         policy: writes ``action``.
         observation: that it reads; None: any.
-        mask: behind which it drives; None: that of the command or call, by default none.
+        mask: of its actions; None: that of the command or call, by default none.
     """
 
     name: str
@@ -162,7 +151,7 @@ class Driver:
     mask: MaskParameters | None = None
 
     def behind(self, mask: MaskParameters | None) -> tuple[MaskParameters, TensorDictModuleBase]:
-        """The mask that holds where ``mask`` is the default, and the policy behind it."""
+        """The mask in force, where ``mask`` is the default, and the policy with that mask."""
         chosen = self.mask or mask or MaskParameters()
         return chosen, self.policy if chosen.form == "none" else MaskedPolicy(self.policy)
 
@@ -172,10 +161,10 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
 
     Args:
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent, the path of an agent's file,
-            or the import path of a policy of your own (a class or function; it may ask for ``road``, ``stream``,
-            ``idm`` and ``mobil``). ``+safe``, ``+legal`` or ``+none`` may follow: the mask behind which it drives, in
-            place of the one that it was trained with.
-        env: where it is to drive.
+            or the import path of a policy of your own (a class or function; it may have arguments ``road``,
+            ``stream``, ``idm`` and ``mobil``). A suffix ``+safe``, ``+legal`` or ``+none`` sets its mask, in place of
+            the one that it was trained with.
+        env: the environment it drives in.
         stream: of its random numbers, if it draws any.
         device: of its network.
 
@@ -210,10 +199,10 @@ def _trained(name: str, env: EnvConfig, device: str) -> Driver:
 
 
 def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
-    """The mask that an agent was trained with; None for one that was trained without, or before there were any.
+    """The mask that an agent was trained with; None for none.
 
     Raises:
-        UserError: the metadata name one that there is not.
+        UserError: an unknown mask.
     """
     try:
         mask = MaskParameters(**metadata.get("mask", {}))
@@ -226,7 +215,7 @@ def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
     """The observation that an agent's metadata name.
 
     Raises:
-        UserError: they name none that there is.
+        UserError: no observation, or an unknown one.
     """
     try:
         return ObservationConfig(form=metadata["observation"], **metadata["observation_scale"])

@@ -1,4 +1,4 @@
-"""Drivers beside each other: every one on every traffic, on the same episodes."""
+"""Drivers compared: every one on every traffic, on the same episodes."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from ganlane.evaluation import (
     write_episodes,
     write_results,
 )
+from ganlane.evaluation.statistics import entries
 from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import Stream
@@ -64,20 +65,52 @@ def compare(
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(num_envs, episodes), []
     made: tuple[tuple[str, ObservationConfig, MaskParameters], EnvBase] | None = None
-    with _Progress(len(pairs) * episodes) as progress:
-        for traffic, driver in pairs:
-            seen = (observation or ObservationConfig()).read_by(driver.observation)
-            shield, policy = driver.behind(mask)
-            make = partial(make_env, modules[traffic], env, seen, reward, seed=seed, device=device, mask=shield)
-            if made is None or made[0] != (traffic, seen, shield):
-                # Drivers that see the same share an environment, which is compiled once then.
-                made = (traffic, seen, shield), make(rows)
+    bar = tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=not sys.stderr.isatty())
+    with bar:
+        for number, (traffic, driver) in enumerate(pairs):
+            own_observation = (observation or ObservationConfig()).read_by(driver.observation)
+            own_mask, policy = driver.behind(mask)
+            make = partial(
+                make_env, modules[traffic], env, own_observation, reward, seed=seed, device=device, mask=own_mask
+            )
+            if made is None or made[0] != (traffic, own_observation, own_mask):
+                # Drivers with the same observation and mask share an environment, so that it is compiled once.
+                made = (traffic, own_observation, own_mask), make(rows)
             smaller = None if env.compile else make
-            report = progress.start(f"{driver.name} on {traffic}")
-            table = run_episodes(made[1], policy, range(episodes), seed, report, smaller)
+            on_progress = _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
+            table = run_episodes(made[1], policy, range(episodes), seed, on_progress, smaller)
             named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             tables.append(_with_scenes(named, modules[traffic], seed))
     return pl.concat(tables, how="diagonal")
+
+
+def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.DataFrame:
+    """:func:`compare` with the traffics, episodes and environment of ``config``."""
+    return compare(
+        drivers,
+        config.chosen_traffics(),
+        config.env,
+        config.reward,
+        config.observation,
+        config.episodes,
+        config.seed,
+        config.num_envs,
+        config.device,
+        Stream[config.stream.upper()],
+        config.mask,
+    )
+
+
+def _reporter(bar: tqdm, title: str, before: int) -> Callable[[int, int], None]:
+    """Shows the progress of one driver and traffic: on the bar, or as one line where there is no terminal."""
+    bar.set_description(title)
+
+    def report(finished: int, wanted: int) -> None:
+        bar.update(before + finished - bar.n)
+        if bar.disable and finished == wanted:
+            print(f"{title}: {wanted} episodes", file=sys.stderr, flush=True)
+
+    return report
 
 
 def _with_scenes(table: pl.DataFrame, traffic: TrafficModule, seed: int) -> pl.DataFrame:
@@ -101,26 +134,10 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
     recorded = table.filter(pl.col("scene").is_not_null())
     for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
         crashes = crashes_by_scene(episodes, episodes["scene"].to_list())
-        per_km = {"per_km": crashes.per_km.value, "per_km_ci": crashes.per_km.interval}
-        found.append({"agent": agent, "traffic": traffic, **per_km, "scenes": crashes.rows})
+        found.append(
+            {"agent": agent, "traffic": traffic, **entries("per_km", crashes.per_km), "scenes": crashes.rows}
+        )
     return found
-
-
-def compare_as_told(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.DataFrame:
-    """:func:`compare` with everything else as ``config`` says."""
-    return compare(
-        drivers,
-        config.chosen_traffics(),
-        config.env,
-        config.reward,
-        config.observation,
-        config.episodes,
-        config.seed,
-        config.num_envs,
-        config.device,
-        Stream[config.stream.upper()],
-        config.mask,
-    )
 
 
 def publish(
@@ -130,51 +147,22 @@ def publish(
     seeds: Mapping[str, Any],
     numbers: Mapping[str, Any] | None = None,
 ) -> str:
-    """Print the table of a comparison, write its episodes and ``results.json``; the line that names the latter.
+    """Print the tables of a comparison, write its episodes and ``results.json``; the line that names the latter.
 
-    With two drivers or more a second table, and ``paired`` in the record, say by how much the first one is ahead of
-    each of the others on the same episodes (:func:`ganlane.evaluation.paired_rows`). Where a traffic replays recorded
-    scenes, the record holds ``crashes_by_scene`` (:func:`recorded_crashes`).
+    The record also holds ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table with two drivers or more)
+    and, where a traffic replays recorded scenes, ``crashes_by_scene`` (:func:`recorded_crashes`).
 
     Args:
         table: what :func:`compare` returned.
         folder: of the run.
         config, seeds: of the run, for the record.
-        numbers: what the record holds beside ``rows``.
+        numbers: further entries of the record.
     """
-    rows, paired = evaluation_rows(table), paired_rows(table)
+    rows, paired, recorded = evaluation_rows(table), paired_rows(table), recorded_crashes(table)
     print(text_table(rows))
     if paired:
         print(f"\n{paired_table(paired)}")
     write_episodes(folder, table)
-    recorded = recorded_crashes(table)
     scenes = {"crashes_by_scene": recorded} if recorded else {}
-    known = {"rows": rows, "paired": paired, **scenes, **(numbers or {})}
-    return f"results: {write_results(folder, known, config, seeds)}"
-
-
-class _Progress:
-    """A bar on a terminal, elsewhere a line for every driver and traffic."""
-
-    def __init__(self, total: int) -> None:
-        self._bar = tqdm(total=total, unit="episode", file=sys.stderr, disable=not sys.stderr.isatty())
-        self._finished = 0
-
-    def start(self, title: str) -> Callable[[int, int], None]:
-        """Begin with the next driver and traffic; the function to call as its episodes finish."""
-        before = self._finished
-        self._bar.set_description(title)
-
-        def report(finished: int, wanted: int) -> None:
-            self._finished = before + finished
-            self._bar.update(self._finished - self._bar.n)
-            if self._bar.disable and finished == wanted:
-                print(f"{title}: {wanted} episodes", file=sys.stderr, flush=True)
-
-        return report
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
+    record = {"rows": rows, "paired": paired, **scenes, **(numbers or {})}
+    return f"results: {write_results(folder, record, config, seeds)}"

@@ -8,15 +8,335 @@ folders and extras. Nothing is written. What is MISSING is needed; what is absen
 exit status: 0 all that is needed is there, 1 something needed is missing, 2 a mistake on the command line
 """
 
+# Nothing here needs an installation that works: imports of other parts are inside functions, and what cannot be
+# imported becomes a finding.
+
 from __future__ import annotations
 
+import importlib
+import os
+import platform
+import re
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from importlib import metadata
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from ganlane._version import __version__
 
 NEEDED_IS_MISSING = 1
 USER_ERROR = 2
+PYTHON: Final = (3, 10)
+#: As in ``pyproject.toml``; a test compares them.
+REQUIRED: Final = (
+    "torch>=2.11,<2.14",
+    "torchrl>=0.14.1,<0.15",
+    "tensordict>=0.14.3,<0.15",
+    "gymnasium>=1.1,<2",
+    "hydra-core>=1.3.2,<1.4",
+    "matplotlib>=3.8",
+    "numpy>=1.26",
+    "polars>=1.20",
+    "pillow>=10.1",
+    "safetensors>=0.4.5",
+    "scikit-learn>=1.4",
+    "scipy>=1.11",
+    "tqdm>=4.66",
+)
+#: Extra to its purpose and what it installs, as in ``pyproject.toml``.
+EXTRAS: Final = {
+    "video": ("films as mp4", ("imageio>=2.34", "imageio-ffmpeg>=0.5")),
+    "tensorboard": ("logger=tensorboard", ("tensorboard>=2.16",)),
+    "bench": (
+        "peers of ganlane bench",
+        ("highway-env>=1.10", "stable-baselines3>=2.4", "eclipse-sumo>=1.20", "libsumo>=1.20"),
+    ),
+    "sumo": ("traffic=sumo", ("eclipse-sumo>=1.20", "libsumo>=1.20")),
+    "wandb": ("logger=wandb", ("wandb>=0.18",)),
+    "ray": ("distributed collection", ("ray>=2.40",)),
+    "sweeps": ("sweeps in several processes", ("hydra-joblib-launcher>=1.2",)),
+    "slurm": ("sweeps as Slurm jobs", ("hydra-submitit-launcher>=1.2",)),
+    "ray-sweeps": ("sweeps on a Ray cluster", ("hydra-ray-launcher>=1.2.1",)),
+    "docs": ("building these pages", ("mkdocs-material>=9.5", "mkdocstrings[python]>=0.27")),
+}
+#: Distributions whose module has another name.
+MODULES: Final = {"hydra-core": "hydra", "pillow": "PIL", "scikit-learn": "sklearn"}
+#: Weights without which the commands' defaults do not run.
+NEEDED_WEIGHTS: Final = ("agent_idm", "generator_paper", "generator_calibrated")
+_REINSTALL: Final = "python -m pip install --force-reinstall --no-deps PATH_OF_THE_CHECKOUT_OR_WHEEL"
+_MEND_FIRST: Final = "mend what is MISSING above, then run ganlane doctor again"
+_CUDA_PAGE: Final = "install torch for CUDA as https://pytorch.org/get-started/locally/ says"
+_INSTALL_COMPILER: Final = {"darwin": "xcode-select --install", "win32": "install the Visual Studio build tools"}
+
+
+class State(Enum):
+    """``MISSING`` is needed and makes the exit status 1; ``ABSENT`` is for further purposes only."""
+
+    OK = "ok"
+    ABSENT = "absent"
+    MISSING = "MISSING"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """``subject`` was looked at, ``found`` is what there is, ``mend`` is what to type where something lacks."""
+
+    subject: str
+    state: State
+    found: str
+    mend: str = ""
+
+    def lines(self) -> list[str]:
+        """As the report shows it."""
+        first = f"  {self.state.value:<8}{self.subject:<22}{self.found}"
+        return [first, f"          mend: {self.mend}"] if self.mend else [first]
+
+
+def guarded(subject: str, look: Callable[[], Finding], mend: str = _MEND_FIRST) -> Finding:
+    """What ``look`` finds; whatever it raises is a finding too, since a broken installation can fail in any way."""
+    try:
+        return look()
+    except Exception as error:
+        message = " ".join(str(error).split()) or type(error).__name__
+        return Finding(subject, State.MISSING, message, mend)
+
+
+def examine() -> dict[str, list[Finding]]:
+    """Title of a section to its findings; loads every shipped checkpoint, so it takes seconds."""
+    return {
+        "software": [python(), *map(required, REQUIRED)],
+        "machine": machine(),
+        "files": [
+            guarded("configuration", _configuration, _REINSTALL),
+            *checkpoints(),
+            guarded("recordings", recordings),
+            guarded("cache", cache),
+            outputs(),
+        ],
+        "extras (not needed)": [extra(name) for name in EXTRAS],
+    }
+
+
+def missing(sections: Mapping[str, Sequence[Finding]]) -> list[str]:
+    """The subjects that are needed and not there."""
+    return [found.subject for findings in sections.values() for found in findings if found.state is State.MISSING]
+
+
+def report(sections: Mapping[str, Sequence[Finding]]) -> str:
+    """All findings, section by section, and a last line with the conclusion."""
+    blocks = [
+        "\n".join([title, *(line for finding in findings for line in finding.lines())])
+        for title, findings in sections.items()
+    ]
+    lacking = missing(sections)
+    conclusion = (
+        f"Missing: {', '.join(lacking)}; run what stands beside 'mend'."
+        if lacking
+        else "All that is needed is there; what is absent serves further purposes only."
+    )
+    return "\n\n".join([*blocks, conclusion])
+
+
+class Requirement(NamedTuple):
+    """A distribution and the versions that will do."""
+
+    name: str
+    ranges: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def parsed(cls, text: str) -> Requirement:
+        """``torch>=2.11,<2.14`` taken apart."""
+        name = re.match(r"[\w.-]+", text)
+        if name is None:
+            raise ValueError(text)
+        return cls(name[0], tuple(re.findall(r"(>=|<)([\d.]+)", text)))
+
+    def allows(self, version: str) -> bool:
+        """Whether ``version`` is in all ranges."""
+        found = _release(version)
+        return all(
+            found >= _release(limit) if sign == ">=" else found < _release(limit) for sign, limit in self.ranges
+        )
+
+    def installed(self) -> str | None:
+        """The installed version; None where the distribution is not installed."""
+        try:
+            return metadata.version(self.name)
+        except metadata.PackageNotFoundError:
+            return None
+
+
+def _release(version: str) -> tuple[int, ...]:
+    """The release as numbers, without what follows: (2, 13) for ``2.13.0+cpu``; zeros at the end do not count."""
+    found = re.match(r"\d+(\.\d+)*", version)
+    release = [int(part) for part in found[0].split(".")] if found else []
+    while release and release[-1] == 0:
+        release.pop()
+    return tuple(release)
+
+
+def _install(*requirements: str) -> str:
+    quoted = (f'"{text}"' for text in requirements)
+    return f"python -m pip install {' '.join(quoted)}"
+
+
+def python() -> Finding:
+    """The interpreter."""
+    found = f"{platform.python_version()} ({sys.executable})"
+    if sys.version_info >= PYTHON:
+        return Finding("python", State.OK, found)
+    wanted = ".".join(map(str, PYTHON))
+    return Finding("python", State.MISSING, found, f"a virtual environment with Python {wanted} or newer")
+
+
+def required(text: str) -> Finding:
+    """Whether a requirement is installed in a version that will do, and can be imported."""
+    requirement = Requirement.parsed(text)
+    name, version = requirement.name, requirement.installed()
+    if version is None:
+        return Finding(name, State.MISSING, "not installed", _install(text))
+    if not requirement.allows(version):
+        return Finding(name, State.MISSING, f"{version}, needed {text.removeprefix(name)}", _install(text))
+
+    def look() -> Finding:
+        importlib.import_module(MODULES.get(name, name))
+        return Finding(name, State.OK, version)
+
+    return guarded(name, look, f"{_install(text)} --force-reinstall")
+
+
+def extra(name: str) -> Finding:
+    """Whether everything of an extra is installed; nothing of it is imported."""
+    purpose, texts = EXTRAS[name]
+    parts = {text: Requirement.parsed(text) for text in texts}
+    versions = {text: part.installed() for text, part in parts.items()}
+    lacking = [text for text, version in versions.items() if version is None or not parts[text].allows(version)]
+    if lacking:
+        without = ", ".join(parts[text].name for text in lacking)
+        return Finding(f"extra {name}", State.ABSENT, f"{purpose}: {without} not installed", _install(*lacking))
+    found = ", ".join(f"{part.name} {versions[text]}" for text, part in parts.items())
+    return Finding(f"extra {name}", State.OK, found)
+
+
+def machine() -> list[Finding]:
+    """What the commands can compute on."""
+    looks = {"processor": _processor, "devices": _devices, "C++ compiler": _compiler}
+    return [guarded(subject, look) for subject, look in looks.items()]
+
+
+def _processor() -> Finding:
+    """Usable cores, and how many threads torch would take by itself."""
+    from ganlane.evaluation import machine
+
+    here = machine()
+    threads = f"torch by itself takes {here['threads']} threads, the commands one (threads=N for more)"
+    return Finding("processor", State.OK, f"{here['cores']} usable cores, {here['cpu']}; {threads}")
+
+
+def _devices() -> Finding:
+    """The values that device=... can have here; a card that torch cannot use is reported."""
+    import torch
+
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if count:
+        cards = ", ".join(torch.cuda.get_device_name(number) for number in range(count))
+        return Finding("devices", State.OK, f"cpu, cuda ({cards}; CUDA {torch.version.cuda})")
+    if shutil.which("nvidia-smi"):
+        return Finding("devices", State.ABSENT, "cpu; a graphics card that torch does not see", _CUDA_PAGE)
+    return Finding("devices", State.OK, "cpu (no CUDA device)")
+
+
+def _compiler() -> Finding:
+    """The C++ compiler that only ``env.compile=true`` needs; ``CXX`` names another one."""
+    from ganlane.runtime import COMPILERS
+
+    named = os.environ.get("CXX")
+    looked_for = (named,) if named else COMPILERS
+    path = next(filter(None, map(shutil.which, looked_for)), None)
+    if path is None:
+        found = f"none (looked for {', '.join(looked_for)}); env.compile=true needs one"
+        mend = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
+        return Finding("C++ compiler", State.ABSENT, found, mend)
+    return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")
+
+
+def _configuration() -> Finding:
+    """The YAML files of the commands."""
+    from ganlane.files import conf_folder
+
+    return Finding("configuration", State.OK, str(conf_folder()))
+
+
+def checkpoints() -> list[Finding]:
+    """The weights that ship, each of them loaded."""
+    from ganlane.files import CHECKPOINTS
+
+    names = sorted({*NEEDED_WEIGHTS, *(path.stem for path in CHECKPOINTS.glob("*.safetensors"))})
+    return [guarded(name, _loader(name, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL) for name in names]
+
+
+def _loader(name: str, path: Path) -> Callable[[], Finding]:
+    def look() -> Finding:
+        if name.startswith("generator_"):
+            from ganlane.generator import load_generator
+
+            load_generator(path)
+        else:
+            from ganlane.agents import load_agent
+
+            load_agent(path)
+        return Finding(name, State.OK, f"{path} ({_megabytes(path)})")
+
+    return look
+
+
+def recordings() -> Finding:
+    """The recordings that ``data.path=null`` means; needed for fitting and realism, not for training or driving."""
+    from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
+    from ganlane.errors import UserError
+
+    try:
+        path = default_scenes()
+    except UserError as error:
+        mend = f"export {DATA_VARIABLE}=FOLDER   (one that holds {SCENES}), or give data.path=FILE (docs/own_data.md)"
+        return Finding("recordings", State.ABSENT, str(error).partition("; ")[0], mend)
+    return Finding("recordings", State.OK, f"{path} ({_megabytes(path)})")
+
+
+def cache() -> Finding:
+    """The folder with groups of windows between fits."""
+    from ganlane.generator.windows import CACHE_VARIABLE, cache_folder
+
+    folder = cache_folder()
+    if folder is None:
+        return Finding("cache", State.OK, f"off ({CACHE_VARIABLE} is empty)")
+    if not _can_write(folder):
+        return Finding("cache", State.ABSENT, f"{folder} cannot be written to", f"export {CACHE_VARIABLE}=FOLDER")
+    files = list(folder.glob("*.npz")) if folder.is_dir() else []
+    size = sum(path.stat().st_size for path in files) / 2**20
+    return Finding("cache", State.OK, f"{folder} ({len(files)} files, {size:.1f} MB)")
+
+
+def outputs() -> Finding:
+    """The folder of the commands' run folders."""
+    folder = Path("outputs").resolve()
+    if _can_write(folder):
+        return Finding("run folders", State.OK, f"below {folder}")
+    return Finding("run folders", State.MISSING, f"{folder} cannot be written to", "cd to a folder of your own")
+
+
+def _can_write(folder: Path) -> bool:
+    """Whether files can be made in ``folder``, or it can be made."""
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    return there.is_dir() and os.access(there, os.W_OK)
+
+
+def _megabytes(path: Path) -> str:
+    return f"{path.stat().st_size / 2**20:.1f} MB"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,8 +348,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments:
         print(f"ganlane doctor: {arguments[0]}: it takes no keys; run ganlane doctor alone.", file=sys.stderr)
         return USER_ERROR
-    from ganlane.diagnosis import examine, missing, report
-
     found = examine()
     print(f"ganlane {__version__}\n\n{report(found)}")
     return NEEDED_IS_MISSING if missing(found) else 0

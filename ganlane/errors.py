@@ -1,4 +1,4 @@
-"""A user's mistake, told in one sentence that says what to do."""
+"""A user's mistake as one sentence that says what to do."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any
 
 
 class UserError(Exception):
-    """Something the user can mend: a config value, a file, a column, a shape or a checkpoint.
+    """Something the user can correct: a config value, a file, a column, a shape or a checkpoint.
 
-    The message names the value, what was expected and what to do. Entry points print it alone, without a
-    traceback, and exit with status 2 (design: 'Errors').
+    The message names the value, what was expected and what to do. Entry points print it without a traceback and exit
+    with status 2.
     """
 
 
 class ParameterError(UserError):
     """A parameter out of its range, or parameters that do not go together.
 
-    The record that finds it knows its fields, not where a user set them. So the sentence holds the fields in braces,
-    ``"{timeout_s}=0: expected a number above 0."``; who knows the record's place names it by :meth:`below`.
+    The record that raises it knows its fields, not their keys. So the sentence holds the fields in braces,
+    ``"{timeout_s}=0: expected a number above 0."``, and a caller that knows the key adds it with :meth:`below`.
 
     Args:
         text: the sentence.
@@ -34,7 +34,7 @@ class ParameterError(UserError):
         return re.sub(r"\{([\w.]+)\}", rf"{place}\1", self.text)
 
     def below(self, where: str) -> ParameterError:
-        """The same with the record's key."""
+        """The same error with the record's key."""
         return ParameterError(self.text, where)
 
 

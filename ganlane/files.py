@@ -1,4 +1,7 @@
-"""Files that are either whole or absent, documents with a part to rewrite, and weights that cannot execute code."""
+"""The package's own folders, files written whole or not at all, and weights that cannot execute code.
+
+It imports no torch, so that the command line answers quickly.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,35 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
 from ganlane.errors import UserError
 
+if TYPE_CHECKING:
+    import torch
+
+PACKAGE = Path(__file__).resolve().parent
+#: Weights that ship: ``agent_*.safetensors`` and ``generator_*.safetensors``.
+CHECKPOINTS = PACKAGE / "checkpoints"
 #: Bytes that are written to find out whether there is room; libraries leave smaller rests unused.
 _PROBE_BYTES = 2**20
+
+
+def conf_folder() -> Path:
+    """Folder of the YAML files: beside the package in a checkout, inside it in a wheel.
+
+    The one beside comes first, since an editable install can leave a stale copy behind.
+
+    Raises:
+        UserError: neither is there.
+    """
+    for folder in (PACKAGE.parent / "conf", PACKAGE / "conf"):
+        # A folder 'conf' of another project may lie beside an installed package.
+        if (folder / "train.yaml").is_file() and (folder / "traffic" / "gan.yaml").is_file():
+            return folder
+    raise UserError(f"{PACKAGE}: the folder conf/ is missing beside and inside it; install ganlane again.")
 
 
 @contextmanager
@@ -29,7 +51,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     Raises:
         OSError: the file system refuses. It names ``path`` and has an ``errno``, whatever the library that wrote
             made of it.
-        UserError: a folder or a device stands there.
+        UserError: the path is a folder or a device.
     """
     path = Path(path)
     _refuse_all_but_files(path)
@@ -50,7 +72,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def _refuse_all_but_files(path: Path) -> None:
-    """Renaming onto ``/dev/null`` would replace it, where one may."""
+    """Refuse folders and devices: renaming onto ``/dev/null`` would replace it."""
     if path.exists() and not path.is_file():
         what = "a folder" if path.is_dir() else "a device or a pipe"
         raise UserError(f"{path}: {what}, where a file was to be written; give the name of a file.")
@@ -68,9 +90,9 @@ def _new_part(path: Path) -> Path:
 
 
 def _refusal(error: Exception, part: Path) -> OSError | None:
-    """What the file system said when ``part`` was written; None where the error is about something else.
+    """The file system's error when ``part`` was written; None where ``error`` has another cause.
 
-    Libraries tell of a full disk in words of their own (torch: "unexpected pos 576 vs 534"), so it is asked again.
+    Libraries report a full disk in messages of their own (torch: "unexpected pos 576 vs 534"), so a write is tried.
     """
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.filename in (None, str(part)) else None
@@ -94,8 +116,8 @@ def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
     """The text of the document ``path`` up to the marker ``begin``, and from ``end`` on, markers included.
 
     Raises:
-        UserError: there is no such file, or it does not hold the two markers once each and in order. Its sentence
-            names the key of the entry points that update a document, ``report``.
+        UserError: there is no such file, or it does not hold the two markers once each and in order. The sentence
+            names the commands' key ``report``.
     """
     if not path.is_file():
         raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
@@ -131,6 +153,8 @@ def save_weights(
         tensors: flat name to tensor.
         metadata: JSON-serialisable description (config, data, metrics, code version).
     """
+    from safetensors.torch import save  # imports torch
+
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = {"ganlane": json.dumps({"kind": kind, **metadata})}
     write_bytes(path, save(flat, metadata=header))

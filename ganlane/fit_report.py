@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
 from tqdm import tqdm
 
+from ganlane.evaluation.table import aligned
 from ganlane.generator import FitResult, Progress
 
 _ERRORS = ("ade_m", "fde_m", "end_m")
@@ -21,6 +22,9 @@ PUBLISHED_RMSE_M = {
     "CS-LSTM (published)": (0.61, 1.27, 2.09, 3.10, 4.37),
     "Social-GAN (published)": (0.57, 1.32, 2.22, 3.26, 4.40),
 }
+
+#: Headings and rows of a table.
+Lines = list[list[str]]
 
 
 class FitProgress:
@@ -89,36 +93,32 @@ def results_of(result: FitResult) -> dict[str, Any]:
     }
 
 
-def _line(name: str, cells: Iterable[str], first: int = 32, width: int = 15) -> str:
-    """A row of a table: the name in a column ``first`` wide, then the cells."""
-    return f"{name:<{first}}" + "".join(f"{cell:>{width}}" for cell in cells)
+def _percent(change: float) -> str:
+    return f"{change:+.1f} %"
 
 
 def metrics_table(metrics: Mapping[str, Mapping[str, float]]) -> str:
     """ADE and FDE of the generator and of constant velocity on the held-out scenes, as text."""
     overall = _by_kind(metrics["all"])
     errors = [error for error in _ERRORS if error in overall]
-    heads = (error.replace("_m", ", m") for error in errors)
-    lines = [f"{_line('held-out scenes', heads, 20, 10)}{'ADE to CV':>12}"]
+    lines = [["held-out scenes", *(error.replace("_m", ", m") for error in errors), "ADE to CV"]]
     for kind, ade in overall["ade_m"].items():
-        change = 100.0 * (ade / overall["ade_m"][_BASELINE] - 1.0)
-        cells = (f"{overall[error].get(kind, math.nan):.3f}" for error in errors)
-        lines.append(f"{_line(kind, cells, 20, 10)}{change:>+10.1f} %")
-    return "\n".join(lines)
+        change = _percent(100.0 * (ade / overall["ade_m"][_BASELINE] - 1.0))
+        lines.append([kind, *(f"{overall[error].get(kind, math.nan):.3f}" for error in errors), change])
+    return aligned(lines)
 
 
 def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
     """The ablations as text: changes of ADE over all predicted steps and over the first 0.4 s, the ratio at 5 s."""
     first = next(iter(rows.values()))
     kinds = [kind for kind in first["ade_change_percent"] if kind != _BASELINE]
-    heads = [*kinds, *(f"{kind}, 0.4 s" for kind in kinds), *(["RMSE 5 s"] if "rmse_5_s_ratio" in first else [])]
-    lines = [_line("ADE to CV, a quarter of the updates", heads, 36, 18)]
+    at_5_s = ["RMSE 5 s"] if "rmse_5_s_ratio" in first else []
+    lines = [["ADE to CV, a quarter of the updates", *kinds, *(f"{kind}, 0.4 s" for kind in kinds), *at_5_s]]
     for name, row in rows.items():
         parts = (row["ade_change_percent"], row["ade_change_percent_0.4_s"])
-        cells = [f"{part[kind]:+.1f} %" for part in parts for kind in kinds]
-        cells += [f"{row['rmse_5_s_ratio']['mean']:.2f}"] if "rmse_5_s_ratio" in row else []
-        lines.append(_line(name, cells, 36, 18))
-    return "\n".join(lines)
+        ratio = [f"{row['rmse_5_s_ratio']['mean']:.2f}"] if at_5_s else []
+        lines.append([name, *(_percent(part[kind]) for part in parts for kind in kinds), *ratio])
+    return aligned(lines)
 
 
 def fold_tables(folds: Mapping[str, Any]) -> str:
@@ -128,48 +128,47 @@ def fold_tables(folds: Mapping[str, Any]) -> str:
     tables += [_rows("by lane (1 leftmost) and class", scores["parts"]), _direction(scores)]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
-    return "\n\n".join(tables)
+    return "\n\n".join(map(aligned, tables))
 
 
-def _pooled(scores: Mapping[str, Any]) -> str:
+def _pooled(scores: Mapping[str, Any]) -> Lines:
     """ADE and FDE of all forecasts over the windows of all folds."""
-    lines = [_line(f"{scores['windows']} windows of all folds", ("ADE, m", "FDE, m", "ADE to CV"))]
+    lines = [[f"{scores['windows']} windows of all folds", "ADE, m", "FDE, m", "ADE to CV"]]
     for kind, ade in scores["ade_m"].items():
-        change = f"{scores['ade_change_percent'][kind]:+.1f} %"
-        lines.append(_line(kind, (f"{ade:.3f}", f"{scores['fde_m'][kind]:.3f}", change)))
-    return "\n".join(lines)
+        change = _percent(scores["ade_change_percent"][kind])
+        lines.append([kind, f"{ade:.3f}", f"{scores['fde_m'][kind]:.3f}", change])
+    return lines
 
 
-def _rows(title: str, rows: Mapping[str, Any]) -> str:
+def _rows(title: str, rows: Mapping[str, Any]) -> Lines:
     """Windows, constant velocity's ADE, and the generator's change of it, for every row."""
     first = next(iter(rows.values()))
     kinds = [kind for kind in first["ade_m"] if kind in ("mean", "single") or kind.startswith("best_of")]
-    lines = [_line(title, ("windows", "CV, m", *kinds))]
+    lines = [[title, "windows", "CV, m", *kinds]]
     for name, row in rows.items():
-        changes = [f"{row['ade_change_percent'][kind]:+.1f} %" for kind in kinds]
-        lines.append(_line(name, (str(row["windows"]), f"{row['ade_m'][_BASELINE]:.3f}", *changes)))
-    return "\n".join(lines)
+        changes = [_percent(row["ade_change_percent"][kind]) for kind in kinds]
+        lines.append([name, str(row["windows"]), f"{row['ade_m'][_BASELINE]:.3f}", *changes])
+    return lines
 
 
-def _direction(scores: Mapping[str, Any]) -> str:
+def _direction(scores: Mapping[str, Any]) -> Lines:
     """Share of lateral moves of more than 0.1 m that are predicted to the right side."""
     later, whole = scores["direction"], scores["direction_whole_window"]
-    lines = [_line("lateral move to the right side", ("after present", "whole window"))]
-    lines.append(_line("windows that move", (str(later["windows"]), str(whole["windows"]))))
+    lines = [["lateral move to the right side", "after present", "whole window"]]
+    lines.append(["windows that move", str(later["windows"]), str(whole["windows"])])
     for kind, share in later["share_right"].items():
         shares = (share, whole["share_right"].get(kind))
-        lines.append(_line(kind, ("" if value is None else f"{100 * value:.1f} %" for value in shares)))
-    return "\n".join(lines)
+        lines.append([kind, *("" if value is None else f"{100 * value:.1f} %" for value in shares)])
+    return lines
 
 
-def _rollout(rollout: Mapping[str, Any]) -> str:
+def _rollout(rollout: Mapping[str, Any]) -> Lines:
     """RMSE after 1 to 5 s, with published values."""
-    seconds = list(next(iter(rollout["rmse_m"].values())))
-    lines = [_line(f"RMSE, m ({rollout['windows']} windows)", (*seconds, "to CV"))]
-    for kind, values in rollout["rmse_m"].items():
-        ratio = f"{rollout['ratio_to_constant_velocity'][kind]:.2f}"
-        lines.append(_line(kind, (*(f"{value:.2f}" for value in values.values()), ratio)))
+    rmse = {kind: list(values.values()) for kind, values in rollout["rmse_m"].items()}
+    ratios = dict(rollout["ratio_to_constant_velocity"])
     for kind, published in PUBLISHED_RMSE_M.items():
-        ratio = f"{published[-1] / _PUBLISHED_VELOCITY_M[-1]:.2f}"
-        lines.append(_line(kind, (*(f"{value:.2f}" for value in published), ratio)))
-    return "\n".join(lines)
+        rmse[kind], ratios[kind] = list(published), published[-1] / _PUBLISHED_VELOCITY_M[-1]
+    seconds = next(iter(rollout["rmse_m"].values()))
+    lines = [[f"RMSE, m ({rollout['windows']} windows)", *seconds, "to CV"]]
+    lines += [[kind, *(f"{value:.2f}" for value in values), f"{ratios[kind]:.2f}"] for kind, values in rmse.items()]
+    return lines

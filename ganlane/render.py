@@ -28,7 +28,7 @@ def render(config: RenderConfig, folder: Path) -> str:
     """Draw what is asked for; the line that names the file."""
     if config.run is not None:
         return _curves(config, config.run, folder)
-    from ganlane.build import set_threads
+    from ganlane.runtime import set_threads
     from ganlane.view import write_player, write_tracks
 
     set_threads(config.threads)
@@ -65,7 +65,7 @@ def _record(config: RenderConfig, agent: str, number: int) -> Trajectory:
 def _film(config: RenderConfig, episode: Trajectory, out: Path) -> str:
     """Draw an episode and write the film."""
     from ganlane.view import DrawingParameters, Film, FramePainter, WindowParameters, write_film
-    from ganlane.view.films import film_format
+    from ganlane.view.film import film_format
 
     film = config.film
     window = WindowParameters(width=film.width, height=film.height, length_m=film.road_m)
@@ -76,8 +76,7 @@ def _film(config: RenderConfig, episode: Trajectory, out: Path) -> str:
 
 def _curves(config: RenderConfig, runs: Sequence[str], folder: Path) -> str:
     """Draw the learning curves of ``runs``."""
-    from ganlane.view import read_runs
-    from ganlane.view.figures import draw_runs, save_figure
+    from ganlane.view.figures import draw_runs, read_runs, save_figure
 
     out = Path(config.out) if config.out is not None else folder / f"curves.{config.kind}"
     figure = draw_runs(read_runs(runs), config.curves.columns, config.curves.smooth)

@@ -7,7 +7,7 @@
 
     env = ganlane.sb3.make_vec_env("gan", num_envs=64)
     model = PPO("MlpPolicy", env).learn(200_000)
-    print(ganlane.evaluate([ganlane.sb3.driver(model), "mobil"], ["gan"], episodes=300))
+    print(ganlane.api.evaluate([ganlane.sb3.driver(model), "mobil"], ["gan"], episodes=300))
 
 ``SubprocVecEnv`` of single environments costs one process each; this one costs one tensor operation for all of them.
 sb3-contrib's ``MaskablePPO`` finds the action masks by itself (``mask="safe"``). Needs the extra ``sb3``.
@@ -177,7 +177,7 @@ class ModelPolicy(TensorDictModuleBase):
 
 
 def driver(model: BaseAlgorithm, name: str | None = None) -> Driver:
-    """A trained stable-baselines3 model as a driver for ``ganlane.evaluate`` and ``ganlane.render``.
+    """A trained stable-baselines3 model as a driver for ``ganlane.api.evaluate`` and ``ganlane.api.render``.
 
     It reads the observation of the evaluation, by default the one that :func:`make_vec_env` uses by default.
 

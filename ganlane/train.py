@@ -27,26 +27,29 @@ TRAINED = "trained"
 
 def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate what came out."""
-    from ganlane.build import make_driver, make_traffic, set_threads
+    from ganlane.build import make_driver, make_traffic
     from ganlane.compare import compare, publish
-    from ganlane.phases import AGENT_FILE, check_finished, checkpoint_of, length_of, phases_of, run_phase
+    from ganlane.runtime import set_threads
+    from ganlane.training.checkpoint import LAST
+    from ganlane.training.phases import AGENT_FILE, length_if_finished, phases_of, run_phase
 
     set_threads(config.threads)
     for traffic in config.all_traffic():  # a mistake in any of them shows before hours of training, not after
         make_traffic(traffic, config.env)
     others = [make_driver(name, config.env, device=config.device) for name in config.evaluation.agents]
-    outcome: dict[str, dict[str, float]] = {}
-    training = config.compiled()
+    lengths: dict[str, dict[str, float]] = {}
     for phase in phases_of(config, folder):
-        if phase.name == "pretrain" and (phase.folder / AGENT_FILE).is_file():
-            check_finished(config, phase)
-            outcome[phase.name] = length_of(phase.folder / AGENT_FILE)
+        finished = length_if_finished(config, phase)
+        if finished is not None:
+            lengths[phase.name] = finished
             continue
-        result = run_phase(training, phase, checkpoint_of(phase, config.resume))
+        last = phase.folder / LAST
+        resume = last if config.resume is not None and last.is_file() else None
+        result = run_phase(config.compiled(), phase, resume)
         if result.stopped_by is not None:
             print(f"saved; go on with: ganlane train resume={folder}", file=sys.stderr)
             raise Stopped(result.stopped_by)
-        outcome[phase.name] = {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
+        lengths[phase.name] = {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
     trained = replace(make_driver(str(folder / AGENT_FILE), config.env, device=config.device), name=TRAINED)
     table = compare(
         [trained, *others],
@@ -60,7 +63,7 @@ def train(config: TrainConfig, folder: Path) -> str:
         config.device,
     )
     seeds = {"training": config.seed, "stream": "report", "episodes": [0, config.evaluation.episodes - 1]}
-    numbers = {**outcome["train"], "phases": outcome, "agent": str(folder / AGENT_FILE)}
+    numbers = {**lengths["train"], "phases": lengths, "agent": str(folder / AGENT_FILE)}
     return publish(table, folder, asdict(config), seeds, numbers)
 
 

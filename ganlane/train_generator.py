@@ -36,15 +36,14 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     """Read the recordings, fit, print the errors on held-out scenes, save weights and results."""
     # Imported here, so that a mistake on the command line is reported before torch is loaded.
     from ganlane import generator
-    from ganlane.build import set_threads
-    from ganlane.evaluation import write_results
-    from ganlane.evaluation.provenance import code_version
+    from ganlane.evaluation import code_version, write_results
     from ganlane.fit_report import FitProgress, ablation_table, fold_tables, metrics_table, results_of
+    from ganlane.runtime import set_threads
 
     set_threads(config.threads)
     source, frame = _recordings(config.data)
     fit_config: Any = replace(config.generator, seed=config.seed)
-    preset = generator.preset_of(fit_config)
+    preset = fit_config.preset
     scenes = generator.scene_tracks(frame)
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
     split = generator.split_for_fit(scenes, held_out)
@@ -80,9 +79,10 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     weights = folder / f"generator_{preset}.safetensors"
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")
+    numbers = results_of(result) | further | {"weights": str(weights)}
     context = {"seed": config.seed, "held_out": held_out}
     used = asdict(replace(config, generator=fit_config))
-    return f"results: {write_results(folder, results_of(result) | further, used, context)}"
+    return f"results: {write_results(folder, numbers, used, context)}"
 
 
 def _recordings(data: DataConfig) -> tuple[Path, pl.DataFrame]:

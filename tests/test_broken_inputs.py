@@ -28,9 +28,8 @@ from ganlane.config.command_line import typed
 from ganlane.config.schemas import SCHEMAS
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
-from ganlane.files import load_weights, save_weights
+from ganlane.files import CHECKPOINTS, conf_folder, load_weights, save_weights
 from ganlane.parameters.checks import NO_KEY
-from ganlane.paths import CHECKPOINTS, conf_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 AGENT, GENERATOR = CHECKPOINTS / "agent_idm.safetensors", CHECKPOINTS / "generator_paper.safetensors"

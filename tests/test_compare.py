@@ -1,4 +1,4 @@
-"""The comparison on recorded scenes: each episode's scene beside it, and crashes per km by scene in the record."""
+"""The comparison on recorded scenes: the scene of each episode, and what the record holds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def table(recordings):
     return compare(drivers, traffics, env, episodes=EPISODES, seed=5, num_envs=4)
 
 
-def test_every_replayed_episode_stands_beside_the_scene_that_it_ran_in(table, recordings):
+def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, recordings):
     scenes = ReplayTraffic(Stream.REPORT, recordings).scenes_of_episodes(5, range(EPISODES))
     assert len(set(scenes)) == 3
     for agent in ("keep_lane", "random_legal"):
@@ -43,36 +43,29 @@ def test_every_replayed_episode_stands_beside_the_scene_that_it_ran_in(table, re
     assert table.filter(pl.col("traffic") == "idm")["scene"].is_null().all()
 
 
-def test_the_record_holds_crashes_by_scene_for_replayed_traffic(table, tmp_path, capsys):
+def test_the_record_holds_rows_paired_leads_and_crashes_by_scene(table, tmp_path, capsys):
     publish(table, tmp_path, {}, {})
     record = json.loads((tmp_path / "results.json").read_text())
     assert len(record["rows"]) == 4
-    assert [(row["agent"], row["traffic"]) for row in record["crashes_by_scene"]] == [
-        ("keep_lane", "replay"),
-        ("random_legal", "replay"),
+    assert [(row["agent"], row["over"], row["traffic"], row["episodes"]) for row in record["paired"]] == [
+        ("keep_lane", "random_legal", "idm", EPISODES),
+        ("keep_lane", "random_legal", "replay", EPISODES),
     ]
+    assert capsys.readouterr().out.count("keep_lane over random_legal") == 2
+    means = {(row["agent"], row["traffic"]): row["mean_reward"] for row in record["rows"]}
+    for row in record["paired"]:
+        lead = means["keep_lane", row["traffic"]] - means["random_legal", row["traffic"]]
+        assert row["lead"] == pytest.approx(lead)
+        assert row["lead_ci"][0] <= row["lead"] <= row["lead_ci"][1]
+    assert [row["agent"] for row in record["crashes_by_scene"]] == ["keep_lane", "random_legal"]
     for row in record["crashes_by_scene"]:
         own = table.filter(pl.col("traffic") == "replay", pl.col("agent") == row["agent"])
         expected = crashes_by_scene(own, own["scene"].to_list())
+        assert row["traffic"] == "replay"
         assert row["per_km"] == pytest.approx(expected.per_km.value)
         assert row["per_km_ci"] == pytest.approx(expected.per_km.interval)
         assert sum(scene["episodes"] for scene in row["scenes"]) == EPISODES
         assert sum(scene["distance_km"] for scene in row["scenes"]) == pytest.approx(own["distance_m"].sum() / 1000)
-
-
-def test_the_first_driver_is_held_against_the_other_in_print_and_in_the_record(table, tmp_path, capsys):
-    publish(table, tmp_path, {}, {})
-    paired = json.loads((tmp_path / "results.json").read_text())["paired"]
-    assert [(row["agent"], row["over"], row["traffic"], row["episodes"]) for row in paired] == [
-        ("keep_lane", "random_legal", "idm", EPISODES),
-        ("keep_lane", "random_legal", "replay", EPISODES),
-    ]
-    means = table.group_by("agent", "traffic").agg(pl.col("reward").mean())
-    for row in paired:
-        of = {r["agent"]: r["reward"] for r in means.filter(pl.col("traffic") == row["traffic"]).to_dicts()}
-        assert row["lead"] == pytest.approx(of["keep_lane"] - of["random_legal"])
-        assert row["lead_ci"][0] <= row["lead"] <= row["lead_ci"][1]
-    assert capsys.readouterr().out.count("keep_lane over random_legal") == 2
 
 
 def test_other_traffics_have_no_scenes(table, tmp_path, capsys):

@@ -10,7 +10,7 @@ import pytest
 
 from ganlane.__main__ import COMMANDS, main
 from ganlane.config.help import help_text
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -9,10 +9,22 @@ from pathlib import Path
 import pytest
 
 from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
-from ganlane.diagnosis import Finding, State, missing, report
-from ganlane.diagnosis.contents import cache, checkpoints, outputs, recordings
-from ganlane.diagnosis.machine import machine
-from ganlane.diagnosis.software import EXTRAS, REQUIRED, extra, parsed, required
+from ganlane.doctor import (
+    EXTRAS,
+    REQUIRED,
+    Finding,
+    Requirement,
+    State,
+    cache,
+    checkpoints,
+    extra,
+    machine,
+    missing,
+    outputs,
+    recordings,
+    report,
+    required,
+)
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -41,7 +53,7 @@ def test_a_whole_installation_is_found_whole(here, capsys):
 
 
 def test_what_is_needed_and_missing_makes_the_status_1(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("ganlane.paths.CHECKPOINTS", tmp_path)
+    monkeypatch.setattr("ganlane.files.CHECKPOINTS", tmp_path)
     assert main(["doctor"]) == 1
     shown = capsys.readouterr().out
     assert "MISSING agent_idm" in shown
@@ -69,7 +81,7 @@ def test_it_asks_for_what_the_package_asks_for():
     [("2.11", True), ("2.11.0", True), ("2.13.0+cpu", True), ("2.10.9", False), ("2.14.0", False), ("10.0", False)],
 )
 def test_versions_are_compared_as_numbers(version, allowed):
-    assert parsed("torch>=2.11,<2.14").allows(version) is allowed
+    assert Requirement.parsed("torch>=2.11,<2.14").allows(version) is allowed
 
 
 def test_a_package_that_is_not_there_comes_with_its_command():
@@ -84,7 +96,7 @@ def test_a_package_that_cannot_be_imported_is_missing(monkeypatch):
     def broken(name):
         raise OSError("lib.so:\n undefined symbol")
 
-    monkeypatch.setattr("ganlane.diagnosis.software.importlib.import_module", broken)
+    monkeypatch.setattr("ganlane.doctor.importlib.import_module", broken)
     found = required("numpy>=1.26")
     assert (found.state, found.found) == (State.MISSING, "lib.so: undefined symbol")
     assert "--force-reinstall" in found.mend
@@ -98,11 +110,11 @@ def test_an_extra_names_only_what_it_lacks(monkeypatch):
 
 
 def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
-    from ganlane.paths import CHECKPOINTS
+    from ganlane.files import CHECKPOINTS
 
     for file in CHECKPOINTS.glob("*.safetensors"):
         (tmp_path / file.name).write_bytes(file.read_bytes()[: -100 if "paper" in file.name else None])
-    monkeypatch.setattr("ganlane.paths.CHECKPOINTS", tmp_path)
+    monkeypatch.setattr("ganlane.files.CHECKPOINTS", tmp_path)
     assert {found.subject for found in checkpoints() if found.state is State.MISSING} == {"generator_paper"}
 
 

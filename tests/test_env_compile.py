@@ -9,7 +9,7 @@ import torch
 from reference.worlds import environment
 from tensordict import TensorDictBase
 
-from ganlane import build, compiling, keys
+from ganlane import build, keys, runtime
 from ganlane.agents.drivers import MobilDriver
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmTrafficConfig
@@ -25,7 +25,7 @@ def no_compiler(monkeypatch):
 
 def test_without_a_compiler_on_the_path_one_sentence_says_so(no_compiler):
     with pytest.raises(UserError, match=r"^compile=true needs a C\+\+ compiler, and there is none \(looked"):
-        compiling.check_compiler()
+        runtime.check_compiler()
     with pytest.raises(UserError, match="apt install"):
         environment(vehicles=3).compile()
 
@@ -34,9 +34,9 @@ def test_the_compiler_that_cxx_names_is_the_one_that_is_looked_for(monkeypatch):
     monkeypatch.setenv("CXX", "my-compiler")
     monkeypatch.setattr(shutil, "which", lambda name: "/bin/g++" if name == "g++" else None)
     with pytest.raises(UserError, match="looked for CXX=my-compiler"):
-        compiling.check_compiler()
+        runtime.check_compiler()
     monkeypatch.delenv("CXX")
-    compiling.check_compiler()
+    runtime.check_compiler()
 
 
 def test_arguments_of_torchrls_version_are_refused():
@@ -71,7 +71,7 @@ def drive(env: HighwayEnv, decisions: int) -> list[TensorDictBase]:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not any(map(shutil.which, compiling.COMPILERS)), reason="no C++ compiler")
+@pytest.mark.skipif(not any(map(shutil.which, runtime.COMPILERS)), reason="no C++ compiler")
 def test_a_compiled_environment_drives_as_the_eager_one_to_rounding():
     """In float64: 20 decisions of 4 rows, several episodes each, with vehicles that return."""
     settings = {"num_envs": 4, "vehicles": 4, "goal_m": 150.0, "recycle": True}

@@ -8,8 +8,7 @@ from reference.worlds import environment, same_bits, step
 from tensordict import TensorDict
 
 from ganlane import keys
-from ganlane.env.decision import Decision
-from ganlane.env.frozen import Frozen
+from ganlane.env.decision import EndedRows, run_decision
 from ganlane.parameters.driving import Visibility
 from ganlane.traffic import IdmTraffic, Overlay, TrafficModule, TrafficSequential
 
@@ -60,8 +59,8 @@ def test_an_ended_row_remembers_no_step_more_than_it_was_driven(chained):
 def test_where_a_look_would_stall_the_device_the_memory_is_the_same(monkeypatch):
     """As on a GPU: the rows are kept as they are in every step."""
     looked = ages(Ageing())
-    monkeypatch.setattr("ganlane.env.decision.asking_is_free", lambda flag: False)
-    monkeypatch.setattr(Frozen, "note", None)
+    monkeypatch.setattr("ganlane.env.decision.readable", lambda flag: False)
+    monkeypatch.setattr(EndedRows, "keep", None)
     for one, other in zip(looked, ages(Ageing())):
         assert torch.equal(one, other)
 
@@ -76,7 +75,7 @@ def test_a_decision_without_steps_leaves_everything_as_it_is():
         dict(td[keys.EGO].items()),
         td[keys.STEP],
     )
-    _, memory = Decision(env.traffic, env.physics, env.rules).drive(td, start, torch.arange(3), substeps=0)
+    _, memory = run_decision(env.traffic, env.physics, env.rules, td, start, torch.arange(3), substeps=0)
     assert same_bits(memory, td[keys.TRAFFIC]) == []
 
 
@@ -85,7 +84,7 @@ def test_a_row_that_never_ran_and_one_that_ended_may_differ_in_empty_parts():
     age = torch.arange(3)
     before = TensorDict({"a": TensorDict({"age": age}, [3])}, [3])
     after = TensorDict({"a": TensorDict({"age": age + 10}, [3]), "b": TensorDict({}, [3])}, [3])
-    frozen = Frozen()
-    frozen.note(torch.tensor([True, False, False]), before)
-    frozen.note(torch.tensor([False, True, False]), after)
-    assert frozen.put_back(after.clone())["a", "age"].tolist() == [0, 11, 12]
+    ended = EndedRows()
+    ended.keep(torch.tensor([True, False, False]), before)
+    ended.keep(torch.tensor([False, True, False]), after)
+    assert ended.restore(after.clone())["a", "age"].tolist() == [0, 11, 12]

@@ -15,11 +15,9 @@ from torchrl.envs import Compose, TransformedEnv
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
-from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardParameters, RewardTransform
-from ganlane.transforms.fixed_order import places
+from ganlane.transforms import OBSERVATIONS, ObservationTransform, RewardParameters, RewardTransform, observation
 
 FIXED = ("length", "width", "desired_speed", "visibility", "valid")
 
@@ -201,28 +199,29 @@ def check_observations(env: HighwayEnv, plan: list[list[int]], form: str) -> Non
     td = whole.reset()
     for action in [None, *plan]:
         td = td if action is None else step(whole, td, action)
-        observation = td[keys.OBSERVATION]
-        assert whole.observation_spec[keys.OBSERVATION].contains(observation)
-        assert observation.shape[1] == len(low)
-        assert ((observation >= low) & (observation <= high)).all()
+        values = td[keys.OBSERVATION]
+        assert whole.observation_spec[keys.OBSERVATION].contains(values)
+        assert values.shape[1] == len(low)
+        assert ((values >= low) & (values <= high)).all()
         if td["done"].any():
             break
 
 
 def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Lowest and highest value of every entry of an observation (Table III and what was added to it)."""
-    listed, viewed, progress, placed, drift, overlap = OBSERVATIONS[form]
-    # Speed over desired speed (25 m/s at the least; nobody drives at twice that), a lane to the left, to the right.
-    low, high = [0.0, 0.0, 0.0], [2.0, 1.0, 1.0]
-    if listed or placed:
-        count = vehicles - 1 if listed else places(vehicles - 1)
-        low, high = low + [-1.0] * 3 * count, high + [1.0] * 3 * count
-    if viewed:  # six times gap, nearness, relative speed, and place in the lane; bodies overlap by 4.5 m at the most
-        gap, nearness = (-4.5 / 200.0, 5.5) if overlap else (0.0, 1.0)
-        low += [gap, 0.0, -1.0, -1.0][: 3 + drift] * 6
-        high += [1.0, nearness, 1.0, 1.0][: 3 + drift] * 6
-    if progress:
-        low, high = [*low, 0.0, -1.0], [*high, 1.0, 1.0]
+    others = vehicles - 1
+    # A gap, a nearness, a relative speed and a place in the lane; bodies overlap by 4.5 m at the most.
+    gap, drift, overlap = [(0.0, 1.0), (0.0, 1.0), (-1.0, 1.0)], (-1.0, 1.0), [(-4.5 / 200.0, 1.0), (0.0, 5.5)]
+    ranges = {
+        # Speed over desired speed (at least 25 m/s; nobody drives twice that), a lane to the left, to the right.
+        observation.OWN: [(0.0, 2.0), (0.0, 1.0), (0.0, 1.0)],
+        observation.LIST: [(-1.0, 1.0)] * 3 * others,
+        observation.VIEW: gap * 6,
+        observation.DRIFT_VIEW: [*gap, drift] * 6,
+        observation.OVERLAP_VIEW: [*overlap, (-1.0, 1.0), drift] * 6,
+        observation.CHANGE: [(0.0, 1.0), (-1.0, 1.0)],
+    }
+    low, high = zip(*(pair for part in OBSERVATIONS[form] for pair in ranges[part]))
     return torch.tensor(low), torch.tensor(high)
 
 
@@ -238,7 +237,7 @@ def test_a_vehicle_that_is_not_valid_is_in_no_observation(data, form, lanes, oth
     seen = [ObservationTransform(road, 1 + others, form).observe(s, own, own.long(), road) for s in (scene, haunted)]
     assert torch.equal(*seen)
     # And those that are valid are seen: all of them, from the nearest on, in the list of Table III.
-    if OBSERVATIONS[form][0]:
+    if observation.LIST in OBSERVATIONS[form]:
         distance = (scene.x[0, 1:] - scene.x[0, 0])[valid[0, 1:]].abs().sort().values / 200.0
         listed = seen[0][0, 3 : 3 + 3 * others : 3]
         torch.testing.assert_close(listed[: len(distance)].abs(), distance.clamp_max(1.0))

@@ -15,7 +15,7 @@ from ganlane.env import HighwayEnv
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 ROWS = 16
 

@@ -12,7 +12,7 @@ from reference.worlds import DOUBLE, environment, packed, placed, rules_of, scal
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 MOTION = ("x", "y", "heading", "speed", "acceleration")
 

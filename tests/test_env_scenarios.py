@@ -23,10 +23,9 @@ from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
-from ganlane.sim.road import Road
-from ganlane.sim.scenes import RandomScenes
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.scenes import FixedScene, SceneVehicle
+from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmTraffic
 
 ROWS = 16

@@ -48,10 +48,8 @@ TABLE = pl.DataFrame({"a": NOISE.ravel()})
 #: Every library that writes files here; each has words of its own for a full disk.
 WRITERS = {
     "python": lambda path: path.write_bytes(NOISE.tobytes()),
-    "polars, parquet": lambda path: pl.DataFrame({"a": NOISE.ravel()}).write_parquet(
-        path, compression="uncompressed"
-    ),
-    "polars, csv": lambda path: pl.DataFrame({"a": NOISE.ravel()}).write_csv(path),
+    "polars, parquet": lambda path: TABLE.write_parquet(path, compression="uncompressed"),
+    "polars, csv": lambda path: TABLE.write_csv(path),
     "torch": lambda path: torch.save({"a": torch.from_numpy(NOISE)}, path),
     "pillow": lambda path: Image.fromarray(NOISE).save(path, format="PNG"),
     "numpy": lambda path: np.savez(path.open("wb"), a=NOISE),

@@ -12,7 +12,7 @@ import ganlane
 PACKAGE = Path(ganlane.__file__).parent
 #: From the bottom up; what stands in one line may import each other's neighbours to the left only within itself.
 ORDER = [
-    {"_version", "keys", "errors", "files", "paths", "compiling", "memory"},
+    {"_version", "keys", "errors", "files", "runtime"},
     {"parameters"},
     {"data", "sim"},
     {"generator"},
@@ -21,12 +21,13 @@ ORDER = [
     {"transforms"},
     {"agents"},
     {"evaluation"},
-    {"training"},
     {"view"},
     {"config"},
     {"build"},
-    {"compare", "phases", "fit_report", "benchmarks", "diagnosis"},
+    {"training"},
+    {"compare", "fit_report"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
+    {"options"},
     # The typed calls run the commands' own functions.
     {"api"},
     {"gym"},

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import ganlane
-from ganlane.paths import PACKAGE, conf_folder
+from ganlane.files import PACKAGE, conf_folder
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -41,7 +41,7 @@ def test_a_conf_folder_of_somebody_else_is_not_ours(tmp_path, monkeypatch):
     inside.mkdir(parents=True)
     for file in (inside.parent / "train.yaml", inside / "gan.yaml"):
         file.touch()
-    monkeypatch.setattr("ganlane.paths.PACKAGE", tmp_path / "package")
+    monkeypatch.setattr("ganlane.files.PACKAGE", tmp_path / "package")
     assert conf_folder() == inside.parent
 
 
@@ -51,18 +51,12 @@ def test_the_wheel_holds_configuration_and_weights(tmp_path):
     assert Path(artifact).name.startswith(f"ganlane-{ganlane.__version__}-")
     with zipfile.ZipFile(artifact) as packed:
         names = set(packed.namelist())
-    missing = [
-        path
-        for path in (ROOT / "conf").rglob("*.yaml")
-        if f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" not in names
-    ]
-    assert not missing
+    assert {f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")} <= names
     for kind in ("safetensors", "json"):
         shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob(f"*.{kind}")}
         assert shipped
         assert shipped <= names
-    pages = [path for path in (PACKAGE / "view" / "player").iterdir() if path.suffix in (".html", ".css", ".js")]
-    assert pages
-    assert {f"ganlane/view/player/{path.name}" for path in pages} <= names
+    page = {f"ganlane/view/player_page/{path.name}" for path in (PACKAGE / "view" / "player_page").iterdir()}
+    assert "ganlane/view/player_page/page.html" in page <= names
     assert "ganlane/py.typed" in names
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]

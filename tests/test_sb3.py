@@ -134,7 +134,7 @@ def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorith
             assert len(returns) == len(lengths) == 4
     assert model.ep_info_buffer
     driver = ganlane.sb3.driver(model)
-    table = ganlane.evaluate([driver, "mobil"], ["idm"], 3, mask="safe", **SHORT)
+    table = ganlane.api.evaluate([driver, "mobil"], ["idm"], 3, mask="safe", **SHORT)
     assert table["agent"].to_list() == [algorithm.__name__.lower(), "mobil"]
     assert table["episodes"].to_list() == [3, 3]
     assert table["out_of_road"].to_list() == [0, 0]

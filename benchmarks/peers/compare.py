@@ -1,4 +1,4 @@
-"""Drive every scene in every simulator and say what tells them apart.
+"""Drive every scene in every simulator and measure the differences.
 
     python -m benchmarks.peers.compare
 
@@ -18,11 +18,30 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.peers import highway_env_peer, ours, report, sumo_peer
-from benchmarks.peers.plot import draw
-from benchmarks.peers.scene import OBSTACLE, SCENES, SETTLED_MPS, SLOW_AND_GO, Scene, Trace, settling
-from benchmarks.peers.schemes import LAW, Law, Scheme, equilibrium_gap, integrate
-from benchmarks.peers.simulators import PEERS, Peer, require_peers, versions
+from benchmarks.peers.report import draw, fill, page
+from benchmarks.peers.scene import (
+    LAW,
+    OBSTACLE,
+    SCENES,
+    SETTLED_MPS,
+    SLOW_AND_GO,
+    Law,
+    Scene,
+    Scheme,
+    Trace,
+    equilibrium_gap,
+    integrate,
+    settling,
+)
+from benchmarks.peers.simulators import (
+    PEERS,
+    Peer,
+    drive_highway_env,
+    drive_ours,
+    drive_sumo,
+    require_peers,
+    versions,
+)
 from benchmarks.peers.tolerance import Largest, between, largest, tolerance, unsettled_gap_m
 from ganlane.errors import UserError
 from ganlane.files import write_bytes, write_json
@@ -67,7 +86,7 @@ def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
     traces: dict[str, dict[str, Trace]] = {}
     rows: list[dict[str, Any]] = []
     for scene in SCENES:
-        mine = ours.drive(scene)
+        mine = drive_ours(scene)
         traces[scene.name] = {"ganlane": mine, **{peer.name: peer.drive(scene) for peer in PEERS}}
         for peer in PEERS:
             apart = take_apart(scene, peer, mine, traces[scene.name][peer.name])._asdict()
@@ -78,7 +97,7 @@ def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
 
 
 def _settled() -> list[dict[str, Any]]:
-    drivers = [("ganlane", ours.drive, LAW), *((peer.name, peer.drive, peer.law) for peer in PEERS)]
+    drivers = [("ganlane", drive_ours, LAW), *((peer.name, peer.drive, peer.law) for peer in PEERS)]
     return [
         {"speed_mps": speed, "simulator": name, **settled(speed, drive, law)}
         for speed in SETTLED_MPS
@@ -95,12 +114,12 @@ def _stops(traces: dict[str, dict[str, Trace]]) -> list[dict[str, Any]]:
 
 def _steps() -> list[dict[str, Any]]:
     """What the step itself does in the scene 'slow and go'; every simulator against ganlane at 0.1 s."""
-    mine = ours.drive(SLOW_AND_GO)
+    mine = drive_ours(SLOW_AND_GO)
     others = {
         "its own equations at 0.01 s": (every(integrate(SLOW_AND_GO, Scheme.BALLISTIC, dt=0.01), 10), 1),
-        "HighwayEnv at its default 1/15 s": (every(highway_env_peer.drive(SLOW_AND_GO, dt=1 / 15), 3), 2),
-        "SUMO at its default 1 s, Euler": (sumo_peer.drive(SLOW_AND_GO, ballistic=False, dt=1.0), 10),
-        "SUMO at 1 s, ballistic": (sumo_peer.drive(SLOW_AND_GO, dt=1.0), 10),
+        "HighwayEnv at its default 1/15 s": (every(drive_highway_env(SLOW_AND_GO, dt=1 / 15), 3), 2),
+        "SUMO at its default 1 s, Euler": (drive_sumo(SLOW_AND_GO, ballistic=False, dt=1.0), 10),
+        "SUMO at 1 s, ballistic": (drive_sumo(SLOW_AND_GO, dt=1.0), 10),
     }
     return [
         {"other": name, **between(other, every(mine, stride))._asdict()} for name, (other, stride) in others.items()
@@ -132,10 +151,10 @@ def main(argv: list[str] | None = None) -> int:
     except UserError as error:
         print(error, file=sys.stderr)
         return 2
-    print(report.page(figures))
+    print(page(figures))
     write_json(out / "peers.json", figures)
     draw(traces, figures, out / "peers.png")
-    write_bytes(arguments.page, report.fill(arguments.page.read_text(), figures).encode())
+    write_bytes(arguments.page, fill(arguments.page.read_text(), figures).encode())
     print(f"results: {out / 'peers.json'}")
     return 0
 

@@ -1,21 +1,267 @@
-"""The simulators that ganlane is held against, each as it is set up here."""
+"""The scene in ganlane, HighwayEnv and SUMO: the same drivers, with what has to be set for that.
+
+**ganlane**: the traffic module that the package ships, in float64, on one lane.
+
+**HighwayEnv** (1.10 to 1.12): its own IDM vehicles on its own road.
+
+- ``COMFORT_ACC_MAX``, ``COMFORT_ACC_MIN`` (negative), ``TIME_WANTED``, ``DELTA`` and ``DISTANCE_WANTED`` are Table V.
+  ``DISTANCE_WANTED`` is from centre to centre and so includes a length.
+- ``ACC_MAX`` (6 m/s2) bounds the acceleration both ways; here Table V's 20 m/s2.
+- ``target_speed`` is the desired speed, but the lane's ``speed_limit`` (20 or 30 m/s by default) cuts it.
+- Lane changes are off; the step is 0.1 s rather than the environments' 1/15 s.
+
+**SUMO** (1.20 to 1.28): ``carFollowModel`` IDM through libsumo.
+
+- ``accel``, ``decel`` (the comfortable one), ``tau``, ``minGap`` and ``delta`` are Table V; ``emergencyDecel`` is its
+  hardest braking. ``maxSpeed`` is the desired speed, as long as the lane allows it and ``speedFactor`` is 1.
+- ``stepping`` (0.25 s by default) is the step within a step; at the step itself (0.1 s) IDM is evaluated once a
+  step, as elsewhere.
+- ``sigma`` and ``speedDev`` are 0; vehicles enter without checks (``insertionChecks="none"``).
+- The prescribed leader is driven by ``setSpeed`` with all checks off (speed mode 0).
+"""
 
 from __future__ import annotations
 
 import importlib.metadata
 import math
 import platform
+import tempfile
 from collections.abc import Callable
+from enum import Enum
 from functools import partial
 from importlib.util import find_spec
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from benchmarks.peers import highway_env_peer, sumo_peer
-from benchmarks.peers.highway_env_peer import Distances
-from benchmarks.peers.scene import LENGTH_M, Trace
-from benchmarks.peers.schemes import Law, Scheme
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.peers.scene import DESIRED_SPEED_MPS, LENGTH_M, ROAD_M, Law, Scene, Scheme, Trace
 from ganlane._version import __version__
 from ganlane.errors import UserError
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.sim.idm import TABLE_V, IdmParameters
+from ganlane.sim.lanes import Visibility
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.idm_mobil import IdmTraffic
+
+
+def vehicles_of(scene: Scene, dtype: torch.dtype = torch.float64) -> Vehicles:
+    """The first moment of ``scene`` as one row of vehicles on the centre of lane 0."""
+    speed = torch.tensor([scene.speeds_mps], dtype=dtype)
+    zero, whole = torch.zeros_like(speed), torch.zeros_like(speed, dtype=torch.int64)
+    return Vehicles(
+        x=torch.tensor(scene.positions_m(), dtype=dtype)[None],
+        y=zero,
+        heading=zero,
+        speed=speed,
+        acceleration=zero,
+        length=zero + LENGTH_M,
+        width=zero + 2.5,
+        desired_speed=zero + DESIRED_SPEED_MPS,
+        target_lane=whole,
+        visibility=whole + int(Visibility.BODY),
+        valid=whole == 0,
+    )
+
+
+def led(before: Vehicles, moved: Vehicles, leader_mps: float, dt: float) -> Vehicles:
+    """``moved`` with the foremost at its prescribed speed, at constant acceleration within the step."""
+    speed, x = moved.speed.clone(), moved.x.clone()
+    speed[:, 0] = leader_mps
+    x[:, 0] = before.x[:, 0] + 0.5 * dt * (before.speed[:, 0] + leader_mps)
+    return moved.with_(speed=speed, x=x)
+
+
+def drive_ours(scene: Scene, dt: float = PHYSICS_STEP_S, dtype: torch.dtype = torch.float64) -> Trace:
+    """Drive ``scene`` with :class:`~ganlane.traffic.idm_mobil.IdmTraffic` as it stands, at steps of ``dt`` s."""
+    traffic = IdmTraffic(Road(lanes=1))
+    traffic.dt = dt
+    vehicles = vehicles_of(scene, dtype)
+    key = torch.zeros(1, dtype=torch.int64)
+    memory = traffic.fresh_memory(vehicles, key)
+    speeds, positions = [vehicles.speed], [vehicles.x]
+    for step in range(scene.steps(dt)):
+        moved, memory = traffic.move(vehicles, memory, key, key + step)
+        vehicles = led(vehicles, moved, scene.leader_speeds(dt)[step + 1], dt) if scene.leader else moved
+        speeds.append(vehicles.speed)
+        positions.append(vehicles.x)
+    return Trace(_stack(speeds), _stack(positions))
+
+
+def _stack(rows: list[Tensor]) -> np.ndarray:
+    return torch.cat(rows).double().numpy()
+
+
+class Distances(Enum):
+    """What HighwayEnv's drivers take for the distance to their leader."""
+
+    #: As it comes: from centre to centre, with one vehicle's length in the minimum gap.
+    CENTRES = LENGTH_M
+    #: Points instead of bodies, as far apart as the bumpers are: HighwayEnv's equations see the net gap.
+    BUMPERS = 0.0
+
+
+def driver_class(distances: Distances, idm: IdmParameters) -> Any:
+    """``IDMVehicle`` with the parameters ``idm`` and vehicles of 4.5 m."""
+    from highway_env.vehicle.behavior import IDMVehicle
+
+    class Driver(IDMVehicle):
+        LENGTH = LENGTH_M
+        ACC_MAX = -idm.min_acceleration
+        COMFORT_ACC_MAX = idm.max_acceleration
+        COMFORT_ACC_MIN = -idm.comfortable_deceleration
+        DISTANCE_WANTED = idm.min_gap_m + distances.value
+        TIME_WANTED = idm.headway_s
+        DELTA = 4.0
+
+    return Driver
+
+
+def highway_env_road(scene: Scene, distances: Distances, idm: IdmParameters) -> Any:
+    """A HighwayEnv road with the vehicles of ``scene`` at their places, the foremost first."""
+    from highway_env.road.road import Road, RoadNetwork
+    from highway_env.vehicle.kinematics import Vehicle
+
+    network = RoadNetwork.straight_road_network(lanes=1, length=ROAD_M, speed_limit=2.0 * DESIRED_SPEED_MPS)
+    road = Road(network, np_random=np.random.RandomState(0))
+    driver = driver_class(distances, idm)
+    squeezed = scene.positions_m() + squeeze(scene, distances)
+    for rank, (x, speed) in enumerate(zip(squeezed, scene.speeds_mps)):
+        if rank == 0 and scene.leader:
+            vehicle = Vehicle(road, [x, 0.0], speed=speed)
+        else:
+            vehicle = driver(
+                road, [x, 0.0], speed=speed, target_speed=DESIRED_SPEED_MPS, enable_lane_change=False, timer=1.0
+            )
+        # Its crash physics would push the points apart that stand for bodies.
+        vehicle.check_collisions = distances is Distances.CENTRES
+        road.vehicles.append(vehicle)
+    return road
+
+
+def squeeze(scene: Scene, distances: Distances) -> np.ndarray:
+    """How far forward each vehicle is drawn so that centres are as far apart as bumpers should be, m, [M]."""
+    rank = np.arange(len(scene.speeds_mps))
+    return rank * (LENGTH_M - distances.value)
+
+
+def drive_highway_env(
+    scene: Scene,
+    distances: Distances = Distances.BUMPERS,
+    dt: float = PHYSICS_STEP_S,
+    idm: IdmParameters = TABLE_V,
+) -> Trace:
+    """Drive ``scene`` with HighwayEnv at steps of ``dt`` seconds; positions in the trace are the bodies' centres."""
+    road = highway_env_road(scene, distances, idm)
+    leader = scene.leader_speeds(dt) if scene.leader else None
+    speeds, positions = [_speeds(road)], [_positions(road)]
+    for step in range(scene.steps(dt)):
+        road.act()
+        if leader is not None:
+            road.vehicles[0].act({"steering": 0.0, "acceleration": (leader[step + 1] - leader[step]) / dt})
+        road.step(dt)
+        speeds.append(_speeds(road))
+        positions.append(_positions(road))
+    return Trace(np.array(speeds), np.array(positions) - squeeze(scene, distances))
+
+
+def _speeds(road: Any) -> list[float]:
+    return [vehicle.speed for vehicle in road.vehicles]
+
+
+def _positions(road: Any) -> list[float]:
+    return [vehicle.position[0] for vehicle in road.vehicles]
+
+
+#: SUMO's own ``stepping``, for steps longer than that.
+DEFAULT_STEPPING_S = 0.25
+#: One lane from a dead end to a dead end; its speed limit is out of everybody's way.
+NETWORK = f"""<net version="1.20">
+  <location netOffset="0,0" convBoundary="0,0,{ROAD_M},0" origBoundary="0,0,{ROAD_M},0" projParameter="!"/>
+  <edge id="road" from="start" to="end">
+    <lane id="road_0" index="0" speed="{2 * DESIRED_SPEED_MPS}" length="{ROAD_M}" shape="0,0 {ROAD_M},0"/>
+  </edge>
+  <junction id="start" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape="0,0"/>
+  <junction id="end" type="dead_end" x="{ROAD_M}" y="0" incLanes="road_0" intLanes="" shape="{ROAD_M},0"/>
+</net>
+"""
+
+
+def vehicle_type(name: str, max_speed_mps: float, dt: float, p: IdmParameters) -> str:
+    """A ``vType`` of drivers with the parameters ``p``."""
+    return (
+        f'<vType id="{name}" carFollowModel="IDM" length="{LENGTH_M}" minGap="{p.min_gap_m}" tau="{p.headway_s}" '
+        f'accel="{p.max_acceleration}" decel="{p.comfortable_deceleration}" emergencyDecel="{-p.min_acceleration}" '
+        f'delta="4" stepping="{min(dt, DEFAULT_STEPPING_S)}" '
+        f'sigma="0" speedFactor="1" speedDev="0" maxSpeed="{max_speed_mps}"/>'
+    )
+
+
+def demand(scene: Scene, dt: float, idm: IdmParameters) -> str:
+    """The route file: everybody on the road from the first step, front bumpers half a length ahead of the centres."""
+    limits = {"leader": 2 * DESIRED_SPEED_MPS, "driver": DESIRED_SPEED_MPS}
+    lines = [vehicle_type(name, limit, dt, idm) for name, limit in limits.items()]
+    lines.append('<route id="all" edges="road"/>')
+    for rank, (x, speed) in enumerate(zip(scene.positions_m().tolist(), scene.speeds_mps)):
+        kind = "leader" if rank == 0 and scene.leader else "driver"
+        lines.append(
+            f'<vehicle id="{rank}" type="{kind}" route="all" depart="0" departPos="{x + 0.5 * LENGTH_M!r}" '
+            f'departSpeed="{speed!r}" insertionChecks="none"/>'
+        )
+    return "<routes>\n" + "\n".join(lines) + "\n</routes>\n"
+
+
+def command(folder: Path, ballistic: bool, dt: float) -> list[str]:
+    """SUMO's command line for the files in ``folder``."""
+    return [
+        *("sumo", "--net-file", str(folder / "net.xml"), "--route-files", str(folder / "routes.xml")),
+        *("--step-length", str(dt), "--step-method.ballistic", str(ballistic).lower(), "--default.speeddev", "0"),
+        *("--collision.action", "none", "--time-to-teleport", "-1", "--xml-validation", "never"),
+        *("--no-step-log", "true", "--duration-log.disable", "true", "--no-warnings", "true"),
+    ]
+
+
+def drive_sumo(
+    scene: Scene, ballistic: bool = True, dt: float = PHYSICS_STEP_S, idm: IdmParameters = TABLE_V
+) -> Trace:
+    """Drive ``scene`` with SUMO at steps of ``dt`` seconds; positions in the trace are the bodies' centres.
+
+    Raises:
+        UserError: a vehicle is missing, so the trace would not be that of the scene.
+    """
+    import libsumo
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "net.xml").write_text(NETWORK)
+        (folder / "routes.xml").write_text(demand(scene, dt, idm))
+        libsumo.start(command(folder, ballistic, dt))
+        try:
+            return _run_sumo(libsumo, scene, dt)
+        finally:
+            libsumo.close()
+
+
+def _run_sumo(libsumo: Any, scene: Scene, dt: float) -> Trace:
+    """Step the loaded simulation and record it. SUMO inserts at the end of its first step: that is the start."""
+    leader = scene.leader_speeds(dt) if scene.leader else None
+    libsumo.simulationStep()
+    names = [str(rank) for rank in range(len(scene.speeds_mps))]
+    if sorted(libsumo.vehicle.getIDList()) != names:
+        raise UserError(f"SUMO put {libsumo.vehicle.getIDList()} on the road; expected the vehicles {names}.")
+    if leader is not None:
+        libsumo.vehicle.setSpeedMode("0", 0)
+    speeds, positions = [], []
+    for step in range(scene.steps(dt) + 1):
+        if step and leader is not None:
+            libsumo.vehicle.setSpeed("0", leader[step])
+        if step:
+            libsumo.simulationStep()
+        speeds.append([libsumo.vehicle.getSpeed(vehicle) for vehicle in names])
+        positions.append([libsumo.vehicle.getLanePosition(vehicle) for vehicle in names])
+    return Trace(np.array(speeds), np.array(positions) - 0.5 * LENGTH_M)
 
 
 class Peer(NamedTuple):
@@ -32,16 +278,16 @@ class Peer(NamedTuple):
 _HIGHWAY_ENV = Law(floored=False, reverses=True, free_gap_m=math.inf)
 _SUMO = Law(free_gap_m=math.inf)
 PEERS = (
-    Peer("HighwayEnv", "highway_env", highway_env_peer.drive, Scheme.EXPLICIT_EULER, _HIGHWAY_ENV),
+    Peer("HighwayEnv", "highway_env", drive_highway_env, Scheme.EXPLICIT_EULER, _HIGHWAY_ENV),
     Peer(
         "HighwayEnv, centres",
         "highway_env",
-        partial(highway_env_peer.drive, distances=Distances.CENTRES),
+        partial(drive_highway_env, distances=Distances.CENTRES),
         Scheme.EXPLICIT_EULER,
         Law(LENGTH_M, floored=False, reverses=True, free_gap_m=math.inf),
     ),
-    Peer("SUMO, ballistic", "libsumo", sumo_peer.drive, Scheme.BALLISTIC, _SUMO),
-    Peer("SUMO, Euler", "libsumo", partial(sumo_peer.drive, ballistic=False), Scheme.SEMI_IMPLICIT_EULER, _SUMO),
+    Peer("SUMO, ballistic", "libsumo", drive_sumo, Scheme.BALLISTIC, _SUMO),
+    Peer("SUMO, Euler", "libsumo", partial(drive_sumo, ballistic=False), Scheme.SEMI_IMPLICIT_EULER, _SUMO),
 )
 PACKAGES = ("highway-env", "eclipse-sumo", "libsumo", "torch", "numpy")
 

@@ -17,8 +17,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.peers.scene import DESIRED_SPEED_MPS, Array, Scene, Trace
-from benchmarks.peers.schemes import BRAKE, LAW, Law, Scheme, acceleration, ahead
+from benchmarks.peers.scene import (
+    BRAKE,
+    DESIRED_SPEED_MPS,
+    LAW,
+    Array,
+    Law,
+    Scene,
+    Scheme,
+    Trace,
+    acceleration,
+    ahead,
+)
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V
 
@@ -38,7 +48,7 @@ class Slopes(NamedTuple):
 
 
 def slopes(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) -> Slopes:
-    """Derivatives of :func:`~benchmarks.peers.schemes.acceleration`; 0 where it is cut to Table V's bounds."""
+    """Derivatives of :func:`~benchmarks.peers.scene.acceleration`; 0 where it is cut to Table V's bounds."""
     p = TABLE_V
     dynamic = speed * p.headway_s + speed * (speed - leader_speed) / BRAKE
     answers = (dynamic > 0.0) | (not law.floored)

@@ -2,15 +2,13 @@
 
 A decision flows through the files in this order: :mod:`~ganlane.agents.network` turns an observation into a
 distribution over returns for each action, :mod:`~ganlane.agents.policy` picks one, :mod:`~ganlane.agents.n_step`
-joins n decisions into a transition, :mod:`~ganlane.agents.replay` keeps it, :mod:`~ganlane.agents.sampler` draws it
-again by priority, :mod:`~ganlane.agents.loss` compares it with the target network, and
-:mod:`~ganlane.agents.rainbow` holds it all together; :mod:`~ganlane.agents.resume` takes down its whole state for a
-run that is to go on. :mod:`~ganlane.agents.checkpoint` writes the trained network to a file and reads it back, and
-:mod:`~ganlane.agents.handover` starts another agent from it.
+joins n decisions into a transition, :mod:`~ganlane.agents.replay` keeps it and draws it again by priority,
+:mod:`~ganlane.agents.loss` compares it with the target network, and :mod:`~ganlane.agents.rainbow` holds it all
+together. :mod:`~ganlane.agents.checkpoint` writes the trained network to a file, reads it back, and starts another
+agent from it. :mod:`~ganlane.agents.drivers` need no learning.
 """
 
-from ganlane.agents.checkpoint import agent_file, load_agent, read_agent, save_agent
-from ganlane.agents.handover import transfer
+from ganlane.agents.checkpoint import agent_file, load_agent, read_agent, save_agent, warm_start
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import NetworkConfig, QNetwork
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy
@@ -29,5 +27,5 @@ __all__ = [
     "load_agent",
     "read_agent",
     "save_agent",
-    "transfer",
+    "warm_start",
 ]

@@ -17,8 +17,7 @@ from ganlane.sim.ego import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
-from ganlane.sim.road import Road, road_in
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.idm_mobil import MOBIL_PERIOD_STEPS
 from ganlane.transforms.mask import on_road_actions
 
@@ -26,8 +25,8 @@ from ganlane.transforms.mask import on_road_actions
 class Driver(TensorDictModuleBase):
     """A rule-based policy: reads the raw state, writes ``action`` [N] int64 through :meth:`act`.
 
-    One of your own that remembers something per row in the module itself sets ``rows_must_stay = True``: an
-    evaluation then never moves a running episode to another row, or into a smaller batch.
+    Set ``rows_must_stay = True`` in one that remembers something per row in the module itself: an evaluation then
+    never moves a running episode to another row, or into a smaller batch.
     """
 
     in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
@@ -74,8 +73,7 @@ class RandomLegalDriver(RandomDriver):
         legal = legal_actions(tensordict, road_in(tensordict, self.road))
         wanted = (self._uniform(tensordict) * legal.sum(1)).long()
         rank = legal.cumsum(1) - 1
-        chosen = legal & (rank == wanted[:, None])
-        return (chosen.long() * torch.arange(3, device=legal.device)).amax(1)
+        return (legal & (rank == wanted[:, None])).long().argmax(1)
 
 
 class KeepLaneDriver(Driver):
@@ -90,11 +88,7 @@ class MobilDriver(Driver):
     """The ego driven by MOBIL; with ``politeness_rear=politeness_side=0`` an egoistic one."""
 
     def __init__(
-        self,
-        road: Road,
-        stream: int = Stream.TRAIN,
-        idm: IdmParameters = TABLE_V,
-        mobil: MobilParameters = TABLE_IV,
+        self, road: Road, stream: int = Stream.TRAIN, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
     ) -> None:
         super().__init__(road, stream)
         self.idm, self.mobil = idm, mobil
@@ -114,7 +108,7 @@ class MobilDriver(Driver):
 def egoistic_mobil(
     road: Road, stream: int = Stream.TRAIN, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
 ) -> MobilDriver:
-    """MOBIL that cares for nobody but itself: politeness 0."""
+    """MOBIL with politeness 0."""
     return MobilDriver(road, stream, idm, replace(mobil, politeness_rear=0.0, politeness_side=0.0))
 
 

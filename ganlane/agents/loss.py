@@ -19,12 +19,11 @@ from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 from ganlane import keys
 from ganlane.agents.network import QNetwork, Weights
 from ganlane.agents.policy import allowed_values
-from ganlane.agents.projection import outside_support, pick, project
 from ganlane.parameters.agent import RainbowConfig
 
 
-class _TargetNetwork:
-    """A second module whose tensors are the loss's target parameters: its noise can be drawn anew."""
+class _WithTarget:
+    """Mixin: a second module whose tensors are the loss's target parameters, so that its noise can be drawn anew."""
 
     target_network: QNetwork
     network: QNetwork
@@ -43,12 +42,11 @@ class _TargetNetwork:
     @torch.no_grad()
     def update_target(self) -> None:
         """Copy the online parameters to the target network."""
-        pairs = zip(self.target_network.parameters(), self.network.parameters())
-        for target, online in pairs:
+        for target, online in zip(self.target_network.parameters(), self.network.parameters()):
             target.copy_(online)
 
 
-class LeanDistributionalLoss(_TargetNetwork, DistributionalDQNLoss):
+class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
     """Categorical (C51) loss, double or not.
 
     Args:
@@ -95,14 +93,12 @@ class LeanDistributionalLoss(_TargetNetwork, DistributionalDQNLoss):
         values = allowed_values(self.network.expected(choosing), batch.get(("next", keys.ACTION_MASK), None))
         best, action = values.max(-1)
         probabilities = pick(target_logits, action).softmax(-1)
-        discount = self.gamma ** batch.get("steps_to_next_obs")
-        alive = 1.0 - batch.get(("next", "terminated")).to(support.dtype)
-        values = batch.get(("next", "reward")).to(support.dtype) + alive * discount * support
+        values = bellman(batch, self.gamma, support)
         clamped = outside_support(values, probabilities, support)
         return project(values, probabilities, support), clamped, best.mean()
 
 
-class LeanDQNLoss(_TargetNetwork, DQNLoss):
+class LeanDQNLoss(_WithTarget, DQNLoss):
     """Plain DQN loss (Huber), double or not: Rainbow with ``distributional=False``."""
 
     def __init__(self, network: QNetwork, gamma: float, double: bool = True) -> None:
@@ -137,10 +133,7 @@ class LeanDQNLoss(_TargetNetwork, DQNLoss):
         values = self.network(following) if self.double_dqn else target_values
         best, action = allowed_values(values, batch.get(("next", keys.ACTION_MASK), None)).max(-1)
         value = target_values.gather(-1, action[:, None])
-        alive = 1.0 - batch.get(("next", "terminated")).to(value.dtype)
-        discount = self.discount ** batch.get("steps_to_next_obs")
-        target = batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
-        return target.squeeze(-1), best.mean()
+        return bellman(batch, self.discount, value).squeeze(-1), best.mean()
 
 
 def make_loss(network: QNetwork, config: RainbowConfig) -> LeanDistributionalLoss | LeanDQNLoss:
@@ -148,3 +141,37 @@ def make_loss(network: QNetwork, config: RainbowConfig) -> LeanDistributionalLos
     if config.distributional:
         return LeanDistributionalLoss(network, config.gamma, config.double, config.kl_priority)
     return LeanDQNLoss(network, config.gamma, config.double)
+
+
+def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
+    """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows, unless it terminated."""
+    alive = 1.0 - batch.get(("next", "terminated")).to(value.dtype)
+    discount = gamma ** batch.get("steps_to_next_obs")
+    return batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
+
+
+def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
+    """Project the distribution with ``probabilities`` [B, K] at ``values`` [B, K] onto ``support`` [K].
+
+    Values outside the support are clamped to its ends. Each mass is split between its two neighbours in proportion
+    to the nearness of the other (Bellemare et al. 2017, equation 7); the mean is kept but for the clamping.
+    """
+    low, high, atoms = support[0], support[-1], support.numel()
+    place = (values.clamp(low, high) - low) * ((atoms - 1) / (high - low))
+    lower = place.floor().clamp_max(atoms - 2)
+    share = (place - lower) * probabilities
+    index = lower.long()
+    projected = torch.zeros_like(probabilities)
+    projected.scatter_add_(1, index, probabilities - share)
+    return projected.scatter_add_(1, index + 1, share)
+
+
+def outside_support(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
+    """Probability mass that :func:`project` clamps, averaged over the batch, 0-dim."""
+    outside = (values < support[0]) | (values > support[-1])
+    return (probabilities * outside).sum(-1).mean()
+
+
+def pick(rows: Tensor, action: Tensor) -> Tensor:
+    """Rows [B, K] of ``rows`` [B, A, K] at the actions [B]."""
+    return rows.gather(1, action.view(-1, 1, 1).expand(-1, 1, rows.shape[-1])).squeeze(1)

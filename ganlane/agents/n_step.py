@@ -28,6 +28,21 @@ class Step(NamedTuple):
     done: Tensor
     following_mask: Tensor | None = None
 
+    @classmethod
+    def copied(cls, step: TensorDictBase) -> Step:
+        """The tensors of a step, copied: the environment may write into its own afterwards."""
+        after = step.get("next")
+        mask = after.get(keys.ACTION_MASK, None)
+        return cls(
+            step.get("observation").clone(),
+            step.get("action").clone(),
+            after.get("reward").clone(),
+            after.get("observation").clone(),
+            after.get("terminated").clone(),
+            after.get("done").clone(),
+            None if mask is None else mask.clone(),
+        )
+
 
 class NStepWindow:
     """The last ``n`` steps of N environments; each new one gives the transition of the oldest.
@@ -52,7 +67,7 @@ class NStepWindow:
             ``observation``, ``action``, ``steps_to_next_obs`` [N, 1] (the exponent of the discount), and ``next``'s
             ``observation``, ``reward`` (the n-step return), ``terminated``, and ``action_mask`` where there is one.
         """
-        self.steps.append(_copy(step))
+        self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
         transition = combine(self.steps, self.gamma)
@@ -83,22 +98,9 @@ def combine(steps: list[Step], gamma: float) -> TensorDict:
         terminated = torch.where(running, step.terminated, terminated)
         length = length + running
         running = running & ~step.done
-    led_to = {"observation": following, "reward": reward, "terminated": terminated}
-    after = TensorDict(led_to if mask is None else {**led_to, keys.ACTION_MASK: mask}, reward.shape[:1])
-    content = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length, "next": after}
-    return TensorDict(content, reward.shape[:1])
-
-
-def _copy(step: TensorDictBase) -> Step:
-    """The tensors of a step, copied: the environment may write into its own afterwards."""
-    after = step.get("next")
-    mask = after.get(keys.ACTION_MASK, None)
-    return Step(
-        step.get("observation").clone(),
-        step.get("action").clone(),
-        after.get("reward").clone(),
-        after.get("observation").clone(),
-        after.get("terminated").clone(),
-        after.get("done").clone(),
-        None if mask is None else mask.clone(),
-    )
+    after = {"observation": following, "reward": reward, "terminated": terminated}
+    if mask is not None:
+        after[keys.ACTION_MASK] = mask
+    rows = reward.shape[:1]
+    content = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length}
+    return TensorDict({**content, "next": TensorDict(after, rows)}, rows)

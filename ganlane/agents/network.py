@@ -17,40 +17,34 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import NoisyLinear
 
-from ganlane.agents.encoder import make_encoder
 from ganlane.agents.linear import linear
 from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
 
 #: Weight and bias of each layer.
 Weights = list[tuple[Tensor, Tensor]]
-#: No layer is wider: a damaged file must not ask for all memory.
+#: Largest width of a layer: a damaged file must not ask for all memory.
 LARGEST = 65536
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Shape and options of a :class:`QNetwork`.
+    """Shape and options of a :class:`QNetwork`; defaults and meaning as in :class:`RainbowConfig`.
 
     ``observation_size`` D and ``actions`` A come from the environment. ``v_min`` and ``v_max`` bound the discounted
-    return, with ``atoms`` points between; without ``distributional`` they are ignored. ``noisy_sigma`` is the
-    initial noise of Fortunato et al. 2017 (0.5), divided there by the root of the layer's width. ``encoder`` stands
-    before the noisy layers and has no noise (:func:`ganlane.agents.encoder.make_encoder`).
+    return, with ``atoms`` points between; without ``distributional`` they are ignored.
     """
 
     observation_size: int
     actions: int = 3
-    hidden: tuple[int, ...] = (256, 256)
-    encoder: str = "none"
-    encoder_width: int = 64
-    encoder_layers: int = 2
-    noisy: bool = True
-    dueling: bool = True
-    distributional: bool = True
-    atoms: int = 51
-    v_min: float = -120.0
-    v_max: float = 120.0
-    noisy_sigma: float = 0.5
+    hidden: tuple[int, ...] = RainbowConfig.hidden
+    noisy: bool = RainbowConfig.noisy
+    dueling: bool = RainbowConfig.dueling
+    distributional: bool = RainbowConfig.distributional
+    atoms: int = RainbowConfig.atoms
+    v_min: float = RainbowConfig.v_min
+    v_max: float = RainbowConfig.v_max
+    noisy_sigma: float = RainbowConfig.noisy_sigma
 
     @classmethod
     def of(cls, config: RainbowConfig, observation_size: int, actions: int = 3) -> NetworkConfig:
@@ -60,7 +54,6 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}
-        sizes |= {"encoder_width": self.encoder_width, "encoder_layers": self.encoder_layers}
         sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
         for name, size in sizes.items():
             if not isinstance(size, int) or not 1 <= size <= LARGEST:
@@ -68,8 +61,9 @@ class NetworkConfig:
         for name in ("noisy", "dueling", "distributional"):
             if not isinstance(getattr(self, name), bool):
                 raise UserError(f"network {name}={getattr(self, name)!r}: expected true or false.")
-        ends = (self.v_min, self.v_max, self.noisy_sigma)
-        if not all(isinstance(end, int | float) and isfinite(end) for end in ends) or self.v_min >= self.v_max:
+        numbers = (self.v_min, self.v_max, self.noisy_sigma)
+        finite = all(isinstance(number, int | float) and isfinite(number) for number in numbers)
+        if not finite or self.v_min >= self.v_max:
             raise UserError(f"network v_min={self.v_min!r}, v_max={self.v_max!r}: expected finite numbers in order.")
 
     @property
@@ -81,11 +75,7 @@ class NetworkConfig:
 class QNetwork(nn.Module):
     """Action values [*, A], as a distribution over ``support`` [atoms] or as plain numbers.
 
-    Noise is added under ``ExplorationType.RANDOM`` alone and stays the same until it is drawn anew
-    (:func:`ganlane.agents.noise.redraw_noise`).
-
-    Raises:
-        UserError: the encoder does not exist or cannot read observations of this size.
+    Noise is added under ``ExplorationType.RANDOM`` alone, and is the same until :func:`redraw_noise`.
     """
 
     support: Tensor
@@ -93,11 +83,7 @@ class QNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder = make_encoder(
-            config.encoder, config.observation_size, config.encoder_width, config.encoder_layers
-        )
-        inputs = config.observation_size if self.encoder is None else self.encoder.outputs
-        widths = (inputs, *config.hidden)
+        widths = (config.observation_size, *config.hidden)
         self.trunk = nn.ModuleList(self._linear(*pair) for pair in pairwise(widths))
         rows = config.actions + int(config.dueling)
         self.head = self._linear(widths[-1], rows * config.outputs)
@@ -109,7 +95,7 @@ class QNetwork(nn.Module):
         return nn.Linear(inputs, outputs)
 
     def weights(self) -> Weights:
-        """Weight and bias of every layer after the encoder, the head last, with the present noise added."""
+        """Weight and bias of every layer, the head last, with the present noise added."""
         return [(layer.weight, layer.bias) for layer in (*self.trunk, self.head)]
 
     def logits(self, observation: Tensor, weights: Weights | None = None) -> Tensor:
@@ -119,8 +105,6 @@ class QNetwork(nn.Module):
         """
         *hidden_layers, head = self.weights() if weights is None else weights
         hidden = observation.to(self.support.dtype)
-        if self.encoder is not None:
-            hidden = self.encoder(hidden)
         for weight, bias in hidden_layers:
             hidden = linear(hidden, weight, bias, relu=True)
         rows = linear(hidden, *head).unflatten(-1, (-1, self.config.outputs))
@@ -151,7 +135,7 @@ def duel(rows: Tensor) -> Tensor:
 
 
 def parameters_of(network: QNetwork) -> dict[str, Tensor]:
-    """Copies of the parameters by name; the momentary noise is not among them."""
+    """Copies of the parameters by name, without the momentary noise."""
     return {name: value.detach().clone() for name, value in network.named_parameters()}
 
 
@@ -166,11 +150,37 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
     shapes = {name: tuple(value.shape) for name, value in own.items()}
     given = {name: tuple(value.shape) for name, value in weights.items()}
     if shapes != given:
-        differing = sorted(name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name))
-        name = differing[0]
+        name = min(name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name))
         raise UserError(
             f"the weights do not fit the network: {name} is {given.get(name, 'absent')} in the checkpoint and "
             f"{shapes.get(name, 'absent')} in the network; use the observation and agent options it was trained with."
         )
     for name, value in own.items():
         value.copy_(weights[name])
+
+
+@torch.no_grad()
+def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
+    """Draw the factorised Gaussian noise of every noisy layer anew (Fortunato et al. 2017).
+
+    In place of TorchRL's ``reset_noise``, which draws from the global generator; one draw serves all layers.
+    """
+    layers = _noisy_layers(network)
+    if not layers:
+        return
+    sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
+    normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
+    noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
+    for layer, inputs, outputs in zip(layers, noise[::2], noise[1::2]):
+        torch.outer(outputs, inputs, out=layer.weight_epsilon)
+        layer.bias_epsilon.copy_(outputs)
+
+
+def mean_sigma(network: nn.Module) -> Tensor:
+    """Mean absolute noise parameter over the weights of the noisy layers, 0-dim; 0 without noise."""
+    sigmas = [layer.weight_sigma.detach().abs().mean() for layer in _noisy_layers(network)]
+    return torch.stack(sigmas).mean() if sigmas else torch.zeros(())
+
+
+def _noisy_layers(network: nn.Module) -> list[NoisyLinear]:
+    return [layer for layer in network.modules() if isinstance(layer, NoisyLinear)]

@@ -11,8 +11,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ganlane import keys
-from ganlane.agents.network import QNetwork
-from ganlane.agents.noise import redraw_noise
+from ganlane.agents.network import QNetwork, redraw_noise
 from ganlane.errors import UserError
 
 #: Gives the legal actions, [N, A] bool, of what the environment wrote.
@@ -20,40 +19,8 @@ LegalActions = Callable[[TensorDictBase], Tensor]
 
 
 def allowed_values(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Action values [*, A] with minus infinity where ``mask`` [*, A] forbids; as they are without a mask."""
+    """Action values [*, A] with minus infinity where ``mask`` [*, A] forbids; unchanged without a mask."""
     return values if mask is None else values.masked_fill(~mask, -torch.inf)
-
-
-class MaskedPolicy(TensorDictModuleBase):
-    """Any policy behind the environment's ``action_mask``: an action that is not allowed becomes 'keep the lane'.
-
-    A policy that chooses among the allowed actions itself, as this package's agents do, is not changed by it.
-
-    Args:
-        policy: writes ``action`` [N] int64.
-
-    Raises:
-        UserError: the environment has no mask.
-    """
-
-    def __init__(self, policy: TensorDictModuleBase) -> None:
-        super().__init__()
-        self.policy = policy
-        self.rows_must_stay = getattr(policy, "rows_must_stay", True)
-        self.in_keys = [*policy.in_keys, *([] if keys.ACTION_MASK in policy.in_keys else [keys.ACTION_MASK])]
-        self.out_keys = list(policy.out_keys)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``."""
-        mask = tensordict.get(keys.ACTION_MASK, None)
-        if mask is None:
-            raise UserError(
-                "this driver chooses among allowed actions, but the environment has no action_mask; make it with "
-                "mask='safe' or 'legal'."
-            )
-        action = self.policy(tensordict).get(keys.ACTION)
-        allowed = mask.gather(1, action[:, None])[:, 0]
-        return tensordict.set(keys.ACTION, torch.where(allowed, action, keys.KEEP))
 
 
 class GreedyPolicy(TensorDictModuleBase):
@@ -81,11 +48,11 @@ class GreedyPolicy(TensorDictModuleBase):
 
 
 class ExploringPolicy(TensorDictModuleBase):
-    """The policy that collects: network noise drawn anew at every step, or random legal actions.
+    """The policy that collects: network noise drawn anew at every step, mixed with random legal actions.
 
-    Under ``set_exploration_type`` of DETERMINISTIC, MODE or MEAN it does not explore; otherwise it does, so that
-    collecting outside any context (where TorchRL's noisy layers are silent) is not greedy by accident. Where the
-    environment writes ``action_mask``, all actions are among the allowed ones, and ``legal`` is not asked.
+    It explores unless ``set_exploration_type`` says DETERMINISTIC, MODE or MEAN: outside any context, where TorchRL's
+    noisy layers are silent, collecting would else be greedy by accident. Where the environment writes
+    ``action_mask``, all actions are among the allowed ones, and ``legal`` is not asked.
 
     Args:
         network: its noise is redrawn in place, in one draw for all environments of the batch.
@@ -115,13 +82,45 @@ class ExploringPolicy(TensorDictModuleBase):
         if explore and self.epsilon > 0.0:
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
-            action = self._mix(action, mask)
+            action = self._with_random(action, mask)
         chosen = values.gather(-1, action[..., None])
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 
-    def _mix(self, action: Tensor, legal: Tensor) -> Tensor:
+    def _with_random(self, action: Tensor, legal: Tensor) -> Tensor:
         """Replace a fraction epsilon of the actions by legal ones, drawn uniformly."""
-        shape, device = legal.shape, self.generator.device
-        lottery = torch.rand(shape, generator=self.generator, device=device) * legal
+        device = self.generator.device
+        lottery = torch.rand(legal.shape, generator=self.generator, device=device) * legal
         explore = torch.rand(action.shape, generator=self.generator, device=device) < self.epsilon
         return torch.where(explore, lottery.argmax(-1), action)
+
+
+class MaskedPolicy(TensorDictModuleBase):
+    """Any policy behind the environment's ``action_mask``: an action that is not allowed becomes 'keep the lane'.
+
+    Agents of this package choose among the allowed actions themselves; it does not change them.
+
+    Args:
+        policy: writes ``action`` [N] int64.
+
+    Raises:
+        UserError: the environment has no mask.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        super().__init__()
+        self.policy = policy
+        self.rows_must_stay = getattr(policy, "rows_must_stay", True)
+        self.in_keys = list(dict.fromkeys([*policy.in_keys, keys.ACTION_MASK]))
+        self.out_keys = list(policy.out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``."""
+        mask = tensordict.get(keys.ACTION_MASK, None)
+        if mask is None:
+            raise UserError(
+                "this driver chooses among allowed actions, but the environment has no action_mask; make it with "
+                "mask='safe' or 'legal'."
+            )
+        action = self.policy(tensordict).get(keys.ACTION)
+        allowed = mask.gather(1, action[:, None])[:, 0]
+        return tensordict.set(keys.ACTION, torch.where(allowed, action, keys.KEEP))

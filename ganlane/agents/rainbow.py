@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from ganlane.agents.free_decisions import FreeDecisionWindow
 from ganlane.agents.loss import make_loss
 from ganlane.agents.n_step import NStepWindow
-from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters, parameters_of
-from ganlane.agents.noise import mean_sigma, redraw_noise
+from ganlane.agents.network import (
+    NetworkConfig,
+    QNetwork,
+    load_parameters,
+    mean_sigma,
+    parameters_of,
+    redraw_noise,
+)
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
-from ganlane.agents.replay import annealed, make_replay
-from ganlane.agents.resume import agent_state, load_agent_state
-from ganlane.errors import ParameterError
+from ganlane.agents.replay import load_replay_state, make_replay, replay_state
+from ganlane.errors import ParameterError, UserError
 from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.removed import without_removed
 
 
 class Rainbow:
@@ -54,17 +60,16 @@ class Rainbow:
             name: torch.Generator(self.device).manual_seed(seed * 3 + i)
             for i, name in enumerate(("collect", "learn", "replay"))
         }
-        self.network = _fresh_network(NetworkConfig.of(config, observation_size, actions), seed).to(self.device)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            network = QNetwork(NetworkConfig.of(config, observation_size, actions))
+        self.network = network.to(self.device)
         self.loss = make_loss(self.network, config)
-        self.optimizer = _adam(self.network, config)
-        self.replay = make_replay(
-            config.capacity,
-            config.batch_size,
-            self.generators["replay"],
-            config.prioritised,
-            config.alpha,
-            config.beta_start,
+        adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(), lr=config.learning_rate, eps=adam_eps, fused=True
         )
+        self.replay = make_replay(config, self.generators["replay"])
         self.policy = ExploringPolicy(self.network, self.generators["collect"], legal)
         self.greedy = GreedyPolicy(self.network)
         self.updates = 0
@@ -75,16 +80,14 @@ class Rainbow:
         """Whether the buffer holds enough to learn from."""
         return len(self.replay) >= self.config.warmup
 
-    def window(self) -> NStepWindow | FreeDecisionWindow:
+    def window(self) -> NStepWindow:
         """A fresh n-step window for a batch of environments."""
-        kind = FreeDecisionWindow if self.config.decide_when_free else NStepWindow
-        return kind(self.config.n_step, self.config.gamma)
+        return NStepWindow(self.config.n_step, self.config.gamma)
 
     def anneal(self, decisions: int) -> None:
         """Set the share of random actions and the learning rate after ``decisions``."""
         config = self.config
-        share = annealed(config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions)
-        self.policy.epsilon = share
+        self.policy.epsilon = annealed(config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions)
         if config.learning_rate_end is not None:
             now = annealed(config.learning_rate, config.learning_rate_end, decisions, config.learning_rate_decisions)
             for group in self.optimizer.param_groups:
@@ -97,18 +100,24 @@ class Rainbow:
 
     def update(self) -> dict[str, Tensor]:
         """One step of gradient descent; 0-dim tensors to log, read without a host synchronisation."""
-        batch = self._sample()
+        config = self.config
+        if config.prioritised:
+            self.replay.sampler.beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
+        batch = self.replay.sample()
         for module in (self.network, self.loss.target_network):
             redraw_noise(module, self.generators["learn"])
         terms = self.loss(batch)
         weight = batch.get("priority_weight", None)
         # Rainbow's mean of w * loss; TorchRL's own 'mean' divides by the sum of the weights.
         objective = (terms["loss"] if weight is None else weight * terms["loss"]).mean()
-        gradient_norm = self._descend(objective)
-        if self.config.prioritised:
+        self.optimizer.zero_grad(set_to_none=True)
+        objective.backward()
+        gradient_norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip)
+        self.optimizer.step()
+        if config.prioritised:
             self.replay.update_priority(batch.get("index"), batch.get("td_error"))
         self.updates += 1
-        if self.updates % self.config.target_period == 0:
+        if self.updates % config.target_period == 0:
             self.loss.update_target()
         return {
             "loss": objective.detach(),
@@ -118,51 +127,68 @@ class Rainbow:
             "gradient_norm": gradient_norm,
         }
 
-    def _sample(self) -> TensorDict:
-        """A batch, with the exponent of its importance weights annealed."""
-        if self.config.prioritised:
-            config = self.config
-            self.replay.sampler.beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
-        return self.replay.sample()
-
-    def _descend(self, objective: Tensor) -> Tensor:
-        """Clip and apply the gradient; return its norm before clipping, 0-dim."""
-        self.optimizer.zero_grad(set_to_none=True)
-        objective.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
-        self.optimizer.step()
-        return norm
-
     def sigma(self) -> Tensor:
         """Mean noise parameter, 0-dim."""
         return mean_sigma(self.network)
-
-    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Start from trained ``weights`` (transfer): load them first, then let the target follow."""
-        load_parameters(self.network, weights)
-        self.loss.update_target()
 
     def weights(self) -> dict[str, Tensor]:
         """The online network's parameters, without its momentary noise."""
         return parameters_of(self.network)
 
+    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """Start from trained ``weights``: load them first, then let the target follow."""
+        load_parameters(self.network, weights)
+        self.loss.update_target()
+
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
-        """Everything an exact resume needs (:func:`ganlane.agents.resume.agent_state`)."""
-        return agent_state(self, with_replay)
+        """Tensors and plain data for a bit-exact resume; noise is redrawn before use, so it is not among them.
+
+        Without the buffer a resume is not exact anyway, so Adam's moments are kept in bfloat16.
+        """
+        optimizer = self.optimizer.state_dict()
+        return {
+            "config": asdict(self.config),
+            "network": self.weights(),
+            "target": parameters_of(self.loss.target_network),
+            "optimizer": optimizer if with_replay else _halved(optimizer),
+            "generators": {name: generator.get_state() for name, generator in self.generators.items()},
+            "updates": self.updates,
+            "replay": replay_state(self.replay) if with_replay else None,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict` (:func:`ganlane.agents.resume.load_agent_state`)."""
-        load_agent_state(self, state)
+        """Restore :meth:`state_dict`; if it was made without the buffer, the buffer is empty afterwards.
+
+        Raises:
+            UserError: it is the state of an agent with other hyperparameters or another observation.
+        """
+        # An agent saved before there was an option has its default.
+        saved = {**asdict(RainbowConfig()), **without_removed(state["config"], "the saved agent")}
+        for name, value in asdict(self.config).items():
+            if saved[name] != value:
+                raise UserError(
+                    f"agent.{name}={value}: the saved agent has {saved[name]}; give the same to go on from it."
+                )
+        load_parameters(self.network, state["network"])
+        load_parameters(self.loss.target_network, state["target"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        for name, generator in self.generators.items():
+            generator.set_state(state["generators"][name].cpu())
+        self.updates = state["updates"]
+        self.replay.empty()
+        if state["replay"] is not None:
+            load_replay_state(self.replay, state["replay"])
 
 
-def _fresh_network(config: NetworkConfig, seed: int) -> QNetwork:
-    """Weights drawn from ``seed``, torch's global random state as it was."""
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)
-        return QNetwork(config)
+def annealed(start: float, end: float, done: int, total: int) -> float:
+    """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
+    return end if done >= total else start + (end - start) * done / total
 
 
-def _adam(network: QNetwork, config: RainbowConfig) -> torch.optim.Optimizer:
-    """The optimiser of all parameters."""
-    eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
-    return torch.optim.Adam(network.parameters(), lr=config.learning_rate, eps=eps, fused=True)
+def _halved(optimizer: dict[str, Any]) -> dict[str, Any]:
+    """The optimiser's state with its moments in bfloat16; loading it brings them back to the weights' type."""
+    state = {
+        row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in moments.items()}
+        for row, moments in optimizer["state"].items()
+    }
+    return {**optimizer, "state": state}

@@ -1,4 +1,8 @@
-"""TorchRL's replay buffer, with prioritised or uniform sampling from its own generator."""
+"""TorchRL's replay buffer, with prioritised or uniform sampling from a generator of its own.
+
+TorchRL's prioritised sampler needs a C++ extension that loads only with the one torch release it was built for.
+:class:`RowSampler` (Schaul et al. 2016) works on plain tensors instead, and is as fast at a capacity of a million.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.storages import Storage
 
-from ganlane.agents.sampler import RowSampler
+from ganlane.parameters.agent import RainbowConfig
 
 #: What a transition consists of; everything else is dropped before storing.
 TRANSITION_KEYS = (
@@ -21,39 +27,28 @@ TRANSITION_KEYS = (
 )
 #: What it has besides where the environment has a mask.
 MASK_KEY: tuple[str, ...] = ("next", "action_mask")
+#: Priorities per row: a sum tree of two levels, the lower one 64 wide.
+ROW = 64
 
 
-def make_replay(
-    capacity: int,
-    batch_size: int,
-    generator: torch.Generator,
-    prioritised: bool = True,
-    alpha: float = 0.5,
-    beta: float = 0.4,
-) -> TensorDictReplayBuffer:
-    """Replay buffer of ``capacity`` transitions on the generator's device; ``sample()`` draws ``batch_size``."""
-    device = generator.device
-    sampler = RowSampler(capacity, alpha, beta, device=device) if prioritised else RandomSampler()
+def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDictReplayBuffer:
+    """The replay buffer that ``config`` asks for, on the generator's device; ``sample()`` draws a batch."""
+    capacity, device = config.capacity, generator.device
+    sampler = RowSampler(capacity, config.alpha, config.beta_start, device=device) if config.prioritised else None
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
-        sampler=sampler,
-        batch_size=batch_size,
+        sampler=sampler or RandomSampler(),
+        batch_size=config.batch_size,
         generator=generator,
         priority_key="td_error",
     )
 
 
-def annealed(start: float, end: float, done: int, total: int) -> float:
-    """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
-    return end if done >= total else start + (end - start) * done / total
-
-
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """The transitions in use (tensors by dotted key), the place of the next one, the sampler: plain data."""
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
-    masked = rows.get(MASK_KEY, None) is not None
-    stored = (*TRANSITION_KEYS, MASK_KEY) if masked else TRANSITION_KEYS
-    tensors = {".".join(_path(key)): rows.get(key) for key in stored} if len(buffer) else {}
+    stored = [key for key in (*TRANSITION_KEYS, MASK_KEY) if rows.get(key, None) is not None]
+    tensors = {key if isinstance(key, str) else ".".join(key): rows.get(key) for key in stored}
     if len(buffer) < buffer.storage.max_size:  # a view would be saved with all of the storage behind it
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     state = {"rows": tensors, "cursor": buffer.writer._cursor, "sampler": buffer.sampler.state_dict()}
@@ -65,12 +60,95 @@ def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> 
     buffer.empty()
     if state["rows"]:
         rows = {tuple(name.split(".")): tensor for name, tensor in state["rows"].items()}
-        count = next(iter(rows.values())).shape[0]
-        buffer.extend(TensorDict(rows, batch_size=[count]))
+        buffer.extend(TensorDict(rows, batch_size=[len(state["rows"]["action"])]))
     buffer.writer._cursor = state["cursor"]
     buffer.writer._write_count = state["writes"]
     buffer.sampler.load_state_dict(state["sampler"])
 
 
-def _path(key: str | tuple[str, ...]) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key
+class RowSampler(PrioritizedSampler):
+    """Draws item i with probability ``(p_i + eps)^alpha / sum``; weights ``(P_i N)^-beta`` over the batch's largest.
+
+    As in Dopamine, the largest weight is the batch's: the one of the whole buffer belongs to an outlier that is
+    hardly ever drawn, and would shrink every step. New items get the largest priority seen. Draws come from the
+    generator of the replay buffer (``generator=`` at its construction) and from no other.
+    """
+
+    def __init__(
+        self, max_capacity: int, alpha: float, beta: float, eps: float = 1e-8, device: torch.device | None = None
+    ) -> None:
+        # Not the parent's constructor: it warns of the missing C++ extension, which is not needed here.
+        self._max_capacity, self._alpha, self._beta, self._eps = max_capacity, alpha, beta, eps
+        self._device, self.dtype, self.reduction = device, torch.float32, "max"
+        self._max_priority_within_buffer = False
+        self._init()
+
+    def _init(self) -> None:
+        rows = -(-self._max_capacity // ROW)
+        self.priorities = torch.zeros(rows, ROW, device=self._device)
+        self.row_sums = torch.zeros(rows, dtype=torch.float64, device=self._device)
+        self.largest = torch.ones((), device=self._device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the priorities are kept."""
+        return self.priorities.device
+
+    @property
+    def default_priority(self) -> Tensor:
+        """Raw priority of a new item, 0-dim: the largest seen, at least 1."""
+        return self.largest
+
+    def _maybe_init_from_storage(self, storage: Storage | None) -> None:
+        """The device is the constructor's, not the storage's."""
+
+    def _retransform_priority_trees(self, old_alpha: float, new_alpha: float) -> None:
+        raise NotImplementedError("alpha is fixed for the life of a RowSampler")
+
+    @torch.no_grad()
+    def update_priority(
+        self, index: Tensor | int, priority: Tensor | float, *, storage: Storage | None = None
+    ) -> None:
+        """Give the items at ``index`` [B] the raw priorities ``priority`` ([B], [B, 1] or one number), at least 0."""
+        index = torch.as_tensor(index, device=self.device).reshape(-1)
+        priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).reshape(-1)
+        self.largest = torch.maximum(self.largest, priority.amax())
+        self.priorities.view(-1)[index] = ((priority + self._eps) ** self._alpha).expand(index.shape)
+        row = index // ROW
+        self.row_sums[row] = self.priorities[row].sum(-1, dtype=torch.float64)
+
+    @torch.no_grad()
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Indices [B] and ``priority_weight`` [B], in (0, 1]."""
+        if len(storage) == 0:
+            raise RuntimeError("cannot sample from an empty replay buffer")
+        cumulated = self.row_sums.cumsum(0)
+        uniform = torch.rand(batch_size, generator=self._rng, dtype=torch.float64, device=self.device)
+        mass = _below(uniform * cumulated[-1], cumulated[-1])
+        row = torch.searchsorted(cumulated, mass, right=True)
+        rest = mass - (cumulated[row] - self.row_sums[row])
+        within = self.priorities[row].double().cumsum(-1)
+        column = (within <= _below(rest, within[:, -1])[:, None]).sum(-1)
+        index = row * ROW + column
+        chosen = self.priorities.view(-1)[index]
+        weight = (chosen / chosen.amin()) ** -self._beta
+        return index, {"priority_weight": weight}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Priorities of the rows in use, the largest priority, and beta."""
+        used = int((self.row_sums > 0).sum())
+        return {"priorities": self.priorities[:used].clone(), "largest": self.largest.clone(), "beta": self._beta}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        self._init()
+        used = state_dict["priorities"].shape[0]
+        self.priorities[:used] = state_dict["priorities"].to(self.device)
+        self.row_sums[:] = self.priorities.sum(-1, dtype=torch.float64)
+        self.largest = state_dict["largest"].to(self.device)
+        self._beta = state_dict["beta"]
+
+
+def _below(value: Tensor, bound: Tensor) -> Tensor:
+    """``value`` held strictly below ``bound``: rounding must not select past the last item."""
+    return torch.minimum(value, torch.nextafter(bound, torch.zeros_like(bound))).clamp_min(0.0)

@@ -29,8 +29,8 @@ from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_ref
 from ganlane.config.resume import with_resumed
 from ganlane.config.schemas import register
 from ganlane.errors import UserError
-from ganlane.memory import keep_freed_memory
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
+from ganlane.runtime import keep_freed_memory
 
 #: What a command does with its config in its run folder; it returns a line to print last, or None.
 Task = Callable[[Any, Path], str | None]

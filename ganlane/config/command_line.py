@@ -18,7 +18,7 @@ from omegaconf import DictConfig, open_dict
 from ganlane.config.messages import CONFIG_ERRORS, sentence
 from ganlane.config.schemas import made, options_of, register
 from ganlane.errors import UserError
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
 
 VERSION_BASE = "1.3"
 #: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.

@@ -13,8 +13,8 @@ from typing import Any
 
 from ganlane.config.schemas import SCHEMAS, option_of, options_of
 from ganlane.errors import as_typed
+from ganlane.files import conf_folder
 from ganlane.parameters.checks import NO_KEY
-from ganlane.paths import conf_folder
 
 #: Column at which the meanings of keys begin, and where their lines end.
 _COLUMN, _END = 34, 118

@@ -12,8 +12,11 @@ from omegaconf import OmegaConf
 from ganlane.config.command_line import parse, quoted, without_repetitions
 from ganlane.config.folders import CONFIG, OVERRIDES
 from ganlane.errors import UserError
+from ganlane.parameters.removed import without_removed_overrides
 
 _RUNS = Path("outputs")
+#: Where a run keeps its checkpoint, below its folder.
+LAST = Path("checkpoints") / "last.pt"
 #: Keys whose defaults are others than in version 0.1.0.
 CHANGED_SINCE_0_1 = ("total_decisions", "collector.num_envs", "evaluation.episodes")
 
@@ -74,7 +77,7 @@ def _stored(path: Path) -> list[str]:
         raise UserError(
             f"{path}: damaged, expected a list of key=value; write the run's command line there, or start a new run."
         )
-    return [str(override) for override in found]
+    return without_removed_overrides(map(str, found), str(path))
 
 
 def _asked(overrides: Sequence[str]) -> str | None:
@@ -88,15 +91,15 @@ def run_folder(path: Path) -> Path:
     Raises:
         UserError: there is no run.
     """
-    from ganlane.training import find_checkpoint
-
     if path.is_file() and path.name != "last.pt":
         raise UserError(f"resume={path}: a run goes on from its last.pt alone; give the run's folder.")
     candidates = [path, *path.parents[:3]] if path.exists() else []
     for folder in candidates:
         if (folder / OVERRIDES).is_file() and any(folder.rglob("last.pt")):
             return folder
-    find_checkpoint(path, _RUNS)
+    expected = path / LAST if path.is_dir() else path
+    if not expected.is_file():
+        raise UserError(f"resume={path}: no checkpoint there ({expected}); give a run's folder, its {LAST}, or auto.")
     raise UserError(f"resume={path}: {OVERRIDES} is missing there; give the folder that the run was written to.")
 
 

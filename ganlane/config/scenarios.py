@@ -17,7 +17,7 @@ from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 
 if TYPE_CHECKING:
-    from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
+    from ganlane.sim.scenes import FixedScene, SceneVehicle
 
 #: Keys of Table II, which a scene set by hand does not have.
 TABLE_II_KEYS = tuple(field.name for field in fields(SpawnParameters) if field.name != "ego_desired_speed_mps")
@@ -90,8 +90,8 @@ class SceneEnvConfig(EnvConfig):
 
     def fixed_scene(self, others_visibility: int | None = None) -> FixedScene:
         """The scene; ``others_visibility`` is the traffic's."""
-        from ganlane.sim.fixed_scene import FixedScene
-        from ganlane.sim.road import Road
+        from ganlane.sim.scenes import FixedScene
+        from ganlane.sim.state import Road
 
         return FixedScene(
             self.rows(),

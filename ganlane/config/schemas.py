@@ -36,12 +36,12 @@ from ganlane.config.train import (
     TrainConfig,
 )
 from ganlane.errors import ParameterError
+from ganlane.files import conf_folder
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.data import DataConfig, HighdDataConfig, NgsimDataConfig
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
-from ganlane.paths import conf_folder
 
 #: Group (empty at the root) to schema name to dataclass.
 SCHEMAS: dict[str, dict[str, Any]] = {

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from ganlane.config.env import EnvConfig, check_reward
 from ganlane.config.run import NAMES, GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.errors import ParameterError, UserError
+from ganlane.errors import ParameterError
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.checks import at_least, between, check, one_of, optional, text
-from ganlane.parameters.observation import LISTS, MaskParameters, ObservationConfig
+from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 COMPILE = ("auto", "always", "never")
@@ -180,7 +180,7 @@ class TrainConfig(RunConfig):
 
     Attributes:
         total_decisions: of all environments together.
-        compile: always, never; auto: where compiling is known to work (:func:`ganlane.compiling.can_compile`) and the
+        compile: always, never; auto: where compiling is known to work (:func:`ganlane.runtime.can_compile`) and the
             training is long enough to gain by it (:data:`WORTH_COMPILING`). The final evaluation is compiled with
             ``env.compile=true`` alone.
         log_every: decisions between two rows of metrics.csv.
@@ -227,11 +227,10 @@ class TrainConfig(RunConfig):
             checkpoint_every_s=at_least(0),
         )
         check_reward(self.env, self.reward)
-        check_agent(self.agent, self.observation, self.env)
 
     def compiled(self) -> TrainConfig:
         """The same with ``env.compile`` as ``compile`` says."""
-        from ganlane.compiling import can_compile
+        from ganlane.runtime import can_compile
 
         worth = self.total_decisions >= WORTH_COMPILING and can_compile()
         if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):
@@ -247,21 +246,3 @@ class TrainConfig(RunConfig):
         """The traffic of the final evaluation by its name: training's, unless another one was chosen."""
         chosen = self.evaluation.traffic or self.traffic
         return {chosen.label(): chosen}
-
-
-def check_agent(agent: RainbowConfig, observation: ObservationConfig, env: EnvConfig) -> None:
-    """Refuse an agent that could not read the observation, or would not learn what it is asked in ``env``.
-
-    Raises:
-        UserError: an encoder over vehicles without a list of them, or turning back while nothing is learnt.
-    """
-    if agent.encoder != "none" and observation.form not in LISTS:
-        raise UserError(
-            f"agent.encoder={agent.encoder} with observation={observation.form}: the encoder reads vehicles in Table "
-            f"III's layout; give one of {', '.join(LISTS)}, or agent.encoder=none."
-        )
-    if agent.decide_when_free and env.ego.abort_lane_change:
-        raise UserError(
-            "agent.decide_when_free=true with env.ego.abort_lane_change=true: commands are then obeyed during a lane "
-            "change, but nothing would be learnt from them; switch one of the two off."
-        )

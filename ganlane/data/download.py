@@ -1,4 +1,4 @@
-"""Downloads of large files over HTTP that resume after an interruption, and progress in bytes.
+"""Where recordings are on this machine, and downloads of large files that resume after an interruption.
 
 Bytes are written to ``.NAME.part`` next to the file, and the server's version of it to ``.NAME.part.json``. After a
 broken connection, or an earlier run that was interrupted, the download resumes with HTTP's Range, guarded by
@@ -19,9 +19,7 @@ import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Final
 
 from tqdm import tqdm
@@ -30,36 +28,59 @@ from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
 from ganlane.files import write_json
 
+#: Environment variable with the folder of the recordings.
+DATA_VARIABLE: Final = "GANLANE_DATA"
+SCENES: Final = Path("ngsim") / "us101_scenes.csv"
+_FOLDER = Path("shared") / "data"
 _PIECE_BYTES: Final = 2**18
 #: Seconds between two progress lines where there is no terminal.
 LINE_EVERY_S: Final = 10.0
 
 
-@dataclass(frozen=True)
-class DownloadParameters:
-    """How long to wait for a server.
+def data_folder() -> Path | None:
+    """Folder of the recordings: ``GANLANE_DATA``, else ``../shared/data`` next to the checkout or the current folder.
 
-    Attributes:
-        timeout_s: without a byte for this long, the connection counts as broken.
-        attempts: connections without any progress before giving up.
-        wait_s: before the second attempt; doubled each time.
+    None where the variable is unset and no such folder exists.
+
+    Raises:
+        UserError: the folder in ``GANLANE_DATA`` does not exist.
     """
+    named = os.environ.get(DATA_VARIABLE)
+    if named:
+        if not Path(named).is_dir():
+            raise UserError(
+                f"{DATA_VARIABLE}={named}: no such folder; set it to the folder of the recordings or unset it."
+            )
+        return Path(named)
+    checkout = Path(__file__).resolve().parents[2]
+    candidates = (checkout.parent / _FOLDER, Path.cwd().parent / _FOLDER)
+    return next((folder for folder in candidates if folder.is_dir()), None)
 
-    timeout_s: float = 60.0
-    attempts: int = 5
-    wait_s: float = 1.0
+
+def default_scenes() -> Path:
+    """Path of the US-101 scene CSV: ``ngsim/us101_scenes.csv`` in :func:`data_folder`, or the file directly in it.
+
+    Raises:
+        UserError: it does not exist.
+    """
+    folder = data_folder()
+    candidates = [] if folder is None else [folder / SCENES, folder / SCENES.name]
+    for path in candidates:
+        if path.is_file():
+            return path
+    looked = ", ".join(map(str, candidates)) or f"../{_FOLDER}"
+    raise UserError(
+        f"no recordings found (looked for {looked}); give data.path=FILE with a scene CSV, "
+        f"or set {DATA_VARIABLE} to a folder that holds {SCENES}."
+    )
 
 
-class _Broken(Exception):
+class _BrokenConnection(Exception):
     """The connection ended before the file did."""
 
 
 class _Part:
-    """The incomplete file next to ``path``, and a note of its version.
-
-    Attributes:
-        file: ``.NAME.part``.
-    """
+    """The incomplete ``file`` ``.NAME.part`` next to ``path``, and a note of its version."""
 
     def __init__(self, path: Path) -> None:
         self.file = path.with_name(f".{path.name}.part")
@@ -94,22 +115,24 @@ def download(
     path: str | Path,
     sha256: str | None = None,
     on_progress: OnProgress | None = None,
-    parameters: DownloadParameters | None = None,
+    timeout_s: float = 60.0,
+    attempts: int = 5,
+    wait_s: float = 1.0,
 ) -> Path:
-    """Download ``url`` to ``path``; a file that exists already is kept.
+    """Download ``url`` (http or https) to ``path``; a file that exists already is kept.
 
     Args:
-        url: http or https.
-        path: the file to write.
-        sha256: checksum in hexadecimal digits; a file with another checksum is removed.
+        sha256: checksum in hexadecimal digits; a downloaded file with another checksum is removed.
         on_progress: called after every piece.
-        parameters: timeouts and attempts.
+        timeout_s: without a byte for this long, the connection counts as broken.
+        attempts: connections without any progress before giving up.
+        wait_s: before the second attempt; doubled each time.
 
     Raises:
         UserError: not an http address, the server refuses or cannot be reached, or the checksum differs.
         OSError: the disk's error; it names ``path``. Received bytes are kept for the next run.
     """
-    path, parameters = Path(path), parameters or DownloadParameters()
+    path = Path(path)
     if urllib.parse.urlsplit(url).scheme not in ("http", "https"):
         raise UserError(f"{url}: not an address of a file; expected http:// or https://.")
     if path.is_file():
@@ -118,7 +141,7 @@ def download(
     path.parent.mkdir(parents=True, exist_ok=True)
     part = _Part(path)
     with name_in_errors(path, nameless=True):
-        _fetch(url, part, on_progress, parameters)
+        _fetch(url, part, on_progress, timeout_s, attempts, wait_s)
     try:
         _check_sha256(part.file, sha256, "it was removed; download again, or correct data.sha256")
     except UserError:
@@ -129,13 +152,15 @@ def download(
     return path
 
 
-def _fetch(url: str, part: _Part, on_progress: OnProgress | None, parameters: DownloadParameters) -> None:
-    """Connect until the file is complete; give up after several connections in a row that bring nothing."""
-    failures, wait = 0, parameters.wait_s
+def _fetch(
+    url: str, part: _Part, on_progress: OnProgress | None, timeout_s: float, attempts: int, wait_s: float
+) -> None:
+    """Connect until the file is complete; give up after ``attempts`` connections in a row that bring nothing."""
+    failures = 0
     while True:
         before = part.size
         try:
-            _connect(url, part, on_progress, parameters.timeout_s)
+            _connect(url, part, on_progress, timeout_s)
             return
         except urllib.error.HTTPError as error:
             if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and before:
@@ -143,17 +168,17 @@ def _fetch(url: str, part: _Part, on_progress: OnProgress | None, parameters: Do
             elif error.code < 500:
                 raise UserError(f"{url}: the server says {error.code} {error.reason}; check data.url.") from error
             reason = f"{error.code} {error.reason}"
-        except _Broken as error:
+        except _BrokenConnection as error:
             reason = str(error)
         failures = 0 if part.size > before else failures + 1
-        if failures >= parameters.attempts:
+        if failures >= attempts:
             raise UserError(
                 f"{url}: cannot be fetched, {part.size} bytes came ({reason}); check the network and run the "
                 "command again, it goes on from there."
             )
         if failures:
-            time.sleep(wait)
-            wait *= 2.0
+            time.sleep(wait_s)
+            wait_s *= 2.0
 
 
 def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: float) -> None:
@@ -163,42 +188,41 @@ def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: f
     if received and version:
         request.add_header("Range", f"bytes={received}-")
         request.add_header("If-Range", version)
-    with _network():
+    with _network_errors():
         answer = urllib.request.urlopen(request, timeout=timeout_s)
     with answer:
         resumes = answer.status == http.HTTPStatus.PARTIAL_CONTENT
         if resumes and _range_start(answer) != received:
             part.remove()
-            raise _Broken("the server sent another part than the one asked for")
+            raise _BrokenConnection("the server sent another part than the one asked for")
         received = received if resumes else 0
         length = answer.headers.get("Content-Length")
         total = None if length is None else received + int(length)
         if not resumes:
             part.version = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
         with part.file.open("ab" if received else "wb") as file:
-            while piece := _read(answer):
+            while True:
+                with _network_errors():
+                    piece = answer.read1(_PIECE_BYTES)
+                if not piece:
+                    break
                 file.write(piece)
                 received += len(piece)
                 if on_progress is not None:
                     on_progress(received, total)
     if total is not None and received < total:
-        raise _Broken(f"{received} of {total} bytes came")
-
-
-def _read(answer: http.client.HTTPResponse) -> bytes:
-    with _network():
-        return answer.read1(_PIECE_BYTES)
+        raise _BrokenConnection(f"{received} of {total} bytes came")
 
 
 @contextmanager
-def _network() -> Iterator[None]:
+def _network_errors() -> Iterator[None]:
     """Errors in this context are the network's; an OSError elsewhere is the disk's."""
     try:
         yield
     except urllib.error.HTTPError:
         raise
     except (OSError, http.client.HTTPException) as error:
-        raise _Broken(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
+        raise _BrokenConnection(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
 
 
 def _range_start(answer: http.client.HTTPResponse) -> int | None:
@@ -212,8 +236,8 @@ def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
     """Compare with the checksum, if one is given."""
     if sha256 is None:
         return
+    digest = hashlib.sha256()
     with path.open("rb") as file:
-        digest = hashlib.sha256()
         while piece := file.read(2**20):
             digest.update(piece)
     if digest.hexdigest() != sha256.lower():
@@ -222,14 +246,9 @@ def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
 
 @contextmanager
 def name_in_errors(path: Path, nameless: bool = False) -> Iterator[None]:
-    """Make the file system's errors name ``path``, which the user gave, instead of the temporary ``.NAME....``.
+    """Make OSErrors name ``path``, which the user gave, instead of its temporary counterpart ``.NAME....``.
 
-    Args:
-        path: the file or folder being made.
-        nameless: errors without a file name, as those of a write, name ``path`` too.
-
-    Raises:
-        OSError: as it came, with its ``errno``.
+    With ``nameless``, errors without a file name, as those of a write, name ``path`` too.
     """
     try:
         yield
@@ -252,11 +271,7 @@ def _final_path(temporary: str | None, path: Path) -> Path | None:
 
 
 class ByteProgress:
-    """Context that shows bytes done, rate and time left: a bar on a terminal, elsewhere a line every 10 s.
-
-    Args:
-        what: the first word, ``download`` or ``read``.
-    """
+    """Context that shows bytes done, rate and time left: a bar on a terminal, elsewhere a line every 10 s."""
 
     def __init__(self, what: str) -> None:
         self._what = what
@@ -266,7 +281,7 @@ class ByteProgress:
         self._first: int | None = None
 
     def __call__(self, done: int, total: int | None) -> None:
-        """Called with the bytes done so far and the total, None where that is unknown."""
+        """Show the bytes done so far, of a ``total`` where that is known."""
         self._first = done if self._first is None else self._first
         if sys.stderr.isatty():
             self._bar = self._bar or tqdm(
@@ -287,8 +302,6 @@ class ByteProgress:
     def __enter__(self) -> ByteProgress:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.close()

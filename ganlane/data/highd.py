@@ -13,24 +13,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import polars as pl
 
+from ganlane.data.lane_changes import Flags, Floats, Integers
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, number_tracks, sort, validate
-from ganlane.data.tables import (
-    FIRST_LINE,
-    LINE,
-    convert,
-    csv_table,
-    raise_where,
-    read_blocks,
-    read_table,
-)
-from ganlane.data.tracks import Flags, Floats, Integers
+from ganlane.data.tables import FIRST_LINE, LINE, convert, csv_table, raise_where, read_blocks, read_table
 from ganlane.errors import UserError
-from ganlane.parameters.data import BLOCK_BYTES
 
 _TRACKS: Final = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.
@@ -51,10 +42,9 @@ LOWER: Final = 2
 
 @dataclass(frozen=True)
 class _Direction:
-    """One direction of travel.
+    """One direction of travel, ``number`` :data:`UPPER` or :data:`LOWER`.
 
     Attributes:
-        number: :data:`UPPER` or :data:`LOWER`.
         lane_ids: highD's numbers of its lanes, from the rightmost.
         right_edge: ``y`` of the road's right edge in the image, m.
         lane_width: m.
@@ -106,15 +96,11 @@ def _read_recording_meta(path: Path) -> tuple[float, tuple[_Direction, _Directio
         raise UserError(f"{path}, line 2, column frameRate: {row['frameRate']}, expected 10 Hz or more.")
     upper, lower = (_markings(row[name], path, name) for name in ("upperLaneMarkings", "lowerLaneMarkings"))
     n_upper, n_lower = len(upper) - 1, len(lower) - 1
-    first_lower = n_upper + 3
+    upper_ids = tuple(range(2, 2 + n_upper))
+    lower_ids = tuple(range(n_upper + 2 + n_lower, n_upper + 2, -1))
     return row["frameRate"], (
-        _Direction(UPPER, tuple(range(2, 2 + n_upper)), upper[0], (upper[-1] - upper[0]) / n_upper),
-        _Direction(
-            LOWER,
-            tuple(range(first_lower, first_lower + n_lower))[::-1],
-            lower[-1],
-            (lower[-1] - lower[0]) / n_lower,
-        ),
+        _Direction(UPPER, upper_ids, upper[0], (upper[-1] - upper[0]) / n_upper),
+        _Direction(LOWER, lower_ids, lower[-1], (lower[-1] - lower[0]) / n_lower),
     )
 
 
@@ -126,7 +112,8 @@ def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
         found = ()
     if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
         raise UserError(
-            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; expected two or more growing numbers parted by ;"
+            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; "
+            "expected two or more growing numbers separated by ;"
         )
     return found
 
@@ -143,10 +130,9 @@ def _read_tracks_meta(path: Path) -> dict[int, int]:
 def _read_rows(path: Path, direction_of: dict[int, int], count: RowCount) -> pl.DataFrame:
     """Rows of the tracks file, sorted by vehicle and frame, with each vehicle's ``direction``."""
     blocks = []
-    for text in read_blocks(csv_table(path, COLUMNS), list(COLUMNS), BLOCK_BYTES):
-        lines = text[LINE]
-        typed = [convert(text[name], kind, path, lines) for name, kind in COLUMNS.items()]
-        blocks.append(pl.DataFrame([*typed, lines]))
+    for text in read_blocks(csv_table(path, COLUMNS), list(COLUMNS)):
+        columns = [convert(text[name], kind, path, text[LINE]) for name, kind in COLUMNS.items()]
+        blocks.append(pl.DataFrame([*columns, text[LINE]]))
     if not blocks:
         raise UserError(f"{path}: a header but no rows; copy or unpack the recording again.")
     rows = pl.concat(blocks)
@@ -165,7 +151,7 @@ def _read_rows(path: Path, direction_of: dict[int, int], count: RowCount) -> pl.
 def _scene(
     rows: pl.DataFrame, direction: _Direction, rate_hz: float, name: str, path: Path, count: RowCount
 ) -> Scene | None:
-    """One direction in the schema; None where nobody drives in it."""
+    """One direction in the schema; None where it has no vehicles."""
     rows = rows.filter(pl.col("direction") == direction.number)
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
     count.drop("off the lanes of its direction", int((~on_road).sum()))
@@ -209,8 +195,7 @@ def _to_ten_hertz(rows: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
     return pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
 
 
-@dataclass(frozen=True)
-class Resampling:
+class Resampling(NamedTuple):
     """Positions of R new samples among the old ones.
 
     Attributes:
@@ -236,10 +221,7 @@ class Resampling:
 def resample(begins: Flags, frame: Integers, rate_hz: float) -> Resampling:
     """Samples every 0.1 s within each track, none beyond its ends.
 
-    Args:
-        begins: [S] true at the first sample of each track; within a track frames grow by one.
-        frame: [S] frame numbers at ``rate_hz``.
-        rate_hz: frame rate of the old samples.
+    ``begins`` [S] is true at the first old sample of each track; within a track ``frame`` [S] grows by one.
     """
     starts = np.flatnonzero(begins)
     ends = np.append(starts[1:], len(frame)) - 1

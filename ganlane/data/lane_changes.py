@@ -1,5 +1,7 @@
 """Lane changes in recordings and simulations, and their durations (equation 11).
 
+Recordings and simulations are measured in the same form, :class:`Tracks`: flat arrays, vectorised over all samples.
+
 **What counts.** The nearest lane changes between two samples, and it is the old one during the 0.5 s before and the
 new one during the 0.5 s after, without interruption. A vehicle that only touches the boundary has not changed lanes.
 
@@ -18,10 +20,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+import polars as pl
+from numpy.typing import ArrayLike, NDArray
 
+from ganlane.data.lane_widths import scene_lane_widths
 from ganlane.data.schema import FRAME_S
-from ganlane.data.tracks import Flags, Floats, Integers, Tracks, tracks_of_arrays
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 #: Minimum time in the old lane before the change, and in the new lane after it, s.
 HOLD_S: Final = 0.5
@@ -33,6 +40,52 @@ STILL_MPS: Final = 0.1
 SPEED_HALF_WINDOW_S: Final = 0.5
 #: Longest search for start and end, before and after the crossing, s.
 SEARCH_S: Final = 20.0
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """R samples of any number of tracks, track by track; a missing sample ends a track.
+
+    Attributes:
+        y: [R] lateral position, m; lane k's centre is at ``k * lane_width``.
+        lane_width: [R] m.
+        begins: [R] true at the first sample of each track.
+        step_s: time between two samples.
+    """
+
+    y: Floats
+    lane_width: Floats
+    begins: Flags
+    step_s: float = FRAME_S
+
+    @property
+    def lane(self) -> Integers:
+        """[R] lane whose centre is nearest."""
+        return np.rint(self.y / self.lane_width).astype(np.int64)
+
+    @property
+    def first(self) -> Integers:
+        """[R] index of the first sample of each sample's track."""
+        return np.maximum.accumulate(np.where(self.begins, np.arange(len(self.y)), 0))
+
+    @property
+    def last(self) -> Integers:
+        """[R] index of the last sample of each sample's track."""
+        ends = np.append(np.flatnonzero(self.begins)[1:], len(self.y)) - 1
+        return ends[np.cumsum(self.begins) - 1]
+
+
+def tracks_of_frame(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> Tracks:
+    """Tracks of a frame in the schema, sorted; each scene's lane width in m is estimated where not given."""
+    widths = scene_lane_widths(frame) if lane_widths is None else lane_widths
+    continues = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
+    same_scene = pl.col("scene") == pl.col("scene").shift(1)
+    columns = frame.select(
+        "y",
+        width=pl.col("scene").replace_strict(widths, return_dtype=pl.Float64),
+        begins=~(continues & same_scene).fill_null(False),
+    )
+    return Tracks(columns["y"].to_numpy(), columns["width"].to_numpy(), columns["begins"].to_numpy())
 
 
 @dataclass(frozen=True)
@@ -63,7 +116,7 @@ class LaneChanges:
 
     @property
     def complete(self) -> Flags:
-        """[C] both ends were seen."""
+        """[C] true where neither end is censored."""
         return ~(self.start_censored | self.end_censored)
 
     def __len__(self) -> int:
@@ -78,12 +131,12 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     side = np.sign(new - old)
     boundary = (old + 0.5 * side) * tracks.lane_width[sample]
     part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
-    start, start_seen = _find_end(tracks, sample, side, old, -1)
-    end, end_seen = _find_end(tracks, sample + 1, side, new, 1)
+    start, start_found = _find_end(tracks, sample, side, old, -1)
+    end, end_found = _find_end(tracks, sample + 1, side, new, 1)
     tau_s = (sample - start + part) * tracks.step_s
     tau_e = (end - sample - part) * tracks.step_s
     moved = side * (tracks.y[end] - tracks.y[start])
-    return LaneChanges(sample, old, new, tau_s, tau_e, ~start_seen, ~end_seen, moved / (tau_s + tau_e))
+    return LaneChanges(sample, old, new, tau_s, tau_e, ~start_found, ~end_found, moved / (tau_s + tau_e))
 
 
 def lane_changes_of_arrays(
@@ -93,25 +146,35 @@ def lane_changes_of_arrays(
     begins: ArrayLike | None = None,
     step_s: float = FRAME_S,
 ) -> tuple[LaneChanges, Integers]:
-    """Lane changes of a simulation's [T, K] arrays, and [C, 2] the (time, column) of each one's ``sample``.
+    """Lane changes of a simulation, and [C, 2] the (time, column) of each one's ``sample``.
 
-    The arguments are those of :func:`ganlane.data.tracks.tracks_of_arrays`.
+    Args:
+        y: [T, K] lateral positions, m, of K vehicles at T samples.
+        lane_width: m.
+        valid: [T, K] false where there is no vehicle; all true by default.
+        begins: [T, K] true where the column continues with another vehicle (a reset, a recycled vehicle); the first
+            valid sample after a gap always begins a track.
+        step_s: time between samples.
     """
-    tracks, where = tracks_of_arrays(y, lane_width, valid, begins, step_s)
-    changes = find_lane_changes(tracks)
-    return changes, where[changes.sample]
+    columns = np.asarray(y, dtype=np.float64).T
+    present = np.ones(columns.shape, bool) if valid is None else np.asarray(valid, bool).T
+    starts = present.copy()
+    starts[:, 1:] &= ~present[:, :-1]
+    if begins is not None:
+        starts |= np.asarray(begins, bool).T
+    column, time = np.nonzero(present)
+    widths = np.full(len(time), float(lane_width))
+    changes = find_lane_changes(Tracks(columns[present], widths, starts[present], step_s))
+    return changes, np.stack((time, column), axis=1)[changes.sample]
 
 
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:
     """[C] last samples in an old lane, where both the old and the new lane are kept long enough."""
-    index = np.arange(len(lane))
-    fresh = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
-    starts = np.flatnonzero(fresh)
-    lengths = np.diff(starts, append=len(lane))
+    starts_run = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
+    lengths = np.diff(np.flatnonzero(starts_run), append=len(lane))
     long_enough = lengths >= round(HOLD_S / tracks.step_s)
-    run = np.cumsum(fresh) - 1
-    changes = fresh & ~tracks.begins & (index > 0)
-    after = np.flatnonzero(changes)
+    run = np.cumsum(starts_run) - 1
+    after = np.flatnonzero(starts_run & ~tracks.begins)
     return after[long_enough[run[after]] & long_enough[run[after - 1]]] - 1
 
 
@@ -129,10 +192,10 @@ def _find_end(
     inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
     path = np.where(inside, path, limit[:, None])
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    settled = (np.abs(offset) < CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < STILL_MPS)
-    settled &= inside
-    found = settled.any(axis=1)
-    at = np.where(found, settled.argmax(axis=1), inside.sum(axis=1) - 1)
+    done = (np.abs(offset) < CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < STILL_MPS)
+    done &= inside
+    found = done.any(axis=1)
+    at = np.where(found, done.argmax(axis=1), inside.sum(axis=1) - 1)
     return sample + direction * at, found
 
 

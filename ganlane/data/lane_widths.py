@@ -38,15 +38,15 @@ def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
 def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> float:
     """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number.
 
-    Args:
-        y: [R] lateral positions, m, with 0 at the centre of lane 0 and growing with the lane number.
-        lane: [R] lane numbers.
-        scene: name for messages.
-
     The first estimate is the median slope between the median positions of each pair of lanes (Theil and Sen), which
     is robust to outliers. It is kept if no other width within 10 % of it puts more rows into their recorded lane;
     otherwise the result is the middle of the best range. Lane changes make that range narrow, since a vehicle's lane
     number changes just where it crosses the boundary.
+
+    Args:
+        y: [R] lateral positions, m, with 0 at the centre of lane 0 and growing with the lane number.
+        lane: [R] lane numbers.
+        scene: name for messages.
 
     Raises:
         UserError: the estimate is below 2 m or above 6 m.
@@ -64,15 +64,9 @@ def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "sc
 
 
 def lane_grid(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> tuple[float, float]:
-    """Lane width and position of lane 0's centre, both m, where that position is unknown.
+    """Lane width (:func:`lane_width`) and position of lane 0's centre, both m, where ``y`` has any origin.
 
-    Each lane's median position gives an estimate of the centre; their median is returned. The width is
-    :func:`lane_width`'s.
-
-    Args:
-        y: [R] lateral positions, m, growing with the lane number, from any origin.
-        lane: [R] lane numbers.
-        scene: name for messages.
+    Each lane's median position gives an estimate of the centre; their median is returned.
     """
     numbers, centres = _centres(y, lane)
     spacing = _median_spacing(y, lane)

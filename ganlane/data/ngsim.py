@@ -31,6 +31,7 @@ from ganlane.data.tables import (
     convert,
     csv_table,
     first_line,
+    is_number,
     raise_where,
     read_blocks,
 )
@@ -81,7 +82,7 @@ class _Period:
 
     location: str
     number: int
-    parts: tuple[Path, ...]
+    parts: list[Path]
 
     @property
     def name(self) -> str:
@@ -105,19 +106,17 @@ def ngsim_scenes(
     Args:
         path: a raw text file (18 columns, no header) or a CSV with NGSIM's column names, in any case and order; with
             a column ``location`` it may hold several locations.
-        parameters: which rows to read.
         count: rows read and dropped are added to it.
         scratch: folder for temporary files, which are removed at the end; by default the system's.
-        on_progress: called with the bytes read.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
     """
     path, parameters = Path(path), parameters or NgsimParameters()
     count = count if count is not None else RowCount()
-    table = _layout(path)
+    rows = _read_rows(_layout(path), parameters, count, on_progress)
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
-        periods = _store_by_period(_read_rows(table, parameters, count, on_progress), Path(folder), str(path))
+        periods = _store_by_period(rows, Path(folder), str(path))
         if not periods:
             places = ", ".join(parameters.locations)
             raise UserError(f"{path}: no rows of {places}; check data.locations.")
@@ -131,7 +130,7 @@ def _layout(path: Path) -> TextTable:
     """Raw text if the first line begins with a number and has no comma, else a CSV with a header."""
     first = first_line(path)
     fields = first.split()
-    if "," in first or not _is_number(fields[0]):
+    if "," in first or not is_number(fields[0]):
         return csv_table(path, COLUMNS)
     if len(fields) != len(RAW_NAMES):
         raise UserError(
@@ -141,21 +140,13 @@ def _layout(path: Path) -> TextTable:
     return TextTable(path, RAW_NAMES, has_header=False, blanks=True)
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _read_rows(
     table: TextTable, parameters: NgsimParameters, count: RowCount, on_progress: OnProgress | None
 ) -> Iterator[pl.DataFrame]:
     """Blocks with :data:`COLUMNS`, ``location`` and ``line``, in feet, in the order of the file."""
     path, has_location = table.path, LOCATION in table.names
     wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
-    last_row: pl.DataFrame | None = None
+    last_row = pl.DataFrame()
     for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
         count.read += text.height
         if has_location:
@@ -169,7 +160,7 @@ def _read_rows(
         raise_where(columns["v_vel"] < 0.0, columns["v_vel"], path, "is below 0", lines)
         rows = pl.DataFrame([*columns.values(), text[LOCATION], lines])
         if table.blanks:
-            _check_raw_order(rows if last_row is None else pl.concat((last_row, rows)), path)
+            _check_raw_order(last_row.vstack(rows) if last_row.height else rows, path)
             last_row = rows.tail(1)
         yield rows
 
@@ -197,11 +188,7 @@ def _check_raw_order(rows: pl.DataFrame, path: Path) -> None:
 
 
 def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) -> list[_Period]:
-    """Store the rows of all blocks under ``folder`` and return the periods, by location and time.
-
-    Raises:
-        UserError: ``global_time`` and ``frame_id`` contradict each other; the message names line and column.
-    """
+    """Store the rows of all blocks under ``folder`` and return the periods, by location and time."""
     parts: dict[tuple[str, int], list[Path]] = {}
     start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // MINUTE_MS
     for number, block in enumerate(blocks):
@@ -215,15 +202,13 @@ def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) 
                 "expected global_time in milliseconds and frame_id in steps of 100 ms."
             )
     periods: list[_Period] = []
-    previous: tuple[str, int] | None = None
     for location, minute in sorted(parts):
-        files = tuple(parts[location, minute])
-        if previous == (location, minute - 1):
-            periods[-1] = _Period(location, periods[-1].number, periods[-1].parts + files)
+        files = parts[location, minute]
+        if (location, minute - 1) in parts:
+            periods[-1].parts.extend(files)
         else:
-            same_place = sum(period.location == location for period in periods)
-            periods.append(_Period(location, same_place + 1, files))
-        previous = (location, minute)
+            number = 1 + sum(period.location == location for period in periods)
+            periods.append(_Period(location, number, files))
     for period in periods:
         has_others = sum(other.location == period.location for other in periods) > 1
         if has_others and len(period.parts) == 1:
@@ -239,7 +224,7 @@ def _check_size(period: _Period, source: str) -> None:
         raise UserError(
             f"{source}, line {first[LINE]}, columns frame_id and global_time: frame {first['frame_id']} at "
             f"{first['global_time']} ms fits no recording period of {period.location} ({rows.height} rows alone); "
-            "mend or remove the row."
+            "correct or remove the row."
         )
 
 

@@ -13,16 +13,19 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from ganlane.data.distributions import Bins, Distribution, Histogram, describe
 from ganlane.data.download import name_in_errors
 from ganlane.data.highd import highd_scenes
-from ganlane.data.lane_changes import LaneChanges, find_lane_changes
+from ganlane.data.lane_changes import LaneChanges, find_lane_changes, tracks_of_frame
 from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.scenes import cut_into_scenes, parquet_name, read_scenes, scene_csv_scenes, write_prepared
 from ganlane.data.schema import FRAME_S, TRACK, RowCount, Scene, sort
 from ganlane.data.statistics import (
+    Bins,
+    Distribution,
     Exposure,
+    Histogram,
     LaneChangeStatistics,
+    describe,
     followers,
     lane_change_statistics,
     leader_gaps,
@@ -32,7 +35,6 @@ from ganlane.data.statistics import (
     smoothed_accelerations,
 )
 from ganlane.data.tables import OnProgress
-from ganlane.data.tracks import tracks_of_frame
 from ganlane.errors import UserError
 from ganlane.parameters.data import NgsimParameters
 
@@ -51,10 +53,10 @@ STRONG_MPS2: Final = 3.0
 
 @dataclass(frozen=True)
 class SceneSummary:
-    """One scene in numbers: a row of the report.
+    """One scene in numbers; rates as in :class:`LaneChangeStatistics`.
 
     ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre is nearest: near 1 where
-    the road is straight in the recording's coordinates. Rates as in :class:`LaneChangeStatistics`.
+    the road is straight in the recording's coordinates.
     """
 
     name: str
@@ -90,22 +92,22 @@ class PooledStatistics:
         frame, exposure = scene.frame, measure_exposure(scene.frame)
         tracks = tracks_of_frame(frame, {scene.name: scene.lane_width_m})
         changes = find_lane_changes(tracks)
-        quantities = _quantities(frame)
-        self._headways.append(quantities["headway"])
-        for name, values in quantities.items():
-            self.histograms[name].add(values)
-            if name in self._strong:
-                self._strong[name] += int(np.count_nonzero(np.abs(values) > STRONG_MPS2))
         self._exposures.append(exposure)
         self._changes.append(changes)
+        for name, values in _quantities(frame).items():
+            self.histograms[name].add(values)
+            if name == "headway":
+                self._headways.append(values)
+            if name in self._strong:
+                self._strong[name] += int(np.count_nonzero(np.abs(values) > STRONG_MPS2))
+        frames = frame["frame"].to_numpy()
         speed = float(frame["speed"].mean())  # type: ignore[arg-type]
         rates = lane_change_statistics(changes, exposure, speed)
-        frames = int(frame["frame"].max() - frame["frame"].min()) + 1  # type: ignore[operator, arg-type]
         summary = SceneSummary(
             name=scene.name,
             rows=frame.height,
             tracks=exposure.tracks,
-            seconds=round(FRAME_S * frames, 1),
+            seconds=round(FRAME_S * int(np.ptp(frames) + 1), 1),
             lanes=scene.lanes,
             lane_width_m=scene.lane_width_m,
             nearest_lane_share=float(np.mean(tracks.lane == frame["lane"].to_numpy())),
@@ -123,12 +125,9 @@ class PooledStatistics:
     @property
     def exposure(self) -> Exposure:
         """Total amount of driving; the road's length is the mean over the cars."""
-        cars = [each.cars for each in self._exposures]
-        total = {
-            name: sum(getattr(each, name) for each in self._exposures)
-            for name in ("scenes", "tracks", "cars", "samples", "vehicle_km")
-        }
-        return Exposure(road_m=float(np.average([each.road_m for each in self._exposures], weights=cars)), **total)
+        parts = {field.name: [getattr(each, field.name) for each in self._exposures] for field in fields(Exposure)}
+        road_m = float(np.average(parts.pop("road_m"), weights=parts["cars"]))
+        return Exposure(road_m=road_m, **{name: sum(values) for name, values in parts.items()})
 
     @property
     def changes(self) -> LaneChanges:
@@ -206,7 +205,6 @@ def open_scenes(
     """The scenes of recordings of a ``kind``: ``scenes``, ``ngsim`` or ``highd``.
 
     Args:
-        kind: which reader.
         path: file, or folder where the reader takes one.
         count: rows read and dropped are added to it.
         parameters: which rows of an NGSIM file to read.
@@ -251,16 +249,10 @@ def prepare_recordings(
     on_progress: OnProgress | None = None,
     on_scene: Callable[[SceneSummary], None] | None = None,
 ) -> Preparation:
-    """Read recordings, write each as a Parquet file into the folder ``out``, and measure them.
+    """Read recordings, write each as a Parquet file into the new folder ``out``, and measure them.
 
-    The folder ``out`` appears only when everything is written.
-
-    Args:
-        kind, path, parameters: as in :func:`open_scenes`.
-        out: folder to make.
-        scene_s: cut recordings into scenes of so many seconds when they are written; they are measured whole.
-        on_progress: called with the bytes read (NGSIM).
-        on_scene: called after each recording.
+    The folder appears only when everything is written. Recordings are measured first, then cut into scenes of
+    ``scene_s`` seconds if it is given. The other arguments are those of :func:`open_scenes`.
 
     Raises:
         UserError: a damaged or missing file, no moving vehicle in it, or ``out`` exists already.

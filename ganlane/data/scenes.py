@@ -41,35 +41,22 @@ def read_scenes(path: str | Path) -> pl.DataFrame:
     ``y`` is shifted so that it is 0 at the centre of that lane. Positions are not smoothed.
 
     Args:
-        path: CSV with the columns ``scene, vehicle, frame, x, y, v, lane, length, width`` (others are ignored);
-            metres, m/s, 0.1 s a frame; lane 1 leftmost. Or Parquet in the schema: a file ``*.parquet``, or a folder
-            of them.
+        path: CSV with :data:`COLUMNS` (others are ignored); metres, m/s, 0.1 s a frame. Or Parquet in the schema: a
+            file ``*.parquet``, or a folder of them.
 
     Raises:
         UserError: a missing or damaged file, or a scene that is in two files; the message names file, line and
             column.
     """
-    path, file_of = Path(path), dict[str, Path]()
-    if not _is_parquet(path):
-        return _read_csv(path)
-    frames = []
-    for file in _parquet_files(path):
-        frames.append(_read_parquet(file))
-        for scene in frames[-1]["scene"].unique():
-            _check_one_file(scene, file, file_of)
-    return sort(pl.concat(frames))
+    return sort(pl.concat(_read_files(Path(path))))
 
 
-def scene_csv_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
+def scene_csv_scenes(path: str | Path, count: RowCount) -> Iterator[Scene]:
     """The scenes of :func:`read_scenes` one by one, in memory for one file; ``count`` gets the rows read."""
-    path, file_of = Path(path), dict[str, Path]()
-    for file in _parquet_files(path) if _is_parquet(path) else [path]:
-        frame = read_scenes(file)
-        if count is not None:
-            count.read += frame.height
+    for frame in _read_files(Path(path)):
+        count.read += frame.height
         widths = scene_lane_widths(frame)
-        for (name,), rows in frame.group_by("scene", maintain_order=True):
-            _check_one_file(str(name), file, file_of)
+        for (name,), rows in sort(frame).group_by("scene", maintain_order=True):
             yield Scene(str(name), rows, widths[str(name)])
 
 
@@ -82,8 +69,7 @@ def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
 def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
     """Cut each recording into scenes of at most ``seconds``, so that some of them can be held out.
 
-    ``us-101-1`` becomes ``us-101-1-000``, ``us-101-1-001`` and so on; frame numbers do not change. Tracks are cut
-    too, and so may be a lane change.
+    ``us-101-1`` becomes ``us-101-1-000``, ``us-101-1-001`` and so on; frame numbers do not change.
     """
     frames = max(1, round(seconds / FRAME_S))
     first = pl.col("frame").min().over("scene")
@@ -109,16 +95,18 @@ def _read_csv(path: Path) -> pl.DataFrame:
     return sort(pl.concat(scenes).select(SCHEMA.names()))
 
 
-def _is_parquet(path: Path) -> bool:
-    """Whether ``path`` means Parquet: a file of that ending, or a folder."""
-    return path.is_dir() or path.suffix == _ENDING
-
-
-def _parquet_files(path: Path) -> list[Path]:
+def _read_files(path: Path) -> Iterator[pl.DataFrame]:
+    """The CSV, or the Parquet files one by one; a scene must not be in two of them."""
     files = sorted(path.glob(f"*{_ENDING}")) if path.is_dir() else [path]
     if not files:
         raise UserError(f"{path}: no such file as *{_ENDING} in this folder; give what ganlane prepare wrote.")
-    return files
+    file_of: dict[str, Path] = {}
+    for file in files:
+        frame = _read_parquet(file) if file.suffix == _ENDING else _read_csv(file)
+        for scene in frame["scene"].unique():
+            if file_of.setdefault(scene, file) != file:
+                raise UserError(f"{file}: scene {scene} is in {file_of[scene]} too; remove one of them.")
+        yield frame
 
 
 def _read_parquet(path: Path) -> pl.DataFrame:
@@ -129,9 +117,3 @@ def _read_parquet(path: Path) -> pl.DataFrame:
     except (pl.exceptions.PolarsError, OSError) as error:
         raise UserError(f"{path}: not a readable Parquet file ({reason(error)}); prepare it again.") from error
     return validate(frame, str(path), first_line=None)
-
-
-def _check_one_file(scene: str, file: Path, file_of: dict[str, Path]) -> None:
-    """Note the ``file`` of a ``scene``; a scene must not be in two files."""
-    if file_of.setdefault(scene, file) != file:
-        raise UserError(f"{file}: scene {scene} is in {file_of[scene]} too; remove one of them.")

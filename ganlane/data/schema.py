@@ -93,13 +93,9 @@ def sort(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def number_tracks(frame: pl.DataFrame, source: str) -> pl.DataFrame:
-    """Split each car's rows into tracks without a missing frame, and number them.
+    """Split each car's rows into tracks without a missing frame; one scene, sorted by ``vehicle`` and ``frame``.
 
     A car's second track is numbered ``vehicle + TRACK_STRIDE``, its third ``vehicle + 2 TRACK_STRIDE``.
-
-    Args:
-        frame: at least ``vehicle`` and ``frame``, one scene, sorted by both.
-        source: for messages.
 
     Raises:
         UserError: a vehicle number is negative or not below :data:`TRACK_STRIDE`.
@@ -120,8 +116,7 @@ def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LI
     Args:
         frame: rows in the order of the file they come from.
         source: name of the file, for messages.
-        first_line: line of the file that holds the first row; None where rows are not lines of a file, which are
-            then counted from 0.
+        first_line: line of the file that holds the first row; None where rows are not lines (they count from 0).
 
     Raises:
         UserError: a missing column, no rows, NaN or null, a frame number that does not grow within its track,

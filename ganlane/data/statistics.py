@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from dataclasses import asdict, dataclass, is_dataclass
+from typing import Any, Final, TypeVar, get_type_hints
 
 import numpy as np
 import polars as pl
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
-from ganlane.data.distributions import Distribution, Durations, describe, describe_durations
-from ganlane.data.lane_changes import LaneChanges, find_lane_changes
+from ganlane.data.lane_changes import LaneChanges, find_lane_changes, tracks_of_frame
 from ganlane.data.schema import FRAME_S, TRACK, TRACK_STRIDE
-from ganlane.data.tracks import tracks_of_frame
 from ganlane.errors import UserError
 
+_Record = TypeVar("_Record")
+#: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
+LEVELS: Final = (0.01, *(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
 #: Gap of a standing car to its leader, m (Table V's ``s_0``): not part of the headway.
 STANDSTILL_GAP_M: Final = 2.0
 #: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s.
@@ -26,8 +30,139 @@ MIN_FRAMES: Final = 10
 
 
 @dataclass(frozen=True)
+class Distribution:
+    """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample, in its own unit.
+
+    An empty sample has ``mean`` None and no quantiles; fewer than two samples have ``sd`` None.
+    """
+
+    count: int
+    mean: float | None
+    sd: float | None
+    quantiles: tuple[float, ...]
+
+    def quantile(self, level: float) -> float:
+        """Value at ``level``, linear between :data:`LEVELS` and constant beyond them."""
+        return float(np.interp(level, LEVELS, self.quantiles))
+
+
+def describe(values: ArrayLike) -> Distribution:
+    """Summarise a sample without NaN."""
+    sample = np.asarray(values, dtype=np.float64)
+    if not len(sample):
+        return Distribution(0, None, None, ())
+    sd = float(sample.std(ddof=1)) if len(sample) > 1 else None
+    return Distribution(len(sample), float(sample.mean()), sd, tuple(float(q) for q in np.quantile(sample, LEVELS)))
+
+
+@dataclass(frozen=True)
+class Durations:
+    """Durations of which some are censored, s.
+
+    Attributes:
+        complete: the complete ones; their mean is too low, since long durations are censored more often.
+        censored: number of censored ones.
+        survival_mean_s: area under :func:`survival_curve`, up to the longest duration; None without complete ones.
+        survival_median_s: where that curve falls to one half; None if it never does.
+    """
+
+    complete: Distribution
+    censored: int
+    survival_mean_s: float | None
+    survival_median_s: float | None
+
+
+def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
+    """Summarise durations [C], of which those not ``complete`` [C] are lower bounds."""
+    times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
+    mean = median = None
+    if is_complete.any():
+        ends, survival = survival_curve(times, is_complete)
+        edges = np.concatenate(([0.0], ends, [max(times.max(), ends[-1])]))
+        mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
+        halved = np.flatnonzero(survival <= 0.5)
+        median = float(ends[halved[0]]) if len(halved) else None
+    return Durations(describe(times[is_complete]), int(np.count_nonzero(~is_complete)), mean, median)
+
+
+def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Kaplan and Meier's (1958) survival curve of durations [C], of which those not ``complete`` are lower bounds.
+
+    Returns:
+        [E] the distinct complete durations, growing, and [E] the shares of longer durations, falling.
+    """
+    times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
+    ends, ending = np.unique(times[is_complete], return_counts=True)
+    at_risk = len(times) - np.searchsorted(np.sort(times), ends)
+    return ends, np.cumprod(1.0 - ending / at_risk)
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Bins of equal width from ``low`` to ``high``; values beyond are counted in the outermost ones."""
+
+    low: float
+    high: float
+    number: int
+
+    @property
+    def edges(self) -> np.ndarray:
+        """The bins' limits [number + 1]."""
+        return np.linspace(self.low, self.high, self.number + 1)
+
+
+class Histogram:
+    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part by part.
+
+    Quantiles are interpolated linearly within a bin, so they are accurate to a bin's width.
+    """
+
+    def __init__(self, bins: Bins) -> None:
+        self.bins = bins
+        self.counts = np.zeros(bins.number, dtype=np.int64)
+        self._sum = 0.0
+        self._squares = 0.0
+
+    @property
+    def total(self) -> int:
+        """Number of samples."""
+        return int(self.counts.sum())
+
+    def add(self, values: ArrayLike) -> None:
+        """Count more samples, without NaN."""
+        sample = np.asarray(values, dtype=np.float64)
+        bins = self.bins
+        self.counts += np.histogram(np.clip(sample, bins.low, bins.high), bins.number, (bins.low, bins.high))[0]
+        self._sum += float(sample.sum())
+        self._squares += float(np.square(sample).sum())
+
+    def describe(self) -> Distribution:
+        """As :func:`describe` of all samples."""
+        n = self.total
+        if not n:
+            return Distribution(0, None, None, ())
+        mean = self._sum / n
+        spread = math.sqrt(max(self._squares - n * mean * mean, 0.0) / (n - 1)) if n > 1 else None
+        return Distribution(n, mean, spread, tuple(self.quantile(level) for level in LEVELS))
+
+    def quantile(self, level: float) -> float:
+        """Value at ``level``, linear within its bin."""
+        below = np.concatenate(([0], np.cumsum(self.counts)))
+        occupied = np.flatnonzero(self.counts)
+        k = int(occupied[min(int(np.searchsorted(below[occupied + 1], level * self.total)), len(occupied) - 1)])
+        share = (level * self.total - below[k]) / self.counts[k]
+        edges = self.bins.edges
+        return float(edges[k] + min(max(share, 0.0), 1.0) * (edges[k + 1] - edges[k]))
+
+    def density(self) -> np.ndarray:
+        """[number] probability density per unit of the quantity."""
+        width = (self.bins.high - self.bins.low) / self.bins.number
+        return self.counts / max(self.total, 1) / width
+
+
+@dataclass(frozen=True)
 class Exposure:
-    """Amount of driving: the denominator of every rate.
+    """Amount of driving.
 
     ``cars`` counts a car once per scene, however many tracks it has; ``road_m`` is the mean length of the road over
     the cars; ``vehicle_km`` is the distance driven.
@@ -58,13 +193,10 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
 
 
 def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
-    """Rows that have a leader, with its ``gap`` and ``leader_speed``.
+    """Rows of a frame in the schema that have a leader, with its ``gap`` and ``leader_speed``.
 
     The leader is the next vehicle ahead in the same lane and frame, at any distance; ``gap`` is net (bumper to
     bumper), m, negative where two bodies overlap along the road.
-
-    Args:
-        frame: in the schema.
     """
     ahead = {name: pl.col(name).shift(-1).over("scene", "frame", "lane") for name in ("x", "length", "speed")}
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
@@ -81,17 +213,11 @@ def followers(with_leader: pl.DataFrame) -> pl.DataFrame:
 def median_headways(following: pl.DataFrame) -> pl.Series:
     """Median of ``(gap - 2 m) / speed`` of every follower, s: one number per track, in the order of the tracks.
 
-    Args:
-        following: rows of :func:`followers`; tracks with less than 1 s of them are left out.
+    Tracks with less than 1 s of rows of :func:`followers` are left out.
     """
     headway = (pl.col("gap") - STANDSTILL_GAP_M) / pl.col("speed")
     per_track = following.group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
     return per_track.filter(pl.col("len") >= MIN_FRAMES).sort(TRACK)["headway"]
-
-
-def follower_headways(frame: pl.DataFrame) -> pl.Series:
-    """:func:`median_headways` of a frame in the schema."""
-    return median_headways(followers(leader_gaps(frame)))
 
 
 def raw_accelerations(frame: pl.DataFrame) -> pl.Series:
@@ -104,9 +230,7 @@ def smoothed_accelerations(frame: pl.DataFrame, over_s: float = 1.0) -> pl.Serie
     """Mean speed of one second minus the mean speed of the second before, per second, m/s2.
 
     The filter is ``(x[t] - 2 x[t - k] + x[t - 2k]) / (k * 0.1 s)^2`` with ``k`` frames in ``over_s``: the true
-    acceleration weighted by a triangle of two seconds' width. It uses positions, so recordings and simulations are
-    treated alike; a track of less than two seconds gives no value. For statistics only: a generator's windows must
-    not be built from smoothed positions, which leak the future into the past.
+    acceleration weighted by a triangle of two seconds' width. A track of less than two seconds gives no value.
     """
     lag = round(over_s / FRAME_S)
     bend = (pl.col("x") - 2.0 * _earlier("x", lag) + _earlier("x", 2 * lag)) / (lag * FRAME_S) ** 2
@@ -123,11 +247,6 @@ def srlc(changes: int, vehicles: int, road_m: float) -> float:
     """Equation 9: lane changes per vehicle and kilometre of road, ``n / q * 1000 / L``.
 
     It assumes that every vehicle drives the whole road; where tracks cover only part of it, it is too low.
-
-    Args:
-        changes: ``n``, number of lane changes.
-        vehicles: ``q``, number of vehicles.
-        road_m: ``L``, length of the road, m.
     """
     return changes / vehicles * 1000.0 / road_m
 
@@ -135,10 +254,7 @@ def srlc(changes: int, vehicles: int, road_m: float) -> float:
 def steps_between_changes(rate_per_km: float, speed_mps: float, step_s: float = FRAME_S) -> float:
     """Equation 10's ``t_m``: mean time between two lane changes of a vehicle, in steps of ``step_s``.
 
-    Args:
-        rate_per_km: lane changes per vehicle-kilometre, above 0.
-        speed_mps: mean speed, m/s.
-        step_s: s.
+    ``rate_per_km`` counts lane changes per vehicle-kilometre and is above 0; ``speed_mps`` is the mean speed.
     """
     return 1000.0 / (rate_per_km * speed_mps * step_s)
 
@@ -207,7 +323,7 @@ class DrivingStatistics:
         speed_sd_in_frame, speed_sd_in_lane: standard deviation of the speeds within a frame, and within a frame
             and lane, m/s; the mean over those with two vehicles or more, None without any.
         acceleration_raw, acceleration_smoothed: :func:`raw_accelerations`, :func:`smoothed_accelerations`, m/s2.
-        headway: median ``(gap - 2) / speed`` per follower, s (:func:`follower_headways`).
+        headway: median ``(gap - 2) / speed`` per follower, s (:func:`median_headways`).
     """
 
     exposure: Exposure
@@ -221,7 +337,7 @@ class DrivingStatistics:
 
     def to_dict(self) -> dict[str, Any]:
         """Nested dictionaries of numbers, None and lists, as in JSON."""
-        return _tuples_to_lists(asdict(self))
+        return json.loads(json.dumps(asdict(self)))
 
     @classmethod
     def from_dict(cls, numbers: Mapping[str, Any]) -> DrivingStatistics:
@@ -231,29 +347,24 @@ class DrivingStatistics:
             UserError: a name is missing or unknown.
         """
         try:
-            changes = dict(numbers["lane_changes"])
-            duration = dict(changes["duration"])
-            duration["complete"] = _distribution(duration["complete"])
-            changes["duration"] = Durations(**duration)
-            for name in ("lateral_speed", "lateral_speed_with_censored"):
-                changes[name] = _distribution(changes[name])
-            fields = dict(numbers)
-            for name in ("speed", "acceleration_raw", "acceleration_smoothed", "headway"):
-                fields[name] = _distribution(fields[name])
-            fields["exposure"] = Exposure(**numbers["exposure"])
-            fields["lane_changes"] = LaneChangeStatistics(**changes)
-            return cls(**fields)
+            return _record(cls, numbers)
         except (KeyError, TypeError) as error:
             raise UserError(f"not the statistics of a recording ({error}); measure them again.") from error
 
 
-def driving_statistics(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> DrivingStatistics:
-    """Measure a recording.
+def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
+    """A dataclass from nested dictionaries of its fields; lists become tuples."""
+    values: dict[str, Any] = {**numbers}
+    for name, hint in get_type_hints(kind).items():
+        if isinstance(hint, type) and is_dataclass(hint):
+            values[name] = _record(hint, values[name])
+        elif isinstance(values.get(name), list):
+            values[name] = tuple(values[name])
+    return kind(**values)
 
-    Args:
-        frame: in the schema, sorted by scene, vehicle and frame.
-        lane_widths: width of each scene's lanes, m; by default estimated.
-    """
+
+def driving_statistics(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> DrivingStatistics:
+    """Measure a frame in the schema, sorted; each scene's lane width in m is estimated where not given."""
     exposure = measure_exposure(frame)
     speed = describe(frame["speed"].to_numpy())
     changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
@@ -265,20 +376,11 @@ def driving_statistics(frame: pl.DataFrame, lane_widths: dict[str, float] | None
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
         acceleration_raw=describe(raw_accelerations(frame).to_numpy()),
         acceleration_smoothed=describe(smoothed_accelerations(frame).to_numpy()),
-        headway=describe(follower_headways(frame).to_numpy()),
+        headway=describe(median_headways(followers(leader_gaps(frame))).to_numpy()),
     )
 
 
 def _mean_spread(frame: pl.DataFrame, groups: list[str]) -> float | None:
-    spread = frame.group_by(groups).agg(sd=pl.col("speed").std())["sd"].drop_nulls()
+    # In the order of the rows, so that the mean is the same to the last bit in every run.
+    spread = frame.group_by(groups, maintain_order=True).agg(sd=pl.col("speed").std())["sd"].drop_nulls()
     return float(spread.mean()) if len(spread) else None  # type: ignore[arg-type]
-
-
-def _distribution(numbers: Mapping[str, Any]) -> Distribution:
-    return Distribution(**{**numbers, "quantiles": tuple(numbers["quantiles"])})
-
-
-def _tuples_to_lists(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _tuples_to_lists(part) for name, part in value.items()}
-    return [_tuples_to_lists(part) for part in value] if isinstance(value, tuple) else value

@@ -19,10 +19,9 @@ from ganlane.files import atomic_path
 
 @dataclass(frozen=True)
 class SyntheticTraffic:
-    """Parameters of the recordings.
+    """Speeds follow ``speed_mps`` plus a sine of up to ``speed_swing_mps`` and a period of 6 to 10 s.
 
-    Speeds follow ``speed_mps`` plus a sine of up to ``speed_swing_mps`` and a period of 6 to 10 s; with the
-    default slots no two vehicles can collide. A lane change takes 3 to 5 s and ends within the recording.
+    With the default slots no two vehicles can collide. A lane change takes 3 to 5 s and ends within the recording.
     """
 
     scenes: int = 2

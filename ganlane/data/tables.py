@@ -31,13 +31,9 @@ OnProgress = Callable[[int, int | None], None]
 
 @dataclass(frozen=True)
 class TextTable:
-    """Layout of a text table.
+    """Layout of a text table; ``names`` are those of its columns, in lower case.
 
-    Attributes:
-        path: the file.
-        names: names of the columns, in lower case, in order.
-        has_header: whether line 1 holds the names.
-        blanks: whether runs of blanks separate the columns, instead of a comma.
+    With ``blanks``, runs of blanks separate the columns, instead of a comma.
     """
 
     path: Path
@@ -47,12 +43,7 @@ class TextTable:
 
 
 def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
-    """Read the named ``columns`` of a CSV file with a header, in file order; other columns are ignored.
-
-    Args:
-        path: the file.
-        columns: name to polars type: ``String``, ``Int64`` (a whole number; ``3.0`` counts as one) or
-            ``Float64`` (a finite number).
+    """Read the named ``columns`` of a CSV file with a header, in file order, as :func:`convert` types them.
 
     Raises:
         UserError: no such file, no text table, no rows, a missing column, or a field that is empty or not the
@@ -74,11 +65,7 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
 
 
 def csv_table(path: str | Path, wanted: Mapping[str, Kind]) -> TextTable:
-    """Layout of a CSV file according to its header line; names are compared in lower case.
-
-    Raises:
-        UserError: no such file, an empty one, or one without a ``wanted`` column.
-    """
+    """Layout of a CSV file according to its header line, which must hold the ``wanted`` columns in any case."""
     path = Path(path)
     names = tuple(name.strip().lower() for name in next(csv.reader([first_line(path)]), []))
     _check_columns(wanted, names, path)
@@ -86,11 +73,7 @@ def csv_table(path: str | Path, wanted: Mapping[str, Kind]) -> TextTable:
 
 
 def first_line(path: Path) -> str:
-    """The first line of a text file, without a byte order mark.
-
-    Raises:
-        UserError: no such file, an empty file, or not text.
-    """
+    """The first line of a text file, without a byte order mark."""
     if not path.is_file():
         raise UserError(f"{path}: no such file; give the path of a text table.")
     with path.open("rb") as file:
@@ -122,9 +105,7 @@ def convert(
     """Convert one column of text to ``kind``.
 
     Args:
-        text: the column.
-        kind: ``String``, ``Int64`` or ``Float64``.
-        path: for messages.
+        kind: ``String``, ``Int64`` (a whole number; ``3.0`` counts as one) or ``Float64`` (a finite number).
         lines: the line of each row, for messages; by default the rows follow a header.
         thousands: whether commas may separate thousands.
 
@@ -150,30 +131,20 @@ def convert(
 
 
 def raise_where(bad: pl.Series, values: pl.Series, path: Path, what: str, lines: pl.Series | None = None) -> None:
-    """Raise an error for the first row that is ``bad``, if there is one; null is not bad.
-
-    Raises:
-        UserError: naming file, line, column and value.
-    """
+    """Raise a UserError that names the first row that is ``bad``, if there is one; null is not bad."""
     row = bad.fill_null(False).arg_max() if bad.any() else None
     if row is None:
         return
     value = values[row]
     field = "the field" if value in (None, "") else repr(value)
     line = row + FIRST_LINE if lines is None else lines[row]
-    raise UserError(f"{path}, line {line}, column {values.name}: {field} {what}; mend or remove the row.")
+    raise UserError(f"{path}, line {line}, column {values.name}: {field} {what}; correct or remove the row.")
 
 
 def read_blocks(
     table: TextTable, wanted: Sequence[str], block_bytes: int = BLOCK_BYTES, on_progress: OnProgress | None = None
 ) -> Iterator[pl.DataFrame]:
     """The ``wanted`` columns as text, and ``line``, block by block; rows in the order of the file.
-
-    Args:
-        table: the layout.
-        wanted: names of columns.
-        block_bytes: bytes read at once.
-        on_progress: called with the bytes read.
 
     Raises:
         UserError: a row with too many or too few fields or with bytes that are not text, an empty line, or a last
@@ -262,23 +233,26 @@ def _raise_at_bad_line(table: TextTable, block: bytes, number: int) -> None:
         place = f"{table.path}, line {line}"
         if not raw.strip():
             raise UserError(f"{place}: the line is empty; remove it.")
-        if not _is_text(raw):
-            raise UserError(f"{place}: the line is not text; copy or download the file again.")
+        try:
+            raw.decode()
+        except UnicodeDecodeError as error:
+            raise UserError(f"{place}: the line is not text; copy or download the file again.") from error
         if raw.count(b'"') % 2:
-            raise UserError(f"{place}: a quotation mark without its counterpart; mend or remove the row.")
+            raise UserError(f"{place}: a quotation mark without its counterpart; correct or remove the row.")
         found = len(_fields(table, raw))
         if found > expected:
-            raise UserError(f"{place}: {found} fields, expected {expected}; mend or remove the row.")
+            raise UserError(f"{place}: {found} fields, expected {expected}; correct or remove the row.")
         if found < expected:
             column = table.names[found - 1]
             raise UserError(
-                f"{place}, column {column}: the row ends after {found} of {expected} fields; mend or remove it."
+                f"{place}, column {column}: the row ends after {found} of {expected} fields; correct or remove it."
             )
 
 
-def _is_text(raw: bytes) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a field holds a number."""
     try:
-        raw.decode()
-    except UnicodeDecodeError:
+        float(text)
+    except ValueError:
         return False
     return True

@@ -1,4 +1,4 @@
-"""HighwayEnv as TorchRL sees it: specs, reset, step."""
+"""HighwayEnv as a TorchRL environment: specs, reset, step."""
 
 from __future__ import annotations
 
@@ -11,21 +11,19 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
-from ganlane.env.decision import Decision, Recorder, known_false
-from ganlane.env.physics import Physics, Substep, outcome
-from ganlane.env.rules import Rules
+from ganlane.env.decision import Recorder, known_false, run_decision
+from ganlane.env.physics import Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
-from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
+from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.recycle import out_of_range
-from ganlane.sim.road import Road, road_in
-from ganlane.sim.scenes import RandomScenes, Scenes
-from ganlane.sim.steering import STEERING, SteeringParameters
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.scenes import Scenes
+from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.base import TrafficModule
 
 
@@ -42,18 +40,17 @@ class HighwayEnv(EnvBase):
         idm, steering: the ego's car following (Table V) and steering.
         stream: family of episodes (training, selection, report); by default, and at most, the traffic's.
         seed: base of the random numbers; ``set_seed`` changes it for the next full reset.
-        first_episode: row i starts with episode ``first_episode + i`` and goes on in steps of N.
-        scenes: where the vehicles of an episode start; None: at random, by ``spawn_parameters``. It also says who is
-            seen how (``visibility``).
-        device, dtype: where and in which float type to simulate.
-        recycle: put vehicles that the ego leaves behind back in front of it, and the reverse, after every decision
+        first_episode: row i starts with episode ``first_episode + i`` and continues in steps of N.
+        scenes: initial vehicles of an episode and their visibility; None: at random, by ``spawn_parameters``.
+        device, dtype: of the simulation's tensors.
+        recycle: after every decision move vehicles far behind the ego to far ahead of it, and the reverse
             (:mod:`ganlane.sim.recycle`), so that the road never empties.
-        recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1; which ones follows from their
-            numbers. A mixture of roads that empty and roads that do not, to train on both.
+        recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their numbers: a mixture
+            of roads that empty and roads that do not.
 
     An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with ``seed`` and
-    ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With a mask the masked rows go on to
-    their episode plus N, or to ``next_episode`` [N] in ``reset(td, next_episode=...)``, on the seed in ``td``.
+    ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With a mask the masked rows continue
+    with their episode plus N, or ``next_episode`` [N] of ``reset(td, next_episode=...)``, on the seed in ``td``.
     :attr:`recorder`, if set, is called after every physics step.
 
     Raises:
@@ -96,13 +93,13 @@ class HighwayEnv(EnvBase):
         self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
         self.physics = Physics()
         self._seed = seed
-        #: Seed and episode [N] of the rows as they were last seen; automatic resets go on from there.
+        #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
         self._check_parts(vehicles, stream)
         self._make_specs()
 
     def _check_parts(self, vehicles: int | None, stream: int | None) -> None:
-        """Refuse parts that do not go together; ``vehicles`` and ``stream`` as the user gave them."""
+        """Raise :class:`UserError` for parts that do not fit; ``vehicles`` and ``stream`` as the user gave them."""
         if stream is not None and int(stream) != self.stream:
             raise UserError(
                 f"stream={int(stream)}: the traffic was built for stream {self.stream}; give both the same one, "
@@ -123,17 +120,19 @@ class HighwayEnv(EnvBase):
         self.scenes.check(self.road, self.rules.idm)
 
     def _own_scenes(self, vehicles: int) -> Scenes:
-        """The traffic's recorded scenes where it has any, else random ones."""
-        seen = (Visibility.named(self.ego.visibility), self.traffic.visibility)
-        recorded = self.traffic.scenes(vehicles, seen[0], self.spawn_parameters.ego_desired_speed_mps)
-        return recorded or RandomScenes(self.road, vehicles, self.spawn_parameters, *seen)
+        """The traffic's own scenes if it has any, else random ones."""
+        ego_visibility = Visibility.named(self.ego.visibility)
+        recorded = self.traffic.scenes(vehicles, ego_visibility, self.spawn_parameters.ego_desired_speed_mps)
+        return recorded or RandomScenes(
+            self.road, vehicles, self.spawn_parameters, ego_visibility, self.traffic.visibility
+        )
 
     def _make_specs(self) -> None:
         n, device = self.batch_size[0], self.device
         memory = self.traffic.memory_spec(n, self.vehicles, self.dtype)
         self.observation_spec = state_spec(n, self.vehicles, self.dtype, memory, self.traffic.own_roads).to(device)
-        # A TransformedEnv hands on to a reset only what the state spec names; without the counters a reset that asks
-        # for certain episodes would run the first ones.
+        # A TransformedEnv passes to a reset only the keys of the state spec; without the counters a reset to certain
+        # episodes would run the first ones.
         counters = {name: self.observation_spec[name].clone() for name in (keys.SEED, keys.EPISODE)}
         self.state_spec = Composite(counters, shape=(n,), device=device)
         self.action_spec = Categorical(3, shape=(n,), dtype=torch.int64, device=device)
@@ -141,11 +140,11 @@ class HighwayEnv(EnvBase):
         self.done_spec = done_spec(n).to(device)
 
     def compile(self, **kwargs: Any) -> HighwayEnv:
-        """Turn physics and traffic into compiled graphs, several small ones; returns the environment.
+        """Compile physics and traffic to several small graphs; returns the environment.
 
-        How much faster that is at which batch, docs/performance.md tells; the first steps take a minute or so of
-        compiling. Results are the same up to rounding, not bitwise. ``HighwayEnv(compile=True)`` calls this method
-        too: TorchRL's own, which makes one graph of a whole step, is overridden.
+        Compiling takes about a minute in the first steps; docs/performance.md has the speeds. Results are equal up to
+        rounding, not bitwise. Overrides TorchRL's method, which compiles a whole step to one graph;
+        ``HighwayEnv(compile=True)`` calls this one too.
 
         Raises:
             UserError: there is no C++ compiler, or an argument of TorchRL's version is given.
@@ -162,13 +161,13 @@ class HighwayEnv(EnvBase):
     def _episodes(
         self, tensordict: TensorDictBase | None, next_episode: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Seed and episode [N] of every row after this reset; ``next_episode`` [N] counts in masked rows only."""
+        """Seed and episode [N] of every row after this reset; ``next_episode`` [N] applies to masked rows only."""
         n = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
             seed, last = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
         elif mask is not None and self.last_episodes is not None:
-            # An automatic reset hands over the mask alone: TorchRL strips the counters.
+            # In an automatic reset TorchRL passes the mask without the counters.
             seed, last = self.last_episodes
         else:
             seed = torch.full((n,), self._seed, dtype=torch.int64, device=self.device)
@@ -180,7 +179,7 @@ class HighwayEnv(EnvBase):
     def _reset(
         self, tensordict: TensorDictBase | None, next_episode: Tensor | None = None, **kwargs: object
     ) -> TensorDictBase:
-        """All rows at the start of their episodes; EnvBase keeps those of the rows that were not asked for."""
+        """All rows at the start of their episodes; EnvBase keeps the rows that are not to be reset."""
         seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
         key = episode_key(self.stream, seed, episode)
         vehicles, memory = self.traffic.enter(self.scenes(key, self.dtype).with_finite_padding(), key, episode)
@@ -198,35 +197,34 @@ class HighwayEnv(EnvBase):
         key = episode_key(self.stream, *self.last_episodes)
         rules = self._rules_of(tensordict, key)
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(tensordict.get(keys.EGO).items())
-        start, ordered = self.physics.begin(
-            rules, tensordict.get(keys.ACTION), vehicles, ego, tensordict.get(keys.STEP)
-        )
-        at, memory = Decision(self.traffic, self.physics, rules).drive(tensordict, start, key, self.recorder)
-        remembered = self.physics.remember(rules, ego, start.vehicles.speed[:, EGO_INDEX], start.step, at, ordered)
-        events, flags = outcome(rules, at, ordered)
+        action, step = tensordict.get(keys.ACTION), tensordict.get(keys.STEP)
+        start, command = self.physics.begin(rules, action, vehicles, ego, step)
+        end, memory = run_decision(self.traffic, self.physics, rules, tensordict, start, key, self.recorder)
+        ego = self.physics.remember(rules, ego, start, end, command)
+        events, flags = outcome(rules, end, command)
         rest = {
             keys.SEED: tensordict.get(keys.SEED),
             keys.EPISODE: tensordict.get(keys.EPISODE),
-            keys.STEP: at.step,
-            keys.REWARD: torch.zeros_like(remembered["distance"])[:, None],
+            keys.STEP: end.step,
+            keys.REWARD: torch.zeros_like(ego["distance"])[:, None],
             **flags,
         }
         if self.traffic.own_roads:
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
-        return pack(self._recycled(rules, at, key), remembered, memory, events, rest)
+        return pack(self._recycled(rules, end, key), ego, memory, events, rest)
 
     def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
-        """The rules of every row: replayed scenes have roads and an end of their own."""
+        """The rules of every row: replayed scenes have their own roads and ends."""
         if not self.traffic.own_roads:
             return self.rules
         return self.rules._replace(road=road_in(state, self.road), scene_steps=self.traffic.steps_of(key))
 
-    def _recycled(self, rules: Rules, at: Substep, key: Tensor) -> Vehicles:
-        """The vehicles after a decision; in rows that go on moved round the ego where it has left them behind."""
-        if not self.recycle or known_false(out_of_range(at.vehicles, rules.road).any()):
-            return at.vehicles
-        recycled = at.running
+    def _recycled(self, rules: Rules, end: Substep, key: Tensor) -> Vehicles:
+        """The vehicles after a decision; in running rows with recycling those left behind are moved."""
+        if not self.recycle or known_false(out_of_range(end.vehicles, rules.road).any()):
+            return end.vehicles
+        recycled = end.running
         if self.recycle_share < 1.0:
             chosen = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)[..., 0].reshape(recycled.shape)
             recycled = recycled & (chosen < self.recycle_share)
-        return self.physics.recycle(at.vehicles, rules.road, rules.idm).where(recycled, at.vehicles)
+        return self.physics.recycle(end.vehicles, rules.road, rules.idm).where(recycled, end.vehicles)

@@ -1,4 +1,4 @@
-"""What the environment's state consists of: fields, specs, and how it looks at the start of an episode."""
+"""The environment's state: fields, specs, and the start of an episode."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torchrl.data import Composite, Unbounded
 from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
-#: Steering angle (rad), mean acceleration over the last decision (m/s2), progress of a lane change (0..1), m driven.
+#: Steering angle (rad), mean acceleration in the last decision (m/s2), lane change progress (0 to 1), distance (m).
 EGO_FLOATS = ("steering", "mean_acceleration", "change_progress", "distance")
-#: Direction of the lane change under way (-1, 0, 1), decisions taken and lane changes started in this episode.
+#: Direction of the current lane change (-1, 0, 1), decisions and started lane changes in this episode.
 EGO_INTEGERS = ("change_direction", "decisions", "lane_changes")
-#: Whether the last substep was dangerously close (ahead, behind), whether the last decision started a lane change.
+#: Soft crash in the last physics step (ahead, behind), lane change started in the last decision.
 EGO_FLAGS = ("soft_crash", "soft_crash_behind", "started_change")
 EVENT_COUNTS = (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
 DONE_FLAGS = ("done", "terminated", "truncated")
@@ -25,7 +25,7 @@ COUNTERS = (keys.SEED, keys.EPISODE, keys.STEP)
 
 
 def state_spec(n: int, m: int, dtype: torch.dtype, memory: dict[str, Any], own_roads: bool = False) -> Composite:
-    """Spec of all that a step writes, but for the done flags and the reward; ``memory`` is the traffic's."""
+    """Spec of everything that a step writes except done flags and reward; ``memory`` is the traffic's."""
     vehicles = _fields((n, m), dtype, keys.VEHICLE_FLOATS, keys.VEHICLE_INTEGERS, keys.VEHICLE_FLAGS)
     ego = _fields((n,), dtype, EGO_FLOATS, EGO_INTEGERS, EGO_FLAGS)
     events = _fields((n, 1), dtype, (), EVENT_COUNTS, keys.END_EVENTS)
@@ -84,7 +84,7 @@ def no_events(zero: Tensor) -> dict[str, Tensor]:
 def pack(
     vehicles: Vehicles, ego: dict[str, Tensor], traffic: TensorDictBase, events: dict[str, Tensor], rest: dict
 ) -> TensorDictBase:
-    """The state as one TensorDict [N]; ``rest`` stands at its top."""
+    """The state as one TensorDict [N]; ``rest`` is not nested."""
     batch, device = ego["distance"].shape, ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
     made = {name: TensorDict._new_unsafe(value, batch_size=batch, device=device) for name, value in nested.items()}
@@ -92,7 +92,7 @@ def pack(
 
 
 def where(rows: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:
-    """``new`` in the rows [N] where ``rows`` holds, ``old`` in the others, leaf by leaf."""
+    """``new`` where ``rows`` [N] is true, ``old`` elsewhere, leaf by leaf."""
 
     def choose(fresh: Tensor, kept: Tensor) -> Tensor:
         return torch.where(rows.reshape(-1, *[1] * (fresh.ndim - 1)), fresh, kept)

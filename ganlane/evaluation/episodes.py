@@ -1,4 +1,4 @@
-"""Running given episodes with a policy, and one row of facts about each of them.
+"""Running given episodes with a policy: one row of facts about each of them.
 
 The rows of the batch drive side by side. A row whose episode has ended takes the next one that has not been driven
 yet, so none waits for the slowest. Once all have been handed out, the last ones move to smaller batches.
@@ -18,10 +18,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.evaluation.tally import EpisodeTally
 
-#: Called after every look at the rows with (episodes finished, episodes in all).
-Progress = Callable[[int, int], None]
+#: Called now and then with (episodes finished, episodes in all).
+OnProgress = Callable[[int, int], None]
 #: Makes the same environment with another number of rows.
 MakeEnv = Callable[[int], EnvBase]
 #: Decisions between two looks at which rows have ended. A look waits for the device and a reset costs about a tenth
@@ -31,6 +30,9 @@ CHECK_EVERY = 8
 SMALL_BATCH = 16
 #: The reason of an episode that something outside the environment ended (a user's own transform).
 OTHER = "other"
+#: Events that are summed over the decisions of an episode, and facts about the ego at its end.
+_SUMMED_EVENTS = (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
+_LAST_EGO = ("distance", "lane_changes", "decisions")
 
 
 def run_episodes(
@@ -38,7 +40,7 @@ def run_episodes(
     policy: TensorDictModuleBase,
     episodes: Sequence[int],
     seed: int,
-    on_progress: Progress | None = None,
+    on_progress: OnProgress | None = None,
     make_smaller: MakeEnv | None = None,
 ) -> pl.DataFrame:
     """Drive exactly ``episodes`` of ``seed``, each to its own end; one row per episode, in the order given.
@@ -76,8 +78,8 @@ def run_episodes(
         shape = list(env.batch_size)
         raise UserError(f"env: batch size {shape} was found, expected [N]; build the environment with N rows.")
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        measures = _Evaluation(env, policy, list(episodes), seed, make_smaller).run(on_progress)
-    return _episode_rows(measures, list(episodes), seed)
+        counts = _Evaluation(env, policy, list(episodes), seed, make_smaller).run(on_progress)
+    return _episode_rows(counts, list(episodes), seed)
 
 
 def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
@@ -89,10 +91,10 @@ def start_of(env: EnvBase, numbers: Sequence[int], seed: int) -> TensorDict:
 
 
 class _Evaluation:
-    """Episodes on their way through the rows of an environment; arguments as :func:`run_episodes` has them.
+    """Episodes on their way through the rows of an environment; arguments as in :func:`run_episodes`.
 
     Attributes:
-        place: [N] int64, where in the list of episodes the one of a row stands; the list's length in spare rows.
+        place: [N] int64, the index in the list of episodes of the one in a row; the list's length in spare rows.
         handed_out: episodes that have been started.
         finished: places and counts of those that have ended.
     """
@@ -116,15 +118,15 @@ class _Evaluation:
         self.handed_out = min(rows, self.total)
         self.finished: list[tuple[Tensor, dict[str, Tensor]]] = []
         self.state: TensorDictBase = env.reset(start_of(env, numbers[:rows], seed))
-        self.tally = EpisodeTally(self.place < self.total)
+        self.counts = _Counts(self.place < self.total)
 
-    def run(self, on_progress: Progress | None) -> dict[str, Tensor]:
+    def run(self, on_progress: OnProgress | None) -> dict[str, Tensor]:
         """Drive all episodes to their ends; the counts by name, each [E], in the order of the episodes."""
         done = 0
         while done < self.total:
             for _ in range(self.check_every):
                 after = self.env.step(self.policy(self.state))
-                self.tally.add(after["next"])
+                self.counts.add(after["next"])
                 self.state = step_mdp(after)
             self._collect()
             done = sum(len(places) for places, _ in self.finished)
@@ -137,29 +139,31 @@ class _Evaluation:
         return {name: torch.cat([counts[name] for _, counts in self.finished])[order] for name in names}
 
     def _collect(self) -> None:
-        """Put aside the counts of the episodes that have ended; their rows are spare then."""
-        ended = ((self.place < self.total) & ~self.tally.driving).nonzero()[:, 0]
+        """Save the counts of the episodes that have ended; their rows are spare then."""
+        ended = ((self.place < self.total) & ~self.counts.driving).nonzero()[:, 0]
         if len(ended) > 0:
-            self.finished.append((self.place[ended].cpu(), self.tally.measures(ended)))
+            self.finished.append((self.place[ended].cpu(), self.counts.of(ended)))
             self.place[ended] = self.total
 
     def _go_on(self) -> None:
         """Give spare rows the next episodes; without any, start the last ones again or leave such rows out."""
-        driving = self.tally.driving.nonzero()[:, 0]
+        driving = self.counts.driving.nonzero()[:, 0]
         rows = self.env.batch_size[0]
         wide = rows > SMALL_BATCH and 2 * len(driving) <= rows
         if wide and self.handed_out == self.total and self.make_smaller is not None:
-            self._shrink(self.make_smaller(len(driving)), driving)
+            self.env = self.make_smaller(len(driving))
+            self.state, self.place = self.state[driving], self.place[driving]
+            self.counts.select(driving)
             return
-        spare = (~self.tally.driving).nonzero()[:, 0]
+        spare = (~self.counts.driving).nonzero()[:, 0]
         new = spare[: self.total - self.handed_out]
         self.place[new] = torch.arange(self.handed_out, self.handed_out + len(new), device=self.place.device)
         self.handed_out += len(new)
         self._reset(new)
-        self.tally.begin(new)
+        self.counts.begin(new)
 
     def _reset(self, new: Tensor) -> None:
-        """Start the episodes of the rows ``new``; spare rows that have ended start theirs again, for nothing."""
+        """Start the episodes of the rows ``new``; spare rows that have ended start theirs again, uncounted."""
         mask = self.state["done"] & (self.place == self.total)[:, None]
         mask[new] = True
         if not bool(mask.any()):
@@ -174,40 +178,73 @@ class _Evaluation:
                 "start it in the rows of the _reset mask, as ganlane.env.HighwayEnv does."
             )
 
-    def _shrink(self, smaller: EnvBase, rows: Tensor) -> None:
-        """Go on with ``rows`` alone, in an environment of as many."""
-        self.env, self.state, self.place = smaller, self.state[rows], self.place[rows]
-        self.tally.keep(rows)
+
+class _Counts:
+    """Sums and last values of N rows, each until its first end; later decisions do not count.
+
+    :meth:`add` reads nothing back to the host, so it never waits for the device.
+
+    Args:
+        driving: [N] bool, the rows that count from the start.
+    """
+
+    def __init__(self, driving: Tensor) -> None:
+        self.driving = driving.clone()
+        self._sums: dict[str, Tensor] = {}
+        self._last: dict[str, Tensor] = {}
+
+    def add(self, after: TensorDictBase) -> None:
+        """Count one decision, from the tensordict after it (``next``)."""
+        events, ego, terms = after[keys.EVENTS], after[keys.EGO], after.get(keys.REWARD_TERMS, None)
+        summed = {"reward": after[keys.REWARD]}
+        summed |= {} if terms is None else {f"reward_{name}": value for name, value in terms.items()}
+        summed |= {name: events[name] for name in _SUMMED_EVENTS}
+        for name, value in summed.items():
+            flat = value.reshape(value.shape[0]).double()
+            counted = torch.where(self.driving, flat, torch.zeros_like(flat))
+            self._sums[name] = self._sums[name] + counted if name in self._sums else counted
+        last = {name: ego[name] for name in _LAST_EGO}
+        last |= {"duration_s": after[keys.STEP].double() * keys.PHYSICS_STEP_S}
+        last |= {name: events[name].squeeze(-1) for name in keys.END_EVENTS}
+        for name, value in last.items():
+            before = self._last.get(name)
+            self._last[name] = value.clone() if before is None else torch.where(self.driving, value, before)
+        self.driving = self.driving & ~after["done"].squeeze(-1)
+
+    def of(self, rows: Tensor) -> dict[str, Tensor]:
+        """All counts of ``rows`` [K] (int64) by name, each [K], on the CPU."""
+        return {name: value[rows].cpu() for name, value in (self._sums | self._last).items()}
+
+    def begin(self, rows: Tensor) -> None:
+        """Count from 0 again in ``rows`` (int64), in which other episodes start."""
+        self.driving[rows] = True
+        for value in self._sums.values():
+            value[rows] = 0.0
+
+    def select(self, rows: Tensor) -> None:
+        """Continue with ``rows`` [K] (int64) alone, in that order."""
+        self.driving = self.driving[rows]
+        self._sums = {name: value[rows] for name, value in self._sums.items()}
+        self._last = {name: value[rows] for name, value in self._last.items()}
 
 
-def _episode_rows(measures: dict[str, Tensor], numbers: list[int], seed: int) -> pl.DataFrame:
-    """The rows of the episodes ``numbers`` from their counts (see :func:`run_episodes` for the columns)."""
-    counts = {name: value.numpy() for name, value in measures.items()}
+def _episode_rows(counts: dict[str, Tensor], numbers: list[int], seed: int) -> pl.DataFrame:
+    """The rows of the episodes ``numbers``; see :func:`run_episodes` for the columns."""
     terms = [name for name in counts if name.startswith("reward_")]
-    integer = pl.Int64
-    frame = pl.DataFrame({"episode": numbers, **counts})
-    return frame.select(
+    ends = (pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS)
+    distance, duration, integer = pl.col("distance").cast(pl.Float64), pl.col("duration_s"), pl.Int64
+    return pl.DataFrame({"episode": numbers, **{name: value.numpy() for name, value in counts.items()}}).select(
         pl.col("episode").cast(integer),
         pl.lit(seed, integer).alias("seed"),
-        pl.coalesce(*(_named_where_true(name) for name in keys.END_EVENTS), pl.lit(OTHER)).alias("reason"),
+        pl.coalesce(*ends, pl.lit(OTHER)).alias("reason"),
         pl.col(keys.SOFT_CRASH).cast(integer),
         (pl.col(keys.SOFT_CRASH) > 0).alias("had_soft_crash"),
         pl.col(keys.SOFT_CRASH_BEHIND).cast(integer),
         pl.col("reward", *terms),
         pl.col("decisions").cast(integer),
-        pl.col("duration_s"),
-        pl.col("distance").cast(pl.Float64).alias("distance_m"),
-        _mean_speed().alias("mean_speed_mps"),
+        duration,
+        distance.alias("distance_m"),
+        # Null for an episode that ended before it drove (off the road at once).
+        pl.when(duration > 0).then(distance / duration).alias("mean_speed_mps"),
         pl.col("lane_changes").cast(integer),
     )
-
-
-def _mean_speed() -> pl.Expr:
-    """Distance over time, m/s; null for an episode that ended before it drove (off the road at once)."""
-    speed = pl.col("distance").cast(pl.Float64) / pl.col("duration_s")
-    return pl.when(pl.col("duration_s") > 0).then(speed)
-
-
-def _named_where_true(event: str) -> pl.Expr:
-    """The event's name where it happened, null elsewhere."""
-    return pl.when(pl.col(event)).then(pl.lit(event))

@@ -1,9 +1,12 @@
-"""What a measuring command leaves in its run folder: ``results.json`` and ``episodes.parquet``."""
+"""What a measuring command leaves in its run folder: ``results.json`` with its origin, and ``episodes.parquet``."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -13,8 +16,34 @@ import numpy as np
 import polars as pl
 import torch
 
-from ganlane.evaluation.provenance import code_version, machine
-from ganlane.files import atomic_path, write_json
+from ganlane._version import __version__
+from ganlane.files import PACKAGE, atomic_path, write_json
+
+
+def write_results(
+    folder: str | Path, numbers: Mapping[str, Any], config: Mapping[str, Any], seeds: Mapping[str, Any]
+) -> Path:
+    """Write ``results.json`` into ``folder`` atomically and return its path.
+
+    Args:
+        folder: of the run.
+        numbers: the command's own results, for instance ``{"rows": evaluation_rows(...)}``.
+        config: the whole configuration, plain or dataclasses.
+        seeds: the seeds and episode numbers behind the numbers.
+    """
+    path = Path(folder) / "results.json"
+    origin = {"seeds": seeds, "config": config, "code": code_version(), "machine": machine()}
+    written = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    write_json(path, plain({**numbers, **origin, "written": written}))
+    return path
+
+
+def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
+    """Write one row per episode as ``episodes.parquet`` into ``folder`` atomically and return its path."""
+    path = Path(folder) / "episodes.parquet"
+    with atomic_path(path) as part:
+        episodes.write_parquet(part)
+    return path
 
 
 def plain(value: Any) -> Any:
@@ -32,38 +61,58 @@ def plain(value: Any) -> Any:
     return value if value is None or isinstance(value, (bool, int, str)) else str(value)
 
 
-def results_record(numbers: Mapping[str, Any], config: Mapping[str, Any], seeds: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of ``results.json``: the numbers, and all it takes to know where they come from.
+def code_version() -> dict[str, Any]:
+    """``version`` of the package, and ``revision`` and ``modified`` where it lies in a checkout of its own.
 
-    Args:
-        numbers: the command's own results, for instance ``{"rows": evaluation_rows(...)}``.
-        config: the whole configuration, plain or dataclasses.
-        seeds: the seeds and episode numbers behind the numbers.
+    An installed copy inside somebody else's checkout has no revision: git must know the package's own file.
     """
-    return plain(
-        {
-            **numbers,
-            "seeds": seeds,
-            "config": config,
-            "code": code_version(),
-            "machine": machine(),
-            "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        }
+    version: dict[str, Any] = {"version": __version__, "revision": None, "modified": None}
+    if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
+        version["revision"] = _git("rev-parse", "HEAD")
+        version["modified"] = bool(_git("status", "--porcelain", "--untracked-files=no", "--", "."))
+    return version
+
+
+def _git(*arguments: str) -> str | None:
+    """Output of a git command in the package's folder; None where git is absent or fails."""
+    command = ["git", "-C", str(PACKAGE), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def machine() -> dict[str, Any]:
+    """CPU, usable cores, torch's threads, system, accelerator (or None), and the versions that ran."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {
+        "cpu": _cpu_name(),
+        "cores": usable,
+        "threads": torch.get_num_threads(),
+        "system": platform.platform(),
+        "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def machine_sentence(threads: Sequence[int]) -> str:
+    """Where and on which code the figures were taken, without host names or paths; ``threads`` are torch's."""
+    here, code = machine(), code_version()
+    usable = f"{here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
+    accelerator = f", {here['accelerator']}" if here["accelerator"] else ""
+    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    return (
+        f"{here['cpu']}, {usable}{accelerator}; Python {here['python']}, torch {here['torch']} (threads: "
+        f"{', '.join(map(str, threads))}); ganlane {code['version']}{revision}."
     )
 
 
-def write_results(
-    folder: str | Path, numbers: Mapping[str, Any], config: Mapping[str, Any], seeds: Mapping[str, Any]
-) -> Path:
-    """Write ``results.json`` into ``folder`` atomically and return its path (see :func:`results_record`)."""
-    path = Path(folder) / "results.json"
-    write_json(path, results_record(numbers, config, seeds))
-    return path
-
-
-def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
-    """Write one row per episode as ``episodes.parquet`` into ``folder`` atomically and return its path."""
-    path = Path(folder) / "episodes.parquet"
-    with atomic_path(path) as part:
-        episodes.write_parquet(part)
-    return path
+def _cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text(errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

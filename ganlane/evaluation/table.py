@@ -1,134 +1,156 @@
-"""The table of an evaluation: one row per agent and traffic, from one row per episode."""
+"""Tables as text, aligned for a terminal or in Markdown, and the tables of an evaluation."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-import polars as pl
+Row = Mapping[str, Any]
 
-from ganlane import keys
-from ganlane.evaluation.counts import clopper_pearson, rate_per_1000_km
-from ganlane.evaluation.paired import paired_lead, paired_rewards
-from ganlane.evaluation.score import NormalizedScore, no_score, normalized_percent
-from ganlane.evaluation.statistics import mean_interval
-
-#: The two drivers that give the normalised score its scale.
-SCALE_TOP = "mobil"
-SCALE_BOTTOM = "random_legal"
-
-Row = dict[str, Any]
+NOTHING = "-"
 
 
-def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
-    """Rows of the ``evaluate`` command, in the order in which agents and traffics first appear.
+def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
+    """A text table of headings (the first line) and rows, with a ruler between them.
 
-    Args:
-        episodes: what :func:`ganlane.evaluation.run_episodes` returns, with ``agent`` and ``traffic`` added,
-            for every pair, one below the other.
-
-    Returns:
-        Per pair ``agent, traffic, episodes``; the counts ``goal, hard_crash, out_of_road, timeout,
-        scene_end`` (how episodes ended) and ``soft_crash`` (episodes with at least one),
-        ``soft_crash_onsets``, ``soft_crash_behind_onsets`` and the latter's mean ``soft_crash_behind_per_episode``;
-        ``mean_reward`` and ``reward_sd``;
-        ``mean_speed_mps`` (distance over time of all episodes together); ``lane_changes_per_km``;
-        ``distance_km``; ``hard_crash_share`` and ``out_of_road_share`` of the episodes (exact intervals);
-        ``crashes_per_1000_km`` (hard crashes);
-        ``minus_mobil`` (paired difference of the mean reward to MOBIL's on the same episodes);
-        ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with ``_ci``
-        holds the 95 % interval of its namesake as ``[low, high]``, or None.
+    The first ``names`` columns are left-aligned, the others right-aligned.
     """
-    pairs = episodes.partition_by(["agent", "traffic"], maintain_order=True)
-    return [_row(pair, episodes) for pair in pairs]
+    widths = [max(map(len, column)) for column in zip(*lines)]
+
+    def line(cells: Sequence[str]) -> str:
+        fitted = [cell.ljust(w) if i < names else cell.rjust(w) for i, (cell, w) in enumerate(zip(cells, widths))]
+        return "  ".join(fitted).rstrip()
+
+    return "\n".join([line(lines[0]), "  ".join("-" * width for width in widths), *map(line, lines[1:])])
 
 
-def _row(pair: pl.DataFrame, episodes: pl.DataFrame) -> Row:
-    """The row of one agent on one traffic; ``episodes`` holds those of the drivers that give the scale."""
-    agent, traffic = pair["agent"][0], pair["traffic"][0]
-    row: Row = {"agent": agent, "traffic": traffic, "episodes": pair.height}
-    row |= _outcomes(pair) | _returns(pair) | _driving(pair)
-    same_traffic = episodes.filter(pl.col("traffic") == traffic)
-    return row | _lead(pair, same_traffic) | _score_fields(_score(pair, same_traffic))
+def number(value: float | None, digits: int = 3) -> str:
+    """A cell with a number; ``-`` where there is none."""
+    return NOTHING if value is None else f"{value:.{digits}f}"
 
 
-def _outcomes(pair: pl.DataFrame) -> Row:
-    """How the episodes ended, and soft crashes on the way."""
-    ended = {reason: int((pair["reason"] == reason).sum()) for reason in keys.END_EVENTS}
-    return {
-        "goal": ended["goal"],
-        "hard_crash": ended["hard_crash"],
-        "soft_crash": int(pair["had_soft_crash"].sum()),
-        "out_of_road": ended["out_of_road"],
-        "timeout": ended["timeout"],
-        "scene_end": ended["scene_end"],
-        "soft_crash_onsets": int(pair["soft_crash"].sum()),
-        "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
-        **_mean_fields("soft_crash_behind_per_episode", pair["soft_crash_behind"].to_numpy()),
+def with_interval(row: Row, key: str, digits: int = 3) -> str:
+    """A cell with ``row[key]``, followed by ``[low, high]`` where the row has an interval for it (``key_ci``)."""
+    text, interval = number(row.get(key), digits), row.get(f"{key}_ci")
+    return text if not interval else f"{text} [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, headings, lines of cells, and notes.
+
+    The first ``names`` columns hold words and are set to the left, the others hold numbers and are set to the right.
+    """
+
+    title: str
+    headings: Sequence[str]
+    lines: Sequence[Sequence[str]]
+    names: int = 1
+    notes: Sequence[str] = ()
+
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        rows: Sequence[Mapping[str, Any]],
+        columns: Mapping[str, Callable[[Any], str]],
+        names: int = 1,
+        notes: Sequence[str] = (),
+    ) -> Table:
+        """One line per row; ``columns`` maps each heading to the function that makes a cell of a row."""
+        lines = [[cell(row) for cell in columns.values()] for row in rows]
+        return cls(title, list(columns), lines, names, notes)
+
+    def text(self) -> str:
+        """Aligned columns, with the notes below."""
+        table = aligned([self.headings, *self.lines], self.names)
+        return "\n".join([self.title, "", table, *self.notes])
+
+    def markdown(self, heading: bool = True) -> str:
+        """The title as a heading (unless turned off), the table, and the notes below."""
+        rulers = ["---" if i < self.names else "---:" for i in range(len(self.headings))]
+        lines = ["| " + " | ".join(line) + " |" for line in [self.headings, rulers, *self.lines]]
+        parts = [*([f"### {self.title}"] if heading else []), "\n".join(lines)]
+        return "\n\n".join([*parts, "\n".join(self.notes)] if self.notes else parts)
+
+
+def significant(value: float | None) -> str:
+    """Three significant digits, without exponent."""
+    if value is None:
+        return NOTHING
+    rounded = float(f"{value:.3g}")
+    whole = len(str(int(abs(rounded))))
+    return f"{rounded:.{max(0, 3 - whole)}f}" if abs(rounded) >= 1 else f"{rounded:.3g}"
+
+
+def count(value: float | None) -> str:
+    """Three significant digits, with k, M and G: ``612``, ``54.3 k``, ``1.23 M``."""
+    if value is None:
+        return NOTHING
+    for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if abs(value) >= limit * 0.9995:
+            return f"{significant(value / limit)}{unit}"
+    return significant(value)
+
+
+def percent(share: float | None, digits: int = 0) -> str:
+    """A share as per cent."""
+    return NOTHING if share is None else f"{100 * share:.{digits}f} %"
+
+
+def _plain(key: str) -> Callable[[Row], str]:
+    return lambda row: str(row.get(key, NOTHING))
+
+
+def _estimate(key: str, digits: int) -> Callable[[Row], str]:
+    return lambda row: with_interval(row, key, digits)
+
+
+#: Heading and cell of each column of an evaluation; the first two are names, the others numbers.
+_COLUMNS: Mapping[str, Callable[[Row], str]] = {
+    "agent": _plain("agent"),
+    "traffic": _plain("traffic"),
+    "episodes": _plain("episodes"),
+    "goal": _plain("goal"),
+    "hard": _plain("hard_crash"),
+    "soft": _plain("soft_crash"),
+    "off road": _plain("out_of_road"),
+    "time-out": _plain("timeout"),
+    "scene end": _plain("scene_end"),
+    "mean reward [95 %]": _estimate("mean_reward", 1),
+    "minus MOBIL, paired": _estimate("minus_mobil", 1),
+    "m/s": _estimate("mean_speed_mps", 1),
+    "changes/km": _estimate("lane_changes_per_km", 2),
+    "% of MOBIL [95 %]": _estimate("normalized_percent", 0),
+    "crashes/1000 km [95 %]": _estimate("crashes_per_1000_km", 1),
+}
+#: Columns that are left out where no row has anything in them.
+_OPTIONAL = ("time-out", "scene end", "minus MOBIL, paired")
+
+
+def text_table(rows: Sequence[Row]) -> str:
+    """The rows of :func:`ganlane.evaluation.evaluation_rows`, and a line for each reason why a score is missing."""
+    columns = {
+        heading: cell
+        for heading, cell in _COLUMNS.items()
+        if heading not in _OPTIONAL or any(cell(row) not in ("0", NOTHING) for row in rows)
     }
+    reasons: dict[str, dict[str, None]] = {}
+    for row in rows:
+        reason = row.get("normalized_percent_reason")
+        if reason is not None:
+            reasons.setdefault(reason, {})[row["traffic"]] = None
+    notes = [f"% of MOBIL on {', '.join(traffics)}: none, {reason}" for reason, traffics in reasons.items()]
+    table = aligned([list(columns), *([cell(row) for cell in columns.values()] for row in rows)], names=2)
+    return "\n".join([table, *notes])
 
 
-def _mean_fields(key: str, values: npt.ArrayLike) -> Row:
-    """Mean of one value per episode, with its bootstrap interval."""
-    mean = mean_interval(values)
-    return {key: mean.value, f"{key}_ci": mean.interval}
-
-
-def _returns(pair: pl.DataFrame) -> Row:
-    """Mean return with its interval, and the returns' standard deviation as the paper gives it."""
-    returns = pair["reward"].to_numpy()
-    spread = float(np.std(returns, ddof=1)) if len(returns) > 1 else None
-    return {**_mean_fields("mean_reward", returns), "reward_sd": spread}
-
-
-def _driving(pair: pl.DataFrame) -> Row:
-    """Speed, lane changes and crashes, related to the time and the distance of all episodes together."""
-    distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
-    crashes = int((pair["reason"] == "hard_crash").sum())
-    share, rate = clopper_pearson(crashes, pair.height), rate_per_1000_km(crashes, distance_m)
-    off_road = clopper_pearson(int((pair["reason"] == "out_of_road").sum()), pair.height)
-    changes = int(pair["lane_changes"].sum())
-    return {
-        "mean_speed_mps": distance_m / duration_s if duration_s > 0 else None,
-        "lane_changes_per_km": changes / distance_m * 1000.0 if distance_m > 0 else None,
-        "distance_km": distance_m / 1000.0,
-        "hard_crash_share": share.value,
-        "hard_crash_share_ci": share.interval,
-        "out_of_road_share": off_road.value,
-        "out_of_road_share_ci": off_road.interval,
-        "crashes_per_1000_km": None if rate is None else rate.value,
-        "crashes_per_1000_km_ci": None if rate is None else rate.interval,
-    }
-
-
-def _lead(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
-    """What the agent earns more than MOBIL on the episodes that both drove; None for MOBIL itself or without it."""
-    mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
-    if pair["agent"][0] == SCALE_TOP or mobil.height == 0:
-        return {"minus_mobil": None, "minus_mobil_ci": None}
-    lead, _ = paired_lead(pair, mobil)
-    return {"minus_mobil": lead.value if lead else None, "minus_mobil_ci": lead.interval if lead else None}
-
-
-def _score_fields(score: NormalizedScore) -> Row:
-    """The columns of the normalised score."""
-    return {
-        "normalized_percent": score.percent,
-        "normalized_percent_ci": score.interval,
-        "normalized_percent_reason": score.reason,
-    }
-
-
-def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
-    """The normalised score of one agent, from the episodes that it shares with the two drivers of the scale."""
-    drivers = [pair]
-    for name in (SCALE_TOP, SCALE_BOTTOM):
-        driver = same_traffic.filter(pl.col("agent") == name)
-        if driver.height == 0:
-            return no_score(f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing")
-        drivers.append(driver)
-    agent, mobil, random_legal = paired_rewards(*drivers)
-    if len(agent) < 2:
-        return no_score("fewer than two episodes are shared by the drivers")
-    return normalized_percent(agent, mobil, random_legal)
+def paired_table(rows: Sequence[Row]) -> str:
+    """The rows of :func:`ganlane.evaluation.paired_rows`, each lead with its sign."""
+    lines = [["paired lead", "traffic", "reward [95 %]", "verdict"]]
+    for row in rows:
+        sign = "" if row["lead"] < 0.0 else "+"
+        lead = sign + with_interval(row, "lead", 1)
+        lines.append([f"{row['agent']} over {row['over']}", row["traffic"], lead, row["verdict"]])
+    return aligned(lines, names=2)

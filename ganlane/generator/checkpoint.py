@@ -5,25 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
-from ganlane.files import load_weights, save_weights
+from ganlane.files import CHECKPOINTS, load_weights, save_weights
 from ganlane.generator.networks import Generator
 from ganlane.generator.scores import Metrics
-from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
-from ganlane.paths import CHECKPOINTS
+from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
 
 KIND = "generator"
-Preset = Literal["paper", "calibrated"]
 #: Inputs in addition to the motion, by preset.
 PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
 #: Sizes that older files do not have; they get their defaults.
-_NAMED_LATER = {"differences"}
+_ADDED_LATER = {"differences"}
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,6 @@ class FitResult:
         """Write weights and metadata, atomically.
 
         Args:
-            path: where to write.
             folds: result of :func:`ganlane.generator.cross_validate`, if it was called.
             code: the code's version in more detail than the package's number.
         """
@@ -82,10 +79,9 @@ def shipped_generator(preset: Preset) -> Path:
 
 
 def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Generator, dict[str, Any]]:
-    """The generator in evaluation mode, without gradients, and its metadata.
+    """The generator in evaluation mode, without gradients, and its metadata, as :meth:`FitResult.save` wrote them.
 
     Args:
-        path: what :meth:`FitResult.save` wrote.
         preset: the required one; None accepts any.
 
     Raises:
@@ -97,7 +93,7 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         raise UserError(
             f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one."
         )
-    generator = _build(path, metadata, tensors)
+    generator = _generator_of(path, metadata.get("sizes"), tensors)
     if generator.sizes.extra_inputs != PRESET_INPUTS[found]:
         raise UserError(
             f"{path}: takes {generator.sizes.extra_inputs} further inputs, expected {PRESET_INPUTS[found]} for the "
@@ -108,13 +104,11 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
     return generator.eval().requires_grad_(False), metadata
 
 
-def _build(path: str | Path, metadata: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Generator:
+def _generator_of(path: str | Path, sizes: Any, tensors: Mapping[str, Tensor]) -> Generator:
     """A generator of the stored sizes with the stored weights."""
-    sizes: Any = metadata.get("sizes")
     kinds = {field.name: type(field.default) for field in fields(GeneratorSizes)}
-    needed = set(kinds) - _NAMED_LATER
-    whole = isinstance(sizes, dict) and needed <= set(sizes) <= set(kinds)
-    if not whole or not all(_is_size(value, kinds[name]) for name, value in sizes.items()):
+    complete = isinstance(sizes, dict) and set(kinds) - _ADDED_LATER <= set(sizes) <= set(kinds)
+    if not complete or not all(_is_size(value, kinds[name]) for name, value in sizes.items()):
         raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(kinds)}); fit it again.")
     try:
         with torch.random.fork_rng(devices=[]):

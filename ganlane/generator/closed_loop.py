@@ -28,11 +28,9 @@ from torch import Tensor
 from ganlane.generator.networks import Generator, Observation
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import IdmParameters
+from ganlane.sim.idm import IdmParameters, following_acceleration
 from ganlane.sim.neighbours import Scene, leader, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3
@@ -54,11 +52,6 @@ class History(NamedTuple):
 
     motions: tuple[Tensor, ...]
     displacement: Tensor
-
-    @property
-    def projections(self) -> Tensor:
-        """The motions as one tensor [N, M, observed - 1, 4H]."""
-        return torch.stack(self.motions, dim=-2)
 
 
 def start(generator: Generator, displacement: Tensor) -> History:
@@ -84,10 +77,8 @@ def push(generator: Generator, history: History, displacement: Tensor) -> tuple[
     return History((*history.motions[1:], new), displacement), difference
 
 
-def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor | None = None) -> Observation:
+def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor) -> Observation:
     """The generator's input after :func:`push`."""
-    if extra is None:
-        extra = difference[..., :0]
     position = torch.stack([vehicles.x, vehicles.y], dim=-1)
     return Observation(history.motions, history.displacement, difference, position, vehicles.valid, extra)
 
@@ -141,11 +132,11 @@ def paper_step(
     """One step of the paper's preset: vehicles 0.1 s later, their history, and the rest of the plan.
 
     Without a plan (``execute_k`` = 1) one decoder step is run and driven. With one, ``execute_k`` steps are run
-    and used by the vehicles whose last plan is finished (each at its own time).
+    for the vehicles whose last plan is finished.
     """
     history, difference = push(generator, history, displacement_of(vehicles))
     steps = 1 if plan is None else plan.ahead.shape[-2]
-    predicted = generator(observe(history, difference, vehicles), noise, steps)
+    predicted = generator(observe(history, difference, vehicles, difference[..., :0]), noise, steps)
     if plan is not None:
         finished = plan.left <= 0
         predicted = torch.where(finished[..., None, None], predicted, plan.ahead)
@@ -198,12 +189,6 @@ def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
-def washout(residual: Tensor, mean: Tensor, washout_s: float) -> tuple[Tensor, Tensor]:
-    """``residual`` minus its exponential mean, and the updated mean; a constant residual decays to 0."""
-    mean = mean + (PHYSICS_STEP_S / washout_s) * (residual - mean)
-    return residual - mean, mean
-
-
 def inside_lane(residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float) -> Tensor:
     """Lateral ``residual`` [N, M] in m/s2 without what would move the body out of its lane.
 
@@ -220,12 +205,6 @@ def inside_lane(residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor
     return residual * ((room - outwards) / _FADE_M).clamp(0.0, 1.0)
 
 
-def bounded(outputs: Tensor, largest: tuple[float, float]) -> Tensor:
-    """Outputs [..., 2] softly limited to ``largest``, m/s2."""
-    limit = outputs.new_tensor(largest)
-    return limit * torch.tanh(outputs / limit)
-
-
 def anchored_step(
     generator: Generator,
     vehicles: Vehicles,
@@ -239,8 +218,7 @@ def anchored_step(
     Args:
         generator: with ``extra_inputs`` = 4.
         vehicles: [N, M]; ``target_lane`` is the lane to keep or to change to, ``desired_speed`` is the driver's own.
-        road: lanes; one per row in recorded scenes.
-        memory: of the previous step.
+        road: one per row in recorded scenes.
         noise: latent vectors [N, M, Z]; zeros give the mean driver.
     """
     p = parameters
@@ -254,7 +232,10 @@ def anchored_step(
     extra = extra_inputs(scene, anchor_x, offset)
     observation = observe(history, difference, vehicles, extra if p.further_inputs else torch.zeros_like(extra))
     outputs = generator.decode(generator.summarise(observation), noise, observation, 1)[..., 0, :]
-    residual, mean = washout(bounded(outputs, p.residual), memory.mean, p.washout_s)
+    limit = outputs.new_tensor(p.residual)
+    residual = limit * torch.tanh(outputs / limit)
+    mean = memory.mean + (PHYSICS_STEP_S / p.washout_s) * (residual - memory.mean)
+    residual = residual - mean
     room = 0.5 * (road.lane_width_m - vehicles.width) - _MARGIN_M
     residual_y = inside_lane(residual[..., 1], offset, velocity[..., 1], room, p.lane_damping)
     velocity_x = velocity[..., 0] + (anchor_x + residual[..., 0]) * PHYSICS_STEP_S

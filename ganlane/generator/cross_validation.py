@@ -10,18 +10,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
 
-from ganlane.data import scene_lane_widths
 from ganlane.files import atomic_path
 from ganlane.generator.checkpoint import FitResult
-from ganlane.generator.fit import Config, Task, fit_key, fit_result, fit_task, preset_of
+from ganlane.generator.fit import Config, Split, Task, assign_folds, fit_key, fit_result, fit_task, split_for_fit
 from ganlane.generator.fit_calibrated import CalibratedTask
 from ganlane.generator.forecasts import baseline_forecasts, calibrated_forecasts, idm_forecasts, paper_forecasts
-from ganlane.generator.groups import save_arrays
 from ganlane.generator.loop import FitLoop, OnProgress
 from ganlane.generator.scores import (
     BASELINE,
@@ -32,10 +30,9 @@ from ganlane.generator.scores import (
     long_rollout_scores,
     open_loop_scores,
 )
-from ganlane.generator.segments import segment_sources
-from ganlane.generator.splits import Split, assign_folds, split_for_fit
-from ganlane.generator.windows import OBSERVED_POSITIONS, Windows, cut_windows, join_windows, scene_tracks
-from ganlane.parameters.generator import CalibratedConfig, LoopConfig
+from ganlane.generator.segments import OBSERVED_POSITIONS, scene_tracks
+from ganlane.generator.windows import Windows, cut_windows, group_windows, join_windows, save_arrays
+from ganlane.parameters.generator import CalibratedConfig
 
 #: Frames between the starts of two scored windows, the same for both presets.
 STRIDE = 3
@@ -53,8 +50,7 @@ OnFit = Callable[[str], None]
 OnFold = Callable[[int, FitResult], None]
 
 
-@dataclass(frozen=True)
-class HeldOut:
+class HeldOut(NamedTuple):
     """Windows of held-out scenes and all forecasts of them."""
 
     windows: Windows
@@ -74,38 +70,33 @@ class ScoredFit:
     long: HeldOut | None
 
 
-def fit_and_forecast(
-    config: Config, split: Split, widths: dict[str, float], folder: Path, on_progress: OnProgress | None = None
-) -> ScoredFit:
+def fit_and_forecast(config: Config, split: Split, folder: Path, on_progress: OnProgress | None = None) -> ScoredFit:
     """Fit to ``split`` and forecast its held-out scenes; resumes from what ``folder`` holds."""
-    task = fit_task(config, split, widths)
-    path = folder / f"{preset_of(config)}_{fit_key(config, split)}.pt"
+    task = fit_task(config, split)
+    path = folder / f"{config.preset}_{fit_key(config, split)}.pt"
     loop = FitLoop(task, config.loop, path)
     loop.run(on_progress)
-    short, long = _forecasts(path, task, split, widths, config.sizes.predicted, STRIDE), None
+    short = _forecasts(path, task, split, config.sizes.predicted, STRIDE)
     frames = OBSERVED_POSITIONS + LONG_STEPS
-    if isinstance(config, CalibratedConfig) and any(
-        (scene.present.sum(0) >= frames).any() for scene in split.held_out
-    ):
-        long = _forecasts(path, task, split, widths, LONG_STEPS, LONG_STRIDE)
-    return ScoredFit(task, loop, short, long)
+    far = isinstance(task, CalibratedTask) and any((each.present.sum(0) >= frames).any() for each in split.held_out)
+    return ScoredFit(task, loop, short, _forecasts(path, task, split, LONG_STEPS, LONG_STRIDE) if far else None)
 
 
-def _forecasts(path: Path, task: Task, split: Split, widths: dict[str, float], steps: int, stride: int) -> HeldOut:
+def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) -> HeldOut:
     """Forecasts of the held-out windows by the generator, IDM and all baselines, saved next to the fit's state."""
     path = path.with_name(f"{path.stem}_{steps}.npz")
     windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
     if path.exists():
         with np.load(path, allow_pickle=False) as kept:
             return HeldOut(windows, dict(kept))
-    sources = segment_sources(split.held_out, widths)
     if isinstance(task, CalibratedTask):
         samples = 1 if steps == LONG_STEPS else SAMPLES  # the best of 20 is for short forecasts only
-        own = calibrated_forecasts(task.generator, sources, steps, stride, task.config, samples)
+        own = calibrated_forecasts(task.generator, split.held_out, steps, stride, task.config, samples)
     else:
-        own = paper_forecasts(task.generator, windows, task.config.group_size, task.config.seed)
+        groups = group_windows(windows, task.config.group_size, task.config.seed)
+        own = paper_forecasts(task.generator, windows, groups, task.config.seed)
     baselines = baseline_forecasts(windows, split.fitted + split.validation, stride)
-    every = own | baselines | idm_forecasts(sources, steps, stride)
+    every = own | baselines | idm_forecasts(split.held_out, steps, stride)
     forecasts = {name: positions.astype(np.float32) for name, positions in every.items()}
     with atomic_path(path) as part, part.open("wb") as file:
         save_arrays(file, forecasts)
@@ -115,7 +106,7 @@ def _forecasts(path: Path, task: Task, split: Split, widths: dict[str, float], s
 def pooled(parts: list[HeldOut]) -> tuple[Windows, Forecasts, np.ndarray]:
     """All folds' windows and forecasts, and the fold [W] of each window."""
     forecasts = {name: np.concatenate([part.forecasts[name] for part in parts]) for name in parts[0].forecasts}
-    fold = np.concatenate([np.full(len(part.windows), number) for number, part in enumerate(parts)])
+    fold = np.repeat(np.arange(len(parts)), [len(part.windows) for part in parts])
     return join_windows([part.windows for part in parts]), forecasts, fold
 
 
@@ -131,8 +122,8 @@ def cross_validate(
 ) -> dict[str, Any]:
     """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
 
-    Within a fold a part of the other scenes is for early stopping. ``on_fold`` gets each fold's generator, with
-    driving statistics of its other scenes only. ``source`` names the recordings in its metadata.
+    ``on_fold`` gets each fold's generator, with driving statistics of its other scenes only; ``source`` names the
+    recordings in its metadata.
 
     Returns:
         ``open_loop`` (:func:`ganlane.generator.scores.open_loop_scores`), ``splits`` (names of the scenes of each
@@ -142,34 +133,38 @@ def cross_validate(
     Raises:
         UserError: too many folds for the recordings.
     """
-    scenes, widths = scene_tracks(frame), scene_lane_widths(frame)
+    scenes = scene_tracks(frame)
     splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
     fits: list[ScoredFit] = []
     for number, split in enumerate(splits, start=1):
         if on_fit is not None:
             on_fit(f"fold {number} of {folds}")
-        fit = fit_and_forecast(config, split, widths, folder, on_progress)
+        fit = fit_and_forecast(config, split, folder, on_progress)
         fits.append(fit)
         if on_fold is not None:
             others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
-            on_fold(number, fit_result(fit.task, fit.loop, split, frame, widths, source, {}, others))
+            on_fold(number, fit_result(fit.task, fit.loop, split, frame, source, {}, others))
     scores: dict[str, Any] = {
         "splits": [split.names for split in splits],
         "open_loop": open_loop_scores(*pooled([fit.short for fit in fits])),
     }
     long = [fit.long for fit in fits if fit.long is not None]
     if long:
-        scores["rollout"] = long_rollout_scores(*pooled(long)[:2])
+        windows, forecasts, _ = pooled(long)
+        scores["rollout"] = long_rollout_scores(windows, forecasts)
     return scores
 
 
 def variants(config: Config) -> dict[str, Config]:
     """Settings of the ablations by name, with a quarter of the updates; the first is the preset itself."""
-    short: dict[str, int] = {
-        name: max(1, getattr(config.loop, name) // BUDGET) for name in ("updates", "evaluate_every", "warmup")
-    }
-    loop: LoopConfig = replace(config.loop, **short)  # type: ignore[arg-type]  # all of these are whole numbers
-    config = replace(config, loop=loop)
+    loop = config.loop
+    shorter = replace(
+        loop,
+        updates=max(1, loop.updates // BUDGET),
+        evaluate_every=max(1, loop.evaluate_every // BUDGET),
+        warmup=max(1, loop.warmup // BUDGET),
+    )
+    config = replace(config, loop=shorter)
     if isinstance(config, CalibratedConfig):
         return {
             "as it is": config,
@@ -206,23 +201,25 @@ def ablate(
         all predicted steps and over the first 0.4 s (``ade_change_percent_0.4_s``), and for the calibrated preset
         ``rmse_5_s_ratio``, the RMSE after 5 s divided by constant velocity's.
     """
-    split, widths = split_for_fit(scene_tracks(frame), held_out), scene_lane_widths(frame)
+    split = split_for_fit(scene_tracks(frame), held_out)
     rows = {}
     for name, variant in variants(config).items():
         if on_fit is not None:
             on_fit(name)
-        rows[name] = _ablation_row(fit_and_forecast(variant, split, widths, folder, on_progress))
+        rows[name] = _ablation_row(fit_and_forecast(variant, split, folder, on_progress))
     return rows
 
 
 def _ablation_row(fit: ScoredFit) -> dict[str, Any]:
-    errors = errors_of(fit.short.forecasts, fit.short.windows.future)
-    kinds = [kind for kind in errors if kind in ("mean", "single") or kind.startswith("best_of")]
-    errors = {kind: errors[kind] for kind in (*kinds, BASELINE)}
+    kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
+    errors = errors_of({kind: fit.short.forecasts[kind] for kind in kinds}, fit.short.windows.future)
+    all_steps = displacement_errors(errors)
     early = displacement_errors({kind: values[:, :_COMMON_STEPS] for kind, values in errors.items()})
-    whole = displacement_errors(errors)
-    row = {"windows": whole["windows"], "ade_change_percent": whole["ade_change_percent"]}
-    row["ade_change_percent_0.4_s"] = early["ade_change_percent"]
+    row = {
+        "windows": all_steps["windows"],
+        "ade_change_percent": all_steps["ade_change_percent"],
+        "ade_change_percent_0.4_s": early["ade_change_percent"],
+    }
     if fit.long is not None:
         ratio = long_rollout_scores(fit.long.windows, fit.long.forecasts)["ratio_to_constant_velocity"]
         row["rmse_5_s_ratio"] = {kind: ratio[kind] for kind in ("mean", "single")}

@@ -1,34 +1,53 @@
-"""Fitting the paper's preset, open loop: adversarial, variety, single-sample and mean terms on k-means groups."""
+"""Fitting the paper's preset, open loop: adversarial, variety, single-sample and mean terms on k-means groups.
+
+Losses after Gupta et al. (2018), with the changes that the fit needs here.
+"""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ganlane.generator.groups import Groups, group_windows
-from ganlane.generator.layers import DIFFERENCE_SCALE_M
+from ganlane.generator.forecasts import paper_forecasts, repeated
 from ganlane.generator.loop import descend
-from ganlane.generator.losses import (
-    adversarial_loss,
-    discriminator_accuracy,
-    discriminator_loss,
-    distances,
-    variety_loss,
-)
-from ganlane.generator.networks import Discriminator, Generator, displacements_of
-from ganlane.generator.scores import Metrics, window_errors
-from ganlane.generator.windows import SceneTracks, cut_windows
+from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
+from ganlane.generator.scores import BASELINE, Metrics, distance, scene_metrics
+from ganlane.generator.segments import SceneTracks
+from ganlane.generator.windows import Groups, Windows, cut_windows, group_windows
 from ganlane.parameters.generator import PaperConfig
 
 
-class PaperTask:
-    """The Social-GAN on windows; see :class:`ganlane.generator.loop.FitTask`.
+def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
+    """Distances [..., T] in m between two trajectories given as displacements [..., T, 2]."""
+    apart = (predicted - recorded).cumsum(dim=-2)
+    return distance(apart, torch.zeros_like(apart))
 
-    Args:
-        fitted: scenes to fit to.
-        validation: scenes for early stopping.
-        config: settings.
-    """
+
+def variety_loss(errors: Tensor) -> Tensor:
+    """Mean error of each vehicle's best sample; ``errors`` is [K, n] in m."""
+    return errors.amin(dim=0).mean()
+
+
+def adversarial_loss(logits: Tensor) -> Tensor:
+    """Cross-entropy of classifying generated trajectories as recorded; ln 2 is chance."""
+    return binary_cross_entropy_with_logits(logits, torch.ones_like(logits), reduction="none").mean()
+
+
+def discriminator_loss(recorded: Tensor, generated: Tensor) -> Tensor:
+    """Cross-entropy of classifying recorded and generated trajectories by their logits; ln 2 is chance."""
+    fake = binary_cross_entropy_with_logits(generated, torch.zeros_like(generated), reduction="none").mean()
+    return 0.5 * (adversarial_loss(recorded) + fake)
+
+
+def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
+    """Share of logits with the right sign, both classes with equal weight; 0.5 is chance."""
+    return 0.5 * ((recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean())
+
+
+class PaperTask:
+    """The Social-GAN on windows; see :class:`ganlane.generator.loop.FitTask`."""
 
     def __init__(self, fitted: list[SceneTracks], validation: list[SceneTracks], config: PaperConfig):
         torch.manual_seed(config.seed)
@@ -40,8 +59,8 @@ class PaperTask:
             name: torch.optim.Adam(module.parameters()) for name, module in self.modules.items()
         }
         self.random = torch.Generator().manual_seed(config.seed)
-        self.groups = self._groups(fitted, config.stride)
-        self.validation_groups = self._groups(validation, config.held_out_stride)
+        _, self.groups = self._grouped_windows(fitted, config.stride)
+        self.validation = self._grouped_windows(validation, config.held_out_stride)
 
     def update(self, number: int) -> dict[str, float]:
         """One step of the discriminator, if the adversarial term is on, and one of the generator."""
@@ -60,24 +79,25 @@ class PaperTask:
 
     def evaluate(self) -> float:
         """ADE of the mean prediction on the validation scenes, m."""
-        return window_errors(self.generator, self.validation_groups, self.config.seed)["all"]["ade_m/mean"]
-
-    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
-        """ADE and FDE of the generator on ``scenes``, all and each."""
-        return window_errors(self.generator, self._groups(scenes, self.config.held_out_stride), self.config.seed)
+        windows, groups = self.validation
+        mean = paper_forecasts(self.generator, windows, groups, samples=0)["mean"]
+        return float(np.linalg.norm(mean - windows.future, axis=-1).mean())
 
     @torch.no_grad()
-    def discriminator_accuracy(self, scenes: list[SceneTracks]) -> float:
-        """How often the discriminator is right about recordings of ``scenes`` and samples; 0.5 is chance."""
-        groups = self._groups(scenes, self.config.held_out_stride)
-        recorded, generated = groups.displacements[groups.mask], self._samples(groups)[0]
-        return float(discriminator_accuracy(self.discriminator(recorded), self.discriminator(generated)))
+    def metrics(self, scenes: list[SceneTracks]) -> Metrics:
+        """ADE and FDE of the generator on ``scenes``, all and each, and the discriminator's accuracy on them."""
+        windows, groups = self._grouped_windows(scenes, self.config.held_out_stride)
+        forecasts = paper_forecasts(self.generator, windows, groups, self.config.seed)
+        forecasts[BASELINE] = repeated(windows.past[:, -1], self.config.sizes.predicted)
+        logits = self.discriminator(groups.displacements[groups.mask]), self.discriminator(self._samples(groups)[0])
+        accuracy = {"held_out_accuracy": float(discriminator_accuracy(*logits))}
+        return scene_metrics(windows, forecasts) | {"discriminator": accuracy}
 
-    def _groups(self, scenes: list[SceneTracks], stride: int) -> Groups:
-        """k-means groups of all windows of ``scenes``."""
+    def _grouped_windows(self, scenes: list[SceneTracks], stride: int) -> tuple[Windows, Groups]:
+        """All windows of ``scenes`` and their k-means groups."""
         sizes = self.config.sizes
         windows = cut_windows(scenes, stride, sizes.observed + 1 + sizes.predicted)
-        return group_windows(windows, self.config.group_size, self.config.seed)
+        return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
     def _batch(self) -> Groups:
         rows = torch.randint(len(self.groups), (self.config.batch,), generator=self.random)
@@ -117,4 +137,4 @@ class PaperTask:
         return terms
 
     def _descend(self, name: str, loss: Tensor) -> None:
-        descend(self.optimisers[name], loss, self.modules[name], self.config.loop.largest_gradient)
+        descend(self.optimisers[name], loss, self.config.loop.largest_gradient)

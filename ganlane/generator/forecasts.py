@@ -17,25 +17,31 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from ganlane.generator.closed_loop import displacement_of, moved_by
-from ganlane.generator.fit_calibrated import evaluation_params, fit_anchor
-from ganlane.generator.groups import group_windows
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
     DriverParams,
     common_driver_params,
-    drive,
-    sampled_rollouts,
+    driven_positions,
+    evaluation_params,
+    fit_anchor,
+    rollout,
     typical_driver_params,
 )
-from ganlane.generator.scores import SAMPLES, Forecasts
-from ganlane.generator.segments import Segments, SegmentSource, constant_velocity
-from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, SceneTracks, Windows, cut_windows
+from ganlane.generator.scores import BASELINE, SAMPLES, Forecasts
+from ganlane.generator.segments import (
+    OBSERVED_POSITIONS,
+    PRESENT,
+    SceneTracks,
+    Segments,
+    constant_velocity,
+    segment_batches,
+)
+from ganlane.generator.windows import Groups, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 #: Groups, and segments times samples, in one pass; bounds the memory.
 _GROUPS, _ROLLOUTS = 128, 160
@@ -55,70 +61,64 @@ def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
 
 
 @torch.no_grad()
-def paper_forecasts(generator: Generator, windows: Windows, group_size: int = 9, seed: int = 0) -> Forecasts:
-    """The paper's preset on k-means groups of the windows, open loop."""
-    groups, random = group_windows(windows, group_size, seed), torch.Generator().manual_seed(seed)
-    samples = np.empty((1 + SAMPLES, *windows.future.shape))
+def paper_forecasts(
+    generator: Generator, windows: Windows, groups: Groups, seed: int = 0, samples: int = SAMPLES
+) -> Forecasts:
+    """The paper's preset, open loop, on the windows in ``groups``."""
+    random = torch.Generator().manual_seed(seed)
+    positions = np.empty((1 + samples, *windows.future.shape))
     for rows in torch.arange(len(groups)).split(_GROUPS):
         chunk = groups.select(rows)
         past = chunk.displacements[..., : generator.sizes.observed, :]
-        noise = torch.randn(1 + SAMPLES, *chunk.mask.shape, generator.sizes.noise, generator=random)
+        noise = torch.randn(1 + samples, *chunk.mask.shape, generator.sizes.noise, generator=random)
         noise[0] = 0.0
-        positions = generator(generator.observe(past, chunk.position, chunk.mask), noise).cumsum(dim=-2)
-        samples[:, chunk.window[chunk.mask].numpy()] = positions[:, chunk.mask].double().numpy()
-    return by_kind(samples, windows.future)
-
-
-#: From a batch of segments to positions [K, B, H, V, 2] in m, all vehicles driven jointly.
-Driver = Callable[[Segments], Tensor]
+        predicted = generator(generator.observe(past, chunk.position, chunk.mask), noise).cumsum(dim=-2)
+        positions[:, chunk.window[chunk.mask].numpy()] = predicted[:, chunk.mask].double().numpy()
+    return by_kind(positions, windows.future)
 
 
 def driven_windows(
-    driver: Driver, sources: list[SegmentSource], horizon: int, stride: int, samples: int = 1
+    driver: Callable[[Segments], Tensor], scenes: list[SceneTracks], horizon: int, stride: int, samples: int = 1
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames by a ``driver`` of K = ``samples`` samples.
+    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames.
 
-    Of every segment the vehicles are kept that were recorded throughout: these are the windows.
+    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K = ``samples``
+    samples. Of every segment the vehicles are kept that were recorded throughout: these are the windows.
     """
     forecasts = []
-    for source in sources:
-        for segments in source.batches(horizon, stride, max(1, _ROLLOUTS // samples)):
+    for scene in scenes:
+        for segments in segment_batches(scene, horizon, stride, max(1, _ROLLOUTS // samples)):
             positions = driver(segments.without_intentions()) - segments.positions[:, PRESENT, None]
-            whole = segments.present.all(dim=1)
-            forecasts.append(positions.transpose(2, 3)[:, whole].double().numpy())
+            complete = segments.present.all(dim=1)
+            forecasts.append(positions.transpose(2, 3)[:, complete].double().numpy())
     return np.concatenate(forecasts, axis=1)
 
 
 @torch.no_grad()
 def calibrated_forecasts(
     generator: Generator,
-    sources: list[SegmentSource],
+    scenes: list[SceneTracks],
     horizon: int,
     stride: int,
     config: CalibratedConfig,
     samples: int = SAMPLES,
 ) -> Forecasts:
-    """The calibrated preset, rolled out through whole scenes with the anchor and the noise of ``config``.
-
-    Target lanes and driver parameters are those of the present.
-    """
+    """The calibrated preset, rolled out through whole scenes with the target lanes and drivers of the present."""
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
         headway, desired = evaluation_params(config)(segments)
         noise = torch.randn(1 + horizon, 1 + samples, *headway.shape, generator.sizes.noise, generator=random)
         noise[:, 0] = 0.0
-        return sampled_rollouts(
-            generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config)
-        )
+        return rollout(generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config))
 
-    forecasts = driven_windows(driver, sources, horizon, stride, 1 + samples)
-    recorded = driven_windows(lambda segments: segments.future[None], sources, horizon, stride)[0]
+    forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
+    recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
     return by_kind(forecasts, recorded)
 
 
 @torch.no_grad()
-def idm_forecasts(sources: list[SegmentSource], horizon: int, stride: int) -> Forecasts:
+def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forecasts:
     """IDM along the road in whole scenes, with constant lateral positions.
 
     ``idm``: all drivers with Table V's headway and a desired speed of 22 m/s. ``idm_own_headway``: with the headway
@@ -133,11 +133,11 @@ def idm_forecasts(sources: list[SegmentSource], horizon: int, stride: int) -> Fo
             velocity = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S + acceleration * PHYSICS_STEP_S
             return moved_by(vehicles, velocity, torch.zeros_like(velocity))
 
-        return drive(segments, desired, move)[None]
+        return driven_positions(segments, desired, move)[None]
 
     kinds = {"idm": common_driver_params, "idm_own_headway": typical_driver_params}
     return {
-        name: driven_windows(partial(driver, driver_params=params), sources, horizon, stride)[0]
+        name: driven_windows(partial(driver, driver_params=params), scenes, horizon, stride)[0]
         for name, params in kinds.items()
     }
 
@@ -149,7 +149,7 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
     """
     past, steps = windows.past, windows.future.shape[1]
     return {
-        "constant_velocity": repeated(past[:, -1], steps),
+        BASELINE: repeated(past[:, -1], steps),
         "mean_velocity": repeated(past.mean(axis=1), steps),
         "constant_acceleration": constant_acceleration(past, steps),
         "ridge": RidgeForecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps))(past),
@@ -157,7 +157,7 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
-    """Positions [W, T, 2] in m when ``displacement`` [W, 2] is repeated (:func:`constant_velocity` for arrays)."""
+    """:func:`constant_velocity` for arrays: positions [W, T, 2] when ``displacement`` [W, 2] is repeated."""
     return constant_velocity(torch.from_numpy(displacement), steps).numpy()
 
 
@@ -169,13 +169,10 @@ def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
 
 
 class RidgeForecast:
-    """Linear regression with a penalty, from the generator's history to the error of constant velocity.
-
-    Inputs are the last displacement and the differences of all observed ones; fitted to windows and their mirror
-    images.
+    """Ridge regression from the last displacement and all observed differences to the error of constant velocity.
 
     Args:
-        windows: to fit to.
+        windows: to fit to, as they are and mirrored.
     """
 
     def __init__(self, windows: Windows):

@@ -20,15 +20,9 @@ from ganlane.parameters.generator import LoopConfig
 
 @dataclass(frozen=True)
 class Progress:
-    """State of a fit, for a progress bar or a log.
+    """State of a fit after ``update`` of at most ``updates``, ``seconds`` after the start of this run.
 
-    Attributes:
-        update: updates done.
-        updates: updates at most.
-        losses: the last update's losses.
-        score: the last evaluation's score (lower is better), or None before the first.
-        best: the lowest score so far.
-        seconds: since the start of this call.
+    ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best`` the lowest.
     """
 
     update: int
@@ -57,11 +51,9 @@ class FitTask(Protocol):
 
 
 class FitLoop:
-    """Runs a task until it stops improving; ``state_dict`` holds everything that a later run needs to resume.
+    """Runs a task until it stops improving.
 
     Args:
-        task: what is fitted.
-        config: its schedule.
         resume_path: file that keeps the state after every evaluation; the fit resumes from it if it exists.
 
     ``seconds`` is the time that the updates took, in earlier runs of the same fit too.
@@ -74,13 +66,14 @@ class FitLoop:
         self.seconds = 0.0
         self.best_weights: dict[str, dict[str, Tensor]] = {}
         if self.path is not None and self.path.exists():
-            self.load_state_dict(load_resume(self.path))
+            self._resume(self.path)
 
     def run(self, on_progress: OnProgress | None = None) -> None:
         """Fit, then put the best weights into the task's networks."""
         begun, earlier, score = time.monotonic(), self.seconds, None
         while self.done < self.config.updates and self.waited < self.config.patience:
-            self._set_learning_rate()
+            for optimiser in self.task.optimisers.values():
+                optimiser.param_groups[0]["lr"] = learning_rate(self.config, self.done)
             losses = self.task.update(self.done)
             self.done += 1
             seconds = time.monotonic() - begun
@@ -103,15 +96,10 @@ class FitLoop:
             self.best_weights = {name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()}
         if self.path is not None:
             with atomic_path(self.path) as part:
-                torch.save(self.state_dict(), part)
+                torch.save(self._state(), part)
         return score
 
-    def _set_learning_rate(self) -> None:
-        for optimiser in self.task.optimisers.values():
-            for group in optimiser.param_groups:
-                group["lr"] = learning_rate(self.config, self.done)
-
-    def state_dict(self) -> dict[str, Any]:
+    def _state(self) -> dict[str, Any]:
         """Counters, weights, optimisers and the random generator: tensors and plain data."""
         return {
             "counters": [self.done, self.waited, self.best_update],
@@ -123,12 +111,16 @@ class FitLoop:
             "random": self.task.random.get_state(),
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from :meth:`state_dict`.
-
-        Raises:
-            UserError: the state belongs to other networks.
-        """
+    def _resume(self, path: Path) -> None:
+        """Continue from a stored state; reading it never executes code."""
+        try:
+            state = torch.load(path, weights_only=True)
+            if "counters" not in state:
+                raise ValueError("no counters")
+        except Exception as error:
+            raise UserError(
+                f"{path}: not the state of a fit; give the file that a fit keeps, or remove it."
+            ) from error
         try:
             for name, module in self.task.modules.items():
                 module.load_state_dict(state["modules"][name])
@@ -136,27 +128,12 @@ class FitLoop:
                 optimiser.load_state_dict(state["optimisers"][name])
         except (KeyError, RuntimeError, ValueError) as error:
             raise UserError(
-                f"{self.path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
+                f"{path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
             ) from error
         self.done, self.waited, self.best_update = state["counters"]
         self.best, self.best_weights = state["best"], state["best_weights"]
         self.seconds = state["seconds"]
         self.task.random.set_state(state["random"])
-
-
-def load_resume(path: Path) -> dict[str, Any]:
-    """Read the state that :class:`FitLoop` keeps; never executes code.
-
-    Raises:
-        UserError: not such a file.
-    """
-    try:
-        state = torch.load(path, weights_only=True)
-        if "counters" not in state:
-            raise ValueError("no counters")
-    except Exception as error:
-        raise UserError(f"{path}: not the state of a fit; give the file that a fit keeps, or remove it.") from error
-    return state
 
 
 def learning_rate(config: LoopConfig, number: int) -> float:
@@ -165,9 +142,9 @@ def learning_rate(config: LoopConfig, number: int) -> float:
     return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))
 
 
-def descend(optimiser: torch.optim.Optimizer, loss: Tensor, module: nn.Module, largest: float) -> None:
-    """One step of ``optimiser`` down ``loss``, with the gradient's norm clipped at ``largest``."""
+def descend(optimiser: torch.optim.Optimizer, loss: Tensor, largest: float) -> None:
+    """One step of ``optimiser`` down ``loss``, with the norm of its parameters' gradient clipped at ``largest``."""
     optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    nn.utils.clip_grad_norm_(module.parameters(), largest)
+    nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], largest)
     optimiser.step()

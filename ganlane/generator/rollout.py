@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,14 +12,13 @@ from torch import Tensor
 from ganlane.data import DrivingStatistics
 from ganlane.generator.closed_loop import ANCHOR, AnchorParameters, DriverMemory, anchored_step, recorded, wander
 from ganlane.generator.networks import Generator
-from ganlane.generator.segments import Segments
-from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT
+from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import ENTRY_M, Visibility
 from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 #: Levels of the headway quantiles.
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -66,11 +66,11 @@ def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> 
 Move = Callable[[Vehicles, int], Vehicles]
 
 
-def drive(segments: Segments, desired_speed: Tensor, move: Move) -> Tensor:
+def driven_positions(segments: Segments, desired_speed: Tensor, move: Move) -> Tensor:
     """Positions [B, H, V, 2] in m when ``move`` drives all vehicles jointly for H steps after the observed frames.
 
-    A vehicle that appears later starts at its first recorded position with the velocity of its first displacement,
-    and is driven from there on. A vehicle is removed at the frame where its recording ends.
+    A vehicle that appears later starts at its first recorded position with the velocity of its first displacement.
+    A vehicle is removed at the frame where its recording ends.
     """
     vehicles, positions = recorded_vehicles(segments, PRESENT, desired_speed), []
     appeared = segments.present.cumsum(dim=1) > 0
@@ -90,60 +90,32 @@ def rollout(
     headway: Tensor,
     desired_speed: Tensor,
     noise: Tensor,
-    fresh: Tensor | None = None,
     noise_period_s: float = 5.0,
     parameters: AnchorParameters = ANCHOR,
 ) -> Tensor:
-    """Positions [B, H, V, 2] in m when the model drives all vehicles jointly (:func:`drive`).
+    """Positions [K, B, H, V, 2] in m of K joint rollouts (:func:`driven_positions`) by the calibrated preset.
 
     Args:
-        generator: of the calibrated preset.
-        segments: the recordings; their number of frames gives H.
+        segments: their number of frames gives H.
         headway, desired_speed: of each driver, [B, V], s and m/s.
-        noise: latent vectors [B, V, Z] at the start.
-        fresh: [H, B, V, Z] standard normal numbers that change them (:func:`wander`); None keeps them constant.
+        noise: [1 + H, K, B, V, Z], latent vectors at the start, then the numbers that change them (:func:`wander`).
         noise_period_s: time constant of this change.
     """
+    samples = noise.shape[1]
+    segments = segments.repeated(samples)
+    headway, desired_speed = headway.repeat(samples, 1), desired_speed.repeat(samples, 1)
+    latent, *fresh = noise.flatten(1, 2)
     past = segments.positions[:, :OBSERVED_POSITIONS].diff(dim=1).transpose(1, 2)
     history = recorded(generator, past[..., :-1, :])
     memory, road = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway), segments.road
 
     def move(vehicles: Vehicles, step: int) -> Vehicles:
-        nonlocal memory, noise
-        moved, memory = anchored_step(generator, vehicles, road, memory, noise, parameters)
-        if fresh is not None:
-            noise = wander(noise, fresh[step], noise_period_s)
+        nonlocal memory, latent
+        moved, memory = anchored_step(generator, vehicles, road, memory, latent, parameters)
+        latent = wander(latent, fresh[step], noise_period_s)
         return moved
 
-    return drive(segments, desired_speed, move)
-
-
-def sampled_rollouts(
-    generator: Generator,
-    segments: Segments,
-    headway: Tensor,
-    desired_speed: Tensor,
-    noise: Tensor,
-    noise_period_s: float,
-    parameters: AnchorParameters = ANCHOR,
-) -> Tensor:
-    """K rollouts [K, B, H, V, 2] of the same drivers in one pass.
-
-    ``noise`` [1 + H, K, B, V, Z] holds the latent vectors at the start, then those by which they change.
-    """
-    samples = noise.shape[1]
-    noise = noise.flatten(1, 2)
-    positions = rollout(
-        generator,
-        segments.repeated(samples),
-        headway.repeat(samples, 1),
-        desired_speed.repeat(samples, 1),
-        noise[0],
-        noise[1:],
-        noise_period_s,
-        parameters,
-    )
-    return positions.unflatten(0, (samples, -1))
+    return driven_positions(segments, desired_speed, move).unflatten(0, (samples, -1))
 
 
 def headway_quantiles(statistics: Mapping[str, Any]) -> tuple[float, ...]:
@@ -183,9 +155,10 @@ def sampled_driver_params(segments: Segments, random: torch.Generator) -> tuple[
     u = torch.rand(2, *segments.length.shape, generator=random)
     scatter = torch.exp(_SCATTER * torch.randn(segments.length.shape, generator=random))
     low, high = DESIRED_EXCESS_MPS
-    desired = _present_speed(segments) + low + (high - low) * u[0]
-    now = recorded_vehicles(segments, PRESENT, desired)
-    return balanced_headway(now, segments.road, headway_from_uniform(u[1])) * scatter, desired
+    now = recorded_vehicles(segments, PRESENT, torch.ones_like(scatter))
+    desired = now.speed + low + (high - low) * u[0]
+    otherwise = headway_from_uniform(u[1])
+    return balanced_headway(now.with_(desired_speed=desired), segments.road, otherwise) * scatter, desired
 
 
 def common_driver_params(segments: Segments) -> tuple[Tensor, Tensor]:
@@ -196,10 +169,17 @@ def common_driver_params(segments: Segments) -> tuple[Tensor, Tensor]:
 
 def typical_driver_params(segments: Segments) -> tuple[Tensor, Tensor]:
     """For evaluation, [B, V] each: the balanced headway or the median one, the middle desired speed."""
-    desired = _present_speed(segments) + 0.5 * sum(DESIRED_EXCESS_MPS)
+    now = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length))
+    desired = now.speed + 0.5 * sum(DESIRED_EXCESS_MPS)
     median = torch.full_like(desired, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
-    return balanced_headway(recorded_vehicles(segments, PRESENT, desired), segments.road, median), desired
+    return balanced_headway(now.with_(desired_speed=desired), segments.road, median), desired
 
 
-def _present_speed(segments: Segments) -> Tensor:
-    return recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length)).speed
+def fit_anchor(config: CalibratedConfig) -> AnchorParameters:
+    """The anchor with a fit's washout and inputs."""
+    return replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
+
+
+def evaluation_params(config: CalibratedConfig) -> DriverParams:
+    """Headways and desired speeds for evaluation."""
+    return typical_driver_params if config.traits else common_driver_params

@@ -1,7 +1,7 @@
-"""Scores of predictions: errors of the networks during a fit, and of any forecasts of recorded windows.
+"""Scores of forecasts of recorded windows: displacement errors, direction, long rollouts.
 
-Kinds of predictions: ``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE), ``constant_velocity``.
-ADE is the mean error over the predicted steps, FDE the error at the last of them, both in m.
+Kinds of forecasts by a generator: ``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean
+error over the predicted steps, FDE the error at the last of them, both in m.
 """
 
 from __future__ import annotations
@@ -13,24 +13,18 @@ import torch
 from sklearn.ensemble import HistGradientBoostingClassifier
 from torch import Tensor
 
-from ganlane.generator.closed_loop import ANCHOR, AnchorParameters
-from ganlane.generator.groups import Groups
-from ganlane.generator.losses import distance, distances, energy_score
-from ganlane.generator.networks import Generator
-from ganlane.generator.rollout import DriverParams, sampled_rollouts, typical_driver_params
-from ganlane.generator.segments import SegmentSource
-from ganlane.generator.windows import PREDICTED_STEPS, Windows
+from ganlane.generator.windows import Windows
 
 #: Samples of which the best counts.
 SAMPLES = 20
-#: Groups, and segments, in one forward pass; bounds the memory.
-_GROUPS, _SEGMENTS = 128, 16
 #: Every ADE change is relative to this forecast: the last displacement repeated.
 BASELINE = "constant_velocity"
 #: Vehicles longer than this are trucks, m.
 TRUCK_M = 6.0
 #: A lateral move over the horizon has a direction if it is larger than this, m.
 SIDEWAYS_M = 0.1
+#: Keeps the gradient of a distance of 0 finite; 0.1 mm.
+_SMALLEST_DISTANCE_M = 1e-4
 #: ``{"all" or scene: {"ERROR/KIND": value}}``.
 Metrics = dict[str, dict[str, float]]
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
@@ -38,115 +32,20 @@ Forecasts = dict[str, np.ndarray]
 Row = dict[str, Any]
 
 
-@torch.no_grad()
-def window_errors(generator: Generator, groups: Groups, seed: int = 0) -> Metrics:
-    """ADE and FDE of the paper's preset in m, over all ``groups`` and for each of their scenes.
+def distance(one: Tensor, other: Tensor) -> Tensor:
+    """Euclidean distance [...] between positions [..., 2], with a finite gradient at distance 0."""
+    apart = one - other
+    return torch.sqrt((apart * apart).sum(-1) + _SMALLEST_DISTANCE_M * _SMALLEST_DISTANCE_M)
 
-    Returns:
-        ``{"all" or scene: {"ade_m/KIND", "fde_m/KIND", ..., "windows"}}`` with the four kinds of this module.
-    """
-    random = torch.Generator().manual_seed(seed)
-    parts: dict[str, list[Tensor]] = {}
-    scenes = []
-    for rows in torch.arange(len(groups)).split(_GROUPS):
-        chunk = groups.select(rows)
-        scenes.append(chunk.scene[:, None].expand_as(chunk.mask)[chunk.mask])
-        for kind, values in _group_errors(generator, chunk, random).items():
-            parts.setdefault(kind, []).append(values[chunk.mask])
-    errors, scene = {kind: torch.cat(pieces) for kind, pieces in parts.items()}, torch.cat(scenes)
-    metrics = {"all": _window_means(errors, torch.ones_like(scene, dtype=torch.bool))}
-    for index in scene.unique().tolist():
-        metrics[groups.scene_names[index]] = _window_means(errors, scene == index)
+
+def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
+    """``{"all" or scene: {"ade_m/KIND", "fde_m/KIND", ..., "windows"}}`` of the forecasts, in m."""
+    errors, metrics = errors_of(forecasts, windows.future), {}
+    for name, rows in {"all": np.ones(len(windows), dtype=bool), **windows.by_scene}.items():
+        row = displacement_errors(errors, rows)
+        metrics[name] = {f"{error}/{kind}": row[error][kind] for error in ("ade_m", "fde_m") for kind in forecasts}
+        metrics[name]["windows"] = float(row["windows"])
     return metrics
-
-
-def _group_errors(generator: Generator, groups: Groups, random: torch.Generator) -> dict[str, Tensor]:
-    """Errors [B, G, T] in m by kind."""
-    observed = generator.sizes.observed
-    past, future = groups.displacements[..., :observed, :], groups.displacements[..., observed:, :]
-    noise = torch.randn(SAMPLES, *groups.mask.shape, generator.sizes.noise, generator=random)
-    observation = generator.observe(past, groups.position, groups.mask)
-    errors = distances(generator(observation, torch.cat([torch.zeros_like(noise[:1]), noise])), future)
-    best = errors[1:].mean(-1).argmin(dim=0)[None, ..., None].expand(1, *errors.shape[1:])
-    return {
-        "mean": errors[0],
-        "single": errors[1],
-        f"best_of_{SAMPLES}": errors[1:].gather(0, best)[0],
-        BASELINE: distances(past[..., -1:, :].expand_as(future), future),
-    }
-
-
-def _window_means(errors: dict[str, Tensor], rows: Tensor) -> dict[str, float]:
-    """ADE and FDE over the chosen windows, and their number."""
-    means = {}
-    for kind, values in errors.items():
-        means[f"ade_m/{kind}"] = float(values[rows].mean())
-        means[f"fde_m/{kind}"] = float(values[rows][:, -1].mean())
-    return means | {"windows": float(rows.sum())}
-
-
-@torch.no_grad()
-def rollout_errors(
-    generator: Generator,
-    sources: list[SegmentSource],
-    horizon: int,
-    stride: int,
-    noise_period_s: float,
-    seed: int = 0,
-    parameters: AnchorParameters = ANCHOR,
-    driver_params: DriverParams = typical_driver_params,
-) -> Metrics:
-    """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.
-
-    Target lanes and driver parameters are those of the present, so no information of the future is used.
-
-    Returns:
-        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
-        "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``, ``single``,
-        ``constant_velocity`` and ``energy`` (the energy score of two samples).
-    """
-    random = torch.Generator().manual_seed(seed)
-    parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
-    for source in sources:
-        for batch in source.batches(horizon, stride, _SEGMENTS):
-            segments = batch.without_intentions()
-            headway, desired = driver_params(segments)
-            fresh = torch.randn(1 + horizon, 2, *headway.shape, generator.sizes.noise, generator=random)
-            noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            mean, one, other = sampled_rollouts(
-                generator, segments, headway, desired, noise, noise_period_s, parameters
-            )
-            future = segments.future
-            errors = {
-                "mean": distance(mean, future),
-                "single": distance(one, future),
-                "energy": energy_score(one, other, future),
-                BASELINE: distance(segments.constant_velocity, future),
-            }
-            for name in ("all", source.scene.name):
-                parts.setdefault(name, []).append((errors, segments.scored))
-    return {name: _step_means(errors, horizon) for name, errors in parts.items()}
-
-
-def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
-    count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
-    return torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0) / count
-
-
-def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dict[str, float]:
-    """Means over the vehicles that are still recorded at the step in question."""
-    means = {kind: mean_by_step([(errors[kind], scored) for errors, scored in parts]) for kind in parts[0][0]}
-    short = min(PREDICTED_STEPS, horizon)
-    metrics = {}
-    for kind, errors in means.items():
-        metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
-        metrics[f"fde_m/{kind}"] = float(errors[short - 1])
-        metrics[f"end_m/{kind}"] = float(errors[-1])
-    for kind in ("mean", "energy"):
-        metrics[f"relative_{kind}"] = float((means[kind] / means[BASELINE].clamp_min(1e-6)).mean())
-    windows = max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts)))
-    return metrics | {"end_s": 0.1 * horizon, "windows": windows}
 
 
 def errors_of(forecasts: Forecasts, recorded: np.ndarray) -> Forecasts:
@@ -194,9 +93,8 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
     Gradient boosting on the observed motion, the lane and the length, fitted to the other folds' moving vehicles: a
     reference for :func:`direction_scores`, about as much as the history contains.
     """
-    lateral = windows.future[:, -1, 1]
+    lateral, past = windows.future[:, -1, 1], windows.past
     moving = np.abs(lateral) > SIDEWAYS_M
-    past = windows.past
     moved = past[..., 1][:, ::-1].cumsum(axis=1)
     others = np.stack([windows.lane, windows.lane_from_left, windows.length], axis=1)
     differences = np.diff(past, axis=1)[..., 0]
@@ -211,26 +109,21 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
     return float(np.concatenate(hits).mean()) if hits else None
 
 
-def rmse_by_second(errors: Forecasts, step_s: float = 0.1) -> dict[str, dict[str, float]]:
-    """Root mean square error in m after each whole second, of every forecast."""
-    per_second = round(1.0 / step_s)
+def rmse_by_second(errors: Forecasts) -> dict[str, dict[str, float]]:
+    """Root mean square error in m after each whole second (10 steps), of every forecast."""
     return {
         name: {
-            f"{second} s": float(np.sqrt((values[:, second * per_second - 1] ** 2).mean()))
-            for second in range(1, values.shape[1] // per_second + 1)
+            f"{second} s": float(np.sqrt((values[:, 10 * second - 1] ** 2).mean()))
+            for second in range(1, values.shape[1] // 10 + 1)
         }
         for name, values in errors.items()
     }
 
 
 def open_loop_scores(windows: Windows, forecasts: Forecasts, fold: np.ndarray, least_part: int = 100) -> Row:
-    """All scores of forecasts over 0.8 s, pooled over the windows of all folds.
+    """All scores of the forecasts of ``windows``, each of which was held out in its ``fold`` [W].
 
-    Args:
-        windows: of the held-out scenes.
-        forecasts: of these windows.
-        fold: [W], the fold in which each window was held out.
-        least_part: parts (lanes, classes) with fewer windows are left out.
+    Parts (lanes, classes) of fewer than ``least_part`` windows are left out.
     """
     errors = errors_of(forecasts, windows.future)
 
@@ -242,9 +135,7 @@ def open_loop_scores(windows: Windows, forecasts: Forecasts, fold: np.ndarray, l
     return {
         **displacement_errors(errors),
         "folds": by({str(number): fold == number for number in range(int(fold.max()) + 1)}),
-        "scenes": by(
-            {name: windows.scene == windows.scene_names.index(name) for name in sorted(windows.scene_names)}
-        ),
+        "scenes": by(windows.by_scene),
         "parts": by(parts_of(windows, least_part)),
         "direction": direction,
         "direction_whole_window": direction_scores(forecasts, windows.future, windows.past[..., 1].sum(1)),

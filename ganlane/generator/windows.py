@@ -1,81 +1,35 @@
-"""Recorded scenes as dense arrays, and the windows of 9 observed and 8 future positions that are cut from them.
+"""Windows of 9 observed and 8 future positions, cut from recorded scenes, and k-means groups of them.
 
-Nothing is smoothed: a filter applied before windows are cut would carry the future into the past.
+Nothing is smoothed: a filter applied before windows are cut would carry the future into the past. Grouping takes most
+of the time before a fit, so it is cached under a hash of everything that it follows from.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
-import polars as pl
+import sklearn
+import torch
+from sklearn.cluster import KMeans
+from torch import Tensor
 
 from ganlane.errors import UserError
+from ganlane.files import atomic_path
+from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks
 
-REQUIRED_COLUMNS = ("scene", "vehicle", "frame", "x", "y", "speed", "lane", "length", "width")
-#: Observed positions; they give 8 observed displacements (the paper's ``o_l`` = 8).
-OBSERVED_POSITIONS = 9
-#: Row of the last of them.
-PRESENT = OBSERVED_POSITIONS - 1
+#: Environment variable with the cache folder; empty switches the cache off.
+CACHE_VARIABLE = "GANLANE_CACHE"
 #: Predicted positions (the paper's ``p_l``): 0.8 s.
 PREDICTED_STEPS = 8
 WINDOW_FRAMES = OBSERVED_POSITIONS + PREDICTED_STEPS
-
-
-@dataclass(frozen=True)
-class SceneTracks:
-    """One recorded scene of T frames (0.1 s apart) and V vehicles; entries of absent vehicles are 0.
-
-    Attributes:
-        name: the scene's name.
-        first_frame: frame number of row 0.
-        vehicles: [V] vehicle numbers.
-        positions: [T, V, 2] float64, centre of the body, m; x along the road, y to the left.
-        lane: [T, V] int64, 0 is the rightmost.
-        present: [T, V] bool.
-        length, width: [V] float64, m.
-    """
-
-    name: str
-    first_frame: int
-    vehicles: np.ndarray
-    positions: np.ndarray
-    lane: np.ndarray
-    present: np.ndarray
-    length: np.ndarray
-    width: np.ndarray
-
-
-def _one_scene(name: str, rows: pl.DataFrame) -> SceneTracks:
-    vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
-    frame = rows["frame"].to_numpy()
-    row = frame - frame.min()
-    shape = (int(row.max()) + 1, len(vehicles))
-    positions, lane = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.int64)
-    present, size = np.zeros(shape, dtype=bool), np.zeros((2, len(vehicles)))
-    positions[row, column] = rows.select("x", "y").to_numpy()
-    lane[row, column] = rows["lane"].to_numpy()
-    present[row, column] = True
-    size[:, column] = rows.select("length", "width").to_numpy().T
-    return SceneTracks(name, int(frame.min()), vehicles, positions, lane, present, size[0], size[1])
-
-
-def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
-    """Every scene of a trajectory frame (``ganlane.data``'s schema), in order of their names.
-
-    Raises:
-        UserError: a column is missing, or there is no row.
-    """
-    missing = [name for name in REQUIRED_COLUMNS if name not in frame.columns]
-    if missing:
-        raise UserError(
-            f"trajectory frame: columns {missing} are missing; expected {list(REQUIRED_COLUMNS)}; "
-            "read the recordings with ganlane.data.read_scenes."
-        )
-    if frame.is_empty():
-        raise UserError("trajectory frame: no rows; give recordings of at least 1.7 s.")
-    names = sorted(frame["scene"].unique().to_list())
-    return [_one_scene(name, frame.filter(pl.col("scene") == name)) for name in names]
 
 
 @dataclass(frozen=True)
@@ -85,12 +39,10 @@ class Windows:
     Attributes:
         positions: [W, frames, 2] float64, m.
         scene: [W] int64, index into ``scene_names``.
-        start: [W] int64, row of the scene at which the window starts.
-        vehicle: [W] int64, column of the vehicle in the scene.
+        start, vehicle: [W] int64, row of the scene at which the window starts, and column of its vehicle.
         lane: [W] int64, its lane at the last observed position, 0 the rightmost.
         lane_from_left: [W] int64, the same counted from the scene's leftmost lane, which is 1.
-        length: [W] float64, its length, m.
-        scene_names: names of the scenes.
+        length: [W] float64, m.
     """
 
     positions: np.ndarray
@@ -106,6 +58,12 @@ class Windows:
         return len(self.start)
 
     @property
+    def by_scene(self) -> dict[str, np.ndarray]:
+        """Masks [W] of the windows of each scene that has any, by name."""
+        numbers = sorted(np.unique(self.scene), key=lambda number: self.scene_names[number])
+        return {self.scene_names[number]: self.scene == number for number in numbers}
+
+    @property
     def future(self) -> np.ndarray:
         """Recorded positions [W, T, 2] after the present, relative to it, m."""
         return self.positions[:, OBSERVED_POSITIONS:] - self.positions[:, PRESENT : PRESENT + 1]
@@ -117,7 +75,7 @@ class Windows:
 
 
 def join_windows(parts: list[Windows]) -> Windows:
-    """All windows of ``parts`` in order; no scene is in two parts."""
+    """All windows of ``parts`` in order; no two parts share a scene."""
     names = tuple(name for part in parts for name in part.scene_names)
     before = np.cumsum([0, *(len(part.scene_names) for part in parts[:-1])])
     joined = {
@@ -129,7 +87,7 @@ def join_windows(parts: list[Windows]) -> Windows:
     return Windows(**joined, scene=scene, scene_names=names)
 
 
-def _whole(scene: SceneTracks, frames: int) -> np.ndarray:
+def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
     """Whether each vehicle is present in all ``frames`` frames that start at each row; bool [S, V]."""
     if len(scene.present) < frames:
         return np.zeros((0, scene.present.shape[1]), dtype=bool)
@@ -137,15 +95,9 @@ def _whole(scene: SceneTracks, frames: int) -> np.ndarray:
     return running[frames:] - running[:-frames] == frames
 
 
-def _cut(scene: SceneTracks, stride: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Starts and vehicles ([W], [W]) of the scene's windows."""
-    start, vehicle = np.nonzero(_whole(scene, frames)[::stride])
-    return start * stride, vehicle
-
-
-def count_windows(scene: SceneTracks, frames: int) -> int:
+def count_windows(scene: SceneTracks, frames: int = WINDOW_FRAMES) -> int:
     """Number of windows of ``frames`` frames in a scene, one per possible start."""
-    return int(_whole(scene, frames).sum())
+    return int(_present_throughout(scene, frames).sum())
 
 
 def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW_FRAMES) -> Windows:
@@ -154,22 +106,158 @@ def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW
     Raises:
         UserError: no vehicle is present for a whole window.
     """
-    cuts = [_cut(tracks, stride, frames) for tracks in scenes]
-    start, vehicle = (np.concatenate(part) for part in zip(*cuts))
-    if not len(start):
+    windows = join_windows([_scene_windows(scene, stride, frames) for scene in scenes])
+    if not len(windows):
         raise UserError(
             f"recordings: no vehicle is present for {frames} frames in a row; give longer tracks (10 Hz)."
         )
-    scene = np.concatenate([np.full(len(cut[0]), index) for index, cut in enumerate(cuts)])
-    gathered = [_gather(tracks, *cut, frames) for tracks, cut in zip(scenes, cuts)]
-    positions, lane, from_left, length = (np.concatenate(part) for part in zip(*gathered))
-    names = tuple(tracks.name for tracks in scenes)
-    return Windows(positions, scene, start, vehicle, lane, from_left, length, names)
+    return windows
 
 
-def _gather(scene: SceneTracks, start: np.ndarray, vehicle: np.ndarray, frames: int) -> tuple[np.ndarray, ...]:
-    """Positions, lanes from the right and from the left, and lengths of a scene's windows."""
+def _scene_windows(scene: SceneTracks, stride: int, frames: int) -> Windows:
+    start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
+    start *= stride
     lane = scene.lane[start + PRESENT, vehicle]
-    leftmost = int(scene.lane[scene.present].max())
-    positions = scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]]
-    return positions, lane, leftmost + 1 - lane, scene.length[vehicle]
+    return Windows(
+        positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
+        scene=np.zeros_like(start),
+        start=start,
+        vehicle=vehicle,
+        lane=lane,
+        lane_from_left=scene.lanes - lane,
+        length=scene.length[vehicle],
+        scene_names=(scene.name,),
+    )
+
+
+def cache_folder() -> Path | None:
+    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder; None if switched off."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named is not None:
+        return Path(named) if named else None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
+
+
+def content_hash(settings: Any, *arrays: np.ndarray) -> str:
+    """Hash of plain settings and of the arrays' types, shapes and bytes."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for array in arrays:
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:32]
+
+
+def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays that ``compute`` returns, from the cache if it ran for this ``key`` before.
+
+    A damaged file is computed again, and a folder that cannot be written to is ignored: the cache never causes a
+    wrong result or a failure.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return compute()
+    path = folder / f"{name}_{key}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            return dict(kept)
+    except (OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError):
+        arrays = compute()
+    try:
+        with atomic_path(path) as part, part.open("wb") as file:
+            save_arrays(file, arrays)
+    except OSError:
+        pass
+    return arrays
+
+
+def save_arrays(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as .npz; reading them needs no pickle."""
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's stub takes a name for an option
+
+
+@dataclass(frozen=True)
+class Groups:
+    """B groups of up to G vehicles over the same frames of the same scene, padded.
+
+    Attributes:
+        displacements: [B, G, frames - 1, 2] float32, m per 0.1 s.
+        position: [B, G, 2] float32, the last observed position relative to the group's mean, m.
+        mask: [B, G] bool, false is padding.
+        window: [B, G] int64, row in :class:`Windows`; -1 is padding.
+    """
+
+    displacements: Tensor
+    position: Tensor
+    mask: Tensor
+    window: Tensor
+
+    def __len__(self) -> int:
+        return len(self.mask)
+
+    def select(self, rows: Tensor) -> Groups:
+        """The groups of the given rows, without padding that none of them needs."""
+        width = int(self.mask[rows].sum(1).max())
+        return Groups(*(value[rows, :width] for value in vars(self).values()))
+
+    def mirrored(self, flip: Tensor) -> Groups:
+        """The same groups, left and right swapped where ``flip`` [B] is true."""
+        sign = torch.ones(len(self), 1, 2)
+        sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
+        return replace(self, displacements=self.displacements * sign[:, :, None], position=self.position * sign)
+
+
+def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
+    """Group number [n] of each of n positions [n, 2], in groups of about ``size``, by k-means on metres."""
+    groups = max(1, round(len(positions) / size))
+    if groups == 1:
+        return np.zeros(len(positions), dtype=np.int64)
+    return KMeans(groups, n_init=1, random_state=seed).fit_predict(positions).astype(np.int64)
+
+
+def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
+    """Split the vehicles of every (scene, start) into k-means groups of about ``size`` and pad them.
+
+    Uses the last observed positions only; each scene's groups are cached (:func:`cached`).
+    """
+    now = windows.positions[:, PRESENT]
+    settings = {"size": size, "seed": seed, "k-means": sklearn.__version__}
+
+    def labels_of_scene(rows: np.ndarray) -> np.ndarray:
+        place, start = now[rows], windows.start[rows]
+
+        def compute() -> dict[str, np.ndarray]:
+            return {"labels": _labels_by_run(start, lambda chosen: kmeans_labels(place[chosen], size, seed))}
+
+        return cached("groups", content_hash(settings, place, start), compute)["labels"]
+
+    return _pad(windows, now, _labels_by_run(windows.scene, labels_of_scene))
+
+
+def _labels_by_run(values: np.ndarray, labels_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Labels [W] of each run of equal ``values`` [W], by ``labels_of`` its rows; no label is used in two runs."""
+    labels, used = np.empty(len(values), dtype=np.int64), 0
+    for rows in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
+        labels[rows] = used + labels_of(rows)
+        used = int(labels[rows].max()) + 1
+    return labels
+
+
+def _pad(windows: Windows, now: np.ndarray, labels: np.ndarray) -> Groups:
+    """Scatter windows into [B, G] by group number and rank within the group."""
+    _, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    order = np.argsort(labels, kind="stable")
+    rank = np.empty(len(labels), dtype=np.int64)
+    rank[order] = np.arange(len(labels)) - np.repeat(np.cumsum(counts) - counts, counts)
+    shape = (len(counts), int(counts.max()))
+    window = np.full(shape, -1)
+    window[labels, rank] = np.arange(len(labels))
+    mean = np.stack([np.bincount(labels, now[:, axis]) / counts for axis in (0, 1)], axis=-1)
+    mask = window >= 0
+    displacements = np.where(mask[..., None, None], np.diff(windows.positions, axis=1)[window], 0.0)
+    position = np.where(mask[..., None], now[window] - mean[:, None], 0.0)
+    return Groups(
+        torch.from_numpy(displacements).float(),
+        torch.from_numpy(position).float(),
+        torch.from_numpy(mask),
+        torch.from_numpy(window),
+    )

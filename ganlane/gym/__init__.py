@@ -8,11 +8,9 @@
     env = gymnasium.make("ganlane/Highway-v0", traffic="gan", lanes=4)
     envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, traffic="gan")
 
-Importing ganlane registers them (gymnasium 1 looks for no plugins); ``gymnasium.make("ganlane:ganlane/Highway-v0")``
-imports and makes in one call. :mod:`~ganlane.gym.single` and :mod:`~ganlane.gym.vector` are the two facades,
-:mod:`~ganlane.gym.rows` is what they share: a batch of TorchRL environments seen as NumPy arrays;
-:mod:`~ganlane.gym.arguments` checks what is handed to them. :mod:`~ganlane.gym.pictures` and
-:mod:`~ganlane.gym.window` draw. This module itself stays light.
+Importing ganlane registers them (gymnasium 1 has no plugins); ``gymnasium.make("ganlane:ganlane/Highway-v0")``
+imports and makes in one call. :mod:`~ganlane.gym.single` and :mod:`~ganlane.gym.vector` are the two environments on
+top of :mod:`~ganlane.gym.rows`; :mod:`~ganlane.gym.rendering` draws. This module itself imports no torch.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ ENV_ID: Final = "ganlane/Highway-v0"
 
 
 def register_envs() -> None:
-    """Tell gymnasium of the environments; again does no harm. Without gymnasium it does nothing."""
+    """Register the environments with gymnasium, once; without gymnasium nothing happens."""
     try:
         import gymnasium
     except ModuleNotFoundError:  # the rest of the package works; 'ganlane doctor' says what is missing

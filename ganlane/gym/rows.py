@@ -1,4 +1,7 @@
-"""A batch of TorchRL environments as NumPy arrays: what both facades share."""
+"""A batch of TorchRL environments as NumPy arrays, and checks of the arguments of reset and step.
+
+Both environments, single and vector, stand on this module.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,15 @@ from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
-from ganlane.sim.road import road_in
+from ganlane.sim.state import road_in
 from ganlane.transforms import ObservationTransform, largest_number
+from ganlane.transforms.mask import ACTIONS
 
 Floats = npt.NDArray[np.float32]
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
 SPEED_RATIO_LIMIT: Final = 4.0
+#: Unseeded environments draw their seed below this.
+SEEDS: Final = 2**31
 
 
 def observation_space(env: TransformedEnv) -> Box:
@@ -35,11 +41,7 @@ def observation_space(env: TransformedEnv) -> Box:
 
 
 class Rows:
-    """N rows of an environment from :func:`ganlane.api.make_env`, their state kept here.
-
-    Args:
-        env: the environment.
-    """
+    """N rows of an environment from :func:`ganlane.api.make_env`, and their state."""
 
     def __init__(self, env: TransformedEnv) -> None:
         self.env, self.count = env, env.batch_size[0]
@@ -58,14 +60,14 @@ class Rows:
 
     @torch.no_grad()
     def step(self, actions: Tensor) -> TensorDictBase:
-        """One decision; the state after it, which also stays here. No row is reset."""
+        """One decision; the state after it, which is kept. No row is reset."""
         stepped = self.env.step(self._with(actions))
         self.state = self.env.step_mdp(stepped)
         return stepped.get("next")
 
     @torch.no_grad()
     def step_and_reset(self, actions: Tensor) -> TensorDictBase:
-        """One decision; the state after it. What stays here has the rows that ended at their next episodes."""
+        """One decision; the state after it. The state that is kept has the next episodes of rows that ended."""
         stepped, self.state = self.env.step_and_maybe_reset(self._with(actions))
         return stepped.get("next")
 
@@ -99,27 +101,24 @@ class Rows:
         return legal_actions(state, road_in(state, self.env.base_env.road)) if mask is None else mask
 
     def info(self, state: TensorDictBase | None = None) -> dict[str, Any]:
-        """What is known beside the observation, by name, arrays [N] (the mask [N, 3]); copies.
-
-        docs/gymnasium.md lists the names.
-        """
-        at = self.now() if state is None else state
-        vehicles, ego, events = at.get(keys.VEHICLES), at.get(keys.EGO), at.get(keys.EVENTS)
-        road = road_in(at, self.env.base_env.road)
+        """Gymnasium's info: by name (docs/gymnasium.md lists them) arrays [N], the mask [N, 3]; copies."""
+        state = self.now() if state is None else state
+        vehicles, ego, events = state.get(keys.VEHICLES), state.get(keys.EGO), state.get(keys.EVENTS)
+        road = road_in(state, self.env.base_env.road)
         found = {
-            "seed": at.get(keys.SEED),
-            "episode_number": at.get(keys.EPISODE),
-            "time_s": at.get(keys.STEP).double() * PHYSICS_STEP_S,
+            "seed": state.get(keys.SEED),
+            "episode_number": state.get(keys.EPISODE),
+            "time_s": state.get(keys.STEP).double() * PHYSICS_STEP_S,
             "distance_m": ego.get("distance"),
             "speed_mps": vehicles.get("speed")[:, EGO_INDEX],
             "lane": road.lane_of(vehicles.get("y"))[:, EGO_INDEX].long(),
             "decisions": ego.get("decisions"),
             "lane_changes": ego.get("lane_changes"),
-            "action_mask": self._mask(at).to(torch.int8),
+            "action_mask": self._mask(state).to(torch.int8),
             **{name: events.get(name)[:, 0] for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)},
         }
-        paid = {name: _array(term[:, 0]) for name, term in at.get(keys.REWARD_TERMS).items()}
-        return {**{name: _array(value) for name, value in found.items()}, keys.REWARD_TERMS: paid}
+        terms = {name: _array(term[:, 0]) for name, term in state.get(keys.REWARD_TERMS).items()}
+        return {**{name: _array(value) for name, value in found.items()}, keys.REWARD_TERMS: terms}
 
 
 def _array(tensor: Tensor) -> npt.NDArray[Any]:
@@ -135,3 +134,51 @@ def _item(value: Any, row: int) -> Any:
     if isinstance(value, dict):
         return row_of(value, row)
     return value[row].copy() if value.ndim > 1 else value[row].item()
+
+
+def actions_of(given: Any, rows: int) -> Tensor:
+    """A user's actions as a tensor [rows] int64.
+
+    Raises:
+        UserError: another shape, or no such action.
+    """
+    array = np.asarray(given)
+    if array.shape != (rows,) or array.dtype.kind not in "iu" or not np.isin(array, range(ACTIONS)).all():
+        raise UserError(
+            f"action {array.tolist()}: expected {rows} whole number(s), 0 (keep), 1 (left) or 2 (right); give one "
+            "for every environment."
+        )
+    return torch.as_tensor(array.astype(np.int64))
+
+
+def seed_number(seed: Any) -> int:
+    """A seed, checked: the counters of the environment hold 63 bits."""
+    if not hasattr(seed, "__index__") or not 0 <= int(seed) < 2**63:
+        raise UserError(f"seed={seed}: expected a whole number from 0 to 2**63 - 1; give for instance seed=0.")
+    return int(seed)
+
+
+def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
+    """The options of a reset, checked for unknown names."""
+    unknown = sorted(set(options or {}) - set(names))
+    if unknown:
+        raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")
+    return dict(options or {})
+
+
+def episode_numbers(episode: Any) -> npt.NDArray[np.int64]:
+    """The option ``episode``, checked: whole numbers from 0, one or several."""
+    numbers = np.asarray(episode)
+    if numbers.dtype.kind not in "iu" or (numbers < 0).any():
+        raise UserError(f"options: episode={episode!r}: expected whole numbers from 0; give for instance 3.")
+    return numbers.astype(np.int64)
+
+
+def row_mask(mask: Any, rows: int) -> npt.NDArray[np.bool_]:
+    """The option ``reset_mask``, checked: a boolean array [rows]."""
+    array = np.asarray(mask)
+    if array.shape != (rows,) or array.dtype != np.bool_:
+        raise UserError(
+            f"options: reset_mask: expected a boolean array of shape ({rows},); give one flag for every row."
+        )
+    return array

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from torchrl.envs import Transform, TransformedEnv
 
-from ganlane.api.options import Option, option
-from ganlane.api.parts import make_env
+from ganlane.api import make_env
 from ganlane.errors import UserError
-from ganlane.gym.arguments import ACTIONS, SEEDS, actions_of, episode_numbers, known_options, seed_number
-from ganlane.gym.pictures import LiveView, real_time_fps
-from ganlane.gym.rows import Floats, Rows, row_of
-from ganlane.gym.window import FilmWindow, has_display
+from ganlane.gym.rendering import FilmWindow, LiveView, has_display, real_time_fps
+from ganlane.gym.rows import (
+    ACTIONS,
+    SEEDS,
+    Floats,
+    Rows,
+    actions_of,
+    episode_numbers,
+    known_options,
+    row_of,
+    seed_number,
+)
+from ganlane.options import Option, option
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -25,12 +31,12 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     """``gymnasium.make("ganlane/Highway-v0", ...)``.
 
     Args:
-        traffic, observation, reward, mask, env, transforms, stream, device, overrides: as in
-            :func:`ganlane.api.make_env`.
-        seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random, as gymnasium
-            has it.
+        traffic: as in :func:`ganlane.api.make_env`, as are ``options``.
+        seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random, as in gymnasium.
         render_mode: None, ``rgb_array`` (a frame per decision) or ``human`` (a window, ten frames per second of
             simulated time).
+        options: further arguments of ``make_env``: ``observation``, ``reward``, ``mask``, ``env``, ``transforms``,
+            ``stream``, ``device``, and keys of the environment.
 
     ``reset(seed=s)`` begins episode 0 of seed s, every further ``reset()`` the next one;
     ``reset(options={"episode": k})`` runs episode k. ``action`` is 0 (keep), 1 (left) or 2 (right);
@@ -45,36 +51,27 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     def __init__(
         self,
         traffic: Option = "idm_mobil",
-        observation: Option = "lane_view_overlap",
-        reward: Option = "paper",
-        mask: Option = "none",
+        *,
         seed: int | None = None,
-        env: Option = "highway",
-        transforms: Sequence[Transform] = (),
-        stream: str = "train",
-        device: str = "cpu",
         render_mode: str | None = None,
-        **overrides: Any,
+        **options: Any,
     ) -> None:
-        made = make_env(
-            traffic,
-            env=env,
-            observation=observation,
-            reward=reward,
-            mask=mask,
-            transforms=transforms,
-            stream=stream,
-            device=device,
-            **overrides,
-        )
+        made = make_env(traffic, 1, **options)
         self._rows = Rows(made)
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
-        # What can be drawn here and now: without a display, no window.
+        # Without a display there is no window.
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
         self.metadata = {"render_modes": modes, "render_fps": real_time_fps(made)}
         self.render_mode = render_mode
-        self._view = None if render_mode is None else _view(made, render_mode, label(traffic))
+        self._view: LiveView | None = None
+        if render_mode is not None:
+            if render_mode not in RENDER_MODES:
+                raise UserError(
+                    f"render_mode={render_mode}: expected {' or '.join(RENDER_MODES)}; choose one of them."
+                )
+            window = FilmWindow("ganlane") if render_mode == "human" else None
+            self._view = LiveView(made, option("traffic", traffic).label(), window)
         self._seed = None if seed is None else seed_number(seed)
         self._episode = -1
         self._running = False
@@ -102,13 +99,13 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
             raise UserError("step(): no episode is under way; call reset() first.")
         actions = actions_of(np.reshape(action, -1), 1)
         if self._view is not None:
-            self._view.decide(int(actions[0]))
+            self._view.before_step(int(actions[0]))
         after = self._rows.step(actions)
         reward = float(after.get("reward")[0])
         terminated, truncated = (bool(after.get(name)[0]) for name in ("terminated", "truncated"))
         self._running = not (terminated or truncated)
         if self._view is not None:
-            self._view.decided(after, reward)
+            self._view.after_step(after, reward)
         return self._rows.observation(after)[0], reward, terminated, truncated, row_of(self._rows.info(after), 0)
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
@@ -125,15 +122,3 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         """Close the window, if there is one."""
         if self._view is not None:
             self._view.close()
-
-
-def _view(env: TransformedEnv, render_mode: str, traffic: str) -> LiveView:
-    """What draws in ``render_mode``."""
-    if render_mode not in RENDER_MODES:
-        raise UserError(f"render_mode={render_mode}: expected {' or '.join(RENDER_MODES)}; choose one of them.")
-    return LiveView(env, traffic, FilmWindow("ganlane") if render_mode == "human" else None)
-
-
-def label(traffic: Option) -> str:
-    """Name of the traffic in a picture."""
-    return option("traffic", traffic).label()

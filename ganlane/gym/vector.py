@@ -10,22 +10,22 @@ import numpy.typing as npt
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from torchrl.envs import Transform
 
-from ganlane.api.options import Option, option
-from ganlane.api.parts import make_env
+from ganlane.api import make_env
 from ganlane.errors import UserError
-from ganlane.gym.arguments import (
+from ganlane.gym.rendering import BatchView, real_time_fps
+from ganlane.gym.rows import (
     ACTIONS,
     SEEDS,
+    Floats,
+    Rows,
     actions_of,
     episode_numbers,
     known_options,
     row_mask,
     seed_number,
 )
-from ganlane.gym.pictures import BatchView, real_time_fps
-from ganlane.gym.rows import Floats, Rows
+from ganlane.options import Option, option
 
 Flags = npt.NDArray[np.bool_]
 
@@ -35,10 +35,10 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
 
     Args:
         num_envs: N, highways side by side.
-        traffic, observation, reward, mask, env, transforms, stream, device, overrides: as in
-            :func:`ganlane.api.make_env`.
+        traffic: as in :func:`ganlane.api.make_env`, as are ``options``.
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random.
         render_mode: None or ``rgb_array``.
+        options: as in :class:`ganlane.gym.single.HighwayGym`.
 
     A row that ends is reset in the same step (``AutoresetMode.SAME_STEP``): ``observation`` is the first of its next
     episode, ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended with. Row i of N runs the episodes
@@ -56,33 +56,16 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         self,
         num_envs: int = 1,
         traffic: Option = "idm_mobil",
-        observation: Option = "lane_view_overlap",
-        reward: Option = "paper",
-        mask: Option = "none",
+        *,
         seed: int | None = None,
-        env: Option = "highway",
-        transforms: Sequence[Transform] = (),
-        stream: str = "train",
-        device: str = "cpu",
         render_mode: str | None = None,
-        **overrides: Any,
+        **options: Any,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UserError(
                 f"render_mode={render_mode}: a batch has rgb_array only; use gymnasium.make for a window."
             )
-        made = make_env(
-            traffic,
-            num_envs,
-            env=env,
-            observation=observation,
-            reward=reward,
-            mask=mask,
-            transforms=transforms,
-            stream=stream,
-            device=device,
-            **overrides,
-        )
+        made = make_env(traffic, num_envs, **options)
         self._rows = Rows(made)
         self.num_envs, self.render_mode = self._rows.count, render_mode
         self.metadata = {**self.metadata, "render_fps": real_time_fps(made)}
@@ -123,7 +106,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         self._rows.start(seeds if np.size(seeds) > 1 else np.ravel(seeds)[0], first)
 
     def _next(self, each: npt.NDArray[np.int64]) -> tuple[Any, npt.NDArray[np.int64]]:
-        """Seeds and episodes after the present ones; at first those that the constructor was told."""
+        """Seeds and episodes after the present ones; at first the constructor's seed and the first episodes."""
         if self._rows.state is not None:
             now = self._rows.info()
             return now["seed"], now["episode_number"] + self.num_envs
@@ -137,7 +120,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         )
         info, ended = self._rows.info(), terminated | truncated
         if self._view is not None:
-            self._view.decided(actions, reward)
+            self._view.after_step(actions, reward)
             self._view.start(ended)
         if ended.any():
             final = self._rows.observation(after)
@@ -157,7 +140,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
 
 
 def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
-    """Observations [N] as gymnasium has final ones: an array for every row in ``rows``, None in the others."""
+    """Final observations in gymnasium's form: an object array [N], None outside ``rows``."""
     found = np.full(len(rows), None, dtype=object)
     for row in np.flatnonzero(rows):
         found[row] = observations[row]

@@ -14,12 +14,9 @@ from ganlane.parameters.checks import (
     every,
     lists_to_tuples,
     number,
-    one_of,
     optional,
 )
 
-#: What may stand before the noisy layers (:mod:`ganlane.agents.encoder`).
-ENCODERS = ("none", "shared")
 _DISCOUNT = Rule(lambda value: 0.0 < value <= 1.0, "a number above 0, at most 1")
 
 
@@ -29,16 +26,12 @@ class RainbowConfig:
 
     Attributes:
         hidden: widths of the hidden layers.
-        encoder: shared: layers shared by all vehicles, then a maximum over them (table3 and its like).
-        encoder_width: of these layers.
-        encoder_layers: how many.
         noisy: noisy layers; epsilon explores in addition to them.
         dueling: value and advantages in streams of their own.
         distributional: a distribution over returns (C51).
         double: double Q-learning.
         prioritised: prioritised replay.
         n_step: steps of the returns; 1: no multi-step returns.
-        decide_when_free: true: a decision lasts until its lane change is complete.
         gamma: discount per decision.
         atoms: of the distribution over returns, 2 or more.
         v_min: lowest discounted return; what is below is clamped (metrics: clamped_fraction).
@@ -64,16 +57,12 @@ class RainbowConfig:
     """
 
     hidden: tuple[int, ...] = (256, 256)
-    encoder: str = "none"
-    encoder_width: int = 64
-    encoder_layers: int = 2
     noisy: bool = True
     dueling: bool = True
     distributional: bool = True
     double: bool = True
     prioritised: bool = True
     n_step: int = 3
-    decide_when_free: bool = False
     gamma: float = 0.98
     atoms: int = 101
     v_min: float = -120.0
@@ -100,12 +89,10 @@ class RainbowConfig:
     def __post_init__(self) -> None:
         lists_to_tuples(self)
         counts = ["n_step", "batch_size", "capacity", "warmup", "decisions_per_update", "target_period", "atoms"]
-        counts += ["encoder_width", "encoder_layers"]
         shares = ("alpha", "beta_start", "epsilon_start", "epsilon")
         check(
             self,
             hidden=every(at_least(1)),
-            encoder=one_of(ENCODERS),
             gamma=_DISCOUNT,
             v_min=number(),
             v_max=number(),

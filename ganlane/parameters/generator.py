@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar, Literal
 
 from ganlane.errors import ParameterError
 from ganlane.parameters.checks import (
@@ -18,6 +19,7 @@ from ganlane.parameters.checks import (
     optional,
 )
 
+Preset = Literal["paper", "calibrated"]
 #: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing speed, lane offset.
 EXTRA_INPUTS = 4
 _WASHOUT = Rule(lambda value: value > 0 and not math.isnan(value), "a number above 0, or inf")
@@ -115,6 +117,7 @@ class FitConfig:
         seed: of weights, batches, noise, k-means and drivers' parameters.
     """
 
+    preset: ClassVar[Preset]
     seed: int = field(default=0, kw_only=True, metadata=NO_KEY)
 
 
@@ -136,6 +139,7 @@ class PaperConfig(FitConfig):
         mirror: swap left and right in half of the groups.
     """
 
+    preset: ClassVar[Preset] = "paper"
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
     weights: LossWeights = field(default_factory=LossWeights)
     loop: LoopConfig = field(default_factory=LoopConfig)
@@ -172,6 +176,7 @@ class CalibratedConfig(FitConfig):
         traits: whether every driver has its own headway and desired speed.
     """
 
+    preset: ClassVar[Preset] = "calibrated"
     sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS), metadata=NO_KEY)
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40))
     horizons: tuple[int, ...] = (8, 16, 29)

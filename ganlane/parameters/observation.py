@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from ganlane.errors import ParameterError
 from ganlane.parameters.checks import above, assign, at_least, between, check, one_of, part_of
+from ganlane.parameters.removed import refuse_removed_observation
 
 #: How far a delay may be from a whole number of decisions, in decisions.
 _TOLERANCE = 1e-6
@@ -17,10 +18,7 @@ FORMS = (
     "lane_view_drift",
     "lane_view_overlap",
     "table3_lane_view",
-    "fixed_order",
 )
-#: Those laid out as Table III is, from one vehicle to the next: what ``agent.encoder=shared`` can read.
-LISTS = ("table3", "table3_progress", "fixed_order")
 #: The masks, see :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe")
 
@@ -96,6 +94,7 @@ class ObservationConfig(ObservationScale):
         # One way to say that there are no errors, which is also that of older runs.
         if self.sensors == SensorParameters():
             assign(self, sensors=None)
+        refuse_removed_observation(self.form)
         check(self, form=one_of(FORMS))
 
     def scale(self) -> ObservationScale:

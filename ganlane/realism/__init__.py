@@ -16,17 +16,16 @@ driving. Long runs without an ego show what a traffic does over minutes.
 
 The modules, from the bottom up:
 
+- :mod:`~ganlane.realism.recordings`: recorded scenes as arrays.
 - :mod:`~ganlane.realism.quantities`: what is measured of trajectories, recorded or simulated.
 - :mod:`~ganlane.realism.distances`: the distance of two distributions, with intervals.
-- :mod:`~ganlane.realism.recordings`: recorded scenes as arrays.
 - :mod:`~ganlane.realism.references`: the histograms that ship, and reference drivers.
 - :mod:`~ganlane.realism.replay_starts`: a traffic drives recorded scenes.
-- :mod:`~ganlane.realism.fit_speeds`: measures that, and fits each traffic's desired speeds.
-- :mod:`~ganlane.realism.counters`, :mod:`~ganlane.realism.long_runs`: events and long runs.
-- :mod:`~ganlane.realism.starts`: every traffic from recorded or spawned starts, by folds where asked for.
-- :mod:`~ganlane.realism.card`: the numbers and checks of a card.
-- :mod:`~ganlane.realism.make_card`: drives a card from the command's configuration.
-- :mod:`~ganlane.realism.figures`, :mod:`~ganlane.realism.output`: figures, tables and documents.
+- :mod:`~ganlane.realism.long_runs`: long runs, and the events in them.
+- :mod:`~ganlane.realism.starts`: every traffic from recorded or spawned starts, its desired speeds fitted, by folds
+  where asked for.
+- :mod:`~ganlane.realism.card`: drives a card; its numbers and checks.
+- :mod:`~ganlane.realism.output`: tables, documents and figures.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ from ganlane.config.realism import RealismConfig
 
 def realism(config: RealismConfig, folder: Path) -> str:
     """Make a card: drive, measure, print and save; the line that names its results."""
-    from ganlane.build import set_threads
     from ganlane.evaluation import write_results
-    from ganlane.realism.make_card import drive_card, scenes_path
+    from ganlane.realism.card import drive_card, scenes_path
     from ganlane.realism.output import card_text, check_targets, draw, publish, show
+    from ganlane.runtime import set_threads
 
     config = config.shortened()
     set_threads(config.threads)

@@ -1,23 +1,48 @@
-"""The numbers of a card: every traffic's distances to the same recordings, rates, quantiles, and checks."""
+"""A card: every traffic driven from the command's configuration, its distances to the recordings, and checks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
-import numpy as np
-
-from ganlane.evaluation.statistics import Estimate
+from ganlane.build import make_road, make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.config.realism import RealismConfig
+from ganlane.config.traffic import TrafficConfig
+from ganlane.data import data_folder, default_scenes, read_scenes
+from ganlane.errors import UserError
+from ganlane.evaluation.statistics import Array, Estimate, entries
+from ganlane.generator import HELD_OUT
+from ganlane.parameters.checks import assign
 from ganlane.realism.distances import RESAMPLES, ceiling, distance, distance_difference, pooled_distance
-from ganlane.realism.fit_speeds import FLOORS, Driven
-from ganlane.realism.long_runs import totals
-from ganlane.realism.quantities import UNITS
-from ganlane.realism.references import quantiles_of, rate
-from ganlane.realism.starts import Starts
+from ganlane.realism.long_runs import LongRunParameters, long_run, totals
+from ganlane.realism.quantities import UNITS, Measured, measure_recordings
+from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
+from ganlane.realism.replay_starts import Factory, StartOptions
+from ganlane.realism.starts import (
+    FLOORS,
+    Fold,
+    Starts,
+    check_folds_cover,
+    fold_weights,
+    print_progress,
+    recorded_starts,
+    simulate_all,
+    spawned_starts,
+)
+from ganlane.sim.random import Stream
+from ganlane.sim.state import Road
+from ganlane.traffic import TrafficModule
 
+#: Preset of the weights that a traffic drives with.
+PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
+#: Quantities that one lane shows.
+I80_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
 #: Quantities in which generated traffic should come closer to recordings than rules do.
 CLOSER_IN = ("speed_spread", "acceleration", "time_headway", "time_to_collision", "lane_change_duration")
 #: Largest relative error of an acceleration quantile; largest share of steps that a guard may alter.
@@ -57,89 +82,84 @@ class Card:
         """The content of ``results.json``."""
         starts, held_out = self.starts, self.starts.separately_held_out
         apart = card_rows(starts.restricted_to(held_out), self.traffic, self.resamples) if held_out else None
-        driving = {"recorded": starts.recorded_summary, **driving_summary(starts.driven)}
+        driving = {name: each.summary() for name, each in starts.driven.items()}
+        recorded, own = starts.recorded_summary, driving[self.traffic]
+        rate, spread = starts.reference.rate(), starts.reference.spread_mps
+        checks = card_checks(
+            self.quantities, own["quantiles"], recorded["quantiles"], rate["per_vehicle_km_ci"], spread, self.runs
+        )
         return {
             "traffic": self.traffic,
             **starts.description(),
             "quantities": self.quantities,
             "quantities_held_out": apart,
-            "driving": driving,
+            "driving": {"recorded": recorded, **driving},
             "i80": self.site,
             **totals(self.runs),
             "long_runs": self.runs,
             "long_runs_against": {name: runs for name, runs in self.long_runs.items() if name != self.traffic},
-            "checks": self._checks(driving[self.traffic]["quantiles"]),
+            "checks": checks,
         }
-
-    def _checks(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        recorded, reference = self.starts.recorded_summary["quantiles"], self.starts.reference
-        return card_checks(self.quantities, own, recorded, reference.rate(), reference.spread_mps, self.runs)
 
 
 def card_rows(starts: Starts, traffic: str, resamples: int = RESAMPLES) -> dict[str, Any]:
-    """The rows of a traffic's card by quantity, with its difference to every other traffic from the same starts."""
-    others = {name: each for name, each in starts.driven.items() if name != traffic}
+    """The rows of a traffic's card by quantity, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
-    return quantity_rows(starts.driven[traffic], others, starts.recorded, floors, starts.paired, resamples)
+    return quantity_rows(traffic, starts.driven, starts.recorded, floors, starts.paired, resamples)
 
 
 def quantity_rows(
-    driven: Driven,
-    others: Mapping[str, Driven],
-    recorded: Mapping[str, np.ndarray],
+    traffic: str,
+    driven: Mapping[str, Measured],
+    recorded: Mapping[str, Array],
     floors: Mapping[str, Mapping[str, float]],
     paired: bool = True,
     resamples: int = RESAMPLES,
 ) -> dict[str, Any]:
-    """By quantity: distance, ceiling, floor, constant velocity, and the difference to each of ``others``.
+    """By quantity: distance, ceiling, floor, constant velocity, and the difference to each rival.
 
     Args:
-        driven: the traffic.
-        others: further traffics from the same starts; ``random`` and ``constant_velocity`` become the floors.
+        traffic: whose rows.
+        driven: it and others from the same starts; all but :data:`FLOORS` are rivals.
         recorded: by quantity, [units, bins]; its quantities are the rows. Their halves give the ceilings.
-        floors: by driver and quantity, where ``others`` does not have it.
+        floors: by driver and quantity, where ``driven`` does not hold the driver.
         paired: whether the recorded units are those that were driven.
         resamples: of the bootstrap.
     """
-    rivals = {name: each for name, each in others.items() if name not in FLOORS}
-    ends = {**floors, **floors_of({name: each for name, each in others.items() if name in FLOORS}, recorded)}
-    return {
-        name: {
+    rivals = [name for name in driven if name != traffic and name not in FLOORS]
+    ends = {**floors, **floors_of(driven, recorded)}
+    rows = {}
+    for name, counts in recorded.items():
+        own = driven[traffic].counts[name]
+        rows[name] = {
             "unit": UNITS[name],
-            **_estimate("distance", distance(driven.counts[name], counts, paired, resamples)),
+            **entries("distance", distance(own, counts, paired, resamples)),
             "ceiling": ceiling(counts),
             "floor": ends.get("random", {}).get(name),
             "constant_velocity": ends.get("constant_velocity", {}).get(name),
-            "samples": int(driven.counts[name].sum()),
+            "samples": int(own.sum()),
             "recorded_samples": int(counts.sum()),
             "against": {
-                rival: _against(driven.counts[name], each.counts[name], counts, paired, resamples)
-                for rival, each in rivals.items()
+                rival: _against(own, driven[rival].counts[name], counts, paired, resamples) for rival in rivals
             },
         }
-        for name, counts in recorded.items()
-    }
+    return rows
 
 
-def floors_of(driven: Mapping[str, Driven], recorded: Mapping[str, np.ndarray]) -> dict[str, dict[str, float]]:
-    """Finite distances of the reference drivers to the recordings, by driver and quantity."""
-    rows = {
-        floor: {name: pooled_distance(driven[floor].counts[name], counts) for name, counts in recorded.items()}
-        for floor in FLOORS
-        if floor in driven
-    }
-    return {
-        floor: {name: value for name, value in row.items() if math.isfinite(value)} for floor, row in rows.items()
-    }
+def floors_of(driven: Mapping[str, Measured], recorded: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+    """Finite distances of the reference drivers in ``driven`` to the recordings, by driver and quantity."""
+    found: dict[str, dict[str, float]] = {}
+    for floor in (name for name in FLOORS if name in driven):
+        values = {name: pooled_distance(driven[floor].counts[name], counts) for name, counts in recorded.items()}
+        found[floor] = {name: value for name, value in values.items() if math.isfinite(value)}
+    return found
 
 
-def _against(
-    own: np.ndarray, other: np.ndarray, recorded: np.ndarray, paired: bool, resamples: int
-) -> dict[str, Any]:
+def _against(own: Array, other: Array, recorded: Array, paired: bool, resamples: int) -> dict[str, Any]:
     """Another traffic's distance, and the difference to it."""
     theirs = distance(other, recorded, paired, resamples)
     difference = distance_difference(own, other, recorded, paired, resamples)
-    return {**_estimate("distance", theirs), **_estimate("difference", difference), "verdict": verdict(difference)}
+    return {**entries("distance", theirs), **entries("difference", difference), "verdict": verdict(difference)}
 
 
 def verdict(difference: Estimate) -> str:
@@ -149,30 +169,11 @@ def verdict(difference: Estimate) -> str:
     return "closer" if difference.value < 0.0 else "farther"
 
 
-def _estimate(name: str, estimate: Estimate) -> dict[str, Any]:
-    return {name: _finite(estimate.value), f"{name}_ci": estimate.interval}
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-def driving_summary(driven: Mapping[str, Driven]) -> dict[str, Any]:
-    """By traffic, lane changes per vehicle-km and the quantiles of every quantity."""
-    return {
-        name: {
-            **rate(sum(each.measured.lane_changes.values()), sum(each.measured.vehicle_km.values())),
-            "quantiles": quantiles_of(each.measured),
-        }
-        for name, each in driven.items()
-    }
-
-
 def card_checks(
     quantities: Mapping[str, Any],
     own: Mapping[str, Any],
     recorded: Mapping[str, Any],
-    recorded_rate: Mapping[str, Any],
+    recorded_rate: Sequence[float] | None,
     spread_mps: float,
     runs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
@@ -181,7 +182,7 @@ def card_checks(
     Args:
         quantities: the card's rows.
         own, recorded: quantiles of the traffic and of the recordings, from the same starts.
-        recorded_rate: lane changes per vehicle-km with their interval.
+        recorded_rate: interval of the recorded lane changes per vehicle-km.
         spread_mps: recorded mean spread of speeds within a frame.
         runs: the long runs.
     """
@@ -203,14 +204,13 @@ def _quantiles_near(own: Mapping[str, Any], recorded: Mapping[str, Any]) -> bool
     return all(abs(mine - theirs) <= _QUANTILE_SHARE * abs(theirs) for mine, theirs in pairs)
 
 
-def _run_checks(run: Mapping[str, Any], recorded_rate: Mapping[str, Any], spread_mps: float) -> dict[str, Any]:
+def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float) -> dict[str, Any]:
     changes, overlaps = run["lane_changes_per_vehicle_km"], run["overlaps_per_1000_vehicle_km"]
-    recorded = recorded_rate["per_vehicle_km_ci"]
     spreads = [at["spread_mps"] for at in run["speeds"].values() if at["spread_mps"] is not None]
     wide = None if not spreads else min(spreads) >= 0.5 * spread_mps
     return {
         "vehicles": run["vehicles"],
-        "lane_changes_inside_recorded_interval": _inside(changes, recorded),
+        "lane_changes_inside_recorded_interval": _inside(changes, recorded_rate),
         "overlaps_under_1_per_1000_vehicle_km": None if overlaps is None else overlaps < 1.0,
         "nobody_off_the_road": run["off_road"] == 0,
         "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,
@@ -221,3 +221,121 @@ def _run_checks(run: Mapping[str, Any], recorded_rate: Mapping[str, Any], spread
 
 def _inside(value: float | None, interval: Sequence[float] | None) -> bool | None:
     return None if value is None or not interval else interval[0] <= value <= interval[1]
+
+
+def drive_card(config: RealismConfig, path: Path | None) -> Card:
+    """Drive the traffic and its rivals: from the same starts, on I-80, and in long runs.
+
+    ``path`` is None where there are no recordings.
+
+    Raises:
+        UserError: recordings, weights or names that do not fit, or I-80 files that were asked for and are not there.
+    """
+    factories, files, traffic = traffic_factories(config), i80_files_wanted(config, path), config.traffic.label()
+    starts = drive_from_starts(config, factories, path)
+    site = i80_cards(factories, files, starts.options, config.resamples)
+    far = factories if config.long_against else {traffic: factories[traffic]}
+    runs = {name: long_runs(config, name, make) for name, make in far.items()}
+    return Card(traffic, starts, site, runs, config.resamples)
+
+
+def scenes_path(config: RealismConfig) -> Path | None:
+    """The recordings; None where none are named and none are found."""
+    if config.data.path:
+        return Path(config.data.path)
+    data_folder()  # a folder that was named must be there
+    try:
+        return default_scenes()
+    except UserError:
+        return None
+
+
+def traffic_factories(config: RealismConfig, weights: Mapping[str, Path] | None = None) -> dict[str, Factory]:
+    """Factories of traffic on a given road, by name: the card's traffic first, then its rivals.
+
+    ``weights`` of a fold, by preset, replace those that generated traffics name themselves; :class:`UserError` where
+    there are none of a preset.
+    """
+    every = {config.traffic.label(): config.traffic, **config.rivals()}
+    if weights is not None:
+        every = {name: _with_weights(name, traffic, weights) for name, traffic in every.items()}
+    return {name: _factory(traffic, config.env) for name, traffic in every.items()}
+
+
+def _factory(traffic: TrafficConfig, env: EnvConfig) -> Factory:
+    def make(road: Road) -> TrafficModule:
+        # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
+        own = copy(env)
+        assign(own, lanes=int(road.lanes), lane_width_m=float(road.lane_width_m))
+        return make_traffic(traffic, own, Stream.REPORT)
+
+    return make
+
+
+def _with_weights(name: str, traffic: TrafficConfig, weights: Mapping[str, Path]) -> TrafficConfig:
+    """A generated traffic with the weights of a fold; others as they are."""
+    if name not in PRESETS:
+        return traffic
+    if PRESETS[name] not in weights:
+        raise UserError(
+            f"fold_weights: traffic {name} needs the preset {PRESETS[name]}, and a fold has no such file; give one "
+            "for every fold."
+        )
+    return replace(traffic, path=str(weights[PRESETS[name]]))  # type: ignore[call-arg]
+
+
+def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
+    """The scenes that traffics start from: the held-out ones, all, or all by folds."""
+    if not config.fold_weights:
+        held_out = config.data.held_out_scenes(scenes, HELD_OUT)
+        return [Fold(traffic_factories(config), scenes if config.scenes == "all" else held_out, held_out)]
+    folds = fold_weights([Path(path) for path in config.fold_weights])
+    check_folds_cover(list(folds), scenes)
+    return [Fold(traffic_factories(config, weights), held_out, held_out) for held_out, weights in folds.items()]
+
+
+def drive_from_starts(config: RealismConfig, factories: Mapping[str, Factory], path: Path | None) -> Starts:
+    """Drive every traffic from recorded scenes, or from spawned ones where there are none."""
+    if path is None:
+        spawn = config.env.spawn_parameters()
+        return spawned_starts(factories, make_road(config.env), spawn, config.repeats, config.seed)
+    frame = read_scenes(path)
+    folds = folds_of(config, sorted(frame["scene"].unique().to_list()))
+    fit, options = config.desired_above_mps is None, StartOptions(repeats=config.repeats, seed=config.seed)
+    if config.desired_above_mps is not None:
+        options = replace(options, desired_above_mps=config.desired_above_mps)
+    return recorded_starts(folds, frame, options, fit, str(path))
+
+
+def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
+    """The I-80 files next to the scenes that ``config`` asks for, by name."""
+    files = {} if path is None or config.i80 is False else i80_files(path.parent)
+    if config.i80 and not files:
+        raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies beside the scenes; use i80=false.")
+    return files
+
+
+def i80_cards(
+    factories: Mapping[str, Factory], files: Mapping[str, Path], options: Mapping[str, StartOptions], resamples: int
+) -> dict[str, Any]:
+    """By I-80 file, the rows of the first of ``factories``; nothing is fitted to the site."""
+    cards, once = {}, {name: replace(each, repeats=1) for name, each in options.items()}
+    for name, path in files.items():
+        recordings = read_i80(name, path)
+        driven, measured = simulate_all(factories, recordings, once), measure_recordings(recordings)
+        recorded = {quantity: measured.counts[quantity] for quantity in I80_QUANTITIES}
+        cards[name] = quantity_rows(next(iter(factories)), driven, recorded, {}, resamples=resamples)
+    return cards
+
+
+def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
+    """One long run of a traffic per number of vehicles."""
+    spawn, runs = config.env.spawn_parameters(), []
+    for vehicles in config.long_vehicles if config.vehicle_km > 0 else []:
+        parameters = LongRunParameters(vehicles, config.vehicle_km, config.long_s, config.seed, spawn)
+
+        def report(km: float, vehicles: int = vehicles) -> None:
+            print_progress(f"{name}, long run of {vehicles} vehicles: {km:.0f} of {config.vehicle_km:g} vehicle-km")
+
+        runs.append(long_run(make, make_road(config.env), parameters, report))
+    return runs

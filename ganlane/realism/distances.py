@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import stdtrit
 
-from ganlane.evaluation.statistics import Estimate, percentile_levels, resample_counts
-
-Array = npt.NDArray[np.float64]
+from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, resample_counts
 
 RESAMPLES = 2_000
 #: Random halves of the recordings that the ceiling is the mean of.
@@ -58,8 +55,8 @@ def distance(
     (drawn,) = _resampled((simulated,), recorded, paired, resamples, seed)
     known = drawn[np.isfinite(drawn)]
     if not np.isfinite(value) or len(known) < 2:
-        return Estimate(value, None, None)
-    tails = np.quantile(known**2, percentile_levels())
+        return Estimate(value)
+    tails = np.quantile(known**2, TAIL_LEVELS)
     low, high = np.sqrt(np.maximum(2.0 * value**2 - tails[::-1], 0.0))
     return Estimate(value, min(value, float(low)), min(1.0, max(value, float(high))))
 
@@ -84,9 +81,9 @@ def distance_difference(
     known = (ours**2 - theirs**2)[np.isfinite(ours) & np.isfinite(theirs)]
     units, value = len(first), one - other
     if not np.isfinite(value) or len(known) < 2:
-        return Estimate(value, None, None)
+        return Estimate(value)
     error = float(known.std()) * np.sqrt(units / (units - 1))
-    reach = float(stdtrit(units - 1, percentile_levels()[1])) * error / max(one + other, _TINY)
+    reach = float(stdtrit(units - 1, TAIL_LEVELS[1])) * error / max(one + other, _TINY)
     return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 

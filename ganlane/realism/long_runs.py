@@ -7,9 +7,10 @@ time, and quantiles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -17,18 +18,19 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.data import lane_changes_of_arrays
-from ganlane.evaluation.counts import poisson_interval
+from ganlane.evaluation.statistics import entries, poisson_interval
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.realism.counters import EventCounter, GuardMeter, watched
 from ganlane.realism.replay_starts import Factory, step_traffic
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.lanes import lateral_half_extent
+from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import TrafficModule
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic import Guard, TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
-DRIFT_S = (10.0, 60.0, 150.0, 300.0)
+SPEEDS_AT_S = (10.0, 60.0, 150.0, 300.0)
 GOAL_M = 5000.0
 #: Levels of the acceleration's quantiles.
 QUANTILES = (0.05, 0.95)
@@ -37,6 +39,16 @@ _EVENTS = ("off_road", "standstills_in_free_flow")
 #: Samples of one batch (times, rows, vehicles); bounds the memory.
 _MOST_SAMPLES = 12_000_000
 _MOST_ROWS = 64
+#: A body further beyond the edge than this is off the road, m; less is rounding.
+EDGE_M: Final = 0.01
+#: A vehicle slower than this with a leader no nearer than that stands still without reason, m/s and m.
+STANDING_MPS: Final = 1.0
+FREE_M: Final = 50.0
+#: Standstills are tested once in so many steps.
+_SECOND: Final = 10
+#: A guard intervenes where it alters more than this, m/s2 and m.
+ALTERED_ACCELERATION: Final = 0.1
+ALTERED_POSITION_M: Final = 0.02
 
 
 @dataclass(frozen=True)
@@ -65,11 +77,13 @@ class LongRunParameters:
 
 
 class Trajectories(NamedTuple):
-    """Positions and speeds [T, N, M] of the vehicles of a batch (no ego), m and m/s."""
+    """Vehicles of a batch without ego: positions [T, N, M] in m, speeds [T, N, M] in m/s, sizes [N, M] in m."""
 
     x: np.ndarray
     y: np.ndarray
     speed: np.ndarray
+    length: np.ndarray
+    width: np.ndarray
 
     @property
     def driven_m(self) -> np.ndarray:
@@ -77,16 +91,95 @@ class Trajectories(NamedTuple):
         return self.x - self.x[:1]
 
 
+class EventCounter:
+    """Counts onsets; index 0 (the ego's) and vehicles that are not valid do not count.
+
+    Attributes:
+        overlaps: pairs of vehicles whose boxes began to overlap.
+        off_road: vehicles whose body began to reach beyond the edge of the road.
+        standstills: vehicles that began to stand still in free flow.
+    """
+
+    def __init__(self, road: Road) -> None:
+        self.road = road
+        self.overlaps = self.off_road = self.standstills = 0
+        self._before: dict[str, Tensor] = {}
+
+    def begin(self) -> None:
+        """Forget the last state: a new batch of episodes begins."""
+        self._before = {}
+
+    def count(self, vehicles: Vehicles, step: int) -> None:
+        """Count the events of a physics step."""
+        others = vehicles.columns(slice(1, None))
+        self.overlaps += self._onsets("overlap", pair_overlaps(others).triu(1))
+        half = lateral_half_extent(others) - EDGE_M
+        left, right = self.road.left_edge_m(), self.road.right_edge_m()
+        outside = (others.y + half > left) | (others.y - half < right)
+        self.off_road += self._onsets("off_road", outside & others.valid)
+        if step % _SECOND == _SECOND - 1:
+            self.standstills += self._onsets("standstill", self._standing(vehicles)[:, 1:])
+
+    def _standing(self, vehicles: Vehicles) -> Tensor:
+        slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
+        ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
+        return slow & (ahead.gap > FREE_M)
+
+    def _onsets(self, name: str, now: Tensor) -> int:
+        """Number of entries that are true now and were not at the last count."""
+        before = self._before.get(name, torch.zeros_like(now))
+        self._before[name] = now
+        return int((now & ~before).sum())
+
+
+class GuardMeter:
+    """Counts the vehicle-steps in which a guard alters acceleration or lateral position.
+
+    A counter of one step's sums stays on the device; :attr:`share` fetches it.
+    """
+
+    def __init__(self) -> None:
+        self._altered = torch.zeros((), dtype=torch.int64)
+        self._steps = torch.zeros((), dtype=torch.int64)
+
+    def __call__(self, before: Vehicles, moved: Vehicles, guarded: Vehicles) -> None:
+        """Called by the guard at every step; index 0 is the ego's and does not count."""
+        wanted = (moved.speed - before.speed) / PHYSICS_STEP_S
+        given = (guarded.speed - before.speed) / PHYSICS_STEP_S
+        along = (given - wanted).abs() > ALTERED_ACCELERATION
+        across = (guarded.y - moved.y).abs() > ALTERED_POSITION_M
+        counts = before.valid.clone()
+        counts[:, 0] = False
+        self._altered = self._altered + ((along | across) & counts).sum()
+        self._steps = self._steps + counts.sum()
+
+    @property
+    def share(self) -> float | None:
+        """Share of the vehicle-steps; None where no guard was at work."""
+        steps = int(self._steps)
+        return int(self._altered) / steps if steps else None
+
+
+@contextmanager
+def watched(traffic: TrafficModule, meter: GuardMeter) -> Iterator[None]:
+    """Attach ``meter`` to every guard in ``traffic`` within the context."""
+    guards = [part for part in traffic.modules() if isinstance(part, Guard)]
+    before = [guard.observer for guard in guards]
+    for guard in guards:
+        guard.observer = meter
+    try:
+        yield
+    finally:
+        for guard, observer in zip(guards, before):
+            guard.observer = observer
+
+
 def long_run(
     make: Factory, road: Road, parameters: LongRunParameters, report: Callable[[float], None] | None = None
 ) -> dict[str, Any]:
-    """Drive ``parameters.vehicle_km`` and count; the numbers as :func:`summary` gives them.
+    """Drive ``parameters.vehicle_km`` and count; the numbers of :func:`summary`.
 
-    Args:
-        make: the traffic.
-        road: of all episodes.
-        parameters: how much.
-        report: called with the vehicle-km driven so far.
+    ``report`` is called with the vehicle-km driven so far.
     """
     traffic, meter, events, parts = make(road), GuardMeter(), EventCounter(road), []
     km, episodes = 0.0, 0
@@ -123,41 +216,27 @@ def spawned_vehicles(traffic: TrafficModule, parameters: LongRunParameters, key:
     return vehicles.with_(valid=vehicles.valid & (index > 0))
 
 
-def _counters(parameters: LongRunParameters, first: int, rows: int) -> dict[str, Tensor]:
-    """Seed and episode [N] of ``rows`` episodes from number ``first`` on."""
-    return {keys.SEED: torch.full((rows,), parameters.seed), keys.EPISODE: first + torch.arange(rows)}
-
-
-def sizes(traffic: TrafficModule, parameters: LongRunParameters, first: int, rows: int) -> tuple[np.ndarray, ...]:
-    """Length and width [N, M] in m of the vehicles that :func:`drive_spawned` drives."""
-    state = spawned_vehicles(
-        traffic, parameters, episode_key(traffic.stream, *_counters(parameters, first, rows).values())
-    )
-    return state.length[:, 1:].numpy(), state.width[:, 1:].numpy()
-
-
 def drive_spawned(
     traffic: TrafficModule, parameters: LongRunParameters, first: int, rows: int, events: EventCounter
 ) -> Trajectories:
     """One batch of ``rows`` episodes from number ``first`` on, from spawned starts; ``events`` counts."""
-    counters = _counters(parameters, first, rows)
+    counters = {keys.SEED: torch.full((rows,), parameters.seed), keys.EPISODE: first + torch.arange(rows)}
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
-    memory = traffic.init_memory(state, torch.ones_like(state.valid), absorb(key, 0))
-    trajectories, start = [_snapshot(state)], state.x
+    memory = traffic.init_memory(state, absorb(key, 0))
+    snapshots, start = [_snapshot(state)], state.x
+    sizes = (state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
     events.begin()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
         state, memory = step_traffic(traffic, state, memory, counters, step)
         events.count(state, step)
-        trajectories.append(_snapshot(state))
+        snapshots.append(_snapshot(state))
         # Distances are tested once in ten seconds of driving: cheap, and exact enough.
-        if step % 100 == 99 and step * PHYSICS_STEP_S >= DRIFT_S[-1] and _goal_reached(state, start):
+        due = step % 100 == 99 and step * PHYSICS_STEP_S >= SPEEDS_AT_S[-1]
+        if due and bool(((state.x - start)[:, 1:].mean(1) >= GOAL_M).all()):
             break
-    return Trajectories(*(np.stack(values) for values in zip(*trajectories)))
-
-
-def _goal_reached(state: Vehicles, start: Tensor) -> bool:
-    return bool(((state.x - start)[:, 1:].mean(1) >= GOAL_M).all())
+    x, y, speed = (np.stack(values) for values in zip(*snapshots))
+    return Trajectories(x, y, speed, *sizes)
 
 
 def _snapshot(state: Vehicles) -> tuple[np.ndarray, ...]:
@@ -172,40 +251,32 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     x = trajectories.x.astype(np.float64)
     # The same filter as for recordings; one sample a second is enough.
     bend = x[2 * second :: second] - 2.0 * x[second:-second:second] + x[: -2 * second : second]
-    rows = x.shape[1]
+    steps, rows = x.shape[:2]
+    times = {f"{seconds:g} s": round(seconds / PHYSICS_STEP_S) for seconds in SPEEDS_AT_S}
+    speeds = {
+        name: [_speeds(trajectories, row, time) for row in range(rows) if time < steps]
+        for name, time in times.items()
+    }
+    # The first time at which the episode's vehicles have covered 5000 m on average.
+    reached = [(row, np.flatnonzero(trajectories.driven_m[:, row].mean(-1) >= GOAL_M)) for row in range(rows)]
+    speeds[f"{GOAL_M:g} m"] = [_speeds(trajectories, row, int(there[0])) for row, there in reached if len(there)]
     return {
         "vehicle_km": float(trajectories.driven_m[-1].sum(dtype=np.float64)) / 1000.0,
         "lane_changes": len(changes),
         "durations": changes.duration_s[changes.complete],
         "acceleration": bend.ravel(),
-        "drift": [[_at_time(trajectories, row, seconds) for row in range(rows)] for seconds in DRIFT_S],
-        "at_goal": [_at_goal(trajectories, row) for row in range(rows)],
+        "speeds": speeds,
     }
 
 
-def _speeds(trajectories: Trajectories, row: int, time: int) -> tuple[float, float]:
-    """Mean and standard deviation of an episode's speeds, m/s."""
+def _speeds(trajectories: Trajectories, row: int, time: int) -> tuple[float, float, float]:
+    """Mean and standard deviation of an episode's speeds, m/s, and the time, s."""
     speed = trajectories.speed[time, row].astype(np.float64)
-    return float(speed.mean()), float(speed.std(ddof=1)) if len(speed) > 1 else 0.0
-
-
-def _at_time(trajectories: Trajectories, row: int, seconds: float) -> tuple[float, float] | None:
-    time = round(seconds / PHYSICS_STEP_S)
-    return _speeds(trajectories, row, time) if time < len(trajectories.x) else None
-
-
-def _at_goal(trajectories: Trajectories, row: int) -> tuple[float, float, float] | None:
-    """Speeds when the episode's vehicles have covered 5000 m on average, and the time, s; None if they never do."""
-    there = np.flatnonzero(trajectories.driven_m[:, row].mean(-1) >= GOAL_M)
-    return (*_speeds(trajectories, row, there[0]), there[0] * PHYSICS_STEP_S) if len(there) else None
+    return float(speed.mean()), float(speed.std(ddof=1)) if len(speed) > 1 else 0.0, time * PHYSICS_STEP_S
 
 
 def summary(
-    parts: list[dict[str, Any]],
-    events: EventCounter,
-    meter: GuardMeter,
-    episodes: int,
-    vehicles: int,
+    parts: list[dict[str, Any]], events: EventCounter, meter: GuardMeter, episodes: int, vehicles: int
 ) -> dict[str, Any]:
     """The numbers of a long run; rates are per vehicle-km, with exact 95 % intervals, None where no vehicle moved."""
     km = sum(part["vehicle_km"] for part in parts)
@@ -223,39 +294,28 @@ def summary(
         "off_road": events.off_road,
         "standstills_in_free_flow": events.standstills,
         "acceleration_quantiles": {f"{level:g}": float(np.quantile(acceleration, level)) for level in QUANTILES},
-        "speeds": _speeds_over_time(parts),
+        "speeds": {
+            name: _mean_speeds([row for part in parts for row in part["speeds"][name]], name.endswith(" m"))
+            for name in parts[0]["speeds"]
+        },
         "guard_share": meter.share,
     }
 
 
 def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
     """Both counts per vehicle-km and per 1000 of them, with exact 95 % intervals; None where no vehicle moved."""
-    numbers: dict[str, Any] = {}
-    for name, events, scale in (
-        ("lane_changes_per_vehicle_km", lane_changes, 1.0),
-        ("overlaps_per_1000_vehicle_km", overlaps, 1000.0),
-    ):
-        count = poisson_interval(events)
-        numbers[name] = scale * count.value / km if km > 0.0 else None
-        numbers[f"{name}_ci"] = [scale * bound / km for bound in count.interval or ()] if km > 0.0 else None
-    return numbers
-
-
-def _speeds_over_time(parts: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float | int | None]]:
-    """Mean speed and spread after each of :data:`DRIFT_S` and after :data:`GOAL_M`."""
-    drift = {
-        f"{seconds:g} s": _mean([row for part in parts for row in part["drift"][index]])
-        for index, seconds in enumerate(DRIFT_S)
+    changes, pairs = poisson_interval(lane_changes), poisson_interval(overlaps)
+    return {
+        **entries("lane_changes_per_vehicle_km", changes.scaled(per=km) if km > 0.0 else None),
+        **entries("overlaps_per_1000_vehicle_km", pairs.scaled(1000.0, per=km) if km > 0.0 else None),
     }
-    return drift | {f"{GOAL_M:g} m": _mean([row for part in parts for row in part["at_goal"]])}
 
 
-def _mean(rows: list[tuple[float, ...] | None]) -> dict[str, float | int | None]:
+def _mean_speeds(rows: Sequence[tuple[float, float, float]], with_time: bool) -> dict[str, float | int | None]:
     """Means over the episodes that lasted so long, and their number."""
-    known = [row for row in rows if row is not None]
-    names = ("mean_speed_mps", "spread_mps", "after_s")
-    means = {name: float(np.mean(values)) for name, values in zip(names, zip(*known))} if known else {}
-    return {"mean_speed_mps": None, "spread_mps": None, **means, "episodes": len(known)}
+    names = ("mean_speed_mps", "spread_mps", "after_s") if with_time else ("mean_speed_mps", "spread_mps")
+    means = {name: float(np.mean(values)) for name, values in zip(names, zip(*rows))} if rows else {}
+    return {"mean_speed_mps": None, "spread_mps": None, **means, "episodes": len(rows)}
 
 
 def totals(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

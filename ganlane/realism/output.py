@@ -1,4 +1,4 @@
-"""Writes a card: tables on stdout, a section of a document, figures, and the file that ships."""
+"""Shows a card: tables on stdout, a section of a document, figures, and the file that ships."""
 
 from __future__ import annotations
 
@@ -9,19 +9,36 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
 from ganlane.config.folders import OVERRIDES
 from ganlane.config.realism import RealismConfig
 from ganlane.errors import UserError
-from ganlane.evaluation.provenance import code_version, machine
+from ganlane.evaluation import code_version, machine
+from ganlane.evaluation.table import aligned, number, with_interval
 from ganlane.files import split_at_markers, write_between_markers, write_bytes
 from ganlane.realism import references
 from ganlane.realism.card import Card, floors_of
-from ganlane.realism.figures import card_figures
-from ganlane.realism.make_card import print_progress
-from ganlane.realism.starts import Starts
-from ganlane.view.figures import save_figure
+from ganlane.realism.quantities import QUANTITIES, UNITS
+from ganlane.realism.starts import FLOORS, Starts, print_progress
+from ganlane.view.figures import (
+    FAINT,
+    GRID,
+    INK,
+    STYLE,
+    FloatArray,
+    add_legend,
+    palette,
+    panel_grid,
+    plot_line,
+    save_figure,
+)
 
-_NOTHING = "-"
+#: Colour of the recordings.
+RECORDED = INK
 #: The check of a guard, and its answer where there is none.
 _GUARD, _WITHOUT_GUARD = "guard_under_5_percent", "no guard"
 
@@ -34,12 +51,6 @@ def check_targets(config: RealismConfig, path: Path | None) -> None:
         split_at_markers(Path(config.report), *markers(config.card()))
     if config.figures is not None and not Path(config.figures).is_dir():
         raise UserError(f"figures={config.figures}: no such folder; make it, or name another.")
-
-
-def draw(card: Card, to: Path) -> list[Path]:
-    """The figures of a card, into the folder ``to``."""
-    figures = card_figures(card.starts, card.runs, card.quantities, card.traffic)
-    return [save_figure(figure, to / f"{name}.png") for name, figure in figures.items()]
 
 
 def show(
@@ -77,12 +88,7 @@ def markers(card: str) -> tuple[str, str]:
 
 
 def card_text(numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """The card's tables, as they are printed.
-
-    Args:
-        numbers: what ``results.json`` holds.
-        long_runs: by traffic; those that drove none are left out.
-    """
+    """The card's tables: of the ``numbers`` in ``results.json``, and of the long runs of all traffics."""
     traffic = numbers["traffic"]
     tables = [quantities_table(numbers["quantities"], traffic)]
     if numbers["quantities_held_out"] is not None:
@@ -115,13 +121,13 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
         heading += [short_name(other), f"minus {short_name(other)} [95 %]", ""]
     lines = [heading]
     for name, row in quantities.items():
-        scale = (_number(row[key]) for key in ("ceiling", "constant_velocity", "floor"))
-        line = [f"{name}, {row['unit']}", _with_interval(row, "distance"), *scale]
+        scale = (number(row[key]) for key in ("ceiling", "constant_velocity", "floor"))
+        line = [f"{name}, {row['unit']}", with_interval(row, "distance"), *scale]
         for other in others:
             rival = row["against"][other]
-            line += [_number(rival["distance"]), _with_interval(rival, "difference"), rival["verdict"]]
+            line += [number(rival["distance"]), with_interval(rival, "difference"), rival["verdict"]]
         lines.append(line)
-    return _aligned(lines)
+    return aligned(lines)
 
 
 def starts_table(driving: Mapping[str, Any]) -> str:
@@ -129,38 +135,37 @@ def starts_table(driving: Mapping[str, Any]) -> str:
     lines = [["from the same starts", "changes per vehicle-km [95 %]", "vehicle-km", "acceleration 5 %, 95 %"]]
     for name, row in driving.items():
         low, high = (row["quantiles"]["acceleration"][level] for level in ("0.05", "0.95"))
-        rate = _with_interval(row, "per_vehicle_km", 2)
-        lines.append(
-            [short_name(name), rate, _number(row["vehicle_km"], 1), f"{_number(low, 2)}, {_number(high, 2)}"]
-        )
-    return _aligned(lines)
+        rate, km = with_interval(row, "per_vehicle_km", 2), number(row["vehicle_km"], 1)
+        lines.append([short_name(name), rate, km, f"{number(low, 2)}, {number(high, 2)}"])
+    return aligned(lines)
 
 
 def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
     """The long runs of a traffic, one column each."""
-    rows: list[list[str]] = [[f"{short_name(traffic)}, long runs", *(f"{run['vehicles']} vehicles" for run in runs)]]
-    plain = ("off_road", "standstills_in_free_flow")
-    rows.append(["vehicle-km", *(_number(run["vehicle_km"], 0) for run in runs)])
-    rows.append(["changes per vehicle-km", *(_with_interval(run, "lane_changes_per_vehicle_km", 2) for run in runs)])
-    rows.append(
-        ["overlaps per 1000 vehicle-km", *(_with_interval(run, "overlaps_per_1000_vehicle_km", 2) for run in runs)]
-    )
-    rows += [[name.replace("_", " "), *(str(run[name]) for run in runs)] for name in plain]
+    cells = {
+        f"{short_name(traffic)}, long runs": [f"{run['vehicles']} vehicles" for run in runs],
+        "vehicle-km": [number(run["vehicle_km"], 0) for run in runs],
+        "changes per vehicle-km": [with_interval(run, "lane_changes_per_vehicle_km", 2) for run in runs],
+        "overlaps per 1000 vehicle-km": [with_interval(run, "overlaps_per_1000_vehicle_km", 2) for run in runs],
+        "off road": [str(run["off_road"]) for run in runs],
+        "standstills in free flow": [str(run["standstills_in_free_flow"]) for run in runs],
+    }
     for time in runs[0]["speeds"]:
         at = [run["speeds"][time] for run in runs]
-        cells = [f"{_number(each['mean_speed_mps'], 1)}, {_number(each['spread_mps'], 2)}" for each in at]
-        rows.append([f"mean speed, spread after {time}, m/s", *cells])
+        cells[f"mean speed, spread after {time}, m/s"] = [
+            f"{number(each['mean_speed_mps'], 1)}, {number(each['spread_mps'], 2)}" for each in at
+        ]
     for level in runs[0]["acceleration_quantiles"]:
-        cells = [_number(run["acceleration_quantiles"][level], 2) for run in runs]
-        rows.append([f"acceleration, {100 * float(level):g} % quantile", *cells])
-    shares = ["none" if run["guard_share"] is None else f"{100 * run['guard_share']:.1f} %" for run in runs]
-    rows.append(["the guard's share", *shares])
-    return _aligned(rows)
+        quantiles = [number(run["acceleration_quantiles"][level], 2) for run in runs]
+        cells[f"acceleration, {100 * float(level):g} % quantile"] = quantiles
+    shares = [run["guard_share"] for run in runs]
+    cells["the guard's share"] = ["none" if share is None else f"{100 * share:.1f} %" for share in shares]
+    return aligned([[name, *row] for name, row in cells.items()])
 
 
 def checks_text(checks: Mapping[str, Any]) -> str:
     """The card's checks, a line each."""
-    words = {True: "yes", False: "no", None: "not told"}
+    words = {True: "yes", False: "no", None: "unknown"}
     near = "acceleration_quantiles_within_30_percent"
     lines = [f"{near.replace('_', ' ')}: {words[checks[near]]}"]
     for other, verdicts in checks["compared_with"].items():
@@ -182,22 +187,93 @@ def short_name(traffic: str) -> str:
     return traffic.rpartition(".")[2]
 
 
-def _number(value: float | None, digits: int = 3) -> str:
-    return _NOTHING if value is None else f"{value:.{digits}f}"
+@rc_context(STYLE)
+def draw_distributions(
+    recorded: Mapping[str, FloatArray], simulated: Mapping[str, Mapping[str, FloatArray]]
+) -> Figure:
+    """One panel per quantity: the recorded density, and each traffic's; none where nothing was counted.
+
+    Args:
+        recorded: by quantity, counts [bins].
+        simulated: by traffic, then quantity.
+    """
+    figure, grid = panel_grid(len(recorded))
+    colours = {**palette(list(simulated)), "recorded": RECORDED}
+    for axes, name in zip(grid, recorded):
+        bounds, unit = QUANTITIES[name].edges, UNITS[name].replace("s2", "s²").replace("s3", "s³")
+        axes.set(title=name.replace("_", " "), xlabel=unit, ylabel=f"density, per {unit}")
+        axes.set_xlim(bounds[0], bounds[-1])
+        for driver, counts in {**simulated, "recorded": recorded}.items():
+            if total := float(counts[name].sum()):
+                middle = 0.5 * (bounds[1:] + bounds[:-1])
+                plot_line(axes, middle, counts[name] / total / np.diff(bounds), color=colours[driver])
+    add_legend(figure, {"recorded": RECORDED, **colours})
+    return figure
 
 
-def _with_interval(row: Mapping[str, Any], name: str, digits: int = 3) -> str:
-    interval = row.get(f"{name}_ci")
-    text = _number(row.get(name), digits)
-    return text if not interval else f"{text} [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]"
+@rc_context(STYLE)
+def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
+    """The rows of :func:`ganlane.realism.card.quantity_rows`: a block per quantity, a line per traffic.
+
+    Vertical lines are the ends of the scale: recordings against each other, and random driving.
+    """
+    others = list(next(iter(quantities.values()))["against"])
+    colours = palette([traffic, *others])
+    block = len(colours) + 1
+    figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
+    axes = figure.subplots()
+    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0), xlabel="Jensen-Shannon distance to recorded driving")
+    axes.set_yticks([block * (index + 0.5) for index in range(len(quantities))])
+    axes.set_yticklabels([name.replace("_", " ") for name in quantities], color=INK, size=9)
+    axes.tick_params("y", length=0)
+    axes.grid(False, axis="y")
+    for index, row in enumerate(quantities.values()):
+        top = block * index
+        axes.axhline(top, color=GRID, lw=0.8)
+        for mark, colour in (("ceiling", INK), ("floor", FAINT)):
+            if row[mark] is not None:
+                axes.vlines(row[mark], top + 0.3, top + block - 0.3, color=colour, lw=1.6)
+        for line, (driver, colour) in enumerate(colours.items()):
+            shown = row if driver == traffic else row["against"][driver]
+            if shown["distance"] is not None:
+                low, high = shown["distance_ci"] or (shown["distance"], shown["distance"])
+                axes.plot([low, high], [top + line + 1] * 2, color=colour)
+                axes.plot(shown["distance"], top + line + 1, "o", color=colour, ms=5)
+    ends = {"half against half": INK, "random": FAINT}
+    marks = [Line2D([], [], color=colour, label=name, marker="|", ls="", ms=10) for name, colour in ends.items()]
+    add_legend(figure, {short_name(name): colour for name, colour in colours.items()}, marks)
+    return figure
 
 
-def _aligned(lines: Sequence[Sequence[str]]) -> str:
-    """A text table: first column left-aligned, the others right-aligned, with a line under the header."""
-    widths = [max(map(len, column)) for column in zip(*lines)]
+@rc_context(STYLE)
+def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
+    """Mean and spread of the speeds of long runs over time; the recorded mean spread within a frame as a level."""
+    figure, grid = panel_grid(2)
+    colours = palette([f"{run['vehicles']} vehicles" for run in runs])
+    for axes, (key, title) in zip(grid, {"mean_speed_mps": "mean speed", "spread_mps": "spread of speeds"}.items()):
+        axes.set(title=title, xlabel="time, s", ylabel="m/s")
+        for run, colour in zip(runs, colours.values()):
+            timed = [(float(time.split()[0]), at[key]) for time, at in run["speeds"].items() if time.endswith(" s")]
+            x, y = np.array(timed, dtype=np.float64).T  # None, where nobody was left to measure, becomes NaN
+            plot_line(axes, x, y, color=colour)
+    grid[1].axhline(spread_mps, color=RECORDED)
+    add_legend(figure, {"recorded": RECORDED, **colours})
+    return figure
 
-    def aligned(line: Sequence[str]) -> str:
-        first, *rest = (cell.rjust(width) for cell, width in zip(line, widths))
-        return "  ".join([first.strip().ljust(widths[0]), *rest]).rstrip()
 
-    return "\n".join([aligned(lines[0]), "  ".join("-" * width for width in widths), *map(aligned, lines[1:])])
+def draw(card: Card, to: Path) -> list[Path]:
+    """The figures of a card, into the folder ``to``: distributions, distances, and drift if there are long runs."""
+    starts = card.starts
+    simulated = {
+        short_name(name): {quantity: counts.sum(0) for quantity, counts in driven.counts.items()}
+        for name, driven in starts.driven.items()
+        if name not in FLOORS
+    }
+    recorded = {name: counts.sum(0) for name, counts in starts.recorded.items()}
+    figures = {
+        "distributions": draw_distributions(recorded, simulated),
+        "distances": draw_distances(card.quantities, card.traffic),
+    }
+    if card.runs:
+        figures["drift"] = draw_speeds_over_time(card.runs, starts.reference.spread_mps)
+    return [save_figure(figure, to / f"{name}.png") for name, figure in figures.items()]

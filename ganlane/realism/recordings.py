@@ -9,7 +9,7 @@ they are of the centre, as everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -25,7 +25,7 @@ from ganlane.errors import UserError
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-#: A scene must last longer than the part that is left out of every measure, s.
+#: A scene must last longer than the seconds that every measure leaves out, s.
 SHORTEST_S = 4.0
 #: Name to file.
 I80_FILES: Final = {"lane_1": "i80_1600_lane1.csv", "pairs": "i80_1600_pairs.csv", "following": "i80_following.csv"}
@@ -80,32 +80,37 @@ def recordings_of(
         scenes: names; None takes all.
     """
     names = sorted(frame["scene"].unique().to_list() if scenes is None else scenes)
-    return [_recording(name, frame.filter(pl.col("scene") == name), lane_widths[name]) for name in names]
+    made = []
+    for name in names:
+        rows = frame.filter(pl.col("scene") == name).with_columns(driven=pl.lit(True))
+        track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
+        made.append(_recording(name, rows, track, int(rows["lane"].to_numpy().max()) + 1, lane_widths[name]))
+    return made
 
 
-def _recording(name: str, rows: pl.DataFrame, lane_width_m: float) -> Recording:
-    vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
-    frame = rows["frame"].to_numpy()
-    row = frame - frame.min()
-    shape = (int(row.max()) + 1, len(vehicles))
-    dense = {field: np.zeros(shape) for field in ("x", "y", "speed")}
-    for field, values in dense.items():
-        values[row, column] = rows[field].to_numpy()
-    present = np.zeros(shape, dtype=bool)
-    present[row, column] = True
-    size = {field: np.zeros(len(vehicles)) for field in ("length", "width")}
-    for field, flat in size.items():
-        flat[column] = rows[field].to_numpy()
-    lanes = int(rows["lane"].to_numpy().max()) + 1
-    everybody = np.ones(len(vehicles), dtype=bool)
-    return Recording(name, name, lanes, lane_width_m, **dense, present=present, **size, driven=everybody)
+def _recording(name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lane_width_m: float) -> Recording:
+    """The recording of ``rows`` [R], of which ``track`` [R] gives the index of each one's track."""
+    time = rows["frame"].to_numpy() - rows["frame"].to_numpy().min()
+    shape = (int(time.max()) + 1, int(track.max()) + 1)
+
+    def dense(field: str) -> Floats:
+        values = np.zeros(shape)
+        values[time, track] = rows[field].to_numpy()
+        return values
+
+    present, driven = np.zeros(shape, dtype=bool), np.zeros(shape[1], dtype=bool)
+    length, width = np.zeros(shape[1]), np.zeros(shape[1])
+    present[time, track], driven[track] = True, rows["driven"].to_numpy()
+    length[track], width[track] = rows["length"].to_numpy(), rows["width"].to_numpy()
+    x, y, speed = (dense(field) for field in ("x", "y", "speed"))
+    return Recording(name, name, lanes, lane_width_m, x, y, speed, present, length, width, driven)
 
 
 def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: str) -> pl.DataFrame:
     """Trajectories [T, V] of the vehicles of ``recording`` as a frame in the schema, sorted by track.
 
     The lane is the one whose centre is nearest, and the speed is 0: everything is measured from positions. The
-    further columns ``unit`` and ``driven`` are the recording's.
+    further columns ``unit``, ``driven`` and ``lane_width`` are the recording's.
     """
     vehicle, time = np.nonzero(present.T)
     width = recording.lane_width_m
@@ -120,14 +125,19 @@ def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: s
         "length": recording.length[vehicle],
         "width": recording.width[vehicle],
     }
-    whose = pl.lit(recording.unit).alias("unit")
-    driven = pl.Series("driven", recording.driven[vehicle])
-    return pl.DataFrame(columns, schema=SCHEMA).with_columns(whose, driven)
+    return pl.DataFrame(columns, schema=SCHEMA).with_columns(
+        unit=pl.lit(recording.unit), driven=pl.Series(recording.driven[vehicle]), lane_width=pl.lit(width)
+    )
 
 
 def recorded_frame(recordings: Sequence[Recording]) -> pl.DataFrame:
     """The recordings in the form in which simulations are measured."""
     return pl.concat([frame_of(each, each.x, each.y, each.present, each.name) for each in recordings])
+
+
+def units_of(recordings: Sequence[Recording]) -> list[str]:
+    """Names of the units that the bootstrap resamples, in order."""
+    return list(dict.fromkeys(each.unit for each in recordings))
 
 
 def segments(recording: Recording, seconds: float, skip_s: float = 0.0) -> list[Recording]:
@@ -159,71 +169,63 @@ def read_i80(name: str, path: Path) -> list[Recording]:
     Raises:
         UserError: it is damaged, or no track in it lasts 15 s.
     """
-    readers = {"lane_1": _lane, "pairs": _pairs, "following": _following}
-    whole = readers[name](path)
-    pieces = [piece for each in whole for piece in each if piece.driven.any()]
+    pieces = [piece for piece in _I80_READERS[name](path) if piece.driven.any()]
     if not pieces:
         raise UserError(f"{path}: nothing in it lasts {SEGMENT_S:g} s; give the whole file.")
     return pieces
 
 
-def _lane(path: Path) -> list[list[Recording]]:
+def _lane(path: Path) -> list[Recording]:
     rows = read_table(path, {"vehicle": pl.Int64, **_NUMBERS}).with_columns(
         length=pl.lit(_LENGTH_M), x=pl.col("x") - 0.5 * _LENGTH_M, driven=pl.lit(True)
     )
     # Each segment is a unit of its own: the whole lane would be a single unit, and gives no interval.
-    whole = _i80_recording("lane_1", rows)
-    return [[replace(piece, unit=piece.name) for piece in segments(whole, SEGMENT_S)]]
+    return [replace(piece, unit=piece.name) for piece in segments(_one_lane("lane_1", rows), SEGMENT_S)]
 
 
-def _pairs(path: Path) -> list[list[Recording]]:
+def _pairs(path: Path) -> list[Recording]:
     columns = {"pair": pl.String, "role": pl.String, "vehicle": pl.Int64, "length": pl.Float64, **_NUMBERS}
     rows = read_table(path, columns).with_columns(
         x=pl.col("x") - 0.5 * pl.col("length"), driven=pl.col("role") == "follower"
     )
-    groups = rows.group_by("pair", maintain_order=True)
-    return [_cut(_i80_recording(f"pair-{name}", group)) for (name,), group in groups]
+    return _pair_segments("pair-", rows.group_by("pair", maintain_order=True))
 
 
-def _following(path: Path) -> list[list[Recording]]:
-    names = ("x_follower", "x_leader", "leader_length")
-    columns = {"period": pl.String, "follower": pl.Int64, "leader": pl.Int64, "frame": pl.Int64}
-    table = read_table(path, columns | {name: pl.Float64 for name in names})
-    length = pl.col("leader_length")
-    behind = table.select(
-        "period", "follower", "leader", "frame",
-        vehicle=pl.col("follower"), x=pl.col("x_follower") - 0.5 * _LENGTH_M,
-        length=pl.lit(_LENGTH_M), driven=pl.lit(True),
-    )  # fmt: skip
-    ahead = table.select(
-        "period", "follower", "leader", "frame",
-        vehicle=pl.col("leader"), x=pl.col("x_leader") - 0.5 * length, length=length, driven=pl.lit(False),
-    )  # fmt: skip
-    groups = pl.concat([behind, ahead]).group_by("period", "follower", "leader", maintain_order=True)
-    return [_cut(_i80_recording("-".join(map(str, name)), rows)) for name, rows in groups]
+def _following(path: Path) -> list[Recording]:
+    whose = ["period", "follower", "leader"]
+    kinds = {"period": pl.String, "follower": pl.Int64, "leader": pl.Int64, "frame": pl.Int64}
+    table = read_table(path, kinds | dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64))
+
+    def car(role: str, length: pl.Expr) -> pl.DataFrame:
+        return table.select(
+            *whose,
+            "frame",
+            vehicle=pl.col(role),
+            x=pl.col(f"x_{role}") - 0.5 * length,
+            length=length,
+            driven=pl.lit(role == "follower"),
+        )
+
+    cars = pl.concat([car("follower", pl.lit(_LENGTH_M)), car("leader", pl.col("leader_length"))])
+    return _pair_segments("", cars.group_by(whose, maintain_order=True))
 
 
-def _cut(pair: Recording) -> list[Recording]:
-    return segments(pair, SEGMENT_S, EDGE_S)
+_I80_READERS = {"lane_1": _lane, "pairs": _pairs, "following": _following}
 
 
-def _i80_recording(name: str, rows: pl.DataFrame) -> Recording:
-    """One lane of cars; a speed is the mean over the second around its frame, cut off at the ends of the track."""
-    rows = rows.sort("vehicle", "frame")
+def _pair_segments(prefix: str, pairs: Iterable[tuple[tuple[object, ...], pl.DataFrame]]) -> list[Recording]:
+    """The segments of all pairs of cars, by the names of the pairs."""
+    recordings = (_one_lane(prefix + "-".join(map(str, name)), rows) for name, rows in pairs)
+    return [piece for each in recordings for piece in segments(each, SEGMENT_S, EDGE_S)]
+
+
+def _one_lane(name: str, rows: pl.DataFrame) -> Recording:
+    """Cars of one lane; a speed is the mean over the second around its frame, cut off at the ends of the track."""
+    rows = rows.sort("vehicle", "frame").with_columns(y=0.0, speed=0.0, width=_WIDTH_M)
     # A gap splits a track, since a recording's tracks have none.
     part = ((pl.col("frame").diff() != 1) | (pl.col("vehicle").diff() != 0)).fill_null(False).cum_sum()
-    rows = rows.with_columns(column=part, row=pl.col("frame") - pl.col("frame").min())
-    row, column = rows["row"].to_numpy(), rows["column"].to_numpy()
-    shape = (int(row.max()) + 1, int(column.max()) + 1)
-    x, present = np.zeros(shape), np.zeros(shape, dtype=bool)
-    x[row, column], present[row, column] = rows["x"].to_numpy(), True
-    flat = {field: np.zeros(shape[1], dtype=kind) for field, kind in (("length", float), ("driven", bool))}
-    for field, values in flat.items():
-        values[column] = rows[field].to_numpy()
-    return Recording(
-        name, name, 1, STANDARD_LANE_WIDTH_M, x, np.zeros(shape), _speeds(x, present), present,
-        flat["length"], np.full(shape[1], _WIDTH_M), flat["driven"],
-    )  # fmt: skip
+    made = _recording(name, rows, rows.select(part).to_series().to_numpy(), 1, STANDARD_LANE_WIDTH_M)
+    return replace(made, speed=_speeds(made.x, made.present))
 
 
 def _speeds(x: np.ndarray, present: np.ndarray) -> np.ndarray:

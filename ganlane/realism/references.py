@@ -17,23 +17,20 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.evaluation.counts import poisson_interval
-from ganlane.files import write_json
+from ganlane.evaluation.statistics import Array
+from ganlane.files import CHECKPOINTS, write_json
 from ganlane.generator.rollout import headway_from_uniform
-from ganlane.paths import CHECKPOINTS
-from ganlane.realism.distances import Array, ceiling
-from ganlane.realism.quantities import QUANTITIES, Measured
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.hazard import random_side
+from ganlane.realism.distances import ceiling
+from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate
+from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.random import Purpose, uniform
+from ganlane.sim.state import Vehicles
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.lane_change import random_side
 
 #: The file that ships.
 SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"
-LEVELS = (0.05, 0.5, 0.95)
 _KIND = "ganlane realism reference"
 
 
@@ -60,10 +57,11 @@ class Reference:
     whole: Mapping[str, float]
     floors: Mapping[str, Mapping[str, float]]
 
-    @property
-    def ceilings(self) -> dict[str, float | None]:
-        """By quantity, the distance of one half of the scenes to the other."""
-        return {quantity: ceiling(counts) for quantity, counts in self.counts.items()}
+    @classmethod
+    def of(cls, measured: Measured, units: Sequence[str], whole: Mapping[str, float], source: str) -> Reference:
+        """The reference that measured recordings give, without floors."""
+        changes, km = measured.lane_changes, measured.vehicle_km
+        return cls(source, list(units), measured.counts, measured.quantiles(), changes, km, whole, floors={})
 
     @property
     def spread_mps(self) -> float:
@@ -72,13 +70,13 @@ class Reference:
 
     def rate(self) -> dict[str, Any]:
         """Lane changes per vehicle-km of the whole recording, with its exact interval."""
-        return rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
+        return lane_change_rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
 
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
-        bins = {name: [b.low, b.high, b.number] for name, b in QUANTITIES.items()}
+        ceilings = {quantity: ceiling(counts) for quantity, counts in self.counts.items()}
         plain = {**vars(self), "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()}}
-        write_json(path, {"kind": _KIND, "bins": bins, "ceilings": self.ceilings, **plain})
+        write_json(path, {"kind": _KIND, "bins": _bins(), "ceilings": ceilings, **plain})
 
     @classmethod
     def load(cls, path: Path) -> Reference:
@@ -91,7 +89,7 @@ class Reference:
             numbers = json.loads(path.read_text())
             if numbers.pop("kind") != _KIND:
                 raise ValueError("another kind of file")
-            if numbers.pop("bins") != {name: [b.low, b.high, b.number] for name, b in QUANTITIES.items()}:
+            if numbers.pop("bins") != _bins():
                 raise ValueError("its histograms have other bins")
             numbers.pop("ceilings")
             counts = {name: np.asarray(value, dtype=np.float64) for name, value in numbers.pop("counts").items()}
@@ -103,42 +101,9 @@ class Reference:
             ) from error
 
 
-def rate(changes: int, km: float) -> dict[str, Any]:
-    """Lane changes, vehicle-km, and their ratio with its exact 95 % interval."""
-    interval = poisson_interval(changes).interval or []
-    return {
-        "lane_changes": changes,
-        "vehicle_km": km,
-        "per_vehicle_km": changes / km if km else None,
-        "per_vehicle_km_ci": [bound / km for bound in interval] if km else None,
-    }
-
-
-def quantiles_of(measured: Measured) -> dict[str, dict[str, float | None]]:
-    """By quantity, the quantiles at :data:`LEVELS`."""
-    return {
-        quantity: {f"{level:g}": measured.quantile(quantity, level) for level in LEVELS} for quantity in QUANTITIES
-    }
-
-
-def reference_of(
-    measured: Measured,
-    units: Sequence[str],
-    whole: Mapping[str, float],
-    source: str,
-    floors: Mapping[str, Mapping[str, float]] | None = None,
-) -> Reference:
-    """Makes a reference of measured recordings."""
-    return Reference(
-        source=source,
-        units=list(units),
-        counts={quantity: measured.counts(units, quantity) for quantity in QUANTITIES},
-        quantiles=quantiles_of(measured),
-        lane_changes=sum(measured.lane_changes.values()),
-        vehicle_km=sum(measured.vehicle_km.values()),
-        whole=dict(whole),
-        floors=floors or {},
-    )
+def _bins() -> dict[str, list[float]]:
+    """Low edge, high edge and number of the bins, by quantity."""
+    return {name: [bins.low, bins.high, bins.number] for name, bins in QUANTITIES.items()}
 
 
 class ConstantVelocity(TrafficModule):
@@ -153,26 +118,11 @@ class ConstantVelocity(TrafficModule):
 class RandomDriving(TrafficModule):
     """Drivers that ignore all others: the far end of the scale.
 
-    An acceleration is drawn every second, uniform up to ``hardest`` either way; a lane change to a random side starts
-    at a constant hazard and takes ``change_s`` seconds. Speeds are never negative.
-
-    Args:
-        road, stream: as for every traffic module.
-        hardest: m/s2.
-        every_s: mean time between two lane changes of a vehicle, s.
-        change_s: how long a change takes, s.
+    An acceleration is drawn every second, uniform up to 3 m/s2 either way; a lane change to a random side starts at a
+    constant hazard, every 20 s on average, and takes 4 s. Speeds are never negative.
     """
 
-    def __init__(
-        self,
-        road: Road | None = None,
-        stream: int = Stream.TRAIN,
-        hardest: float = 3.0,
-        every_s: float = 20.0,
-        change_s: float = 4.0,
-    ) -> None:
-        super().__init__(road, stream)
-        self.hardest, self.every_s, self.change_s = hardest, every_s, change_s
+    hardest, every_s, change_s = 3.0, 20.0, 4.0
 
     def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
         """One step: the second's acceleration, and towards the target lane."""

@@ -27,14 +27,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.generator.rollout import HEADWAY_QUANTILES_S, SHORTEST_HEADWAY_S
+from ganlane.generator.rollout import balanced_headway
 from ganlane.realism.recordings import Recording, frame_of
-from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import ENTRY_M
-from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 
 #: Makes a traffic model for a road.
@@ -117,14 +114,13 @@ def _drive(traffic: TrafficModule, rows: list[Recording], options: StartOptions,
         for name, values in course.items():
             values.append(getattr(state, name)[:, 1:])
         state, memory = step_traffic(traffic, state, memory, counters, step)
-    arrays = {name: torch.stack(values).numpy() for name, values in course.items()}
-    return [_frame(row, arrays, index, first + index) for index, row in enumerate(rows)]
-
-
-def _frame(row: Recording, arrays: dict[str, np.ndarray], index: int, episode: int) -> pl.DataFrame:
-    steps, vehicles = row.x.shape
-    x, y, there = (arrays[name][:steps, index, :vehicles] for name in ("x", "y", "valid"))
-    return frame_of(row, x, y, there, f"{row.name}#{episode}")
+    arrays = [torch.stack(values).numpy() for values in course.values()]
+    frames = []
+    for index, row in enumerate(rows):
+        steps, vehicles = row.x.shape
+        x, y, valid = (array[:steps, index, :vehicles] for array in arrays)
+        frames.append(frame_of(row, x, y, valid, f"{row.name}#{first + index}"))
+    return frames
 
 
 def step_traffic(
@@ -151,7 +147,7 @@ def _updated_memory(
     """The traffic's memory, initialised for the vehicles that enter, with their recorded headways."""
     if memory is not None and not bool(enters.any()):
         return memory
-    fresh = with_recorded_headways(traffic.init_memory(state, enters, key), state, traffic.road, enters)
+    fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
     if memory is None:
         return fresh
 
@@ -257,32 +253,14 @@ def insert_entering(
     return entered.where(enters, state)
 
 
-def balanced_headways(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tensor:
-    """The headway [N, M] in s at which IDM (Table V) neither speeds up nor brakes; ``otherwise`` where there is none.
-
-    Computed from gap, speed and desired speed. Vehicles without a leader, or too far behind it to be following,
-    get ``otherwise``.
-    """
-    ahead = leader(perceive(vehicles, road), vehicles.target_lane.to(vehicles.x.dtype))
-    ratio = vehicles.speed / vehicles.desired_speed
-    settled = ahead.gap * torch.sqrt((1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0))
-    headway = (settled - TABLE_V.min_gap_m) / vehicles.speed.clamp_min(1.0)
-    shown = (ahead.gap < FREE_GAP_M) & (headway <= HEADWAY_QUANTILES_S[-1])
-    return torch.where(shown, headway.clamp_min(SHORTEST_HEADWAY_S), otherwise)
-
-
 def with_recorded_headways(memory: TensorDictBase, vehicles: Vehicles, road: Road, who: Tensor) -> TensorDictBase:
-    """``memory`` with the headways that the drivers ``who`` [N, M] show; unchanged if it holds none.
+    """A traffic's ``memory`` with the headways that the entering drivers ``who`` [N, M] show in their recorded state.
 
-    Args:
-        memory: a traffic's, nested or not; not modified.
-        vehicles: in their recorded state.
-        road: theirs.
-        who: vehicles that enter now.
+    The memory, nested or not, is not modified; one without headways comes back equal.
     """
 
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
         last = name if isinstance(name, str) else name[-1]
-        return torch.where(who, balanced_headways(vehicles, road, value), value) if last == HEADWAY else value
+        return torch.where(who, balanced_headway(vehicles, road, value), value) if last == HEADWAY else value
 
     return memory.named_apply(shown, nested_keys=True)

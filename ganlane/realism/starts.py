@@ -1,43 +1,96 @@
 """Every traffic from the same starts: recorded scenes, or spawned ones where there are no recordings.
 
+Recordings do not show how fast drivers would like to go, so the mean desired speed is fitted for every traffic.
 Generators may be split into folds, so that no scene is driven by weights that were fitted to it. Without recordings
 everything is compared with the histograms that ship.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
+from ganlane.evaluation.statistics import Array
 from ganlane.files import load_weights
-from ganlane.realism.counters import EventCounter
-from ganlane.realism.fit_speeds import (
-    FLOORS,
-    Driven,
-    Report,
-    desired_speeds,
-    drive_all,
-    driven_from,
-    mean_options,
-    measure_recordings,
-)
-from ganlane.realism.long_runs import LongRunParameters, drive_spawned, sizes
-from ganlane.realism.quantities import QUANTITIES, Measured, measure
-from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of
-from ganlane.realism.references import SHIPPED_REFERENCE, Reference, quantiles_of, rate, reference_of
-from ganlane.realism.replay_starts import Factory, StartOptions
-from ganlane.sim.road import Road
+from ganlane.realism.distances import pooled_distance
+from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
+from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate, measure, measure_recordings
+from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of, units_of
+from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
+from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
 from ganlane.sim.spawn import SpawnParameters
+from ganlane.sim.state import Road
 
-#: Vehicles of an episode, its seconds, and episodes per repeat.
+#: Reference drivers at the ends of the scale.
+FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}
+#: Candidates for the mean excess of desired speeds over the speed at entry, m/s.
+EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
+#: Quantities by which the excess is chosen: all that need no lane change.
+FITTED_BY = tuple(name for name in QUANTITIES if name != "lane_change_duration")
+#: Spawned starts: vehicles of an episode, its seconds, and episodes per repeat.
 _SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8
+
+
+def print_progress(text: str) -> None:
+    """Print a line of progress on stderr."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> Measured:
+    """Drive the recordings with a traffic and measure it."""
+    return measure(drive_recordings(make, recordings, options), units_of(recordings))
+
+
+def simulate_all(
+    factories: Mapping[str, Factory],
+    recordings: Sequence[Recording],
+    options: Mapping[str, StartOptions],
+) -> dict[str, Measured]:
+    """Drive every traffic and both reference drivers from the same starts."""
+    driven = {}
+    for name, make in {**factories, **FLOORS}.items():
+        print_progress(f"{name} from {len(recordings)} recorded starts")
+        driven[name] = simulate(make, recordings, options.get(name, StartOptions()))
+    return driven
+
+
+def fit_excess(
+    make: Factory, recordings: Sequence[Recording], options: StartOptions, grid: Sequence[float] = EXCESS_GRID
+) -> float:
+    """The mean excess of desired speeds, of ``grid``, at which a traffic is nearest to ``recordings``, m/s.
+
+    Nearest by the mean distance over :data:`FITTED_BY`. Every traffic is fitted, so that none suffers from desired
+    speeds chosen for another.
+    """
+    recorded = measure_recordings(recordings)
+
+    def mean_distance(excess: float) -> float:
+        driven = simulate(make, recordings, replace(options, desired_above_mps=excess, repeats=1))
+        values = [pooled_distance(driven.counts[name], recorded.counts[name]) for name in FITTED_BY]
+        return float(np.nanmean(values))
+
+    return min(grid, key=mean_distance)
+
+
+def desired_speeds(
+    factories: Mapping[str, Factory], fitted: Sequence[Recording], common: StartOptions
+) -> dict[str, StartOptions]:
+    """Options by traffic: desired speeds fitted to ``fitted``, if there are any; reference drivers as ``common``."""
+    chosen = {name: common for name in FLOORS}
+    for name, make in factories.items():
+        chosen[name] = common
+        if fitted:
+            print_progress(f"{name}: fitting desired speeds on {len(fitted)} scenes")
+            chosen[name] = replace(common, desired_above_mps=fit_excess(make, fitted, common))
+    return chosen
 
 
 @dataclass(frozen=True)
@@ -59,8 +112,8 @@ class Starts:
     scenes: list[str]
     held_out: list[list[str]]
     options: Mapping[str, StartOptions]
-    driven: Mapping[str, Driven]
-    recorded: Mapping[str, np.ndarray]
+    driven: Mapping[str, Measured]
+    recorded: Mapping[str, Array]
     recorded_summary: Mapping[str, Any]
     reference: Reference
 
@@ -81,10 +134,7 @@ class Starts:
         """The same driving from some of its scenes, compared with these alone."""
         rows = [self.scenes.index(name) for name in scenes]
         recorded = {name: counts[rows] for name, counts in self.recorded.items()}
-        driven = {
-            name: replace(each, counts={quantity: counts[rows] for quantity, counts in each.counts.items()})
-            for name, each in self.driven.items()
-        }
+        driven = {name: each.restricted_to(rows) for name, each in self.driven.items()}
         return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
 
     def description(self) -> dict[str, Any]:
@@ -147,17 +197,16 @@ def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> 
 
 
 def recorded_starts(
-    folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str, report: Report
+    folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str
 ) -> Starts:
-    """Drives every traffic from recorded scenes.
+    """Drive every traffic from recorded scenes.
 
     Args:
         folds: traffics and the scenes that they start from; scenes that are too short are skipped.
         frame: the recordings, in the schema.
         options: of the simulations.
         fit: whether to fit every traffic's desired speeds on a fold's other scenes, or take those of ``options``.
-        source: where the recordings come from.
-        report: called with a line of progress.
+        source: of the recordings.
 
     Raises:
         UserError: a fold names an unknown scene, or no scene is long enough.
@@ -165,57 +214,39 @@ def recorded_starts(
     widths = scene_lane_widths(frame)
     every = recordings_of(frame, widths)
     names = [each.name for each in every]
-    _check_names([name for fold in folds for name in fold.held_out], names, source)
+    for name in (name for fold in folds for name in fold.held_out):
+        if name not in names:
+            raise UserError(f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}.")
     long = [each for each in every if len(each.x) * FRAME_S >= SHORTEST_S]
-    parts = [_drive_fold(fold, long, options, fit, report) for fold in folds]
-    parts = [part for part in parts if part.scenes]
-    if not parts:
+    chosen: list[Recording] = []
+    fitted: list[dict[str, StartOptions]] = []
+    driven: list[dict[str, Measured]] = []
+    for fold in folds:
+        scenes = [each for each in long if each.name in fold.starts]
+        if scenes:
+            others = [each for each in long if each.name not in fold.held_out] if fit else []
+            fitted.append(desired_speeds(fold.factories, others, options))
+            driven.append(simulate_all(fold.factories, scenes, fitted[-1]))
+            chosen += scenes
+    if not chosen:
         raise UserError(f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all.")
-    chosen = [each for part in parts for each in part.scenes]
-    rows = [names.index(each.name) for each in chosen]
-    reference = reference_of(measure_recordings(every), names, _whole_recording(frame, widths), source)
+    recorded = measure_recordings(chosen)
     return Starts(
         kind="recorded",
         scenes=[each.name for each in chosen],
         held_out=[list(fold.held_out) for fold in folds],
-        options=mean_options([part.options for part in parts], options),
-        driven={name: merge_driven([part.driven[name] for part in parts]) for name in parts[0].driven},
-        recorded={name: reference.counts[name][rows] for name in QUANTITIES},
-        recorded_summary=_recorded_summary(measure_recordings(chosen)),
-        reference=reference,
+        options=_mean_options(fitted, options),
+        driven={name: Measured.joined([part[name] for part in driven]) for name in driven[0]},
+        recorded=recorded.counts,
+        recorded_summary=recorded.summary(),
+        reference=Reference.of(measure_recordings(every), names, _whole_recording(frame, widths), source),
     )
 
 
-class _Part(NamedTuple):
-    """Driving of one fold: its scenes, and options and results by traffic."""
-
-    scenes: list[Recording]
-    options: Mapping[str, StartOptions]
-    driven: Mapping[str, Driven]
-
-
-def _drive_fold(
-    fold: Fold, recordings: Sequence[Recording], options: StartOptions, fit: bool, report: Report
-) -> _Part:
-    """Drives a fold's traffics from its scenes, with desired speeds fitted on the others; empty without scenes."""
-    scenes = [each for each in recordings if each.name in fold.starts]
-    if not scenes:
-        return _Part([], {}, {})
-    others = [each for each in recordings if each.name not in fold.held_out] if fit else []
-    chosen = desired_speeds(fold.factories, others, options, report)
-    return _Part(scenes, chosen, drive_all(fold.factories, scenes, chosen, report))
-
-
-def merge_driven(parts: Sequence[Driven]) -> Driven:
-    """Joins driving from different scenes."""
-    changes: dict[str, int] = {}
-    km: dict[str, float] = {}
-    for part in parts:
-        changes |= part.measured.lane_changes
-        km |= part.measured.vehicle_km
-    samples = {name: pl.concat([part.measured.samples[name] for part in parts]) for name in QUANTITIES}
-    counts = {name: np.concatenate([part.counts[name] for part in parts]) for name in QUANTITIES}
-    return Driven(counts, Measured(samples, changes, km))
+def _mean_options(parts: Sequence[Mapping[str, StartOptions]], options: StartOptions) -> dict[str, StartOptions]:
+    """By traffic, the mean over folds of the fitted desired speeds, for sites that belong to no fold."""
+    means = {name: float(np.mean([part[name].desired_above_mps for part in parts])) for name in parts[0]}
+    return {name: replace(options, desired_above_mps=excess) for name, excess in means.items()}
 
 
 def _whole_recording(frame: pl.DataFrame, widths: dict[str, float]) -> dict[str, float]:
@@ -228,58 +259,51 @@ def _whole_recording(frame: pl.DataFrame, widths: dict[str, float]) -> dict[str,
     }
 
 
-def _check_names(held_out: Sequence[str], names: Sequence[str], source: str) -> None:
-    for name in held_out:
-        if name not in names:
-            raise UserError(f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}.")
-
-
-def _recorded_summary(measured: Measured) -> dict[str, Any]:
-    changes, km = sum(measured.lane_changes.values()), sum(measured.vehicle_km.values())
-    return rate(changes, km) | {"quantiles": quantiles_of(measured)}
-
-
 def spawned_starts(
     factories: Mapping[str, Factory],
     road: Road,
     spawn: SpawnParameters,
     repeats: int,
     seed: int,
-    report: Report,
     path: Path = SHIPPED_REFERENCE,
 ) -> Starts:
-    """Drives every traffic from the same spawned scenes.
+    """Drive every traffic from the same spawned scenes.
 
     Args:
         factories: traffics by name, the card's own first.
         road, spawn: where and how vehicles start (Table II at the paper's density).
         repeats: 8 episodes of 30 vehicles and 30 s each.
         seed: of the random numbers.
-        report: called with a line of progress.
         path: the histograms.
     """
     reference, rows = Reference.load(path), _SPAWNED_ROWS * repeats
-    report(f"no recordings here: spawned starts against {path.name}; give data.path=FILE for the fair comparison")
+    print_progress(
+        f"no recordings here: spawned starts against {path.name}; give data.path=FILE for the fair comparison"
+    )
     parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
-    scenes = [f"spawned-{row}" for row in range(rows)]
-    widths, driven = dict.fromkeys(scenes, float(road.lane_width_m)), {}
+    scenes, driven = [_spawned_name(row) for row in range(rows)], {}
     for name, make in factories.items():
-        report(f"{name} from {rows} spawned starts")
-        driven[name] = driven_from(measure(spawned_frame(make, road, parameters, rows), widths), scenes)
-    summary = rate(reference.lane_changes, reference.vehicle_km) | {"quantiles": reference.quantiles}
+        print_progress(f"{name} from {rows} spawned starts")
+        driven[name] = measure(spawned_frame(make, road, parameters, rows), scenes)
+    rate = lane_change_rate(reference.lane_changes, reference.vehicle_km)
+    summary = {**rate, "quantiles": reference.quantiles}
     return Starts("spawned", [], [], {}, driven, reference.counts, summary, reference)
 
 
 def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows: int) -> pl.DataFrame:
     """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` s, in the form of measured recordings."""
-    traffic = make(road)
-    trajectories = drive_spawned(traffic, parameters, 0, rows, EventCounter(road))
-    shape, (length, width) = trajectories.x[:, 0].shape, sizes(traffic, parameters, 0, rows)
-    nothing, everywhere = np.zeros(shape), np.ones(shape, dtype=bool)
+    paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
+    everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
     frames = []
     for row in range(rows):
-        name, lanes, lane_width = f"spawned-{row}", int(road.lanes), float(road.lane_width_m)
-        states = (nothing, nothing, nothing, everywhere)
-        made = Recording(name, name, lanes, lane_width, *states, length[row], width[row], everywhere[0])
-        frames.append(frame_of(made, trajectories.x[:, row], trajectories.y[:, row], everywhere, name))
+        name, x, y, speed = _spawned_name(row), paths.x[:, row], paths.y[:, row], paths.speed[:, row]
+        made = Recording(
+            name, name, int(road.lanes), float(road.lane_width_m), x, y, speed, everywhere,
+            paths.length[row], paths.width[row], everywhere[0],
+        )  # fmt: skip
+        frames.append(frame_of(made, x, y, everywhere, name))
     return pl.concat(frames)
+
+
+def _spawned_name(row: int) -> str:
+    return f"spawned-{row}"

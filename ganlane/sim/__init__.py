@@ -1,27 +1,23 @@
-"""The simulator as pure functions on tensors (sections IV and V of the paper); no TorchRL in here.
+"""The simulator as pure functions on tensors (sections IV and V of the paper), without TorchRL.
 
 A scene is a record of [N, M] tensors (:class:`Vehicles`: N environments, M vehicles). From it are computed, in this
-order: what each driver sees (:func:`perceive`, :mod:`~ganlane.sim.lanes`, :mod:`~ganlane.sim.neighbours`), its
-acceleration (:mod:`~ganlane.sim.idm`, :mod:`~ganlane.sim.following`), its lane
-changes (:mod:`~ganlane.sim.mobil`), its steering (:mod:`~ganlane.sim.steering`), its motion
-(:mod:`~ganlane.sim.bicycle`) and collisions (:mod:`~ganlane.sim.collisions`).
-:mod:`~ganlane.sim.spawn` makes the initial scene of an episode, :mod:`~ganlane.sim.recycle` keeps the road populated
-and :mod:`~ganlane.sim.random` makes every random number.
+order: what each driver sees (:mod:`~ganlane.sim.lanes`, :mod:`~ganlane.sim.neighbours`), its acceleration
+(:mod:`~ganlane.sim.idm`), its lane changes (:mod:`~ganlane.sim.mobil`), its steering and motion
+(:mod:`~ganlane.sim.dynamics`), and collisions (:mod:`~ganlane.sim.collisions`). :mod:`~ganlane.sim.spawn` and
+:mod:`~ganlane.sim.scenes` make the initial scene of an episode, :mod:`~ganlane.sim.recycle` keeps the road populated,
+:mod:`~ganlane.sim.random` makes every random number.
 """
 
-from ganlane.sim.bicycle import advance
 from ganlane.sim.collisions import boxes_overlap, dangerously_close, ego_overlaps, pair_overlaps
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V, IdmParameters, equilibrium_gap, idm_acceleration
+from ganlane.sim.dynamics import advance, steer
+from ganlane.sim.idm import TABLE_V, IdmParameters, equilibrium_gap, following_acceleration, idm_acceleration
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.mobil import TABLE_IV, MobilParameters, mobil_changes, safe_change
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, follower, leader, perceive
 from ganlane.sim.random import Purpose, Stream, episode_key
 from ganlane.sim.recycle import recycle
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
-from ganlane.sim.steering import steer
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 __all__ = [
     "FREE_GAP_M",

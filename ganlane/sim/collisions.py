@@ -5,10 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
-
-STRAIGHT = Road()
+from ganlane.sim.state import STRAIGHT, Road, Vehicles
 
 
 def _separated(

@@ -9,14 +9,12 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
 from ganlane.parameters.driving import EgoParameters, IdmParameters
-from ganlane.sim.bicycle import advance
 from ganlane.sim.collisions import dangerously_close
-from ganlane.sim.following import acceleration_behind
+from ganlane.sim.dynamics import SteeringParameters, advance, steer
+from ganlane.sim.idm import acceleration_behind
 from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import Neighbour, Scene, follower, leader, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.steering import SteeringParameters, steer
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 
 class Command(NamedTuple):
@@ -32,15 +30,15 @@ class Command(NamedTuple):
     off_road: Tensor
 
 
-def obey(action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool) -> Command:
+def apply_action(action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool) -> Command:
     """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose current lane change has ``direction``; [N] int64.
 
     During a lane change actions are ignored without penalty; with ``abort`` the opposite action turns back. An action
     that would leave the road has no effect except ``off_road``.
     """
     wish = torch.where(action == LEFT, 1, torch.where(action == RIGHT, -1, 0))
-    heard = (direction == 0) | (wish == -direction) if abort else direction == 0
-    wish = torch.where(heard, wish, 0)
+    accepted = (direction == 0) | (wish == -direction) if abort else direction == 0
+    wish = torch.where(accepted, wish, 0)
     target = target_lane + wish
     off_road = (target < 0) | (target > lanes - 1)
     wish = torch.where(off_road, 0, wish)
@@ -75,7 +73,7 @@ class Surroundings(NamedTuple):
     soft_crash_behind: Tensor
 
 
-def look_around(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> Surroundings:
+def ego_surroundings(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> Surroundings:
     """IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that its body is
     in."""
     body = spanned(scene.body)

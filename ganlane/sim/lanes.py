@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 ENTRY_M = 0.1
 #: In an initial scene: the traffic sets a :class:`Visibility` per episode.
@@ -75,7 +74,7 @@ def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRan
     return LaneRange(torch.where(vehicles.valid, low, nowhere), torch.where(vehicles.valid, high, -nowhere))
 
 
-def settled(vehicles: Vehicles, road: Road) -> Tensor:
+def lane_change_done(vehicles: Vehicles, road: Road) -> Tensor:
     """Whether the lane change is done: centre within :data:`ARRIVED_M` of the target lane's centre, bool."""
     centre = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
     return (vehicles.y - centre).abs() < ARRIVED_M

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import MobilParameters
-from ganlane.sim.following import acceleration_behind
-from ganlane.sim.idm import TABLE_V, AnyIdm, idm_acceleration
-from ganlane.sim.lanes import settled
-from ganlane.sim.neighbours import FREE_GAP_M, Follower, Neighbour, Scene, follower, leader
-from ganlane.sim.road import Road
+from ganlane.sim.idm import TABLE_V, AnyIdm, acceleration_behind, idm_acceleration
+from ganlane.sim.lanes import lane_change_done
+from ganlane.sim.neighbours import FREE_GAP_M, Scene, follower, leader
+from ganlane.sim.state import Road
 
 
 class DriverMobil(NamedTuple):
@@ -30,7 +29,7 @@ AnyMobil: TypeAlias = MobilParameters | DriverMobil
 TABLE_IV = MobilParameters()
 
 
-class Prospect(NamedTuple):
+class LaneAccelerations(NamedTuple):
     """Accelerations in the observer's lane and its neighbours, m/s2, [N, K, L].
 
     ``own`` is the observer's; ``with_it`` and ``without`` are its follower's in that lane with and without the
@@ -41,9 +40,9 @@ class Prospect(NamedTuple):
     with_it: Tensor
     without: Tensor
 
-    def of(self, lanes: int | slice) -> Prospect:
+    def of(self, lanes: int | slice) -> LaneAccelerations:
         """Some of the lanes."""
-        return Prospect(*(number[..., lanes] for number in self))
+        return LaneAccelerations(*(number[..., lanes] for number in self))
 
 
 class Change(NamedTuple):
@@ -53,13 +52,8 @@ class Change(NamedTuple):
     safe: Tensor
 
 
-def _gap_over(behind: Follower, ahead: Neighbour, length: Tensor) -> Tensor:
-    """Gap from the follower to the leader without the vehicle between them, m."""
-    return torch.where(ahead.gap < FREE_GAP_M, behind.gap + length + ahead.gap, FREE_GAP_M)
-
-
-def prospect(scene: Scene, lanes: Tensor, idm: AnyIdm) -> Prospect:
-    """The :class:`Prospect` of each observer in ``lanes`` [N, K, L] (float).
+def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelerations:
+    """The :class:`LaneAccelerations` of each observer in ``lanes`` [N, K, L] (float).
 
     With per-driver parameters, each driver predicts the others with its own parameters.
     """
@@ -67,14 +61,14 @@ def prospect(scene: Scene, lanes: Tensor, idm: AnyIdm) -> Prospect:
     speed, length = (number[..., None] for number in (scene.observers.speed, scene.observers.length))
     with_it = idm_acceleration(behind.speed, behind.desired_speed, behind.gap, speed, idm.per_lane())
     leader_speed = torch.where(ahead.gap >= FREE_GAP_M, behind.speed, ahead.speed)
-    gap = _gap_over(behind, ahead, length)
+    gap = torch.where(ahead.gap < FREE_GAP_M, behind.gap + length + ahead.gap, FREE_GAP_M)
     without = idm_acceleration(behind.speed, behind.desired_speed, gap, leader_speed, idm.per_lane())
     nobody = ~behind.exists
     own = acceleration_behind(scene, ahead, idm)
-    return Prospect(own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0))
+    return LaneAccelerations(own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0))
 
 
-def weigh(there: Prospect, here: Prospect, mobil: AnyMobil) -> Change:
+def mobil_criterion(there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil) -> Change:
     """MOBIL's incentive and safety criterion for a change from ``here`` [N, K, 1] to ``there`` [N, K, L]."""
     burden, relief = there.with_it - there.without, here.without - here.with_it
     incentive = there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
@@ -83,8 +77,8 @@ def weigh(there: Prospect, here: Prospect, mobil: AnyMobil) -> Change:
 
 def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
-    there = prospect(scene, lane[..., None], idm)
-    return weigh(there, there, mobil).safe[..., 0]
+    there = lane_accelerations(scene, lane[..., None], idm)
+    return mobil_criterion(there, there, mobil).safe[..., 0]
 
 
 def on_road(lane: Tensor, road: Road) -> Tensor:
@@ -120,12 +114,12 @@ def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobi
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
-    seen = prospect(scene, lanes, idm)
-    change = weigh(seen.of(slice(1, None)), seen.of(slice(0, 1)), mobil)
+    accelerations = lane_accelerations(scene, lanes, idm)
+    change = mobil_criterion(accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil)
     exists = torch.stack((on_road(lane + 1.0, road), on_road(lane - 1.0, road)), dim=-1)
-    pays = torch.where(exists & change.safe & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
-    left, right = pays.unbind(-1)
-    free = settled(vehicles, road) & vehicles.valid
+    gain = torch.where(exists & change.safe & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
+    left, right = gain.unbind(-1)
+    free = lane_change_done(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)
 

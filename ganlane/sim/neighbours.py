@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from ganlane.sim.lanes import LaneRange, body_lanes, presence, with_target
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 #: Gap in an empty lane, m (Table V's 'maximum gap for empty lane').
 FREE_GAP_M = 10_000.0

@@ -14,8 +14,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.idm import idm_acceleration
 from ganlane.sim.neighbours import Scene, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 #: Range of the positions in Table III, m.
 RANGE_M = 200.0

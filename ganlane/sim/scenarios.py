@@ -1,6 +1,6 @@
 """Test scenarios: cut-in, stalled car, stop-and-go wave, blocked lane. m, m/s; the ego comes first.
 
-Each is a function of a few numbers that returns the rows of a :class:`~ganlane.sim.fixed_scene.FixedScene`.
+Each is a function of a few numbers that returns the rows of a :class:`~ganlane.sim.scenes.FixedScene`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from itertools import accumulate, chain
 
 from ganlane.errors import UserError
 from ganlane.parameters.driving import IdmParameters
-from ganlane.sim.fixed_scene import SceneVehicle
 from ganlane.sim.idm import TABLE_V
+from ganlane.sim.scenes import SceneVehicle
 
 LENGTH_M = 4.5
 #: Desired speed of a broken-down vehicle; IDM requires more than 0.

@@ -19,8 +19,8 @@ from typing import Any
 
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
-from ganlane.sim.road import Road
+from ganlane.sim.scenes import FixedScene, SceneVehicle
+from ganlane.sim.state import Road
 
 #: Columns of a scene file.
 COLUMNS = tuple(field.name for field in fields(SceneVehicle) if field.name != "origin")

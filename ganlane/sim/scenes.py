@@ -1,25 +1,32 @@
-"""Initial vehicles of an episode: random (Table II) or hand-made.
+"""Hand-made initial scenes: the same vehicles in every episode, optionally with small random variations.
 
-A :class:`Scenes` is called with the episode keys [N] and returns the initial vehicles. :class:`RandomScenes` draws
-them, :class:`~ganlane.sim.fixed_scene.FixedScene` holds hand-made ones.
+:class:`Scenes` is the contract; :class:`~ganlane.sim.spawn.RandomScenes` draws scenes by Table II. Scenes set by hand
+are checked for impossible numbers, overlaps and unavoidable crashes; errors name the vehicles.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import IdmParameters, Visibility
-from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.road import Road
-from ganlane.sim.spawn import TABLE_II, check_start, spawn
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.dynamics import advance, steer
+from ganlane.sim.feasibility import needed_deceleration
+from ganlane.sim.idm import following_acceleration
+from ganlane.sim.neighbours import in_lane, perceive
+from ganlane.sim.random import Purpose, Stream, episode_key, uniform
+from ganlane.sim.state import STRAIGHT, Road, Vehicles
 
-STRAIGHT = Road()
+#: Duration of the test drive of :func:`check_drive`, s, and number of episodes with jitter that it simulates.
+DRIVE_S = 15.0
+DRIVES = 32
 
 
 class Scenes(Protocol):
@@ -45,58 +52,260 @@ class Scenes(Protocol):
 
 
 @dataclass(frozen=True)
-class RandomScenes:
-    """Table II: random positions and speeds (:func:`ganlane.sim.spawn.spawn`)."""
+class SceneVehicle:
+    """One vehicle of a hand-made scene. m, m/s.
 
+    Args:
+        x_m: centre of the body along the road; only distances matter, since the scene is shifted to ego x = 0.
+        lane: the vehicle is at the centre of this lane, 0 the rightmost; may be left out if ``y_m`` is given.
+        y_m: centre of the body across the road, if it is not a lane's centre.
+        desired_speed_mps: above 0; 0.001 for a vehicle that stays stopped.
+        target_lane: the lane it keeps or is moving to; None: the lane it is in.
+        visibility: when others see its lane changes; None: the scene's ``ego_visibility`` or ``others_visibility``.
+        origin: place in its file, for messages ("line 3").
+    """
+
+    x_m: float
+    lane: int | None = None
+    speed_mps: float = 0.0
+    desired_speed_mps: float = 25.0
+    y_m: float | None = None
+    length_m: float = 4.5
+    width_m: float = 2.5
+    target_lane: int | None = None
+    visibility: Visibility | None = None
+    origin: str = field(default="", compare=False)
+
+    def y_on(self, road: Road) -> float:
+        """Centre of the body across the road, m."""
+        if self.y_m is not None:
+            return float(self.y_m)
+        return float(self.lane or 0) * float(road.lane_width_m)
+
+    def lane_on(self, road: Road) -> int:
+        """The lane whose centre is nearest."""
+        return int(road.lane_of(torch.tensor(self.y_on(road), dtype=torch.float64)))
+
+
+@dataclass(frozen=True)
+class FixedScene:
+    """The same initial scene in every episode, or with small random variations; the first vehicle is the ego.
+
+    Args:
+        rows: the vehicles; the ego's x becomes 0, and the others keep their distance to it. road: the road;
+        straight, the same in all episodes. jitter_m: largest random shift of the others' x, forwards or backwards,
+        per episode, m. jitter_mps: largest random change of each speed, m/s, never below 0; stopped vehicles stay
+        stopped. Both depend
+            on (stream, seed, episode) only.
+        ego_visibility, others_visibility: for vehicles without a visibility of their own.
+        name: of the scene, for messages.
+
+    Raises:
+        UserError: a vehicle is off the road, has an impossible number, or overlaps another; :meth:`check` also raises
+            it for scenes in which crashes are unavoidable.
+    """
+
+    rows: tuple[SceneVehicle, ...]
     road: Road = STRAIGHT
-    vehicles: int = 9
-    parameters: SpawnParameters = TABLE_II
+    jitter_m: float = 0.0
+    jitter_mps: float = 0.0
     ego_visibility: int = Visibility.BODY
     others_visibility: int = Visibility.SIGNALLED
+    name: str = "scene"
 
-    def check(self, road: Road, idm: IdmParameters) -> None:
-        """See :func:`ganlane.sim.spawn.check_start`; the road must be the scene's, wide and long enough."""
-        if isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
-            return  # a road for each row: its vehicles come from recordings
-        if road != self.road:
-            raise UserError(
-                f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both "
-                "the same road."
-            )
-        check_start(self.parameters, self.vehicles, road.lanes, idm)
-        self._check_room(road.lane_width_m, road.ring_m)
+    def __post_init__(self) -> None:
+        check_rows(self)
+        check_overlaps(self)
+
+    @property
+    def vehicles(self) -> int:
+        """M, the ego included."""
+        return len(self.rows)
 
     @property
     def longest_m(self) -> float:
-        """Length of the longest vehicle of all episodes, m."""
-        return self.parameters.longest_m
+        """Length of the longest vehicle, m."""
+        return max(row.length_m for row in self.rows)
 
-    def _check_room(self, lane_width_m: float, ring_m: float | None) -> None:
-        """Check the room side by side, and where a ring closes: there the last vehicle is the first one's leader."""
-        p = self.parameters
-        if lane_width_m <= p.widest_m:
-            wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
+    def check(self, road: Road, idm: IdmParameters) -> None:
+        """Raise :class:`UserError` if ``road`` differs from the scene's, or a vehicle cannot brake in time."""
+        mine, other = ((r.lanes, r.lane_width_m) for r in (self.road, road))
+        if mine != other or road.ring_m is not None:
             raise UserError(
-                f"env.lane_width_m={lane_width_m:g}: expected more than env.{wide}={p.widest_m:g}, or vehicles in "
-                "neighbouring lanes touch; widen the lanes."
+                f"{self.name}: laid out for a straight road of {mine[0]} lanes of {mine[1]:g} m, the traffic's has "
+                f"{other[0]} of {other[1]} m{' and is a ring' if road.ring_m else ''}; give both the same road."
             )
-        if ring_m is not None and p.spread_m + p.spacing_m > ring_m:
-            more = f" ({p.spacing_m:g} with lorries)" if p.spacing_m > p.min_spacing_m else ""
-            raise UserError(
-                f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and env.min_spacing_m="
-                f"{p.min_spacing_m:g}{more} together, or the first vehicles overlap the last; lengthen the ring "
-                "or lower env.spread_m."
-            )
+        check_braking(self, idm)
+        check_drive(self, idm)
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
-        """One random scene per key."""
-        lanes, width = self.road.lanes, self.road.lane_width_m
-        assert not isinstance(lanes, Tensor)
-        assert not isinstance(width, Tensor)
-        seen = (self.ego_visibility, self.others_visibility)
-        return spawn(key, self.vehicles, lanes, float(width), self.parameters, dtype, *seen)
+        """The scene once per key [N], varied by the jitter."""
+        base = self.base(dtype, key.device)
+        n, m = key.shape[0], self.vehicles
+        whole = Vehicles(*(value.expand(n, m).clone() for value in base.as_dict().values()))
+        if self.jitter_m == 0 and self.jitter_mps == 0:
+            return whole
+        u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
+        is_ego = torch.arange(m, device=key.device) == 0
+        x = torch.where(is_ego, whole.x, whole.x + self.jitter_m * u[..., 0])
+        varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
+        return whole.with_(x=x, speed=torch.where(whole.speed > 0, varied, whole.speed))
+
+    def base(self, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Vehicles:
+        """The scene without jitter, fields [1, M]."""
+        rows, road = self.rows, self.road
+
+        def column(values: list[float], kind: torch.dtype = dtype) -> Tensor:
+            return torch.tensor([values], dtype=kind, device=device)
+
+        lanes = [row.lane_on(road) for row in rows]
+        zero = column([0.0] * len(rows))
+        return Vehicles(
+            x=column([row.x_m - rows[0].x_m for row in rows]),
+            y=column([row.y_on(road) for row in rows]),
+            heading=zero,
+            speed=column([row.speed_mps for row in rows]),
+            acceleration=zero,
+            length=column([row.length_m for row in rows]),
+            width=column([row.width_m for row in rows]),
+            desired_speed=column([row.desired_speed_mps for row in rows]),
+            target_lane=column(
+                [lane if row.target_lane is None else row.target_lane for row, lane in zip(rows, lanes, strict=True)],
+                torch.int64,
+            ),
+            visibility=column([int(self._seen(index)) for index in range(len(rows))], torch.int64),
+            valid=torch.ones_like(zero, dtype=torch.bool),
+        )
+
+    def _seen(self, index: int) -> int:
+        own = self.rows[index].visibility
+        usual = self.ego_visibility if index == 0 else self.others_visibility
+        return usual if own is None else own
+
+    def label(self, index: int) -> str:
+        """Name of a vehicle in messages: ``the ego``, ``vehicle 3 (line 5)``."""
+        name = "the ego" if index == 0 else f"vehicle {index}"
+        origin = self.rows[index].origin
+        return f"{name} ({origin})" if origin else name
 
 
-def _described(road: Road) -> str:
-    shape = "a straight road" if road.ring_m is None else f"a ring of {road.ring_m:g} m"
-    return f"{shape} of {road.lanes} lanes of {road.lane_width_m} m"
+def check_rows(scene: FixedScene) -> None:
+    """Raise :class:`UserError` for a scene of fewer than two vehicles, or a vehicle with an impossible number."""
+    if len(scene.rows) < 2:
+        raise UserError(f"{scene.name}: {len(scene.rows)} vehicles; a scene needs the ego and at least one other.")
+    if not isinstance(scene.road.lanes, int) or isinstance(scene.road.lane_width_m, Tensor):
+        raise UserError(f"{scene.name}: a scene set by hand needs one road for all episodes, not one per row.")
+    if not all(0 <= jitter < torch.inf for jitter in (scene.jitter_m, scene.jitter_mps)):
+        raise UserError(
+            f"{scene.name}: jitter_m={scene.jitter_m:g}, jitter_mps={scene.jitter_mps:g}: expected at least 0."
+        )
+    for index, row in enumerate(scene.rows):
+        fault = _fault(row, scene.road)
+        if fault:
+            raise UserError(f"{scene.name}: {scene.label(index)}: {fault}.")
+
+
+def _fault(row: SceneVehicle, road: Road) -> str:
+    """What is wrong with one vehicle; empty if nothing is."""
+    given = {"x_m": row.x_m, "y_m": row.y_m, "speed_mps": row.speed_mps, "desired_speed_mps": row.desired_speed_mps}
+    for name, value in (given | {"length_m": row.length_m, "width_m": row.width_m}).items():
+        if value is not None and not -torch.inf < value < torch.inf:
+            return f"{name}={value}: expected a finite number"
+    if row.speed_mps < 0:
+        return f"speed_mps={row.speed_mps:g}: expected at least 0; vehicles drive forwards only"
+    for name in ("desired_speed_mps", "length_m", "width_m"):
+        if getattr(row, name) <= 0:
+            return f"{name}={getattr(row, name):g}: expected a number above 0"
+    return _misplaced(row, road)
+
+
+def _misplaced(row: SceneVehicle, road: Road) -> str:
+    lanes = int(road.lanes)
+    if row.lane is None and row.y_m is None:
+        return "neither lane nor y_m is given; give one of them"
+    for name, lane in (("lane", row.lane), ("target_lane", row.target_lane)):
+        if lane is not None and not 0 <= lane < lanes:
+            return f"{name}={lane}: expected 0 to {lanes - 1}, the road has {lanes} lanes"
+    right, left, y = float(road.right_edge_m()), float(road.left_edge_m()), row.y_on(road)
+    if y - 0.5 * row.width_m < right - 1e-6 or y + 0.5 * row.width_m > left + 1e-6:
+        return f"y={y:g} m, width {row.width_m:g} m: expected on the road, which runs from {right:g} to {left:g} m"
+    if row.lane is not None and row.lane != row.lane_on(road):
+        return f"lane={row.lane} and y_m={y:g} contradict each other (that is lane {row.lane_on(road)}); give one"
+    if row.target_lane is not None and abs(row.target_lane - row.lane_on(road)) > 1:
+        return f"target_lane={row.target_lane}: expected a lane beside its own, {row.lane_on(road)}"
+    return ""
+
+
+def check_overlaps(scene: FixedScene) -> None:
+    """Raise :class:`UserError` if two vehicles overlap, or may do so with the largest jitter."""
+    vehicles = scene.base()
+    longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
+    longer[:, 0] = 0.0
+    hits = pair_overlaps(vehicles.with_(length=vehicles.length + longer), scene.road)[0].nonzero().tolist()
+    if hits:
+        one, other = hits[0]
+        worst = f" (with jitter_m={scene.jitter_m:g} at its worst)" if scene.jitter_m else ""
+        raise UserError(
+            f"{scene.name}: {scene.label(one)} and {scene.label(other)} overlap{worst}; move one of them."
+        )
+
+
+def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
+    """Raise :class:`UserError` if any follower would need to brake harder than ``idm.min_acceleration``.
+
+    Leaders are all vehicles ahead in a lane that the follower is in or moving to; they are taken to keep their speed.
+    Jitter is taken at its worst.
+    """
+    vehicles = scene.base()
+    seen = perceive(vehicles, scene.road)
+    shares = in_lane(seen, seen.attention.low) | in_lane(seen, seen.attention.high)
+    ahead = shares & (vehicles.x[:, None, :] > vehicles.x[:, :, None])
+    varied = (vehicles.speed > 0) * scene.jitter_mps
+    slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
+    gap = seen.ahead - torch.minimum(slack[:, None], slack[None, :])
+    fastest, slowest = vehicles.speed + varied, (vehicles.speed - varied).clamp_min(0.0)
+    needed = torch.where(ahead, needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap), 0.0)[0]
+    if bool((needed > -idm.min_acceleration).any()):
+        one, other = divmod(int(needed.argmax()), scene.vehicles)
+        raise UserError(
+            f"{scene.name}: {scene.label(one)} at {fastest[0, one]:g} m/s, {float(gap[0, one, other]):.3g} m behind "
+            f"{scene.label(other)} at {slowest[0, other]:g} m/s, would need {float(needed[one, other]):.3g} m/s2 to "
+            f"avoid it, and env.idm.min_acceleration={idm.min_acceleration:g}; move them apart or slow it down."
+        )
+
+
+def check_drive(scene: FixedScene, idm: IdmParameters) -> None:
+    """Raise :class:`UserError` if vehicles that only follow and finish their lane changes collide."""
+    hit = _first_overlap(scene, idm)
+    if hit is not None:
+        one, other, seconds = hit
+        raise UserError(
+            f"{scene.name}: {scene.label(one)} and {scene.label(other)} crash after {seconds:.1f} s although all "
+            "brake as IDM says; move them apart, slow the rear one down, or let a lane change be seen (signalled)."
+        )
+
+
+@lru_cache(maxsize=64)
+def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, float] | None:
+    """The first two vehicles that overlap and the time, s; None without an overlap."""
+    rows = DRIVES if scene.jitter_m or scene.jitter_mps else 1
+    numbers = torch.arange(rows)
+    vehicles = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
+    steering = torch.zeros_like(vehicles.x)
+    for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
+        vehicles, steering = _follow(vehicles, steering, scene.road, idm)
+        hits = pair_overlaps(vehicles, scene.road)
+        if bool(hits.any()):
+            _, one, other = hits.nonzero()[0].tolist()
+            return one, other, step * PHYSICS_STEP_S
+    return None
+
+
+def _follow(vehicles: Vehicles, steering: Tensor, road: Road, idm: IdmParameters) -> tuple[Vehicles, Tensor]:
+    """All vehicles after a physics step of IDM and steering, without new lane changes."""
+    v = vehicles
+    acceleration = following_acceleration(perceive(v, road), idm)
+    centre = road.centre_of(v.target_lane, v.y.dtype)
+    steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
+    pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
+    return v.with_(**pose._asdict()), steering

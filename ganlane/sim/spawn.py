@@ -1,17 +1,19 @@
-"""Initial scenes (section IV.A, Table II), built without a rejection loop."""
+"""Random initial scenes (section IV.A, Table II), built without a rejection loop."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ganlane.errors import ParameterError
+from ganlane.errors import ParameterError, UserError
 from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.braking import can_brake, highest_speed, least_gap
+from ganlane.sim.feasibility import can_brake, highest_speed, least_gap
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Purpose, draw_keys, uniform
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import STRAIGHT, Road, Vehicles
 
 #: Purposes of the draws for every vehicle, in the order of the columns.
 _DRAWN: list[int] = [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED, Purpose.SPAWN_DESIRED_SPEED, Purpose.SPAWN_TRUCK]
@@ -71,12 +73,8 @@ def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
 
     All places of all lanes are shuffled and the first ``vehicles`` of them taken.
     """
-    places = _place_keys(key, lanes * capacity)
+    places = draw_keys(key, 0, lanes * capacity, [int(Purpose.SPAWN_LANE)])[..., 0]
     return places.argsort(dim=1, stable=True)[:, :vehicles] // capacity
-
-
-def _place_keys(key: Tensor, places: int) -> Tensor:
-    return draw_keys(key, 0, places, [int(Purpose.SPAWN_LANE)])[..., 0]
 
 
 def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
@@ -120,7 +118,7 @@ def spawn(
     is_truck = (u[..., 3] < p.truck_share) & ~is_ego
     desired = torch.where(is_ego, p.ego_desired_speed_mps, _between(u[..., 2], p.desired_speed_mps))
     desired = torch.where(is_truck, _between(u[..., 2], p.truck_desired_speed_mps), desired)
-    seen = torch.where(is_ego, int(ego_visibility), int(others_visibility))
+    visibility = torch.where(is_ego, int(ego_visibility), int(others_visibility))
     zero = torch.zeros_like(x)
     return Vehicles(
         x=x,
@@ -132,6 +130,64 @@ def spawn(
         width=torch.where(is_truck, p.truck_width_m, zero + p.width_m),
         desired_speed=desired,
         target_lane=lane,
-        visibility=seen.expand(x.shape).clone(),
+        visibility=visibility.expand(x.shape).clone(),
         valid=torch.ones_like(lane, dtype=torch.bool),
     )
+
+
+@dataclass(frozen=True)
+class RandomScenes:
+    """Table II: random positions and speeds (:func:`ganlane.sim.spawn.spawn`)."""
+
+    road: Road = STRAIGHT
+    vehicles: int = 9
+    parameters: SpawnParameters = TABLE_II
+    ego_visibility: int = Visibility.BODY
+    others_visibility: int = Visibility.SIGNALLED
+
+    def check(self, road: Road, idm: IdmParameters) -> None:
+        """See :func:`ganlane.sim.spawn.check_start`; the road must be the scene's, wide and long enough."""
+        if isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
+            return  # a road for each row: its vehicles come from recordings
+        if road != self.road:
+            raise UserError(
+                f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both "
+                "the same road."
+            )
+        check_start(self.parameters, self.vehicles, road.lanes, idm)
+        self._check_room(road.lane_width_m, road.ring_m)
+
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest vehicle of all episodes, m."""
+        return self.parameters.longest_m
+
+    def _check_room(self, lane_width_m: float, ring_m: float | None) -> None:
+        """Check the room side by side, and where a ring closes: there the last vehicle is the first one's leader."""
+        p = self.parameters
+        if lane_width_m <= p.widest_m:
+            wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
+            raise UserError(
+                f"env.lane_width_m={lane_width_m:g}: expected more than env.{wide}={p.widest_m:g}, or vehicles in "
+                "neighbouring lanes touch; widen the lanes."
+            )
+        if ring_m is not None and p.spread_m + p.spacing_m > ring_m:
+            more = f" ({p.spacing_m:g} with lorries)" if p.spacing_m > p.min_spacing_m else ""
+            raise UserError(
+                f"ring_m={ring_m:g}: expected at least env.spread_m={p.spread_m:g} and env.min_spacing_m="
+                f"{p.min_spacing_m:g}{more} together, or the first vehicles overlap the last; lengthen the ring "
+                "or lower env.spread_m."
+            )
+
+    def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
+        """One random scene per key."""
+        lanes, width = self.road.lanes, self.road.lane_width_m
+        assert not isinstance(lanes, Tensor)
+        assert not isinstance(width, Tensor)
+        visibility = (self.ego_visibility, self.others_visibility)
+        return spawn(key, self.vehicles, lanes, float(width), self.parameters, dtype, *visibility)
+
+
+def _described(road: Road) -> str:
+    shape = "a straight road" if road.ring_m is None else f"a ring of {road.ring_m:g} m"
+    return f"{shape} of {road.lanes} lanes of {road.lane_width_m} m"

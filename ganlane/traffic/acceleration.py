@@ -8,14 +8,13 @@ import torch
 from torch import Tensor
 
 from ganlane.sim.random import Purpose, Stream, normal, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.sequential import Overlay
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.base import Memory, Moved, Overlay
 
 
 @dataclass(frozen=True)
 class SuddenAccelerations:
-    """How often, how long and how strong: mean time between two (s), duration (s), Gaussian of the data (m/s2)."""
+    """Mean time between two (s), duration (s), mean and standard deviation of their Gaussian (m/s2)."""
 
     every_s: float = 10.0
     lasts_s: float = 1.0
@@ -24,10 +23,10 @@ class SuddenAccelerations:
 
 
 class AccelerationOverlay(Overlay):
-    """Now and then a driver accelerates or brakes by an amount drawn from the recorded accelerations.
+    """At times a driver accelerates or brakes by an amount drawn from the recorded accelerations.
 
     The paper says that accelerations 'were added manually' and no more. Here they come at a constant hazard and
-    replace the base model's acceleration for a second. Memory: the acceleration (m/s2) and the steps it has left.
+    replace the base model's acceleration for a second. Memory: the acceleration (m/s2) and its remaining steps.
     """
 
     memory_fields = {"acceleration": ((), None), "left": ((), torch.int64)}  # noqa: RUF012
@@ -38,14 +37,12 @@ class AccelerationOverlay(Overlay):
         super().__init__(road, stream)
         self.sudden = sudden or SuddenAccelerations()
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """Nobody is startled."""
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """No sudden acceleration."""
         return {"acceleration": torch.zeros_like(vehicles.x), "left": torch.zeros_like(vehicles.target_lane)}
 
-    def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
-    ) -> tuple[Vehicles, dict[str, Tensor]]:
-        """Replace speed and position along the road where a sudden acceleration is under way."""
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Replace speed and position along the road during a sudden acceleration."""
         s, m, dtype = self.sudden, vehicles.x.shape[1], vehicles.x.dtype
         u = uniform(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
         gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]

@@ -1,34 +1,45 @@
-"""What every traffic model is: a TensorDictModule that moves the other vehicles by 0.1 s."""
+"""The contract of traffic models, TensorDictModules that move the other vehicles by 0.1 s, and chains of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any, TypeAlias, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from ganlane import keys
-from ganlane.compiling import compiled
+from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
+from ganlane.runtime import compiled
 from ganlane.sim.random import Stream, absorb, episode_key
-from ganlane.sim.road import Road
 from ganlane.sim.scenes import Scenes
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
+#: A module's memory: name to tensor [N, M, ...].
+Memory: TypeAlias = dict[str, Tensor]
+#: The vehicles after a step, and the memory to keep.
+Moved: TypeAlias = tuple[Vehicles, Memory]
 #: Name to (trailing shape after [N, M], dtype); the dtype None stands for the run's float type.
-MemoryFields = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
+MemoryFields: TypeAlias = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
 
 
-def memory_of(tensordict: TensorDictBase) -> TensorDictBase:
-    """``traffic`` of ``tensordict``; empty where it is missing, since TorchRL drops empty TensorDicts on the way."""
-    memory = tensordict.get(keys.TRAFFIC, None)
+def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDictBase:
+    """The memory under ``key``; empty if it is missing, since TorchRL drops empty TensorDicts."""
+    memory = tensordict.get(key, None)
     return TensorDict({}, batch_size=tensordict.batch_size) if memory is None else memory
 
 
-def _put(tensordict: TensorDictBase, key: str, fields: dict[str, Tensor]) -> None:
+def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
+    """The episodes' keys [N]: ``episode_key`` if the caller has computed it, else from ``seed`` and ``episode``."""
+    key = tensordict.get(keys.EPISODE_KEY, None)
+    return episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)) if key is None else key
+
+
+def _put(tensordict: TensorDictBase, key: str, fields: Memory) -> None:
     """``tensordict[key] = fields`` without the checks, which cost as much as a step of a small batch."""
     nested = TensorDict._new_unsafe(fields, batch_size=tensordict.batch_size)
     tensordict._set_str(key, nested, validated=True, inplace=False, non_blocking=False)
@@ -38,10 +49,10 @@ class TrafficModule(TensorDictModuleBase):
     """Base of all traffic models.
 
     In keys: ``vehicles`` (the state at t, never written), ``traffic`` (the module's memory), ``seed``,
-    ``episode``, ``step`` ([N] int64); ``episode_key`` too, where the caller has worked it out. Out keys: ``moved``
-    (the same fields as ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: what the module
-    writes there is overwritten by the environment. Numbers of vehicles that are not valid may be anything finite.
-    Randomness comes from :mod:`ganlane.sim.random` and the counters alone.
+    ``episode``, ``step`` ([N] int64); optional: ``episode_key``. Out keys: ``moved`` (the same fields as
+    ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: the environment overwrites it. Fields
+    of invalid vehicles may be any finite numbers. Random numbers come from :mod:`ganlane.sim.random` and the counters
+    only.
 
     A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields` and
     fills them in :meth:`fresh_memory`::
@@ -58,13 +69,13 @@ class TrafficModule(TensorDictModuleBase):
     in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
 
-    #: How the vehicles of this model show their lane changes to others; where that differs from episode to episode
-    #: ``VISIBILITY_OF_EPISODE``, which :meth:`enter` replaces.
+    #: When others see the lane changes of this model's vehicles; ``VISIBILITY_OF_EPISODE`` if :meth:`enter` sets it
+    #: per episode.
     visibility: int = Visibility.SIGNALLED
-    #: Whether lanes and lane width differ from row to row (:meth:`road_of`).
+    #: Whether lanes and lane width differ between rows (:meth:`road_of`).
     own_roads: bool = False
-    #: Whether a running episode has to keep its row of the batch, since the module holds something per row outside
-    #: ``traffic`` (a foreign simulator). New episodes then show by their (seed, episode) with step 0.
+    #: Whether a running episode has to keep its row of the batch, since the module holds state per row outside
+    #: ``traffic`` (a foreign simulator). New episodes are recognised by step 0 of their (seed, episode).
     rows_must_stay: bool = False
     #: Per-vehicle memory; empty for a model without any.
     memory_fields: MemoryFields = {}  # noqa: RUF012
@@ -75,7 +86,7 @@ class TrafficModule(TensorDictModuleBase):
         self.stream = int(stream)
         self.dt = PHYSICS_STEP_S
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """The vehicles at t + 0.1 s, and the memory to keep.
 
         Args:
@@ -86,8 +97,8 @@ class TrafficModule(TensorDictModuleBase):
         """
         raise NotImplementedError
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """Memory as if every vehicle had just entered; ``key`` [N] gives random traits."""
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """Memory as if every vehicle had just entered; ``key`` [N] is for random per-driver parameters."""
         return {}
 
     def road_of(self, key: Tensor, dtype: torch.dtype) -> Road:
@@ -99,13 +110,13 @@ class TrafficModule(TensorDictModuleBase):
         return None
 
     def scenes(self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float) -> Scenes | None:
-        """Where the episodes of this traffic start; None: wherever the environment says."""
+        """The initial scenes of this traffic; None: those of the environment."""
         return None
 
     def compile_graphs(self) -> None:
-        """Compile what is a pure function on tensors (``env.compile=true``); here :meth:`move`.
+        """Compile the pure functions on tensors (``env.compile=true``); here :meth:`move`.
 
-        A model whose :meth:`move` asks for the value of a tensor overrides this and compiles the parts between.
+        A model whose :meth:`move` reads the value of a tensor overrides this and compiles the parts between.
         """
         self.move = compiled(self.move)  # type: ignore[method-assign]
 
@@ -113,41 +124,105 @@ class TrafficModule(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``."""
-        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
-        memory = dict(memory_of(tensordict).items())
-        key = tensordict.get(keys.EPISODE_KEY, None)
-        if key is None:
-            key = episode_key(self.stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
-        moved, memory = self._call(tensordict, vehicles, memory, key)
+        vehicles, memory = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(memory_of(tensordict).items())
+        moved, memory = self._call(tensordict, vehicles, memory, key_of(tensordict, self.stream))
         _put(tensordict, keys.MOVED, moved.as_dict())
         _put(tensordict, keys.TRAFFIC, memory)
         return tensordict
 
-    def _call(
-        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor
-    ) -> tuple[Vehicles, dict[str, Tensor]]:
+    def _call(self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor) -> Moved:
         return self.move(vehicles, memory, key, tensordict.get(keys.STEP))
 
-    def init_memory(self, vehicles: Vehicles, who: Tensor, key: Tensor) -> TensorDict:
-        """Memory [N] with leaves [N, M, ...] for the vehicles that enter (``who`` [N, M] bool).
-
-        The environment keeps the old memory of the others, so a module may fill all entries.
-        """
+    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
+        """:meth:`fresh_memory` as a TensorDict [N]."""
         return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
-        """The start of the episodes with ``key`` [N]: the vehicles as this traffic has them, and its memory.
+        """The start of episodes: the vehicles, unchanged here, and the memory.
 
-        Here the vehicles stay as they are and :meth:`init_memory` fills the memory. A traffic that changes what a
-        scene leaves to it (who is seen how, how fast a driver wants to go) overrides this method.
+        A traffic that sets visibilities or desired speeds itself overrides this method.
 
         Args:
-            vehicles: the first scene, fields [N, M].
+            vehicles: the initial scene, fields [N, M].
             key: the episodes' keys [N] int64.
             episode: their numbers [N] int64.
         """
-        return vehicles, self.init_memory(vehicles, torch.ones_like(vehicles.valid), absorb(key, 0))
+        return vehicles, self.init_memory(vehicles, absorb(key, 0))
 
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict:
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
         return {name: ((n, m, *shape), kind or dtype) for name, (shape, kind) in self.memory_fields.items()}
+
+
+class Overlay(TrafficModule):
+    """A traffic module that does not move vehicles itself but rewrites ``moved``.
+
+    Subclasses implement :meth:`rewrite` instead of :meth:`TrafficModule.move`.
+    """
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
+        raise NotImplementedError
+
+    def _call(self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor) -> Moved:
+        moved = Vehicles.of(tensordict.get(keys.MOVED))
+        return self.rewrite(vehicles, moved, memory, key, tensordict.get(keys.STEP))
+
+    def compile_graphs(self) -> None:
+        """Compile :meth:`rewrite`."""
+        self.rewrite = compiled(self.rewrite)  # type: ignore[method-assign]
+
+
+class TrafficSequential(TrafficModule):
+    """A base model followed by overlays, each with its own memory under its name.
+
+    Args:
+        parts: name to module, the base model first. Road, stream and visibility are the first one's.
+
+    Raises:
+        UserError: the base model plays recordings.
+    """
+
+    def __init__(self, parts: dict[str, TrafficModule]) -> None:
+        base = next(iter(parts.values()))
+        if base.own_roads:
+            raise UserError("overlays behind replayed traffic: they go where they went; lay faults over a model.")
+        super().__init__(base.road, base.stream)
+        self.parts = nn.ModuleDict(parts)
+        self.visibility = base.visibility
+        self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
+
+    def named_parts(self) -> list[tuple[str, TrafficModule]]:
+        """Names and parts, in order."""
+        return [(name, cast(TrafficModule, part)) for name, part in self.parts.items()]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Run the parts in order."""
+        memories, kept = memory_of(tensordict), {}
+        for name, part in self.named_parts():
+            tensordict.set(keys.TRAFFIC, memory_of(memories, name))
+            part(tensordict)
+            kept[name] = tensordict.get(keys.TRAFFIC)
+        tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
+        return tensordict
+
+    def compile_graphs(self) -> None:
+        """Compile every part."""
+        for _, part in self.named_parts():
+            part.compile_graphs()
+
+    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
+        """The parts' memories, by name."""
+        memories = {name: part.init_memory(vehicles, key) for name, part in self.named_parts()}
+        return TensorDict(memories, batch_size=[vehicles.x.shape[0]])
+
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+        """The vehicles after the parts' :meth:`TrafficModule.enter` in order, and the memories by name."""
+        memories = {}
+        for name, part in self.named_parts():
+            vehicles, memories[name] = part.enter(vehicles, key, episode)
+        return vehicles, TensorDict(memories, batch_size=[vehicles.x.shape[0]])
+
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+        """The parts' specs, by name."""
+        return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}

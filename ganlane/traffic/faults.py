@@ -1,7 +1,8 @@
-"""Faults of drivers along the road, as overlays on any traffic model: phantom braking and late reactions.
+"""Faults of drivers, as overlays on any traffic model: phantom braking, late reactions, faulty lane changes.
 
-Those across the road stand in :mod:`ganlane.traffic.lane_change_faults`. Each fault is a module of its own, comes
-at random to one driver at a time (never to the ego), and leaves the others bitwise as they were moved.
+Each fault is a module of its own, comes at random to single drivers (never to the ego), and leaves the others bitwise
+as they were moved. The faults of lane changes need a model below that moves towards ``vehicles.target_lane``, as
+every model that ships does.
 """
 
 from __future__ import annotations
@@ -12,29 +13,30 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.traffic import BrakingFaults, ReactionFaults
+from ganlane.parameters.traffic import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
+from ganlane.sim.lanes import lane_change_done
 from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import MemoryFields
-from ganlane.traffic.sequential import Overlay
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.base import Memory, MemoryFields, Moved, Overlay, TrafficModule, TrafficSequential
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its heading.
 _SHORTEST_M = 1e-3
+#: Stands for 'no lane to turn back to'.
+_NO_LANE = -1
 
 
-def drivers(vehicles: Vehicles) -> Tensor:
-    """Whom a fault may come to: everybody who is there but the ego, bool [N, M]."""
+def other_drivers(vehicles: Vehicles) -> Tensor:
+    """Valid non-ego vehicles, bool [N, M]."""
     index = torch.arange(vehicles.x.shape[1], device=vehicles.x.device)
     return vehicles.valid & (index != EGO_INDEX)
 
 
 def chance_per_step(per_hour: float, dt: float) -> float:
-    """Probability per step of ``dt`` s of what comes ``per_hour`` times an hour, at a constant hazard."""
+    """Probability per step of ``dt`` s of an event that comes ``per_hour`` times an hour, at a constant hazard."""
     return -math.expm1(-per_hour * dt / 3600.0)
 
 
-def drawn(key: Tensor, step: Tensor, vehicles: Vehicles, purpose: Purpose) -> Tensor:
+def draw(key: Tensor, step: Tensor, vehicles: Vehicles, purpose: Purpose) -> Tensor:
     """A uniform number per vehicle, [N, M]."""
     return uniform(key, step, vehicles.x.shape[1], [purpose], vehicles.x.dtype)[..., 0]
 
@@ -42,7 +44,7 @@ def drawn(key: Tensor, step: Tensor, vehicles: Vehicles, purpose: Purpose) -> Te
 def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: float) -> Vehicles:
     """``moved`` with another ``acceleration`` (m/s2, [N, M]): the same path, driven more slowly or faster.
 
-    Position and heading go along the path from ``vehicles`` to ``moved`` in proportion to the distance driven.
+    Position and heading follow the path from ``vehicles`` to ``moved`` in proportion to the distance driven.
     """
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     usual = 0.5 * (vehicles.speed + moved.speed) * dt
@@ -64,16 +66,16 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
 def steps_left(
     left: Tensor, u: Tensor, vehicles: Vehicles, faults: BrakingFaults | ReactionFaults, dt: float
 ) -> Tensor:
-    """Steps that a fault still lasts, [N, M] int64: ``left``, or all of them where the fault begins now.
+    """Remaining steps of a fault, [N, M] int64: ``left``, or all of them where a fault begins now.
 
-    It begins where there is none, with the probability of a step, by the uniform numbers ``u`` [N, M].
+    A fault begins where there is none, with the probability per step, by the uniform numbers ``u`` [N, M].
     """
-    begins = (left == 0) & drivers(vehicles) & (u < chance_per_step(faults.per_hour, dt))
+    begins = (left == 0) & other_drivers(vehicles) & (u < chance_per_step(faults.per_hour, dt))
     return torch.where(begins, round(faults.lasts_s / dt), left)
 
 
 class PhantomBraking(Overlay):
-    """Now and then a driver brakes for nothing. Memory: the steps of braking that are left."""
+    """At times a driver brakes without a reason. Memory: the remaining steps of braking."""
 
     memory_fields = {"left": ((), torch.int64)}  # noqa: RUF012
 
@@ -83,32 +85,28 @@ class PhantomBraking(Overlay):
         super().__init__(road, stream)
         self.faults = faults or BrakingFaults()
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """Nobody brakes."""
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """No braking."""
         return {"left": torch.zeros_like(vehicles.target_lane)}
 
-    def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
-    ) -> tuple[Vehicles, dict[str, Tensor]]:
-        """Brake where a fault begins or goes on."""
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Brake during a fault."""
         f = self.faults
-        u = drawn(key, step, vehicles, Purpose.FAULT)
-        left = steps_left(memory["left"], u, vehicles, f, self.dt)
+        left = steps_left(memory["left"], draw(key, step, vehicles, Purpose.FAULT), vehicles, f, self.dt)
         brakes = (left > 0) & (moved.acceleration > -f.deceleration)
         braking = driven_at(vehicles, moved, torch.full_like(moved.acceleration, -f.deceleration), self.dt)
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
 class LateReaction(Overlay):
-    """For a while a driver accelerates and brakes as he should have done ``delay_s`` before.
+    """During a lapse a driver accelerates and brakes as it should have done ``delay_s`` before.
 
     What is delayed is the acceleration that the model below decides on, ``a(t) = f(state(t - delay))``: the
     reaction time of car-following models (Treiber, Kesting and Helbing 2006). A delayed perception would be the
-    same for a model that looks at the present state alone; delaying the output needs no knowledge of the model, so
-    it fits every one. Steering is not delayed.
+    same for a model of the present state only; delaying the output fits every model. Steering is not delayed.
 
-    Memory: ``past`` [N, M, D], the accelerations decided on in the last ``delay_s``, m/s2, oldest first (one who
-    enters has always accelerated as at present), and the steps that are ``left`` of the lapse.
+    Memory: ``past`` [N, M, D], the accelerations decided in the last ``delay_s``, m/s2, oldest first (at the start
+    the present one), and ``left``, the remaining steps of the lapse.
     """
 
     def __init__(
@@ -123,17 +121,94 @@ class LateReaction(Overlay):
         """Trailing shapes of the memory."""
         return {"past": ((self.delay_steps,), None), "left": ((), torch.int64)}
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """Attentive, at a steady acceleration."""
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """No lapse, a constant past acceleration."""
         past = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
         return {"past": past, "left": torch.zeros_like(vehicles.target_lane)}
 
-    def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
-    ) -> tuple[Vehicles, dict[str, Tensor]]:
-        """Drive at the acceleration of ``delay_s`` ago where attention lapses."""
-        u = drawn(key, step, vehicles, Purpose.LATE_REACTION)
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Drive at the acceleration of ``delay_s`` ago during a lapse."""
+        u = draw(key, step, vehicles, Purpose.LATE_REACTION)
         left = steps_left(memory["left"], u, vehicles, self.faults, self.dt)
         late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
         past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
         return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}
+
+
+def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
+    """Drivers whose lane change the model below has just begun, bool [N, M]."""
+    return (moved.target_lane != vehicles.target_lane) & other_drivers(vehicles)
+
+
+class HesitantLaneChange(Overlay):
+    """Some changes take longer: lateral motion is multiplied by ``pace`` until the change is complete.
+
+    Memory: whether the current change is ``hesitant``.
+    """
+
+    memory_fields = {"hesitant": ((), torch.bool)}  # noqa: RUF012
+
+    def __init__(
+        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: HesitationFaults | None = None
+    ) -> None:
+        super().__init__(road, stream)
+        self.faults = faults or HesitationFaults()
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """No hesitant change."""
+        return {"hesitant": torch.zeros_like(vehicles.valid)}
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Reduce the lateral motion of hesitant changes."""
+        begins, u = starting(vehicles, moved), draw(key, step, vehicles, Purpose.HESITANT_CHANGE)
+        hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
+        slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
+        moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
+        return moved, {"hesitant": hesitant & ~lane_change_done(moved, self.road)}
+
+
+class AbortedLaneChange(Overlay):
+    """Some changes are aborted: the driver turns back to its old lane.
+
+    At the default of half way the body is still in the old lane, where the others have seen it all the time, so its
+    place there is free. Memory: the lane to turn back to (-1: none).
+    """
+
+    memory_fields = {"origin": ((), torch.int64)}  # noqa: RUF012
+
+    def __init__(
+        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: AbortFaults | None = None
+    ) -> None:
+        super().__init__(road, stream)
+        self.faults = faults or AbortFaults()
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """No lane to turn back to."""
+        return {"origin": torch.full_like(vehicles.target_lane, _NO_LANE)}
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Set the old lane as the target where the change has come far enough."""
+        begins, u = starting(vehicles, moved), draw(key, step, vehicles, Purpose.ABORTED_CHANGE)
+        chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
+        origin = torch.where(begins, chosen, memory["origin"])
+        start, end = (self.road.centre_of(lane, moved.y.dtype) for lane in (origin, moved.target_lane))
+        far_enough = (moved.y - start).abs() >= self.faults.at * (end - start).abs()
+        turns = (origin != _NO_LANE) & far_enough
+        moved = moved.with_(target_lane=torch.where(turns, origin, moved.target_lane))
+        return moved, {"origin": torch.where(turns, _NO_LANE, origin)}
+
+
+def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> TrafficSequential:
+    """``base`` (any traffic model or chain) with all four faults laid over it.
+
+    Phantom braking comes after the late reactions, since it is no reaction and must not be delayed.
+    """
+    faults, (road, stream) = faults or DriverFaults(), (base.road, base.stream)
+    parts: dict[str, TrafficModule] = {
+        "base": base,
+        "late_reaction": LateReaction(road, stream, faults.late_reaction),
+        "phantom_braking": PhantomBraking(road, stream, faults.phantom_braking),
+        "hesitant_change": HesitantLaneChange(road, stream, faults.hesitant_change),
+        "aborted_change": AbortedLaneChange(road, stream, faults.aborted_change),
+    }
+    return TrafficSequential(parts)

@@ -1,7 +1,7 @@
-"""The guard: what keeps a generated vehicle on the road, in its lane and off its leader's bumper.
+"""The guard: keeps generated vehicles on the road, in their lanes and off their leaders' bumpers.
 
-A network that saw relative positions alone drifts: off the road within a minute, and to any speed. The guard
-stands behind it and corrects what it moved.
+A network with relative positions as its only input drifts: off the road within a minute, and to any speed. The guard
+follows it and corrects its motion.
 """
 
 from __future__ import annotations
@@ -13,14 +13,12 @@ import torch
 from torch import Tensor
 
 from ganlane.parameters.driving import IdmParameters
-from ganlane.sim.following import acceleration_behind
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, acceleration_behind
 from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.sequential import Overlay
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.base import Memory, Moved, Overlay
 
 
 @dataclass(frozen=True)
@@ -28,13 +26,13 @@ class GuardParameters:
     """Limits of the guard.
 
     Attributes:
-        headway_s: the upper bound on acceleration is IDM's with this (short) time headway.
-        slack: the lower bound is IDM's acceleration less this, m/s2, times speed over desired speed, so that a
-            network that always slows settles at a crawl instead of standing still on a free road.
-        hardest_braking: no acceleration below this, m/s2.
-        centring_per_s: rate at which the offset from the target lane's centre is pulled in (the P of the PD).
-        damping: share of the network's lateral motion that is let through (the D).
-        edge_margin_m: the body, as it is turned, stays at least so far inside the edge of the road.
+        headway_s: time headway of the IDM acceleration that is the upper bound.
+        slack: the lower bound is IDM's acceleration minus this, m/s2, times speed over desired speed, so that a
+            network that always slows ends at a crawl instead of standing still on a free road.
+        hardest_braking: lowest acceleration, m/s2.
+        centring_per_s: rate at which the offset from the target lane's centre is reduced (the P of the PD).
+        damping: share of the network's lateral motion that is kept (the D).
+        edge_margin_m: minimum distance of the turned body from the edge of the road.
         steepest_rad: largest angle to the road.
     """
 
@@ -47,14 +45,14 @@ class GuardParameters:
     steepest_rad: float = 0.2
 
 
-#: Called with the vehicles at t, as the chain moved them, and as the guard lets them move.
+#: Called with the vehicles at t, as the chain moved them, and as the guard moves them.
 Observer = Callable[[Vehicles, Vehicles, Vehicles], None]
 
 
 class Guard(Overlay):
     """Bound the acceleration, pull towards the target lane, keep the body on the road.
 
-    :attr:`observer`, if set, sees what it alters.
+    :attr:`observer`, if set, is called with every correction.
     """
 
     def __init__(
@@ -111,9 +109,7 @@ class Guard(Overlay):
         steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)
         return moved.with_(y=y, heading=torch.minimum(torch.maximum(heading, -steepest), steepest))
 
-    def rewrite(
-        self, vehicles: Vehicles, moved: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
-    ) -> tuple[Vehicles, dict[str, Tensor]]:
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Along the road, then across it."""
         guarded = self.across(vehicles, self.along(vehicles, moved))
         if self.observer is not None:

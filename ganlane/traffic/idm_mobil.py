@@ -1,29 +1,26 @@
-"""Rule-driven traffic: IDM along the road, MOBIL or nothing across, steered like the ego."""
+"""Rule-driven traffic: IDM along the road, MOBIL or no lane changes, steered like the ego."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from ganlane.compiling import compiled
 from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.sim.bicycle import advance
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V
+from ganlane.runtime import compiled
+from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
+from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.mobil import TABLE_IV, mobil_changes
 from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
-from ganlane.sim.steering import STEERING, SteeringParameters, steer
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import TrafficModule
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.base import Memory, Moved, TrafficModule
 
 #: MOBIL decides once a second of simulated time, whatever the ego's decision period.
 MOBIL_PERIOD_STEPS = 10
 
 
 class IdmTraffic(TrafficModule):
-    """``traffic=idm``: everybody keeps its lane (the paper's Traffic_IDM, 'without complex decisions').
+    """``traffic=idm``: all keep their lanes (the paper's Traffic_IDM, 'without complex decisions').
 
     Memory: the steering angle of each vehicle, rad.
     """
@@ -40,20 +37,18 @@ class IdmTraffic(TrafficModule):
         super().__init__(road, stream)
         self.idm, self.steering = idm, steering
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """Wheels straight."""
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """Steering angle 0."""
         return {"steering": torch.zeros_like(vehicles.x)}
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Accelerate, steer, advance."""
-        scene = perceive(vehicles, self.road)
-        return self.drive(scene, vehicles.target_lane, memory)
+        return self.drive(perceive(vehicles, self.road), vehicles.target_lane, memory)
 
-    def drive(self, scene: Scene, target: Tensor, memory: dict[str, Tensor]) -> tuple[Vehicles, dict]:
-        """Everybody at t + 0.1 s, on the way to the lanes ``target`` [N, M] int64."""
-        vehicles, acceleration = scene.vehicles, following_acceleration(scene, self.idm)
-        centre = self.road.centre_of(target, vehicles.y.dtype)
-        v = vehicles
+    def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
+        """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
+        v, acceleration = scene.vehicles, following_acceleration(scene, self.idm)
+        centre = self.road.centre_of(target, v.y.dtype)
         steering = steer(memory["steering"], v.y, v.heading, v.speed, centre, self.dt, self.steering)
         pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, self.dt)
         return v.with_(target_lane=target, **pose._asdict()), {"steering": steering}
@@ -73,19 +68,19 @@ class IdmMobilTraffic(IdmTraffic):
         super().__init__(road, stream, idm, steering)
         self.mobil = mobil
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
-        """As IDM; in the rows where a second is full everybody decides first."""
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """As IDM; rows at a full second decide first."""
         due = step % MOBIL_PERIOD_STEPS == 0
-        # On a CPU asking costs nothing and spares nine evaluations in ten; on a GPU it would stall the queue.
+        # Reading a flag is cheap on a CPU and saves nine evaluations of ten; on a GPU it would stall the queue.
         if due.device.type == "cpu" and not bool(due.any()):
             return self.keep_lanes(vehicles, memory)
         return self.decide(vehicles, memory, due)
 
-    def keep_lanes(self, vehicles: Vehicles, memory: dict[str, Tensor]) -> tuple[Vehicles, dict]:
-        """A step in which nobody decides."""
+    def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
+        """A step without decisions."""
         return self.drive(perceive(vehicles, self.road), vehicles.target_lane, memory)
 
-    def decide(self, vehicles: Vehicles, memory: dict[str, Tensor], due: Tensor) -> tuple[Vehicles, dict]:
+    def decide(self, vehicles: Vehicles, memory: Memory, due: Tensor) -> Moved:
         """A step in which the drivers of the rows ``due`` [N] decide."""
         scene = perceive(vehicles, self.road)
         change = torch.where(due[:, None], mobil_changes(scene, self.road, self.idm, self.mobil), 0)

@@ -1,4 +1,4 @@
-"""Rule-driven traffic in which no two drivers are alike: IDM and MOBIL with parameters drawn per driver."""
+"""Rule-driven traffic with individual drivers: IDM and MOBIL with parameters drawn per driver."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from torch import Tensor
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.parameters.traffic import RandomDrivers, Range
-from ganlane.sim.bicycle import advance
-from ganlane.sim.braking import needed_deceleration
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V, DriverIdm
+from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
+from ganlane.sim.feasibility import needed_deceleration
+from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration
 from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.steering import STEERING, SteeringParameters, steer
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import MemoryFields
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.base import Memory, MemoryFields, Moved
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
-#: A body that sways stays at least so far inside its lane's markings, m.
+#: Minimum distance of a swaying body from its lane's markings, m.
 _LANE_MARGIN_M = 0.1
-#: What a driver can brake with is at least so many times what the first scene asks of it.
+#: A driver's strongest braking is at least this many times what the initial scene requires of it.
 _START_MARGIN = 1.5
+#: Number of uniform numbers per driver, and the column of the factor on the desired speed.
+_DRAWS, _DESIRED_SPEED = 12, 11
+#: Key of the drivers' parameters in the memory, which stored training runs hold.
+_PARAMETERS = "traits"
 
 
-class Traits(NamedTuple):
-    """A driver's parameters, tensors [N, M]; names and units as in :class:`RandomDrivers`.
+class DriverParams(NamedTuple):
+    """Per-driver parameters, tensors [N, M]; names and units as in :class:`RandomDrivers`.
 
     ``delay`` is the reaction time in physics steps; the last four are angular frequencies (rad/s) and phases (rad) of
-    the two waves that a driver's sway is made of.
+    the two waves that make up a driver's sway.
     """
 
     headway: Tensor
@@ -45,16 +46,21 @@ class Traits(NamedTuple):
     politeness: Tensor
     delay: Tensor
     sway: Tensor
-    pace_one: Tensor
-    pace_two: Tensor
+    frequency_one: Tensor
+    frequency_two: Tensor
     phase_one: Tensor
     phase_two: Tensor
 
+    @classmethod
+    def of(cls, memory: Memory) -> DriverParams:
+        """From the memory of :class:`IdmRandomTraffic`."""
+        return cls(*memory[_PARAMETERS].unbind(-1))
+
 
 def start_braking(vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m) -> Tensor:
-    """Deceleration (m/s2, [N, M]) with which each driver stays behind all those ahead of it in its lane.
+    """Deceleration (m/s2, [N, M]) with which each driver stays behind all vehicles ahead in its lane.
 
-    Each of them keeps its speed, and who is in between takes its length and ``min_gap_m``. Braking begins after
+    These keep their speeds; each vehicle in between takes the longest length and ``min_gap_m``. Braking begins after
     ``reaction_s`` [N, M].
     """
     scene = perceive(vehicles, road)
@@ -63,22 +69,27 @@ def start_braking(vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m:
     distance = torch.where(ahead, scene.distance, torch.inf)
     between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
     space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
-    speed, theirs = vehicles.speed[:, :, None], vehicles.speed[:, None, :]
-    gap = scene.ahead - between * space - (speed - theirs).clamp_min(0.0) * reaction_s[..., None]
-    needed = needed_deceleration(speed, theirs, gap.clamp_min(1.0))
+    speed, leader_speed = vehicles.speed[:, :, None], vehicles.speed[:, None, :]
+    gap = scene.ahead - between * space - (speed - leader_speed).clamp_min(0.0) * reaction_s[..., None]
+    needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
     return torch.where(ahead, needed, 0.0).amax(-1)
 
 
-class IdmRandomTraffic(IdmMobilTraffic):
-    """``traffic=idm_random``: IDM and MOBIL, each driver with parameters of its own for the whole episode.
+def in_range(u: Tensor, bounds: Range) -> Tensor:
+    """Uniform numbers in [0, 1) scaled to ``bounds``."""
+    return bounds[0] + u * (bounds[1] - bounds[0])
 
-    MOBIL judges what others would have to do by the driver's own parameters, since it knows no others', and without
-    the limit of the brakes. Memory, beside the steering angle: ``traits`` [N, M, 11] (:class:`Traits`) and, if
-    anybody reacts late, ``past`` [N, M, D], the accelerations decided on in the last D steps, m/s2, oldest first.
+
+class IdmRandomTraffic(IdmMobilTraffic):
+    """``traffic=idm_random``: IDM and MOBIL, each driver with its own parameters for the whole episode.
+
+    In MOBIL a driver predicts the others with its own parameters, since it does not know theirs, and without a limit
+    of braking. Memory: the steering angle, ``traits`` [N, M, 11] (:class:`DriverParams`) and, with reaction times,
+    ``past`` [N, M, D], the accelerations decided in the last D steps, m/s2, oldest first.
 
     Args:
         road, stream, steering: as for every rule-driven traffic.
-        idm: minimum gap of everybody; the hardest braking that MOBIL reckons with.
+        idm: minimum gap of all drivers; the hardest braking in MOBIL's predictions.
         mobil: threshold, safe deceleration, and the weights that the politeness multiplies.
         drivers: the ranges.
     """
@@ -100,101 +111,89 @@ class IdmRandomTraffic(IdmMobilTraffic):
     def memory_fields(self) -> MemoryFields:  # type: ignore[override]
         """Trailing shapes of the memory."""
         past: MemoryFields = {"past": ((self.delay_steps,), None)} if self.delay_steps else {}
-        return {"steering": ((), None), "traits": ((len(Traits._fields),), None), **past}
+        return {"steering": ((), None), _PARAMETERS: ((len(DriverParams._fields),), None), **past}
 
     def _drawn(self, vehicles: Vehicles, key: Tensor) -> list[Tensor]:
-        """Uniform numbers [N, M], one for each of 13 purposes."""
-        purposes = [Purpose.DRIVER + index for index in range(13)]
+        """Uniform numbers [N, M] of every purpose."""
+        purposes = [Purpose.DRIVER + index for index in range(_DRAWS)]
         return list(uniform(key, -1, vehicles.x.shape[1], purposes, vehicles.x.dtype).unbind(-1))
 
-    def traits(self, vehicles: Vehicles, key: Tensor) -> Traits:
-        """The drivers of the episodes with ``key`` [N], at their start."""
+    def driver_params(self, vehicles: Vehicles, key: Tensor) -> DriverParams:
+        """The drivers at the start of the episodes with ``key`` [N]."""
         d, u = self.drivers, self._drawn(vehicles, key)
-        ranges = (d.headway_s, d.max_acceleration, d.comfortable_deceleration, d.strongest_braking, d.politeness)
-        headway, most, comfortable, braking, politeness = (between(u[at], each) for at, each in enumerate(ranges))
-        reaction_s = between(u[5], d.reaction_s)
-        asked = _START_MARGIN * start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
+        reaction_s = in_range(u[5], d.reaction_s)
+        required = _START_MARGIN * start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
         room = 0.5 * (self.road.lane_width_m - vehicles.width) - _LANE_MARGIN_M
-        paces = (2.0 * math.pi / between(u[at], d.sway_period_s) for at in (7, 8))
-        phases = (2.0 * math.pi * u[at] for at in (9, 10))
-        return Traits(
-            headway,
-            most,
-            comfortable,
-            torch.maximum(braking, asked),
-            politeness,
-            torch.round(reaction_s / self.dt),
-            torch.minimum(between(u[6], d.sway_m), room.clamp_min(0.0)),
-            *paces,
-            *phases,
+        return DriverParams(
+            headway=in_range(u[0], d.headway_s),
+            max_acceleration=in_range(u[1], d.max_acceleration),
+            comfortable_deceleration=in_range(u[2], d.comfortable_deceleration),
+            strongest_braking=torch.maximum(in_range(u[3], d.strongest_braking), required),
+            politeness=in_range(u[4], d.politeness),
+            delay=torch.round(reaction_s / self.dt),
+            sway=torch.minimum(in_range(u[6], d.sway_m), room.clamp_min(0.0)),
+            frequency_one=2.0 * math.pi / in_range(u[7], d.sway_period_s),
+            frequency_two=2.0 * math.pi / in_range(u[8], d.sway_period_s),
+            phase_one=2.0 * math.pi * u[9],
+            phase_two=2.0 * math.pi * u[10],
         )
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
-        """The others' desired speeds are their own."""
-        factor = between(self._drawn(vehicles, absorb(key, 0))[11], self.drivers.desired_speed)
+        """Gives every driver but the ego its own desired speed."""
+        factor = in_range(self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED], self.drivers.desired_speed)
         others = torch.arange(vehicles.x.shape[1], device=key.device) != EGO_INDEX
         desired = torch.where(others, factor * vehicles.desired_speed, vehicles.desired_speed)
         return super().enter(vehicles.with_(desired_speed=desired), key, episode)
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """Wheels straight, a steady acceleration, and everybody's parameters."""
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """Steering angle 0, a constant past acceleration, and the drivers' parameters."""
         memory = super().fresh_memory(vehicles, key)
-        memory["traits"] = torch.stack(self.traits(vehicles, key), dim=-1)
+        memory[_PARAMETERS] = torch.stack(self.driver_params(vehicles, key), dim=-1)
         if self.delay_steps:
             memory["past"] = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
         return memory
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
-        """As :class:`IdmMobilTraffic`; the clock goes along with the memory, for the sway."""
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """As :class:`IdmMobilTraffic`; the memory carries the step, for the sway."""
         return super().move(vehicles, {**memory, "step": step}, key, step)
 
-    def decide(self, vehicles: Vehicles, memory: dict[str, Tensor], due: Tensor) -> tuple[Vehicles, dict]:
+    def decide(self, vehicles: Vehicles, memory: Memory, due: Tensor) -> Moved:
         """A step in which the drivers of the rows ``due`` [N] decide."""
-        scene, own = perceive(vehicles, self.road), Traits(*memory["traits"].unbind(-1))
-        judged = self._idm(own, torch.full_like(own.headway, -self.idm.min_acceleration))
+        scene, own = perceive(vehicles, self.road), DriverParams.of(memory)
+        idm = self._idm(own, torch.full_like(own.headway, -self.idm.min_acceleration))
         m, politeness = self.mobil, own.politeness[..., None]
-        mobil = DriverMobil(
-            m.threshold,
-            politeness * m.politeness_rear,
-            politeness * m.politeness_side,
-            m.safe_deceleration,
-            m.exclusive_m,
-        )
-        change = torch.where(due[:, None], mobil_changes(scene, self.road, judged, mobil), 0)
+        rear, side = politeness * m.politeness_rear, politeness * m.politeness_side
+        mobil = DriverMobil(m.threshold, rear, side, m.safe_deceleration, m.exclusive_m)
+        change = torch.where(due[:, None], mobil_changes(scene, self.road, idm, mobil), 0)
         return self.drive(scene, vehicles.target_lane + change, memory)
 
-    def _idm(self, own: Traits, braking: Tensor) -> DriverIdm:
+    def _idm(self, own: DriverParams, braking: Tensor) -> DriverIdm:
         """IDM with each driver's parameters; nobody brakes harder than ``braking`` [N, M]."""
         return DriverIdm(
             self.idm.min_gap_m, own.headway, own.comfortable_deceleration, -braking, own.max_acceleration
         )
 
-    def drive(self, scene: Scene, target: Tensor, memory: dict[str, Tensor]) -> tuple[Vehicles, dict]:
-        """Everybody at t + 0.1 s, each as late and as far beside the lane's centre as it drives."""
-        v, own = scene.vehicles, Traits(*memory["traits"].unbind(-1))
-        wanted = following_acceleration(scene, self._idm(own, own.strongest_braking))
-        acceleration, past = self._late(wanted, own, memory)
+    def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
+        """The vehicles at t + 0.1 s, with each driver's delay and sway."""
+        v, own = scene.vehicles, DriverParams.of(memory)
+        decided = following_acceleration(scene, self._idm(own, own.strongest_braking))
+        acceleration, past = self._delayed(decided, own, memory)
         line = self.road.centre_of(target, v.y.dtype) + self.sway(own, memory["step"])
         steering = steer(memory["steering"], v.y, v.heading, v.speed, line, self.dt, self.steering)
         pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, self.dt)
-        kept = {"steering": steering, "traits": memory["traits"], **past}
+        kept = {"steering": steering, _PARAMETERS: memory[_PARAMETERS], **past}
         return v.with_(target_lane=target, **pose._asdict()), kept
 
-    def _late(self, wanted: Tensor, own: Traits, memory: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """What was decided on a reaction time ago, and what to remember for later."""
+    def _delayed(self, decided: Tensor, own: DriverParams, memory: Memory) -> tuple[Tensor, Memory]:
+        """The acceleration decided one reaction time ago, and the memory of later ones."""
         if not self.delay_steps:
-            return wanted, {}
-        decided = torch.cat((memory["past"], wanted[..., None]), dim=-1)
-        at = self.delay_steps - own.delay.long()
-        return decided.gather(-1, at[..., None])[..., 0], {"past": decided[..., 1:].contiguous()}
+            return decided, {}
+        recent = torch.cat((memory["past"], decided[..., None]), dim=-1)
+        index = self.delay_steps - own.delay.long()
+        return recent.gather(-1, index[..., None])[..., 0], {"past": recent[..., 1:].contiguous()}
 
-    def sway(self, own: Traits, step: Tensor) -> Tensor:
-        """How far beside its lane's centre each driver aims at ``step`` [N], m, to the left, [N, M]."""
+    def sway(self, own: DriverParams, step: Tensor) -> Tensor:
+        """Offset of each driver's line from its lane's centre at ``step`` [N], m, to the left, [N, M]."""
         t = (step.to(own.sway.dtype) * self.dt)[:, None]
-        waves = torch.sin(own.pace_one * t + own.phase_one) + torch.sin(own.pace_two * t + own.phase_two)
+        waves = torch.sin(own.frequency_one * t + own.phase_one) + torch.sin(own.frequency_two * t + own.phase_two)
         return 0.5 * own.sway * waves
-
-
-def between(u: Tensor, bounds: Range) -> Tensor:
-    """From uniform numbers in [0, 1) to ``bounds``."""
-    return bounds[0] + u * (bounds[1] - bounds[0])

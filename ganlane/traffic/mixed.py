@@ -1,7 +1,6 @@
-"""Several traffic models side by side: every episode belongs to one of them, by its number.
+"""Traffic that differs from episode to episode: several models in shares, or a model that does not see the ego.
 
-So an agent that trains on a mixture meets all parts in the shares that were asked for, and an episode is the same in
-every batch. Each part computes its own rows alone.
+Which one an episode gets follows from its number or key, so it is the same in every batch.
 """
 
 from __future__ import annotations
@@ -15,49 +14,45 @@ from torch import Tensor, nn
 
 from ganlane import keys
 from ganlane.errors import UserError
+from ganlane.keys import EGO_INDEX
 from ganlane.sim.lanes import VISIBILITY_OF_EPISODE
-from ganlane.sim.random import episode_key
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import TrafficModule, memory_of
+from ganlane.sim.random import Purpose, absorb, uniform
+from ganlane.sim.state import Vehicles
+from ganlane.traffic.base import TrafficModule, key_of, memory_of
 
-#: Where the rows of a part change in number, compiled graphs get them padded to so many different sizes at most.
+#: Compiled graphs get the rows of a part padded, so that there are at most about this many sizes.
 _SIZES = 16
 
 
 def interleaved(shares: Mapping[str, int]) -> list[str]:
-    """Whose turn it is in a period of ``sum(shares)`` episodes, spread as evenly as it goes.
+    """The part of each of ``sum(shares)`` successive episodes, spread as evenly as possible.
 
-    ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, and the one that is owed most (the
-    first of several) goes and pays the sum.
+    ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the most (the first of
+    several) is chosen and pays the sum.
     """
-    owed, turns = dict.fromkeys(shares, 0), []
+    credit, turns = dict.fromkeys(shares, 0), []
     for _ in range(sum(shares.values())):
         for name, share in shares.items():
-            owed[name] += share
-        turn = max(owed, key=lambda name: owed[name])
-        owed[turn] -= sum(shares.values())
-        turns.append(turn)
+            credit[name] += share
+        chosen = max(credit, key=lambda name: credit[name])
+        credit[chosen] -= sum(shares.values())
+        turns.append(chosen)
     return turns
 
 
 class Rows(NamedTuple):
-    """The rows of a batch that belong to a part: ``number`` of them, then repetitions that fill up a size.
+    """The rows of a batch that belong to a part: the first ``number`` of ``picked``, then repetitions as padding.
 
-    ``source`` [N] tells for every row of the batch which of the part's it is; ``number`` where it is not the part's.
+    ``source`` [N] is the index of every row of the batch among the part's; ``number`` for rows of other parts.
     """
 
     picked: Tensor
     number: int
     source: Tensor
 
-    @property
-    def own(self) -> Tensor:
-        """The rows without the repetitions."""
-        return self.picked[: self.number]
-
 
 class Layout(NamedTuple):
-    """Whose rows are which: part of every row [N], rows by part, and the order that brings them back together."""
+    """Part of every row [N], rows by part, and the order that restores the batch from the parts' rows."""
 
     part: Tensor
     rows: tuple[Rows, ...]
@@ -65,7 +60,7 @@ class Layout(NamedTuple):
 
 
 class Compact(NamedTuple):
-    """A tensor of the memory in a part's rows alone, beside the one of the whole batch that it was spread to."""
+    """A memory tensor of a part's rows, and the one of the whole batch that it was scattered to (at ``version``)."""
 
     whole: Tensor
     version: int | None
@@ -81,23 +76,23 @@ def _version(tensor: Tensor) -> int | None:
 class MixedTraffic(TrafficModule):
     """``traffic=mixed``: parts and their shares of the episodes.
 
-    Episode ``e`` belongs to the part whose turn is ``e`` modulo the sum of the shares (:func:`interleaved`). Where
-    the batch size is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; in rows
-    that are not its own a part's memory is zero.
+    Episode ``e`` belongs to the part at ``e`` modulo the sum of the shares (:func:`interleaved`). If the batch size
+    is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; zero in rows of other
+    parts.
 
     A part gets its rows of vehicles, memory and counters, and computes what it would compute alone: bit for bit where
     the model is the same at every batch size, as rule-driven ones are.
 
-    Generated traffic remembers much and renews little of it in a step, so copies of the memory are kept to what is
-    new: a tensor that a part returns as it was given stands for the one of the whole batch, and what was spread to
-    the whole batch is not gathered again in the next step.
+    Generated traffic has a large memory and renews little of it in a step, so only what is new is copied: a tensor
+    that a part returns unchanged keeps its tensor of the whole batch, and what was scattered to the whole batch in
+    one step is not gathered again in the next.
 
     Args:
         parts: models by name, of one road and stream.
         shares: whole numbers above 0 by the same names.
 
     Raises:
-        UserError: no parts, shares that are not theirs, or a part that plays recordings.
+        UserError: no parts, shares of other names, or a part that plays recordings.
     """
 
     def __init__(self, parts: Mapping[str, TrafficModule], shares: Mapping[str, int]) -> None:
@@ -116,8 +111,9 @@ class MixedTraffic(TrafficModule):
         super().__init__(first.road, first.stream)
         if any(part.stream != first.stream or part.road != first.road for part in parts.values()):
             raise UserError("traffic.shares: the parts have different roads or streams; build all with the same.")
-        self.parts = nn.ModuleDict({_key(name): part for name, part in parts.items()})
-        self.shares = {_key(name): shares[name] for name in parts}
+        # An import path as a name has dots, which separate nested names in a module.
+        self.parts = nn.ModuleDict({name.replace(".", "_"): part for name, part in parts.items()})
+        self.shares = {name.replace(".", "_"): shares[name] for name in parts}
         kinds = {int(part.visibility) for part in parts.values()}
         self.visibility = kinds.pop() if len(kinds) == 1 else VISIBILITY_OF_EPISODE
         numbers = {name: number for number, name in enumerate(self.shares)}
@@ -141,12 +137,13 @@ class MixedTraffic(TrafficModule):
         return turns[episode % len(turns)]
 
     def layout(self, episode: Tensor) -> Layout:
-        """The :class:`Layout` of a batch; on a GPU asking for it waits for the queue once a step."""
-        part = self.part_of(episode)
-        if self._layout is None or not _same(self._layout.part, part):
+        """The :class:`Layout` of a batch; on a GPU this waits for the queue once a step."""
+        part, last = self.part_of(episode), self._layout
+        if last is None or last.part.device != part.device or not torch.equal(last.part, part):
             rows = tuple(self._rows(part, index) for index in range(len(self.shares)))
-            self._layout = Layout(part, rows, torch.cat([each.own for each in rows]).argsort())
-        return self._layout
+            back = torch.cat([each.picked[: each.number] for each in rows]).argsort()
+            last = self._layout = Layout(part, rows, back)
+        return last
 
     def _rows(self, part: Tensor, index: int) -> Rows:
         own = (part == index).nonzero()[:, 0]
@@ -155,62 +152,57 @@ class MixedTraffic(TrafficModule):
         source = torch.full_like(part, count).index_copy_(0, own, torch.arange(count, device=part.device))
         if not self.compiled or count in (0, usual):
             return Rows(own, count, source)
-        # A graph is made for every number of rows, which takes a minute.
+        # A graph is compiled for every number of rows, which takes a minute.
         size = max(8, batch // _SIZES)
-        padding = own[:1].expand(-count % size)
-        return Rows(torch.cat((own, padding)), count, source)
+        return Rows(torch.cat((own, own[:1].expand(-count % size))), count, source)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``, each part its rows."""
         vehicles, memories = Vehicles.of(tensordict.get(keys.VEHICLES)), memory_of(tensordict)
         counters = {name: tensordict.get(name) for name in (keys.SEED, keys.EPISODE, keys.STEP)}
-        key = tensordict.get(keys.EPISODE_KEY, None)
-        own_key = episode_key(self.stream, counters[keys.SEED], counters[keys.EPISODE]) if key is None else key
-        counters[keys.EPISODE_KEY] = own_key
-        layout, none = self.layout(counters[keys.EPISODE]), TensorDict({}, batch_size=tensordict.batch_size)
-        given, moved, kept = [], [], {}
+        counters[keys.EPISODE_KEY] = key_of(tensordict, self.stream)
+        layout = self.layout(counters[keys.EPISODE])
+        before, after, kept = [], [], {}
         compact: dict[int, Compact] = {}
         for (name, part), rows in zip(self.named_parts(), layout.rows):
-            memory = memories.get(name, none)
+            memory = memory_of(memories, name)
             if rows.number == 0:
                 kept[name] = memory
                 continue
-            fields = _picked(vehicles, rows)
-            seen = {each: value.index_select(0, rows.picked) for each, value in counters.items()}
-            seen[keys.VEHICLES] = _nested(fields.as_dict(), rows)
-            own = Gathered(rows, self._compact)
-            seen[keys.TRAFFIC] = own.gather(memory)
-            after = part(_nested(seen, rows))
-            given.append(fields)
-            moved.append(Vehicles.of(after.get(keys.MOVED)))
-            kept[name] = own.spread(memory_of(after), compact)
+            fields = _pick(vehicles, rows)
+            inputs: dict[str, Any] = {each: value.index_select(0, rows.picked) for each, value in counters.items()}
+            exchange = MemoryExchange(rows, self._compact)
+            inputs |= {keys.VEHICLES: _nested(fields.as_dict(), rows), keys.TRAFFIC: exchange.gather(memory)}
+            outputs = part(_nested(inputs, rows))
+            before.append(fields)
+            after.append(Vehicles.of(outputs.get(keys.MOVED)))
+            kept[name] = exchange.scatter(memory_of(outputs), compact)
         self._compact = compact
-        everybody = _together(vehicles, given, moved, layout)
-        tensordict.set(keys.MOVED, TensorDict._new_unsafe(everybody.as_dict(), batch_size=tensordict.batch_size))
+        moved = _together(vehicles, before, after, layout)
+        tensordict.set(keys.MOVED, TensorDict._new_unsafe(moved.as_dict(), batch_size=tensordict.batch_size))
         tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
         return tensordict
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
-        """Every row as its part has it; memory of the other parts is zero there."""
+        """Every row by its part; the memory of the other parts is zero there."""
         (n, m), dtype = vehicles.x.shape, vehicles.x.dtype
-        layout, given, entered, memories = self.layout(episode), [], [], {}
+        layout, before, after, memories = self.layout(episode), [], [], {}
         for (name, part), rows in zip(self.named_parts(), layout.rows):
             if rows.number == 0:
                 memories[name] = _zeros(part.memory_spec(n, m, dtype), n, vehicles.x.device)
                 continue
-            fields = _picked(vehicles, rows)
-            seen = fields.visibility
-            shown = torch.where(seen == VISIBILITY_OF_EPISODE, int(part.visibility), seen)
+            fields = _pick(vehicles, rows)
+            of_episode = fields.visibility == VISIBILITY_OF_EPISODE
+            shown = torch.where(of_episode, int(part.visibility), fields.visibility)
             own, memory = part.enter(fields.with_(visibility=shown), key[rows.picked], episode[rows.picked])
-            given.append(fields)
-            entered.append(own)
-            memories[name] = Gathered(rows, {}).spread(memory, {})
-        return _together(vehicles, given, entered, layout), TensorDict._new_unsafe(
-            memories, batch_size=torch.Size([n])
-        )
+            before.append(fields)
+            after.append(own)
+            memories[name] = MemoryExchange(rows, {}).scatter(memory, {})
+        together = _together(vehicles, before, after, layout)
+        return together, TensorDict._new_unsafe(memories, batch_size=torch.Size([n]))
 
-    def init_memory(self, vehicles: Vehicles, who: Tensor, key: Tensor) -> TensorDict:
-        """Not to be had: whose an episode is follows from its number (:meth:`enter`)."""
+    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
+        """Not available: the part follows from the episode's number (:meth:`enter`)."""
         raise UserError("traffic=mixed: its memory begins with an episode's number; call enter() in place of this.")
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
@@ -224,12 +216,12 @@ class MixedTraffic(TrafficModule):
             part.compile_graphs()
 
 
-class Gathered:
-    """The memory of a part: from the whole batch to its rows, and back.
+class MemoryExchange:
+    """Gathers a part's memory from the whole batch to its rows, and scatters it back.
 
     Args:
         rows: the part's.
-        known: tensors of the whole batch that were spread in the last step, by identity.
+        known: tensors of the whole batch that were scattered in the last step, by identity.
     """
 
     def __init__(self, rows: Rows, known: Mapping[int, Compact]) -> None:
@@ -238,9 +230,9 @@ class Gathered:
 
     def gather(self, memory: TensorDictBase) -> TensorDictBase:
         """``memory`` of the whole batch in the part's rows."""
-        return _nested({name: self._gathered(value) for name, value in memory.items()}, self.rows)
+        return _nested({name: self._gather(value) for name, value in memory.items()}, self.rows)
 
-    def _gathered(self, whole: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
+    def _gather(self, whole: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         if not isinstance(whole, Tensor):
             return self.gather(whole)
         found = self.known.get(id(whole))
@@ -251,17 +243,17 @@ class Gathered:
         self.given[id(found.part)] = found
         return found.part
 
-    def spread(self, memory: TensorDictBase, compact: dict[int, Compact]) -> TensorDictBase:
-        """The part's ``memory`` in the whole batch, zero elsewhere; ``compact`` notes which is which."""
-        named = {name: self._spread(value, compact) for name, value in memory.items()}
+    def scatter(self, memory: TensorDictBase, compact: dict[int, Compact]) -> TensorDictBase:
+        """The part's ``memory`` in the whole batch, zero elsewhere; ``compact`` collects the pairs."""
+        named = {name: self._scatter(value, compact) for name, value in memory.items()}
         return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)
 
-    def _spread(self, part: Tensor | TensorDictBase, compact: dict[int, Compact]) -> Tensor | TensorDictBase:
+    def _scatter(self, part: Tensor | TensorDictBase, compact: dict[int, Compact]) -> Tensor | TensorDictBase:
         if not isinstance(part, Tensor):
-            return self.spread(part, compact)
+            return self.scatter(part, compact)
         found = self.given.get(id(part))
         if found is None or found.part is not part:
-            # One row of zeros at the end is what all other rows get: a third faster than zeros and then copies.
+            # All other rows select one row of zeros at the end: a third faster than zeros and then copies.
             zeros = part.new_zeros((1, *part.shape[1:]))
             whole = torch.cat((part[: self.rows.number], zeros)).index_select(0, self.rows.source)
             found = Compact(whole, _version(whole), self.rows.picked, part)
@@ -269,37 +261,29 @@ class Gathered:
         return found.whole
 
 
-def _key(name: str) -> str:
-    """A part's name in the memory: an import path has dots, which separate nested names elsewhere."""
-    return name.replace(".", "_")
-
-
-def _same(one: Tensor, other: Tensor) -> bool:
-    return one.device == other.device and torch.equal(one, other)
-
-
 def _nested(fields: Mapping[str, Any], rows: Rows) -> TensorDict:
     return TensorDict._new_unsafe(dict(fields), batch_size=torch.Size([len(rows.picked)]))
 
 
-def _picked(vehicles: Vehicles, rows: Rows) -> Vehicles:
+def _pick(vehicles: Vehicles, rows: Rows) -> Vehicles:
     return Vehicles(*(value.index_select(0, rows.picked) for value in vehicles))
 
 
-def _together(vehicles: Vehicles, given: list[Vehicles], done: list[Vehicles], layout: Layout) -> Vehicles:
-    """The parts' rows as one batch; a field that no part has touched is that of ``vehicles``."""
+def _together(vehicles: Vehicles, before: list[Vehicles], after: list[Vehicles], layout: Layout) -> Vehicles:
+    """The parts' rows as one batch; a field that no part has changed is that of ``vehicles``."""
     counts = [rows.number for rows in layout.rows if rows.number]
 
-    def field(at: int) -> Tensor:
-        if all(after[at] is before[at] for before, after in zip(given, done)):
-            return vehicles[at]
-        return torch.cat([after[at][:count] for after, count in zip(done, counts)]).index_select(0, layout.back)
+    def joined(index: int) -> Tensor:
+        if all(new[index] is old[index] for old, new in zip(before, after)):
+            return vehicles[index]
+        parts = [new[index][:count] for new, count in zip(after, counts)]
+        return torch.cat(parts).index_select(0, layout.back)
 
-    return Vehicles(*(field(at) for at in range(len(vehicles))))
+    return Vehicles(*(joined(index) for index in range(len(vehicles))))
 
 
 def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
-    """An empty memory as :meth:`TrafficModule.memory_spec` describes it."""
+    """A memory of zeros by :meth:`TrafficModule.memory_spec`."""
     named = {
         name: _zeros(value, n, device)
         if isinstance(value, Mapping)
@@ -307,3 +291,68 @@ def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
         for name, value in spec.items()
     }
     return TensorDict._new_unsafe(named, batch_size=torch.Size([n]))
+
+
+class BlindTraffic(TrafficModule):
+    """Any traffic model, blind to the ego in a share of the episodes, as replayed recordings are.
+
+    In these episodes the model gets a state in which the ego is invalid: nobody brakes or waits for it. The
+    environment is as ever: the ego hits others, is hit, and observes. Whether an episode is blind follows from
+    (stream, seed, episode) alone. Memory: the model's as ``model``, and ``unseen`` [N, M] bool, true for the ego of a
+    blind episode.
+
+    Args:
+        model: the traffic.
+        blind_share: of the episodes, 0 to 1.
+
+    Raises:
+        UserError: the share is out of range, or the model plays recordings.
+    """
+
+    def __init__(self, model: TrafficModule, blind_share: float) -> None:
+        if not 0.0 <= blind_share <= 1.0:
+            raise UserError(f"traffic.blind_share={blind_share:g}: expected a number from 0 to 1; give such a share.")
+        if model.own_roads:
+            raise UserError(
+                f"traffic.blind_share={blind_share:g} with replayed traffic: recorded vehicles see no ego anyway; "
+                "leave it out."
+            )
+        super().__init__(model.road, model.stream)
+        self.model, self.blind_share = model, blind_share
+        self.visibility, self.rows_must_stay = model.visibility, model.rows_must_stay
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``moved`` and ``traffic`` of the model, which does not see the ego of blind episodes."""
+        memory, vehicles = memory_of(tensordict), tensordict.get(keys.VEHICLES)
+        inputs = tensordict.copy()
+        inputs.set(keys.VEHICLES, vehicles.copy().set("valid", vehicles.get("valid") & ~memory.get("unseen")))
+        inputs.set(keys.TRAFFIC, memory_of(memory, "model"))
+        self.model(inputs)
+        kept = {"model": memory_of(inputs), "unseen": memory.get("unseen")}
+        tensordict.set(keys.MOVED, inputs.get(keys.MOVED))
+        tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
+        return tensordict
+
+    def unseen(self, vehicles: Vehicles, key: Tensor) -> Tensor:
+        """The egos of blind episodes, bool [N, M]; ``key`` as for :meth:`TrafficModule.fresh_memory`."""
+        blind = uniform(key, -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0] < self.blind_share
+        return blind & (torch.arange(vehicles.x.shape[1], device=key.device) == EGO_INDEX)
+
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+        """As the model, with ``unseen``."""
+        vehicles, memory = self.model.enter(vehicles, key, episode)
+        named = {"model": memory, "unseen": self.unseen(vehicles, absorb(key, 0))}
+        return vehicles, TensorDict._new_unsafe(named, batch_size=torch.Size([vehicles.x.shape[0]]))
+
+    def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
+        """As the model's, with ``unseen``."""
+        named = {"model": self.model.init_memory(vehicles, key), "unseen": self.unseen(vehicles, key)}
+        return TensorDict(named, batch_size=[vehicles.x.shape[0]])
+
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+        """As the model's, with ``unseen``."""
+        return {"model": self.model.memory_spec(n, m, dtype), "unseen": ((n, m), torch.bool)}
+
+    def compile_graphs(self) -> None:
+        """Compile the model."""
+        self.model.compile_graphs()

@@ -2,45 +2,87 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ganlane.data import DrivingStatistics
+from ganlane.errors import UserError
 from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
-from ganlane.parameters.driving import IdmParameters
+from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.parameters.traffic import CalibratedGanParameters, DriverFaults, GanParameters
+from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
+from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
-from ganlane.traffic.acceleration import AccelerationOverlay
-from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.calibrated_gan import AnchoredGanTraffic
-from ganlane.traffic.driver_faults import idm_faults_traffic, with_faults
-from ganlane.traffic.fitted import fitted_anchor, literal_changes, sudden_accelerations
+from ganlane.sim.state import Road
+from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
+from ganlane.traffic.base import TrafficModule, TrafficSequential
+from ganlane.traffic.faults import with_faults
 from ganlane.traffic.guard import Guard, GuardParameters
-from ganlane.traffic.lane_change import CalibratedChanges, CalibratedLaneChange, LiteralLaneChange
-from ganlane.traffic.sequential import TrafficSequential
-from ganlane.traffic.social_gan import SocialGanTraffic
+from ganlane.traffic.idm_mobil import IdmMobilTraffic
+from ganlane.traffic.lane_change import CalibratedChanges, CalibratedLaneChange, LiteralChanges, LiteralLaneChange
+from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
-__all__ = [
-    "SIMULATED_ANCHOR",
-    "WISH_PER_CHANGE",
-    "DriverFaults",
-    "gan_calibrated_traffic",
-    "gan_traffic",
-    "idm_faults_traffic",
-    "with_faults",
-]
-
-#: Anchor of the calibrated traffic: the fitted one, but drivers pull away more briskly and move over as fast as
-#: recorded ones do.
+#: Anchor of the calibrated traffic: the fitted one, with brisker acceleration and lane changes as fast as recorded
+#: ones.
 SIMULATED_ANCHOR: AnchorParameters = replace(
     ANCHOR, idm=replace(ANCHOR.idm, max_acceleration=1.0), lane_stiffness=0.6, lane_damping=1.55
 )
-#: Wishes per change that is carried out, measured in the simulation with 9 vehicles: a wish comes only while the
-#: driver is near its lane's centre, and waiting for a gap costs distance. A slow test holds the rate that results.
+#: Wishes per executed lane change, measured in the simulation with 9 vehicles: a wish comes only while the driver is
+#: near its lane's centre, and waiting for a gap costs distance. A slow test holds the resulting rate.
 WISH_PER_CHANGE = 1.8
+
+
+def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralChanges:
+    """Equations 9 to 11 with the numbers of all recordings given to the fit, held-out scenes too."""
+    changes = statistics.lane_changes
+    numbers = (changes.t_m_srlc_steps, changes.lateral_speed.mean, changes.lateral_speed.sd)
+    if None in numbers:
+        raise UserError(
+            f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no numbers; "
+            "fit the generator to recordings with lane changes."
+        )
+    mean_steps, speed, sd = (float(number) for number in numbers if number is not None)
+    return LiteralChanges(mean_steps, speed, sd)
+
+
+def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
+    """Gaussian of the recorded accelerations over one second, of all scenes."""
+    recorded = statistics.acceleration_smoothed
+    known = {name: getattr(recorded, name) for name in ("mean", "sd") if getattr(recorded, name) is not None}
+    return SuddenAccelerations(**known)
+
+
+def fitted_anchor(anchor: AnchorParameters, metadata: Mapping[str, Any], source: object) -> AnchorParameters:
+    """``anchor`` with the washout and the further inputs that the weights were fitted with.
+
+    By default those of :data:`ganlane.generator.ANCHOR`.
+
+    Args:
+        anchor: the anchor of the simulation.
+        metadata: of the weights (:func:`ganlane.generator.load_generator`).
+        source: their file, for the message.
+
+    Raises:
+        UserError: fitted without per-driver parameters, which this traffic always draws; or impossible values.
+    """
+    config = metadata["config"] if isinstance(metadata.get("config"), Mapping) else {}
+    washout_s = config.get("washout_s", ANCHOR.washout_s)
+    further_inputs = config.get("further_inputs", ANCHOR.further_inputs)
+    if config.get("traits", True) is not True:
+        raise UserError(
+            f"{source}: fitted with traits={config['traits']}, but every driver of gan_calibrated has a headway "
+            "and a desired speed of its own; give weights fitted with generator.traits=true."
+        )
+    # `not washout_s > 0` since NaN has to fail; `type` since True is no number of seconds.
+    if type(washout_s) not in (int, float) or not washout_s > 0 or type(further_inputs) is not bool:
+        raise UserError(
+            f"{source}: its config says washout_s={washout_s!r} and further_inputs={further_inputs!r}, expected "
+            "seconds above 0 and true or false; fit it again."
+        )
+    return replace(anchor, washout_s=float(washout_s), further_inputs=further_inputs)
 
 
 def gan_traffic(
@@ -52,18 +94,18 @@ def gan_traffic(
     execute_k: int = GanParameters.execute_k,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
-    """``traffic=gan``, the paper's: positions only, literal lane changes that are blind, sudden accelerations.
+    """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden accelerations.
 
     Args:
         road, stream: as for every traffic module.
         path: weights of the paper's preset; by default those that ship.
-        guard: the guard behind it; without, the closed loop drifts off.
+        guard: whether a guard follows; without it the closed loop drifts off.
         noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
-        execute_k: predicted steps that are driven before predicting again (the paper: 1).
+        execute_k: predicted steps driven before predicting again (the paper: 1).
         idm: of the guard's bounds on acceleration.
 
     Raises:
-        UserError: the weights are absent, foreign or of the other preset.
+        UserError: the weights are missing, foreign or of the other preset.
     """
     source = path or shipped_generator("paper")
     generator, metadata = load_generator(source, "paper")
@@ -87,22 +129,19 @@ def gan_calibrated_traffic(
     noise_period_s: float = CalibratedGanParameters.noise_period_s,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
-    """``traffic=gan_calibrated``: anchored residual, traits, lane changes behind a gap check at the recorded rate.
-
-    The washout and the further inputs are those that the weights were fitted with
-    (:func:`ganlane.traffic.fitted.fitted_anchor`).
+    """``traffic=gan_calibrated``: anchored residual, per-driver headways, checked lane changes at the recorded rate.
 
     Args:
         road, stream: as for every traffic module.
         path: weights of the calibrated preset; by default those that ship.
-        noise_scale: of the latent vectors; 1 as fitted, 0 drives everybody by the mean prediction.
-        changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the rate of the
-            recordings, which gives that rate in the simulation.
-        noise_period_s: time in which a driver's latent vector is forgotten.
+        noise_scale: of the latent vectors; 1 as fitted, 0 drives by the mean prediction.
+        changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the recorded
+            rate, which gives that rate in the simulation.
+        noise_period_s: correlation time of a driver's latent vector.
         idm: of the gap check; the anchor keeps its own (:data:`SIMULATED_ANCHOR`).
 
     Raises:
-        UserError: the weights are absent, foreign, of the other preset, or fitted without traits.
+        UserError: the weights are missing, foreign, of the other preset, or fitted without per-driver parameters.
     """
     source = path or shipped_generator("calibrated")
     generator, metadata = load_generator(source, "calibrated")
@@ -120,3 +159,20 @@ def gan_calibrated_traffic(
         "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes), idm),
     }
     return TrafficSequential(parts)
+
+
+def idm_faults_traffic(
+    road: Road | None = None,
+    stream: int = Stream.TRAIN,
+    idm: IdmParameters = TABLE_V,
+    mobil: MobilParameters = TABLE_IV,
+    steering: SteeringParameters = STEERING,
+    faults: DriverFaults | None = None,
+) -> TrafficSequential:
+    """``traffic=idm_faults``: ``idm_mobil`` with drivers' faults.
+
+    Args:
+        road, stream, idm, mobil, steering: as for :class:`ganlane.traffic.IdmMobilTraffic`.
+        faults: rates, durations and sizes.
+    """
+    return with_faults(IdmMobilTraffic(road, stream, idm, steering, mobil), faults)

@@ -1,47 +1,198 @@
-"""``traffic=replay``: recorded scenes, played around the ego."""
+"""``traffic=replay``: recorded scenes, played around the ego.
+
+All samples are in one table. A sample is one vehicle in one frame; the samples of a track follow each other, 0.1 s
+apart, so ``k`` steps after sample ``s`` the vehicle is at sample ``s + k``, as long as its track lasts.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+import polars as pl
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ganlane.data import default_scenes, read_scenes
+from ganlane.data import (
+    FRAME_S,
+    Tracks,
+    default_scenes,
+    read_scenes,
+    scene_lane_counts,
+    scene_lane_widths,
+    tracks_of_frame,
+)
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
 from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.parameters.traffic import ReplayParameters
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
-from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.recordings import Recordings
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.base import Memory, Moved, TrafficModule
 
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+#: Vehicles kept at a start, the ego included: more than anybody simulates around one ego.
+MOST_VEHICLES = 128
+#: Heading and acceleration are taken over this many frames before and after (half a second), or those of the track.
+_HALF_WINDOW = 5
+#: A vehicle that moves less than this in the window keeps its heading along the road, m.
+_LEAST_PATH_M = 1.0
 _X, _LENGTH = VEHICLE_FLOATS.index("x"), VEHICLE_FLOATS.index("length")
+#: Lower bound of a recorded driver's desired speed, m/s (it may be stopped in a jam all the time).
+LEAST_DESIRED_SPEED_MPS = 10.0
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Recorded scenes as tensors: R samples of S scenes, and K possible starts of episodes.
+
+    Attributes:
+        names: of the S scenes.
+        samples: [R, 8] float64, the float fields of ``vehicles`` ordered as in ``ganlane.keys.VEHICLE_FLOATS``.
+        last: [R] the last sample of each sample's track.
+        starts: [K, P] samples in an episode's first frame: the vehicle that the ego replaces, then the others,
+            nearest first, at most :data:`MOST_VEHICLES`; -1 if there are fewer than P.
+        steps: [K] frames from there to the end of the scene.
+        scene: [K] number of the scene.
+        first_start, starts_in: [S] number of a scene's first start, and its number of starts.
+        lanes, lane_width_m: [S].
+    """
+
+    names: tuple[str, ...]
+    samples: Tensor
+    last: Tensor
+    starts: Tensor
+    steps: Tensor
+    scene: Tensor
+    first_start: Tensor
+    starts_in: Tensor
+    lanes: Tensor
+    lane_width_m: Tensor
+
+    @classmethod
+    def of(cls, frame: pl.DataFrame, source: str, least_s: float) -> Recordings:
+        """From a frame in the schema of :mod:`ganlane.data`, sorted by scene, vehicle and frame.
+
+        Args:
+            frame: recorded tracks.
+            source: name of the recordings, for messages.
+            least_s: minimum time that the ego of an episode is recorded, s.
+
+        Raises:
+            UserError: no vehicle is recorded for that time.
+        """
+        widths, counts, tracks = scene_lane_widths(frame), scene_lane_counts(frame), tracks_of_frame(frame)
+        begin = _starts(frame, tracks, round(least_s / FRAME_S))
+        if len(begin.steps) == 0:
+            raise UserError(
+                f"{source}: no vehicle is recorded for {least_s:g} s; give longer recordings or a smaller "
+                "traffic.least_s."
+            )
+        scenes, first, scene, number = np.unique(
+            begin.scene, return_index=True, return_inverse=True, return_counts=True
+        )
+        names = tuple(str(name) for name in scenes)
+        return cls(
+            names,
+            samples=torch.from_numpy(_motion(frame, tracks)),
+            last=torch.from_numpy(tracks.last),
+            starts=torch.from_numpy(begin.starts),
+            steps=torch.from_numpy(begin.steps),
+            scene=torch.from_numpy(scene),
+            first_start=torch.from_numpy(first),
+            starts_in=torch.from_numpy(number),
+            lanes=torch.tensor([counts[name] for name in names]),
+            lane_width_m=torch.tensor([widths[name] for name in names], dtype=torch.float64),
+        )
+
+
+class _Starts(NamedTuple):
+    """Fields of :class:`Recordings`, and the name of each start's scene."""
+
+    starts: Integers
+    steps: Integers
+    scene: NDArray[np.str_]
+
+
+def _motion(frame: pl.DataFrame, tracks: Tracks) -> Floats:
+    """``samples`` of :class:`Recordings`."""
+    x, y, speed, length, width = frame.select("x", "y", "speed", "length", "width").to_numpy().T
+    index = np.arange(len(x))
+    early, late = np.maximum(index - _HALF_WINDOW, tracks.first), np.minimum(index + _HALF_WINDOW, tracks.last)
+    heading = np.arctan((y[late] - y[early]) / np.maximum(x[late] - x[early], _LEAST_PATH_M))
+    acceleration = (speed[late] - speed[early]) / np.maximum((late - early) * FRAME_S, FRAME_S)
+    fastest = np.maximum.reduceat(speed, np.flatnonzero(tracks.begins))[np.cumsum(tracks.begins) - 1]
+    desired = np.maximum(fastest, LEAST_DESIRED_SPEED_MPS)
+    return np.stack((x, y, heading, speed, acceleration, length, width, desired), axis=1)
+
+
+def _starts(frame: pl.DataFrame, tracks: Tracks, least: int) -> _Starts:
+    """Every frame with a vehicle that can be replaced; scene by scene, which bounds the memory."""
+    last, offset, parts = tracks.last, 0, []
+    for rows in frame.partition_by("scene", maintain_order=True):
+        starts, steps = _starts_of_scene(rows, last[offset : offset + rows.height] - offset, least)
+        parts.append(
+            _Starts(np.where(starts < 0, -1, starts + offset), steps, np.repeat(rows["scene"][0], len(steps)))
+        )
+        offset += rows.height
+    widest = max(part.starts.shape[1] for part in parts)
+    wide = [np.pad(p.starts, ((0, 0), (0, widest - p.starts.shape[1])), constant_values=-1) for p in parts]
+    return _Starts(np.concatenate(wide), *(np.concatenate(field) for field in list(zip(*parts))[1:]))
+
+
+def _starts_of_scene(rows: pl.DataFrame, last: Integers, least: int) -> tuple[Integers, Integers]:
+    """``starts`` and ``steps`` of one scene; samples are counted from its first.
+
+    The ego replaces the vehicle nearest the middle of those that are recorded ``least`` frames on. The middle is the
+    median position along the road of all that are recorded in the frame.
+    """
+    frame, table = _by_frame(rows["frame"].to_numpy())
+    there = table >= 0
+    x, y = (np.where(there, rows[name].to_numpy()[table], np.nan) for name in ("x", "y"))
+    stays = there & (last[table] - table >= least)
+    off_middle = np.where(stays, np.abs(x - np.nanmedian(x, axis=1, keepdims=True)), np.inf)
+    ego = off_middle.argmin(axis=1)[:, None]
+    distance = np.hypot(x - np.take_along_axis(x, ego, 1), y - np.take_along_axis(y, ego, 1))
+    np.put_along_axis(distance, ego, -1.0, axis=1)
+    order = np.where(there, distance, np.inf).argsort(axis=1, kind="stable")[:, :MOST_VEHICLES]
+    possible = stays.any(axis=1)
+    return np.take_along_axis(table, order, axis=1)[possible], (frame.max() - frame)[possible]
+
+
+def _by_frame(frame: Integers) -> tuple[Integers, Integers]:
+    """The frame numbers of a scene [F], and the samples in each of them [F, P], -1 where there are fewer than P."""
+    order = frame.argsort(kind="stable")
+    numbers, first, count = np.unique(frame[order], return_index=True, return_counts=True)
+    place = np.arange(count.max())
+    table = order[np.minimum(first[:, None] + place, len(order) - 1)]
+    return numbers, np.where(place < count[:, None], table, -1)
 
 
 class ReplayTraffic(TrafficModule):
     """Plays recorded tracks as they were driven: **nobody reacts to the ego**.
 
-    The ego takes the place of the recorded vehicle nearest the middle of the frame in which the episode starts, with
-    its position, speed and size; the M - 1 nearest to it are its neighbours for the whole episode, fewer where fewer
-    were recorded. A neighbour whose track ends is no longer valid; the episode ends where the scene ends. Lanes and
-    lane width are the scene's, so they differ from row to row (:meth:`road_of`).
+    The ego replaces the recorded vehicle nearest the middle of the episode's first frame, with its position, speed
+    and size; the M - 1 nearest to it (or fewer) are its neighbours for the whole episode. A neighbour whose track
+    ends is no longer valid; the episode ends with the scene. Lanes and lane width are the scene's, so they differ
+    between rows (:meth:`road_of`).
 
-    Which scene and which start an episode takes follows from its key, that is from (stream, seed, episode), and so
-    does everything else: there is no memory. Scenes are equally likely, whatever their length.
+    Scene and start of an episode follow from its key, that is from (stream, seed, episode), so there is no memory.
+    Scenes are equally likely, whatever their length.
 
     Args:
         stream: as for every traffic module.
-        path: what :func:`ganlane.data.read_scenes` reads; by default the US-101 scenes of the recordings' folder.
-        least_s: the replaced vehicle is recorded at least so long from the start on, s, so an episode can last.
-        recordings: tensors in place of a file.
+        path: input of :func:`ganlane.data.read_scenes`; by default the US-101 scenes of the recordings' folder.
+        least_s: minimum time that the replaced vehicle is recorded from the start on, s.
+        recordings: tensors instead of a file.
 
     Raises:
-        UserError: no recordings, a damaged file, or nobody is recorded for ``least_s``.
+        UserError: no recordings, a damaged file, or no vehicle is recorded for ``least_s``.
     """
 
     visibility = Visibility.BODY
@@ -57,7 +208,7 @@ class ReplayTraffic(TrafficModule):
     ) -> None:
         self.source = "recordings" if recordings else str(path or _found())
         recorded = recordings or Recordings.of(read_scenes(self.source), self.source, least_s)
-        # Sizes for all rows together; the road of a row is road_of's.
+        # For sizes only; the road of a row is road_of's.
         super().__init__(Road(int(recorded.lanes.max()), float(recorded.lane_width_m.mean())), stream)
         self.scene_names = recorded.names
         for name, value in vars(recorded).items():
@@ -95,10 +246,10 @@ class ReplayTraffic(TrafficModule):
         return Road(self._lanes[scene], self._lane_width_m[scene].to(dtype))
 
     def recorded(self, key: Tensor, step: Tensor, vehicles: int, dtype: torch.dtype) -> Vehicles:
-        """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x is 0 where the ego began.
+        """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is the ego's start.
 
-        One whose track has ended stays where it was last seen, and is not valid. Entries without a vehicle are copies
-        of the ego's place, not valid either.
+        A vehicle whose track has ended stays at its last position and is invalid. Entries without a vehicle are
+        invalid copies of the ego's start.
         """
         start = self.start_of(key)
         first = self._starts[start, :vehicles]
@@ -118,10 +269,10 @@ class ReplayTraffic(TrafficModule):
     def scenes(
         self, vehicles: int, ego_visibility: int = Visibility.BODY, ego_desired_speed_mps: float = 25.0
     ) -> RecordedScenes:
-        """Where episodes of this traffic start."""
+        """The initial scenes of this traffic."""
         return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """The next recorded frame."""
         moved = self.recorded(key, step + 1, vehicles.x.shape[1], vehicles.x.dtype)
         return moved.with_first(vehicles.at(EGO_INDEX)), memory
@@ -129,10 +280,10 @@ class ReplayTraffic(TrafficModule):
 
 @dataclass(frozen=True)
 class RecordedScenes:
-    """The first scenes of replayed episodes, as the environment asks for them (:class:`ganlane.sim.scenes.Scenes`).
+    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`).
 
     Attributes:
-        traffic: whose recordings.
+        traffic: with the recordings.
         vehicles: M, the ego included.
         ego_visibility, ego_desired_speed_mps: of the ego; the recorded driver's are not known.
     """
@@ -148,7 +299,7 @@ class RecordedScenes:
         return self.traffic.longest_m
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Anything that was recorded will do."""
+        """Recorded scenes are not checked."""
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """Vehicles [N, M] at the start of the episodes with ``key`` [N]; the ego at index 0 and x = 0."""
@@ -161,12 +312,12 @@ class RecordedScenes:
 
 
 def _one_of(u: Tensor, count: Tensor) -> Tensor:
-    """A number from 0 to ``count`` - 1, int64, by a uniform ``u`` in [0, 1)."""
+    """A number from 0 to ``count`` - 1, int64, from a uniform ``u`` in [0, 1)."""
     return torch.minimum((u * count).long(), count - 1)
 
 
 def _found() -> Path:
-    """The recordings where no path is given."""
+    """The default recordings."""
     try:
         return default_scenes()
     except UserError as missing:

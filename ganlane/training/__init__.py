@@ -1,14 +1,24 @@
-"""Training: one loop, and what it needs to be watched, stopped and resumed.
+"""Training: phases, each of which is one run of the loop, watched, stopped and resumed.
 
-:mod:`~ganlane.training.loop` is the algorithm; read it first. :mod:`~ganlane.training.run` is what it works on,
-:mod:`~ganlane.training.meter` sums up what happens, :mod:`~ganlane.training.log` and
-:mod:`~ganlane.training.progress` write and show it, :mod:`~ganlane.training.saver` and
-:mod:`~ganlane.training.checkpoints` save it, :mod:`~ganlane.training.stop` turns Ctrl-C into a clean end.
+:mod:`~ganlane.training.loop` is the algorithm; read it first. :mod:`~ganlane.training.phases` makes of a config what
+it works on, :mod:`~ganlane.training.collectors` and :mod:`~ganlane.training.workers` step the environments,
+:mod:`~ganlane.training.stats` sums up what happens, :mod:`~ganlane.training.logs` writes and shows it,
+:mod:`~ganlane.training.checkpoint` saves and resumes it, and :mod:`~ganlane.training.signals` turns Ctrl-C
+into a clean end.
 """
 
-from ganlane.training.checkpoints import find_checkpoint
-from ganlane.training.config import TrainingConfig, TrainingResult
-from ganlane.training.further import make_logs
-from ganlane.training.loop import train
+from ganlane.training.checkpoint import TrainingState
+from ganlane.training.loop import TrainingConfig, TrainingResult, train
+from ganlane.training.phases import AGENT_FILE, Phase, make_agent, phases_of, run_phase
 
-__all__ = ["TrainingConfig", "TrainingResult", "find_checkpoint", "make_logs", "train"]
+__all__ = [
+    "AGENT_FILE",
+    "Phase",
+    "TrainingConfig",
+    "TrainingResult",
+    "TrainingState",
+    "make_agent",
+    "phases_of",
+    "run_phase",
+    "train",
+]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,59 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from ganlane.agents import GreedyPolicy, Rainbow
+from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
-from ganlane.training.collectors import Source
-from ganlane.training.config import TrainingConfig, TrainingResult
-from ganlane.training.log import Log, Logs
-from ganlane.training.run import Run
-from ganlane.training.saver import Saver
-from ganlane.training.stop import StopRequest
+from ganlane.parameters.checks import at_least, check
+from ganlane.training.checkpoint import Checkpointer, TrainingState
+from ganlane.training.collectors import Collector
+from ganlane.training.logs import Log, Logs
+from ganlane.training.signals import StopRequest
 
 #: Drives the greedy policy through fixed episodes and returns figures.
 Evaluate = Callable[[GreedyPolicy], Mapping[str, float]]
 
 
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Length and schedule of a run. ``*_every`` count decisions over all environments; 0 is never.
+
+    A checkpoint is written ``checkpoint_every_s`` seconds after the last one, later if writing takes long: never
+    more than 2 % of the time. ``checkpoint_replay`` includes the replay buffer, without which a resumed run has to
+    fill it again and is not bit-exact. ``best_metric`` is the figure of the evaluation by which the best agent is
+    kept. ``progress`` shows a bar on a terminal and lines elsewhere.
+    """
+
+    total_decisions: int
+    log_every: int = TrainConfig.log_every
+    evaluate_every: int = TrainConfig.evaluate_every
+    best_metric: str = "mean_reward"
+    checkpoint_every_s: float = TrainConfig.checkpoint_every_s
+    checkpoint_replay: bool = TrainConfig.checkpoint_replay
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        counts = {"total_decisions": at_least(1), "log_every": at_least(1), "evaluate_every": at_least(0)}
+        check(self, **counts, checkpoint_every_s=at_least(0))
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """How a run ended.
+
+    ``stopped_by`` is the number of the signal that stopped it early, or None; an entry point then exits with 128
+    more. ``best`` is the best evaluation's ``best_metric``. ``checkpoint`` is where to resume from.
+    """
+
+    decisions: int
+    updates: int
+    wall_s: float
+    best: float | None
+    stopped_by: int | None
+    checkpoint: Path
+
+
 def train(
-    env: EnvBase | Source,
+    env: EnvBase | Collector,
     agent: Rainbow,
     config: TrainingConfig,
     run_folder: str | Path,
@@ -39,89 +79,86 @@ def train(
 
     Args:
         env: batch [N], writes ``observation`` and ``reward``; its state must travel in the TensorDict for a resumed
-            run to be exact. Or a source of steps (:mod:`ganlane.training.collectors`), which the caller closes.
+            run to be exact. Or a collector (:mod:`ganlane.training.collectors`), which the caller closes.
         agent: trained in place.
-        config: length and rhythm.
+        config: length and schedule.
         run_folder: gets ``metrics.csv``, ``evaluation.csv`` and ``checkpoints/{last.pt, last, best.safetensors}``.
         evaluate: called with the greedy policy every ``config.evaluate_every`` decisions.
         logs: further logs besides the CSV files and the progress.
         metadata: JSON-serialisable, written into the agent's files, e.g. the name of the observation.
+        resume: checkpoint to go on from.
         identity: plain data that makes the run what it is (environment, traffic, reward, seed); a run with another
-            one is not resumed.
-        resume: checkpoint to go on from (see :func:`ganlane.training.checkpoints.find_checkpoint`).
+            one is not resumed (:class:`~ganlane.training.checkpoint.TrainingState`).
 
     Raises:
         UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not evaluated.
     """
-    run = Run(env, agent, identity)
-    missing = None if resume is None else run.restore(resume)
-    saver = Saver(run, run_folder, config, metadata or {})
-    with closing(Logs(Path(run_folder), config, agent.network.config.actions, run.decisions, logs)) as log:
+    state = TrainingState(env, agent, identity)
+    missing = None if resume is None else state.restore(resume)
+    saver = Checkpointer(state, run_folder, config.checkpoint_every_s, config.checkpoint_replay, metadata or {})
+    actions = agent.network.config.actions
+    shown = config.total_decisions if config.progress else None
+    with closing(Logs(run_folder, actions, state.decisions, shown, logs)) as log:
         if missing is not None:
             log.say(f"resumed without {missing}; not bit-exact")
-        stopped_by = _loop(run, config, evaluate, log, saver)
-    return TrainingResult(run.decisions, agent.updates, run.wall_s, run.best, stopped_by, saver.path)
-
-
-def _loop(run: Run, config: TrainingConfig, evaluate: Evaluate | None, log: Logs, saver: Saver) -> int | None:
-    """The algorithm; the number of the signal that ended it early, or None."""
-    run.source.open(run.agent)
-    if run.decisions == 0:
-        saver.save()  # so that there is something to go on from, whenever the run is killed
-    with StopRequest() as stop:
-        while run.decisions < config.total_decisions and stop.signal is None:
-            step = collect(run)
-            run.agent.store(run.window.push(step))
-            learn(run)
-            log.advance(run.decisions)
-            if run.passed(config.log_every):
-                log.write(figures(run))
-            if evaluate is not None and run.passed(config.evaluate_every):
-                assess(run, evaluate, config.best_metric, log, saver)
-            if saver.due():
-                saver.save()
-        if evaluate is not None and stop.signal is None and run.assessed < run.decisions:
-            assess(run, evaluate, config.best_metric, log, saver)
-        saver.save()
-    return stop.signal
+        state.collector.open(agent)
+        if state.decisions == 0:
+            saver.save()  # so that there is something to go on from, whenever the run is killed
+        with StopRequest() as stop:
+            while state.decisions < config.total_decisions and stop.signal is None:
+                step = collect(state)
+                agent.store(state.window.push(step))
+                learn(state)
+                log.advance(state.decisions)
+                if state.passed(config.log_every):
+                    log.write(metrics(state))
+                if evaluate is not None and state.passed(config.evaluate_every):
+                    keep_best(state, evaluate, config.best_metric, log, saver)
+                if saver.due():
+                    saver.save()
+            if evaluate is not None and stop.signal is None and state.evaluated_at < state.decisions:
+                keep_best(state, evaluate, config.best_metric, log, saver)
+            saver.save()
+    return TrainingResult(state.decisions, agent.updates, state.wall_s, state.best, stop.signal, saver.path)
 
 
 @torch.no_grad()
-def collect(run: Run) -> TensorDictBase:
-    """One decision of every environment."""
-    run.agent.anneal(run.decisions)
-    step = run.source.step(run.agent)
-    run.decisions += run.environments
-    run.meter.step(step)
+def collect(state: TrainingState) -> TensorDictBase:
+    """One decision of every environment, batch [N]."""
+    state.agent.anneal(state.decisions)
+    step = state.collector.step(state.agent)
+    state.decisions += state.environments
+    state.stats.step(step)
     return step
 
 
-def learn(run: Run) -> None:
+def learn(state: TrainingState) -> None:
     """As many updates as the decisions since the last one pay for; none before the buffer is full enough."""
-    if not run.agent.ready:
+    agent = state.agent
+    if not agent.ready:
         return
-    run.owed += run.environments
-    while run.owed >= run.agent.config.decisions_per_update:
-        run.meter.update(run.agent.update())
-        run.owed -= run.agent.config.decisions_per_update
+    state.pending_decisions += state.environments
+    while state.pending_decisions >= agent.config.decisions_per_update:
+        state.stats.update(agent.update())
+        state.pending_decisions -= agent.config.decisions_per_update
 
 
-def figures(run: Run) -> dict[str, float]:
+def metrics(state: TrainingState) -> dict[str, float]:
     """A row of metrics, read from the device."""
-    agent = run.agent
-    row = {"decisions": run.decisions, "updates": agent.updates, "wall_s": run.wall_s, **run.meter.read()}
+    agent = state.agent
+    row = {"decisions": state.decisions, "updates": agent.updates, "wall_s": state.wall_s, **state.stats.read()}
     return row | {"sigma": float(agent.sigma()), "epsilon": agent.policy.epsilon}
 
 
-def assess(run: Run, evaluate: Evaluate, best_metric: str, log: Logs, saver: Saver) -> None:
+def keep_best(state: TrainingState, evaluate: Evaluate, best_metric: str, log: Logs, saver: Checkpointer) -> None:
     """Evaluate the greedy policy and keep the best agent so far."""
-    run.assessed = run.decisions
-    row = dict(evaluate(run.agent.greedy))
-    log.write_evaluation({"decisions": run.decisions, **row})
+    state.evaluated_at = state.decisions
+    row = dict(evaluate(state.agent.greedy))
+    log.write_evaluation({"decisions": state.decisions, **row})
     if best_metric not in row:
         known = ", ".join(row)
         raise UserError(f"best_metric={best_metric}: not among the evaluation's figures; choose one of {known}.")
-    if run.best is None or row[best_metric] > run.best:
-        run.best = row[best_metric]
+    if state.best is None or row[best_metric] > state.best:
+        state.best = row[best_metric]
         saver.save_weights("best", row)
         saver.save()  # a resumed run must know of the best, or a worse one could take its place

@@ -1,12 +1,12 @@
-"""TorchRL transforms around the environment: what the agent sees (Table III) and what it is paid (V.C).
+"""TorchRL transforms of the environment: observation (Table III), reward (section V.C), sensor errors, action mask.
 
-Each reads TensorDict keys that :class:`ganlane.env.HighwayEnv` writes and adds its own. A transform of your own
-stands in the same place::
+Each reads TensorDict keys that :class:`ganlane.env.HighwayEnv` writes and adds its own. A transform of your own is
+used in the same way::
 
     TransformedEnv(env, Compose(MyObservation(env), RewardTransform()))
 
-:class:`SensorTransform`, before the observation, puts sensor errors between the true state and what the agent sees.
-:class:`ActionMaskTransform` says which actions are allowed.
+:class:`SensorTransform`, before the observation, adds sensor errors to what the agent sees;
+:class:`ActionMaskTransform` computes the allowed actions.
 """
 
 from ganlane.transforms.mask import MASKS, ActionMaskTransform

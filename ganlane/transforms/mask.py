@@ -1,13 +1,13 @@
 """Action masks: which of the ego's three actions are allowed at each decision.
 
 A mask is a safety layer between a driver and the road (action masking, Krasowski et al. 2020; shielding, Alshiekh
-et al. 2018): it is computed from rules, never learnt, and the same for every driver. ``legal`` removes commands that
-have no meaning (off the road, or while a lane change is under way). ``safe`` also removes lane changes that violate
-MOBIL's safety criterion (Kesting et al. 2007): after the change neither the new follower nor the ego itself would
-have to brake harder than ``safe_deceleration`` by IDM. Keeping the lane is always allowed.
+et al. 2018): computed by rules, never learnt, and the same for every driver. ``legal`` removes commands without an
+effect (off the road, or during a lane change). ``safe`` also removes lane changes that violate MOBIL's safety
+criterion (Kesting et al. 2007): after the change neither the new follower nor the ego itself would have to brake
+harder than ``safe_deceleration`` by IDM. Keeping the lane is always allowed.
 
-The mask sees what the ego perceives: with sensor errors it can be wrong. It holds at the instant of the command; a
-lane change that has begun runs to its end (or, with ``abort_lane_change``, can be turned back if that is safe).
+The mask uses what the ego perceives: with sensor errors it can be wrong. It holds at the instant of the command; a
+lane change that has begun continues (or, with ``abort_lane_change``, can be turned back if that is safe).
 """
 
 from __future__ import annotations
@@ -19,34 +19,29 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.data.tensor_specs import Binary
-from torchrl.envs import Transform
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters
 from ganlane.parameters.observation import MASKS
+from ganlane.runtime import compiled
 from ganlane.sim.ego import ego_scene
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.mobil import prospect
-from ganlane.sim.road import Road, road_in
-from ganlane.sim.vehicles import Vehicles
-from ganlane.transforms.sensors import perceived
+from ganlane.sim.mobil import lane_accelerations
+from ganlane.sim.state import Road, Vehicles, road_in
+from ganlane.transforms.sensors import PerceptionTransform
 
 ACTIONS: Final = 3
 
 
 def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
-    """Which actions stay on the road, bool [N, 3], for an ego whose target lane is ``target_lane`` [N].
-
-    ``lanes`` is one number or one for every row, [N].
-    """
+    """Actions that stay on the road, bool [N, 3]; ``target_lane`` [N] of the ego, ``lanes`` one number or [N]."""
     return torch.stack((target_lane >= 0, target_lane < lanes - 1, target_lane > 0), dim=1)
 
 
 def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
-    """Which actions mean something, bool [N, 3], while a lane change in ``change_direction`` (-1, 0, 1; [N]) lasts.
+    """Actions with an effect, bool [N, 3], during a lane change in ``change_direction`` (-1, 0, 1; [N]).
 
     During a lane change commands are ignored; with ``abort`` the opposite command turns back.
     """
@@ -56,25 +51,26 @@ def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
 
 
 def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
-    """The hardest braking that each action asks for by IDM, as an acceleration in m/s2, [N, 3] (keep, left, right).
+    """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3] (keep, left, right).
 
-    It is the smaller of the ego's own acceleration in that lane and its follower's there. A lane that does not exist
-    has no vehicles; :func:`on_road_actions` excludes it.
+    The smaller of the ego's acceleration in that lane and its follower's there. A lane that does not exist has no
+    vehicles; :func:`on_road_actions` excludes it.
     """
     scene = ego_scene(vehicles, road)
     lane = scene.observers.target_lane.to(vehicles.x.dtype)
-    there = prospect(scene, torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1), idm)
-    return torch.minimum(there.own, there.with_it)[:, 0]
+    lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
+    accelerations = lane_accelerations(scene, lanes, idm)
+    return torch.minimum(accelerations.own, accelerations.with_it)[:, 0]
 
 
-class ActionMaskTransform(Transform):
+class ActionMaskTransform(PerceptionTransform):
     """Write ``action_mask`` [N, 3] bool: which actions are allowed; TorchRL's key and meaning.
 
-    Stands after a :class:`~ganlane.transforms.SensorTransform`, so that the mask sees what the ego perceives. Append
-    TorchRL's own ``ActionMask()`` to restrict the action spec, and with it ``env.rand_action``.
+    Belongs after a :class:`~ganlane.transforms.SensorTransform`. Append TorchRL's own ``ActionMask()`` to restrict
+    the action spec, and with it ``env.rand_action``.
 
     With ``form="safe"`` it also writes ``no_safe_action`` [N, 1] bool: no lane change is allowed, and keeping the
-    lane asks the ego or its follower to brake harder than is safe. The ego then keeps its lane and brakes.
+    lane requires the ego or its follower to brake harder than is safe. The ego then keeps its lane and brakes.
 
     Args:
         road: the environment's.
@@ -109,8 +105,8 @@ class ActionMaskTransform(Transform):
 
         Args:
             vehicles: as the ego perceives them.
-            direction: of its lane change under way, [N].
-            road: where it drives.
+            direction: of its current lane change, [N].
+            road: of every row.
         """
         lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
         legal = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes) & obeyed_actions(direction, self.abort)
@@ -122,25 +118,14 @@ class ActionMaskTransform(Transform):
         return torch.cat((keep, changes), dim=1), none
 
     def compile_graphs(self) -> None:
-        """Make one graph of the mask (``env.compile=true``)."""
+        """Compile the mask to one graph (``env.compile=true``)."""
         self.allowed = compiled(self.allowed)  # type: ignore[method-assign]
 
-    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
-        direction = tensordict.get(keys.EGO).get("change_direction")
-        mask, none = self.allowed(perceived(tensordict, vehicles), direction, road_in(tensordict, self.road))
-        tensordict.set(keys.ACTION_MASK, mask)
-        return tensordict.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form == "safe" else tensordict
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._write(next_tensordict)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._write(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action_mask`` into any TensorDict that holds the raw state."""
-        return self._write(tensordict)
+    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
+        """Write ``action_mask``, and with ``safe`` ``no_safe_action``."""
+        mask, none = self.allowed(seen, state.get(keys.EGO).get("change_direction"), road_in(state, self.road))
+        state.set(keys.ACTION_MASK, mask)
+        return state.set(keys.NO_SAFE_ACTION, none[:, None]) if self.form == "safe" else state
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the mask to the spec."""

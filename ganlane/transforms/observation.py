@@ -1,89 +1,242 @@
-"""The observation as a TorchRL transform: Table III and the forms of it that were found to teach more."""
+"""The observation: Table III of the paper, and the forms of it that were found to teach more.
+
+:data:`OBSERVATIONS` names the forms. A form is a sequence of parts, each a function from a :class:`View` to
+[N, size].
+
+Lane view: for the left, own and right lane the nearest vehicle ahead and behind, each with gap, ``exp(-gap / 15 m)``
+and relative speed. A small network learns the advantages of a lane change from it, but not from the list of vehicles,
+nearest first: the order of that list changes whenever two vehicles swap ranks.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Final, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
 
 from ganlane import keys
-from ganlane.compiling import compiled
 from ganlane.errors import UserError
-from ganlane.sim.road import Road, road_in
-from ganlane.sim.vehicles import Vehicles
-from ganlane.transforms.fixed_order import fixed_order, places
-from ganlane.transforms.lane_view import DRIFT_SIZE, LANE_VIEW_SIZE, lane_view, largest_nearness
-from ganlane.transforms.sensors import perceived
-from ganlane.transforms.table3 import (
-    ObservationScale,
-    as_list,
-    distance_to_ego,
-    nearest_first,
-    other_vehicles,
-    own_state,
-)
+from ganlane.parameters.observation import ObservationScale
+from ganlane.runtime import compiled
+from ganlane.sim.state import Road, Vehicles, road_in
+from ganlane.transforms.sensors import PerceptionTransform
+
+#: Scale of the nearness feature, m.
+NEARNESS_M = 15.0
+#: Overlap along the road that adds 1 to the nearness, m: drivers beside brake so hard that one metre decides.
+OVERLAP_M = 1.0
+LANE_VIEW_SIZE = 18
+DRIFT_SIZE = 6
+#: Lanes of the fixed order: to the left, own, to the right.
+LANES = 3
+#: Of the lane view: lane to the left, own, to the right, each ahead (+1) and behind (-1).
+_SIDES = (1.0, 1.0, 0.0, 0.0, -1.0, -1.0)
+_AHEAD = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
+#: Added to masked values, so that a minimum ignores them.
+_MASKED = 1e9
 
 
-class Form(NamedTuple):
-    """What follows the own state: the list, nearest first; the lane view; own lane change; a place for every role.
+class Others(NamedTuple):
+    """The other vehicles relative to the ego, each [N, M - 1]; the first three are clipped to [-1, 1].
 
-    ``drift`` adds to the lane view where in their lanes the others are, ``overlap`` lets its gaps go below 0.
+    Table III: relative position, relative speed, lane difference (left is positive), and whether the vehicle exists.
+    Not in Table III: ``drift``, the position within its lane (0 in the centre, 1 on the left line, -1 on the
+    right one), and ``bumpers_m``, half of the ego's length plus half of its own, m.
     """
 
-    listed: bool = False
-    viewed: bool = False
-    progress: bool = False
-    placed: bool = False
-    drift: bool = False
-    overlap: bool = False
+    position: Tensor
+    speed: Tensor
+    lane: Tensor
+    valid: Tensor
+    drift: Tensor
+    bumpers_m: Tensor
 
 
-OBSERVATIONS: Final = {
-    "table3": Form(listed=True),
-    "table3_progress": Form(listed=True, progress=True),
-    "lane_view": Form(viewed=True, progress=True),
-    "table3_lane_view": Form(listed=True, viewed=True, progress=True),
-    "lane_view_drift": Form(viewed=True, progress=True, drift=True),
-    "lane_view_overlap": Form(viewed=True, progress=True, drift=True, overlap=True),
-    "fixed_order": Form(placed=True, progress=True),
+class View(NamedTuple):
+    """What the parts of an observation are computed from.
+
+    ``vehicles`` is the true state; ``seen`` the others as the ego perceives them, with the ego (column 0) where it
+    was at that moment. ``progress`` and ``direction`` [N] belong to the ego's own lane change.
+    """
+
+    vehicles: Vehicles
+    seen: Vehicles
+    others: Others
+    road: Road
+    scale: ObservationScale
+    progress: Tensor
+    direction: Tensor
+
+
+def own_state(vehicles: Vehicles, road: Road) -> Tensor:
+    """s1 to s3, [N, 3]: speed over desired speed (not clipped), a lane to the left, a lane to the right."""
+    ego = vehicles.columns(slice(0, 1))
+    lane = road.lane_of(ego.y)
+    left = (lane < road.lanes - 1).to(ego.y.dtype)
+    right = (lane > 0).to(ego.y.dtype)
+    return torch.cat((ego.speed / ego.desired_speed, left, right), dim=1)
+
+
+def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> Others:
+    """s4 and on, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
+    ego, others = vehicles.columns(slice(0, 1)), vehicles.columns(slice(1, None))
+    position = (road.distance_ahead(ego.x, others.x) / scale.range_m).clamp(-1.0, 1.0)
+    speed = ((others.speed - ego.speed) / scale.speed_mps).clamp(-1.0, 1.0)
+    lane = ((road.lane_of(others.y) - road.lane_of(ego.y)) / _widest(road.lanes)).clamp(-1.0, 1.0)
+    valid = others.valid
+    return Others(
+        torch.where(valid, position, 1.0),
+        torch.where(valid, speed, 0.0),
+        torch.where(valid, lane, 0.0),
+        valid,
+        torch.where(valid, drift_of(others.y, road), 0.0),
+        torch.where(valid, 0.5 * ego.length + 0.5 * others.length, 0.0),
+    )
+
+
+def _widest(lanes: int | Tensor) -> int | Tensor:
+    """The largest lane difference, at least 1."""
+    return (lanes - 1).clamp_min(1) if isinstance(lanes, Tensor) else max(lanes - 1, 1)
+
+
+def drift_of(y: Tensor, road: Road) -> Tensor:
+    """Offset to the left of the lane's centre over half of the lane's width, clipped to [-1, 1]."""
+    offset_m = y - road.centre_of(road.lane_of(y), y.dtype)
+    return (2.0 * offset_m / road.lane_width_m).clamp(-1.0, 1.0)
+
+
+def lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
+    """Lanes between the ego and each of the others, [N, M - 1]."""
+    return torch.round(others.lane * _widest(lanes))
+
+
+def distance_to_ego(vehicles: Vehicles, road: Road) -> Tensor:
+    """Distance along the road between the ego and each of the others, m, [N, M - 1]."""
+    return road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:]).abs()
+
+
+def nearest_first(others: Others, distance: Tensor) -> Others:
+    """``others`` ordered by ``distance`` [N, M - 1], invalid ones last."""
+    order = torch.where(others.valid, distance, torch.inf).argsort(dim=1, stable=True)
+    return Others(*(field.gather(1, order) for field in others))
+
+
+def as_list(others: Others) -> Tensor:
+    """s4, s5, s6, s7, ...: three numbers per vehicle, [N, 3 (M - 1)]."""
+    return torch.stack(others[:3], dim=-1).flatten(1)
+
+
+def lane_view(
+    others: Others, lanes: int | Tensor, scale: ObservationScale, drift: bool = False, overlap: bool = False
+) -> Tensor:
+    """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) if empty.
+
+    The nearest vehicle is the one with the nearest centre; one exactly beside the ego counts as behind. The gap, over
+    the range of sight, is from bumper to bumper.
+
+    Args:
+        others: from :func:`other_vehicles`.
+        lanes: of the road.
+        scale: the range of sight.
+        drift: adds a fourth number, :attr:`Others.drift`, [N, 24], which shows a lane change before its middle.
+        overlap: where two bodies overlap along the road the gap is below 0, and the nearness above 1 by 1 per metre;
+            otherwise the gap is 0 there.
+    """
+    side, ahead = (others.position.new_tensor(each)[:, None] for each in (_SIDES, _AHEAD))
+    distance = others.position[:, None, :] * ahead
+    in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
+    on_that_end = (distance > 0) | ((distance == 0) & (ahead < 0))
+    counts = in_sight & on_that_end & (lane_offset(others, lanes)[:, None, :] == side)
+    distance = torch.add(distance, ~counts, alpha=_MASKED)
+    nearest = distance.amin(-1, keepdim=True)
+    farther, found = distance > nearest, nearest <= 1.0
+
+    def of_the_nearest(field: Tensor) -> Tensor:
+        value = torch.add(field[:, None, :], farther, alpha=_MASKED).amin(-1, keepdim=True)
+        return torch.where(found, value, 0.0)
+
+    # Of two equally near vehicles the longer one counts.
+    gap_m = nearest * scale.range_m + of_the_nearest(-others.bumpers_m)
+    gap_m = gap_m if overlap else gap_m.clamp_min(0.0)
+    gap = torch.where(found, gap_m / scale.range_m, 1.0)
+    overlap_m = (-gap_m).clamp_min(0.0)
+    nearness = torch.where(found, torch.exp(-gap_m.clamp_min(0.0) / NEARNESS_M) + overlap_m / OVERLAP_M, 0.0)
+    numbers = (gap, nearness, of_the_nearest(others.speed), *((of_the_nearest(others.drift),) if drift else ()))
+    return torch.cat(numbers, dim=-1).flatten(1)
+
+
+class Part(NamedTuple):
+    """A part of an observation: its size for a number of other vehicles, and its numbers [N, size]."""
+
+    size: Callable[[int], int]
+    numbers: Callable[[View], Tensor]
+
+
+def _own(view: View) -> Tensor:
+    return own_state(view.vehicles, view.road)
+
+
+def _listed(view: View) -> Tensor:
+    return as_list(nearest_first(view.others, distance_to_ego(view.seen, view.road)))
+
+
+def _lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
+    return lane_view(view.others, view.road.lanes, view.scale, drift, overlap)
+
+
+def _lane_change(view: View) -> Tensor:
+    return torch.stack((view.progress, view.direction.to(view.progress.dtype)), dim=1)
+
+
+OWN = Part(lambda others: 3, _own)
+LIST = Part(lambda others: 3 * others, _listed)
+VIEW = Part(lambda others: LANE_VIEW_SIZE, _lane_view)
+DRIFT_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True))
+OVERLAP_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True, overlap=True))
+#: The ego's own lane change: progress 0 to 1, direction -1, 0 or 1.
+CHANGE = Part(lambda others: 2, _lane_change)
+
+#: The forms by name; ``table3`` is the paper's literal 3 + 3 (M - 1) numbers.
+OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
+    "table3": (OWN, LIST),
+    "table3_progress": (OWN, LIST, CHANGE),
+    "lane_view": (OWN, VIEW, CHANGE),
+    "table3_lane_view": (OWN, LIST, VIEW, CHANGE),
+    "lane_view_drift": (OWN, DRIFT_VIEW, CHANGE),
+    "lane_view_overlap": (OWN, OVERLAP_VIEW, CHANGE),
 }
 
 
 def observation_size(name: str, vehicles: int) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
-    form, others = OBSERVATIONS[name], vehicles - 1
-    listed = 3 * (form.listed * others + form.placed * places(others))
-    return 3 + listed + form.viewed * LANE_VIEW_SIZE + form.drift * DRIFT_SIZE + form.progress * 2
+    return sum(part.size(vehicles - 1) for part in OBSERVATIONS[name])
 
 
 def largest_number(name: str, longest_m: float = 4.5) -> float:
-    """What no number of observation ``name`` exceeds, but the first (speed over desired speed, without a bound).
+    """Upper bound of all numbers of observation ``name`` but the first (speed over desired speed, unbounded).
 
     ``longest_m`` is the length of the longest vehicle, m (:attr:`ganlane.sim.scenes.Scenes.longest_m`): with
     ``lane_view_overlap`` the nearness counts metres of overlap.
     """
-    return largest_nearness(longest_m) if OBSERVATIONS[name].overlap else 1.0
+    return 1.0 + longest_m / OVERLAP_M if OVERLAP_VIEW in OBSERVATIONS[name] else 1.0
 
 
-class ObservationTransform(Transform):
-    """Write ``observation`` [N, D] from the raw state, the others as ``perceived`` has them where it is there.
+class ObservationTransform(PerceptionTransform):
+    """Write ``observation`` [N, D] from the raw state, the others as ``perceived`` where that is present.
 
     Args:
         road: the environment's.
         vehicles: M, the ego included.
-        form: ``table3`` (the paper's literal 3 + 3 (M - 1) numbers), ``table3_progress`` (and the ego's own
-            lane change: progress 0 to 1, direction -1, 0 or 1), ``lane_view`` (own state, lane view, lane
-            change), ``lane_view_drift`` (and where in their lanes the others are), ``lane_view_overlap`` (and how far
-            those beside the ego overlap it), ``table3_lane_view`` (list and lane view), ``fixed_order`` (as
-            ``table3_progress``, with a place for every lane and role in the list's stead).
+        form: a key of :data:`OBSERVATIONS`.
         scale: normalisers.
 
     Raises:
-        UserError: an unknown form.
+        UserError: an unknown form, or fewer than two vehicles.
     """
 
     def __init__(
@@ -100,49 +253,21 @@ class ObservationTransform(Transform):
     def observe(
         self, vehicles: Vehicles, progress: Tensor, direction: Tensor, road: Road, seen: Vehicles | None = None
     ) -> Tensor:
-        """The observation [N, D].
-
-        Args:
-            vehicles: the true state; without ``seen`` also what the ego sees of the others.
-            progress, direction: of the ego's own lane change, [N].
-            road: where it drives.
-            seen: the others as the ego perceives them, and where it was itself when it did (column 0).
-        """
+        """The observation [N, D]; arguments as the fields of :class:`View`, ``seen=None``: as they are."""
         seen = vehicles if seen is None else seen
-        form = OBSERVATIONS[self.form]
         others = other_vehicles(seen, road, self.scale)
-        parts = [own_state(vehicles, road)]
-        if form.listed:
-            parts.append(as_list(nearest_first(others, distance_to_ego(seen, road))))
-        if form.placed:
-            parts.append(as_list(fixed_order(others, distance_to_ego(seen, road), road.lanes)))
-        if form.viewed:
-            parts.append(lane_view(others, road.lanes, self.scale, form.drift, form.overlap))
-        if form.progress:
-            parts.append(torch.stack((progress, direction.to(progress.dtype)), dim=1))
-        return torch.cat(parts, dim=1)
+        view = View(vehicles, seen, others, road, self.scale, progress, direction)
+        return torch.cat([part.numbers(view) for part in OBSERVATIONS[self.form]], dim=1)
 
     def compile_graphs(self) -> None:
-        """Make one graph of the observation (``env.compile=true``)."""
+        """Compile the observation to one graph (``env.compile=true``)."""
         self.observe = compiled(self.observe)  # type: ignore[method-assign]
 
-    def _write(self, tensordict: TensorDictBase) -> TensorDictBase:
-        vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict.get(keys.EGO)
-        road = road_in(tensordict, self.road)
-        observation = self.observe(
-            vehicles, ego.get("change_progress"), ego.get("change_direction"), road, perceived(tensordict, vehicles)
-        )
-        return tensordict.set(keys.OBSERVATION, observation)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._write(next_tensordict)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._write(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``observation`` into any TensorDict that holds the raw state."""
-        return self._write(tensordict)
+    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
+        """Write ``observation``."""
+        ego, road = state.get(keys.EGO), road_in(state, self.road)
+        observation = self.observe(vehicles, ego.get("change_progress"), ego.get("change_direction"), road, seen)
+        return state.set(keys.OBSERVATION, observation)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``observation`` to the spec."""

@@ -28,8 +28,8 @@ class RewardTransform(Transform):
     """Write ``reward`` [N, 1] and ``reward_terms.*`` [N, 1] once per decision, on the speed at its end.
 
     Args:
-        decision_period_s: terms that accrue with time are multiplied by it over 1 s.
-        parameters: the numbers of section V.C. With its ``soft_crash_behind`` there is a term of that name, too.
+        decision_period_s: factor of the terms that accrue with time, s.
+        parameters: section V.C; a ``soft_crash_behind`` other than 0 adds a term of that name.
     """
 
     def __init__(self, decision_period_s: float = 1.0, parameters: RewardParameters | None = None) -> None:

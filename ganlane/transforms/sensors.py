@@ -1,9 +1,8 @@
 """Sensor errors as a TorchRL transform: what the ego perceives of the others is noisy, has gaps and comes late.
 
-:mod:`~ganlane.transforms.measurement` says what a single measurement delivers, this module when the ego has it.
-The transform writes ``perceived`` beside ``vehicles``; the observation is made of ``perceived`` where there is one.
-Physics, reward, events and the rule-based drivers go on reading the true ``vehicles``. What is still to be delivered
-travels in the TensorDict as ``sensors``, so a state can be saved, branched and resumed.
+The transform writes ``perceived`` beside ``vehicles``; observation and mask use ``perceived`` where it is present.
+Physics, reward, events and the rule-based drivers read the true ``vehicles``. Measurements that are not yet delivered
+travel in the TensorDict as ``sensors``, so a state can be saved, branched and resumed.
 
 =================================  ===============  ================================================
 ``perceived.x, y, speed, valid``   [N, M]           the scene as it was measured ``delay_s`` ago
@@ -16,25 +15,95 @@ Column 0 is the ego where it was when it measured, without error: what it percei
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.sim.random import Stream, episode_key
-from ganlane.sim.vehicles import Vehicles
-from ganlane.transforms.measurement import Measurement, SensorParameters, measure
+from ganlane.parameters.observation import SensorParameters
+from ganlane.sim.random import Purpose, Stream, episode_key, normal, uniform
+from ganlane.sim.state import Vehicles
 
 PERCEIVED: Final = "perceived"
 SENSORS: Final = "sensors"
+NOISES: Final = [Purpose.SENSED_POSITION, Purpose.SENSED_LATERAL, Purpose.SENSED_SPEED]
+
+
+class Measurement(NamedTuple):
+    """A scene as measured by the ego's sensors, fields [N, M] or [N, K, M], the ego first; m, m/s."""
+
+    x: Tensor
+    y: Tensor
+    speed: Tensor
+    valid: Tensor
+
+    @classmethod
+    def of(cls, mapping: TensorDictBase) -> Measurement:
+        """From a TensorDict that holds the fields."""
+        return cls(*(mapping.get(name) for name in cls._fields))
+
+    def as_tensordict(self) -> TensorDictBase:
+        """The fields by name, batch [N]."""
+        return TensorDict._new_unsafe(self._asdict(), batch_size=self.x.shape[:1], device=self.x.device)
+
+
+def measure(vehicles: Vehicles, key: Tensor, step: Tensor, parameters: SensorParameters) -> Measurement:
+    """A measurement of ``vehicles`` [N, M], without the delay.
+
+    Args:
+        vehicles: the true state.
+        key: of the episodes, [N] (:func:`ganlane.sim.random.episode_key`).
+        step: physics step of the measurement, [N].
+        parameters: sizes of the errors.
+    """
+    x, y, speed, valid = vehicles.x, vehicles.y, vehicles.speed, vehicles.valid
+    scales = (parameters.position_noise_m, parameters.lateral_noise_m, parameters.speed_noise_mps)
+    count = x.shape[1]
+    other = torch.arange(count, device=x.device) != keys.EGO_INDEX
+    if any(scales):
+        noise = normal(key, step, count, [int(purpose) for purpose in NOISES], x.dtype)
+        x, y, speed = (
+            torch.where(other, value + scale * noise[..., i], value)
+            for i, (value, scale) in enumerate(zip((x, y, speed), scales))
+        )
+    if parameters.dropout > 0:
+        lost = uniform(key, step, count, [int(Purpose.SENSED_DROPOUT)], x.dtype)[..., 0] < parameters.dropout
+        valid = valid & ~(lost & other)
+    return Measurement(x, y, speed, valid)
+
+
+def perceived(state: TensorDictBase, vehicles: Vehicles) -> Vehicles:
+    """``vehicles`` as the ego perceives them in ``state``; unchanged without a :class:`SensorTransform`."""
+    seen = state.get(PERCEIVED, None)
+    return vehicles if seen is None else vehicles.with_(**Measurement.of(seen)._asdict())
+
+
+class PerceptionTransform(Transform):
+    """Base of the transforms that read what the ego perceives: subclasses implement :meth:`write`."""
+
+    def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
+        """Write the out keys into ``state``; ``vehicles`` are true, ``seen`` as the ego perceives them."""
+        raise NotImplementedError
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the out keys into any TensorDict that holds the raw state."""
+        vehicles = Vehicles.of(tensordict.get(keys.VEHICLES))
+        return self.write(tensordict, vehicles, perceived(tensordict, vehicles))
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self.forward(tensordict_reset)
 
 
 class SensorTransform(Transform):
-    """Write ``perceived``, and with a delay ``sensors``; stands before the :class:`ObservationTransform`.
+    """Write ``perceived``, and with a delay ``sensors``; belongs before the :class:`ObservationTransform`.
 
     The errors follow from (stream, seed, episode, vehicle, physics step, purpose), so an episode is the same in any
     batch and when it is replayed. The ego measures once per decision, at its end; until the first measurement of an
@@ -78,7 +147,7 @@ class SensorTransform(Transform):
         return next_tensordict.set(PERCEIVED, oldest.as_tensordict())
 
     def _kept(self, state: TensorDictBase) -> Measurement:
-        """The measurements that ``state`` carries, fields [N, K, M]."""
+        """The measurements in ``state``, fields [N, K, M]."""
         kept = state.get(SENSORS, None)
         if kept is None or kept.get("x").shape[1] != self.delay:
             raise UserError(
@@ -113,9 +182,3 @@ def _spec(shape: tuple[int, ...], dtype: torch.dtype) -> Composite:
     """Spec of a :class:`Measurement` with fields of this shape."""
     floats = {name: Unbounded(shape=shape, dtype=dtype) for name in ("x", "y", "speed")}
     return Composite({**floats, "valid": Binary(shape=shape, dtype=torch.bool)}, shape=shape[:1])
-
-
-def perceived(state: TensorDictBase, vehicles: Vehicles) -> Vehicles:
-    """``vehicles`` as the ego perceives them in ``state``: as they are, if no sensors stand between."""
-    seen = state.get(PERCEIVED, None)
-    return vehicles if seen is None else vehicles.with_(**Measurement.of(seen)._asdict())

@@ -1,11 +1,12 @@
-"""Charts by matplotlib: the common style, learning curves of training runs, and what recordings show.
+"""Charts by matplotlib: the common style, learning curves of training runs, and statistics of recordings.
 
-Every function takes data and returns a ``Figure``; :func:`save_figure` writes it as PNG, SVG or PDF. Figures are made
+Every ``draw`` function returns a ``Figure``; :func:`save_figure` writes it as PNG, SVG or PDF. Figures are made
 without pyplot: they need no display, and no global list keeps them.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,18 +21,25 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 from PIL import Image
+from polars.exceptions import PolarsError
 
 from ganlane.data import Histogram, PooledStatistics, survival_curve
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
-from ganlane.view.runs import EVALUATION, X_COLUMN, running_mean
+
+# It reports every table of a font that a PDF leaves out.
+logging.getLogger("fontTools").setLevel(logging.WARNING)
 
 FloatArray = npt.NDArray[np.float64]
+#: Number of decisions so far: the horizontal axis of every learning curve.
+X_COLUMN = "decisions"
+#: Prefix of the columns of ``evaluation.csv``.
+EVALUATION = "evaluation_"
 
 INK, FAINT, GRID = "#262a30", "#6e747c", "#e2e5e9"
 #: Okabe and Ito's palette, which colour-blind readers tell apart, with grey for its yellow (too pale on white).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f")
-#: What all figures look like, as matplotlib's rc parameters (whose type differs between its versions).
+#: Matplotlib's rc parameters for all figures (their type differs between its versions).
 STYLE: Any = {
     "axes.axisbelow": True,
     "axes.edgecolor": FAINT,
@@ -89,17 +97,12 @@ PANELS = (
 
 
 def palette(names: Sequence[str]) -> dict[str, str]:
-    """A colour for each name; after seven they come again."""
+    """A colour for each name; after seven they repeat."""
     return {name: COLOURS[index % len(COLOURS)] for index, name in enumerate(names)}
 
 
 def save_figure(figure: Figure, path: str | Path, kind: str | None = None) -> Path:
-    """Write a figure, atomically.
-
-    Args:
-        figure: made here or with :func:`panel_grid`.
-        path: of the file.
-        kind: one of :data:`FORMATS`; by default what the file's name ends in.
+    """Write a figure, atomically, as ``kind`` (one of :data:`FORMATS`; by default the file's ending).
 
     Raises:
         UserError: another format.
@@ -110,15 +113,11 @@ def save_figure(figure: Figure, path: str | Path, kind: str | None = None) -> Pa
     with atomic_path(path) as part, rc_context(STYLE):
         figure.savefig(part, format=kind, metadata=FORMATS[kind])
         if kind == "png":
-            _reduce_colours(part)
+            # 256 colours, which no chart exceeds by much, take a third of the size.
+            with Image.open(part) as full:
+                reduced = full.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+            reduced.save(part, format="png", optimize=True)
     return Path(path)
-
-
-def _reduce_colours(path: Path) -> None:
-    """Store a PNG with 256 colours, which no chart exceeds by much: a third of the size."""
-    with Image.open(path) as full:
-        reduced = full.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    reduced.save(path, format="png", optimize=True)
 
 
 def panel_grid(count: int, width_in: float = 4.0, height_in: float = 2.3) -> tuple[Figure, list[Axes]]:
@@ -133,7 +132,7 @@ def panel_grid(count: int, width_in: float = 4.0, height_in: float = 2.3) -> tup
 
 
 def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line2D] = ()) -> None:
-    """Names in their colours along the top, in as many rows as they need."""
+    """Names in their colours along the top, in several rows if needed."""
     handles = [*(Line2D([], [], color=colour, label=name, lw=2) for name, colour in colours.items()), *others]
     widths_in = [0.65 + 0.08 * len(str(handle.get_label())) for handle in handles]  # about, at this size of letters
     for columns in range(len(handles), 0, -1):
@@ -144,11 +143,73 @@ def add_legend(figure: Figure, colours: Mapping[str, str], others: Sequence[Line
 
 
 def plot_line(axes: Axes, x: npt.ArrayLike, y: npt.ArrayLike, **style: Any) -> None:
-    """A line with gaps where ``y`` is NaN; a value between two gaps, which no line would show, is a dot."""
+    """A line with gaps where ``y`` is NaN; a single value between two gaps is a dot."""
     known = np.isfinite(np.asarray(y, dtype=np.float64))
-    beside = np.concatenate(([False], known, [False]))
-    lonely = known & ~beside[:-2] & ~beside[2:]
-    axes.plot(x, y, marker="o", markevery=lonely, **style)  # type: ignore[arg-type]
+    padded = np.concatenate(([False], known, [False]))
+    single = known & ~padded[:-2] & ~padded[2:]
+    axes.plot(x, y, marker="o", markevery=single, **style)  # type: ignore[arg-type]
+
+
+def read_metrics(path: str | Path) -> pl.DataFrame:
+    """A run's metrics: the file itself, or ``metrics.csv`` in the run's folder.
+
+    Raises:
+        UserError: no such file, it cannot be read, or it has no column ``decisions`` or no rows.
+    """
+    path = Path(path)
+    file = path / "metrics.csv" if path.is_dir() else path
+    if not file.is_file():
+        raise UserError(f"{file}: no such file; expected the metrics.csv of a training run, give its run folder.")
+    try:
+        frame = pl.read_csv(file, infer_schema_length=None)
+    except (PolarsError, UnicodeDecodeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{file}: not a readable CSV file ({reason}); give a run's metrics.csv.") from error
+    if X_COLUMN not in frame.columns or frame.height == 0:
+        raise UserError(f"{file}: expected a column '{X_COLUMN}' and at least one row; give a run's metrics.csv.")
+    return frame
+
+
+def read_run(path: str | Path) -> pl.DataFrame:
+    """``metrics.csv`` of a run's folder, merged with the rows of ``evaluation.csv`` if there is one.
+
+    Returns:
+        ``decisions`` and the columns of both files, those of the second with :data:`EVALUATION` before their names;
+        null where a row is of the other file.
+
+    Raises:
+        UserError: see :func:`read_metrics`.
+    """
+    path = Path(path)
+    metrics, evaluation = read_metrics(path), path / "evaluation.csv"
+    if not path.is_dir() or not evaluation.is_file():
+        return metrics
+    evaluated = read_metrics(evaluation)
+    renamed = {name: EVALUATION + name for name in evaluated.columns if name != X_COLUMN}
+    return pl.concat([metrics, evaluated.rename(renamed)], how="diagonal_relaxed").sort(X_COLUMN)
+
+
+def read_runs(paths: Sequence[str | Path]) -> dict[str, pl.DataFrame]:
+    """Metrics (:func:`read_run`) of every run folder, by the shortest end of its path that tells them apart.
+
+    Raises:
+        UserError: a folder comes twice, or cannot be read.
+    """
+    folders = [path if path.is_dir() else path.parent for path in (Path(each).resolve() for each in paths)]
+    for depth in range(1, max(len(folder.parts) for folder in folders) + 1):
+        names = ["/".join(folder.parts[-depth:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return {name: read_run(path) for name, path in zip(names, paths)}
+    raise UserError(f"run={','.join(map(str, paths))}: a folder comes twice; give each run once.")
+
+
+def running_mean(values: FloatArray, window: int) -> FloatArray:
+    """Mean over the last ``window`` values (fewer at the start), ignoring NaN; NaN where the value itself is."""
+    known = np.isfinite(values)
+    total = np.cumsum(np.where(known, values, 0.0))
+    count = np.cumsum(known)
+    total[window:], count[window:] = total[window:] - total[:-window], count[window:] - count[:-window]
+    return np.where(known, total / np.maximum(count, 1), np.nan)
 
 
 @rc_context(STYLE)
@@ -156,7 +217,7 @@ def draw_runs(runs: Mapping[str, pl.DataFrame], columns: Sequence[str] | None = 
     """Training runs over the number of decisions, one colour per run.
 
     Args:
-        runs: name to metrics (:func:`ganlane.view.read_run`).
+        runs: name to metrics (:func:`read_run`).
         columns: one panel for each of these; by default those of :data:`PANELS` that any run has numbers for.
         smooth: rows that the running mean takes in; above 1 the rows themselves are drawn faintly.
 
@@ -209,7 +270,7 @@ def binned_density(histogram: Histogram, low: float, high: float) -> tuple[Float
 
     Args:
         histogram: of the quantity; it must reach as far as ``low`` and ``high``.
-        low, high: what is drawn, in the quantity's unit.
+        low, high: of the drawn range, in the quantity's unit.
     """
     edges = histogram.bins.edges
     first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))

@@ -19,8 +19,7 @@ from ganlane import keys
 from ganlane.agents.policy import GreedyPolicy
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
-from ganlane.sim.road import road_in
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.view.trajectory import EpisodeLabel, Trajectory
 
 #: Fields of ``vehicles`` that a trajectory keeps, with their types.
@@ -33,7 +32,7 @@ _FIELDS = {
 
 @dataclass
 class Recorder:
-    """Collects frames of one row; it is also the hook that the environment calls after a physics step."""
+    """Collects frames of one row; the environment calls it after each physics step."""
 
     row: int = 0
     frames: list[dict[str, np.ndarray]] = field(default_factory=list)
@@ -41,8 +40,8 @@ class Recorder:
     action: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
     action_values: list[np.ndarray] = field(default_factory=list)
-    #: Frames recorded by the end of each decision, and its reward; empty where nobody tells them.
-    decided: list[tuple[int, float]] = field(default_factory=list)
+    #: Frames recorded by the end of each decision, and its reward; empty if rewards are not recorded.
+    decisions: list[tuple[int, float]] = field(default_factory=list)
     current_action: int = -1
     current_return: float = 0.0
     current_values: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -63,47 +62,47 @@ class Recorder:
         self.returns.append(self.current_return)
         self.action_values.append(self.current_values)
 
+    def keep_last(self, count: int) -> None:
+        """Forget all frames but the last ``count``."""
+        for kept in (self.frames, self.time_s, self.action, self.returns, self.action_values):
+            del kept[:-count]
+
     def trajectory(self, label: EpisodeLabel, outcome: str = "") -> Trajectory:
         """The frames so far; the last one shows the return after the last decision."""
-        fields = {name: np.stack([frame[name] for frame in self.frames]) for name in _FIELDS}
+        reward = np.full(len(self.frames) if self.decisions else 0, np.nan)
+        begin = 1
+        for end, paid in self.decisions:
+            reward[begin:end], begin = paid, end
+        width = max(len(values) for values in self.action_values)
+        values = [values if len(values) else np.full(width, np.nan) for values in self.action_values]
         return Trajectory(
             label=label,
             time_s=np.array(self.time_s).round(6),
-            **fields,
+            **{name: np.stack([frame[name] for frame in self.frames]) for name in _FIELDS},
             action=np.array(self.action),
             returns=np.array([*self.returns[:-1], self.current_return]),
             outcome=outcome,
-            action_values=self._values(),
-            reward=self._rewards(),
+            action_values=np.stack(values) if width else np.empty((0, 0)),
+            reward=reward,
         )
 
-    def _rewards(self) -> np.ndarray:
-        """Reward of each frame's decision, [T]; not a number before the first; empty where rewards were not told."""
-        rewards = np.full(len(self.frames) if self.decided else 0, np.nan)
-        begin = 1
-        for end, reward in self.decided:
-            rewards[begin:end], begin = reward, end
-        return rewards
 
-    def _values(self) -> np.ndarray:
-        """Action values [T, A]; not a number before the first decision; empty where the policy tells none."""
-        width = max(len(values) for values in self.action_values)
-        unknown = np.full(width, np.nan)
-        rows = [values if len(values) else unknown for values in self.action_values]
-        return np.stack(rows) if width else np.empty((0, 0))
+def road_of_row(state: TensorDictBase, road: Road, row: int) -> tuple[int, float]:
+    """Lanes and lane width, m, of a row: of its replayed scene if ``state`` has one, else of ``road``."""
+    found = road_in(state, road)
+    lanes, width = (torch.as_tensor(value).flatten() for value in (found.lanes, found.lane_width_m))
+    return int(lanes[min(row, len(lanes) - 1)]), float(width[min(row, len(width) - 1)])
 
 
-def innermost(env: Any) -> Any:
-    """The environment itself, below its transforms."""
-    while hasattr(env, "base_env"):
-        env = env.base_env
-    return env
+def outcome_of(state: TensorDictBase, row: int = 0) -> str:
+    """The event that ended the episode of a row; empty where none did."""
+    events = state[keys.EVENTS]
+    return next((name for name in keys.END_EVENTS if bool(events[name][row])), "")
 
 
 @contextmanager
-def _listening(env: EnvBase, recorder: Recorder) -> Iterator[None]:
-    """Hang the recorder into the environment for a while."""
-    base = innermost(env)
+def _recording(base: Any, recorder: Recorder) -> Iterator[None]:
+    """Install the recorder in the environment for a while."""
     if not hasattr(base, "recorder"):
         raise UserError(f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this process.")
     before, base.recorder = base.recorder, recorder
@@ -111,13 +110,6 @@ def _listening(env: EnvBase, recorder: Recorder) -> Iterator[None]:
         yield
     finally:
         base.recorder = before
-
-
-def _label(env: EnvBase, state: TensorDictBase, agent: str, traffic: str, seed: int, episode: int) -> EpisodeLabel:
-    """The label of row 0, with its road: a replayed scene's stands in ``state``, else it is the environment's."""
-    road = road_in(state, innermost(env).road)
-    lanes, width = (torch.as_tensor(value).flatten()[0].item() for value in (road.lanes, road.lane_width_m))
-    return EpisodeLabel(agent, traffic, seed, episode, int(lanes), float(width))
 
 
 def record_episode(
@@ -141,40 +133,32 @@ def record_episode(
     Raises:
         UserError: the environment, below its transforms, is no ``HighwayEnv``.
     """
+    base: Any = env
+    while hasattr(base, "base_env"):
+        base = base.base_env
     recorder = Recorder()
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _listening(env, recorder):
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _recording(base, recorder):
         state = env.reset(start_of(env, [episode], seed))
-        label = _label(env, state, agent, traffic, seed, episode)
+        label = EpisodeLabel(agent, traffic, seed, episode, *road_of_row(state, base.road, 0))
         recorder.add(state[keys.VEHICLES], 0.0)
         outcome, done = "", False
         while not done and recorder.time_s[-1] < max_time_s - 1e-6:
             state = _decide(env, policy, policy(state), recorder)
             done = bool(state["done"][0])
-            outcome = _outcome(state) if done else ""
+            outcome = outcome_of(state) if done else ""
     return recorder.trajectory(label, outcome)
 
 
 def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder) -> TensorDictBase:
     """One decision; the state after it."""
     recorder.current_action = int(state[keys.ACTION][0])
-    values = _action_values(policy, state)
+    # Action values [N, A]: from the policy's network, or its output; None if it has none.
+    is_greedy = isinstance(policy, GreedyPolicy)
+    values = policy.network.values(state[keys.OBSERVATION]) if is_greedy else state.get("action_value", None)
     if values is not None and values.ndim == 2:
         recorder.current_values = values[0].double().cpu().numpy()
     stepped = env.step(state)
     reward = float(stepped["next", keys.REWARD][0])
     recorder.current_return += reward
-    recorder.decided.append((len(recorder.frames), reward))
+    recorder.decisions.append((len(recorder.frames), reward))
     return env.step_mdp(stepped)
-
-
-def _action_values(policy: TensorDictModuleBase, state: TensorDictBase) -> Tensor | None:
-    """What the policy expects of each action, [N, A]: from its output, or from its network; None if it tells none."""
-    if isinstance(policy, GreedyPolicy):
-        return policy.network.values(state[keys.OBSERVATION])
-    return state.get("action_value", None)
-
-
-def _outcome(after: TensorDictBase) -> str:
-    """The end event of row 0; empty where something else ended it."""
-    events = after[keys.EVENTS]
-    return next((name for name in keys.END_EVENTS if bool(events[name][0])), "")

@@ -1,4 +1,4 @@
-"""Colours and letters of the pictures."""
+"""Colours and letters of the frames."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _tint(level: int) -> Colour:
 
 
 def speed_tint(speed_mps: float) -> Colour:
-    """Blue of a vehicle at this speed: dark when it stands, pale at :data:`FAST_MPS` and above."""
+    """Blue of a vehicle at this speed: dark at 0, pale at :data:`FAST_MPS` and above."""
     return _tint(round(min(max(speed_mps / FAST_MPS, 0.0), 1.0) * TINTS))
 
 
@@ -56,15 +56,15 @@ def readable_on(colour: Colour) -> Colour:
 
 
 @lru_cache(maxsize=16)
-def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Pillow's own letters at this size in pixels, so that no font has to be installed."""
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Pillow's own letters at this size in pixels: no font has to be installed."""
     return ImageFont.load_default(size)
 
 
 @lru_cache(maxsize=4096)
 def text_mask(text: str, size: int) -> Image.Image:
     """The text as a coverage mask (mode L), cut to its ink across and to the line height upwards."""
-    letters = font(size)
+    letters = _font(size)
     left, _, right, _ = letters.getbbox(text)
     mask = Image.new("L", (max(1, round(right - left) + 1), round(size * 1.25)))
     ImageDraw.Draw(mask).text((-left, 0), text, fill=255, font=letters)
@@ -73,13 +73,8 @@ def text_mask(text: str, size: int) -> Image.Image:
 
 def put_text(
     image: Image.Image, position: tuple[float, float], text: str, size: int, colour: Colour, anchor: float = 0.0
-) -> int:
-    """Write ``text`` with its top at ``position``; ``anchor`` 0 starts there, 0.5 centres, 1 ends there.
-
-    Returns the text's width in pixels.
-    """
-    if not text:
-        return 0
-    mask = text_mask(text, size)
-    image.paste(colour, (round(position[0] - anchor * mask.width), round(position[1])), mask)
-    return mask.width
+) -> None:
+    """Write ``text`` with its top at ``position``; ``anchor`` 0 starts there, 0.5 centres, 1 ends there."""
+    if text:
+        mask = text_mask(text, size)
+        image.paste(colour, (round(position[0] - anchor * mask.width), round(position[1])), mask)

@@ -1,8 +1,8 @@
-"""Simulated traffic as files that read back like recorded traffic (:func:`ganlane.data.read_scenes`).
+"""Simulated traffic in the form of recorded traffic, and files that :func:`ganlane.data.read_scenes` reads back.
 
-Parquet holds the schema (:mod:`ganlane.data.schema`) itself. CSV is the form in which scenes come from elsewhere:
-the speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is 0 at the centre of lane 1. It does
-not tell how wide the lanes are, and a rightmost lane that nobody drives on does not show.
+Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings from elsewhere, the speed
+is called ``v``, lanes are counted from the left, from 1, and ``y`` is 0 at the centre of lane 1. It has no lane
+width, and a rightmost lane without vehicles is lost.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import polars as pl
 
+from ganlane import keys
 from ganlane.data.scenes import COLUMNS, write_prepared
-from ganlane.data.schema import sort
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
-from ganlane.view.trajectory import EpisodeLabel, Trajectory, to_tracks
+from ganlane.view.trajectory import EpisodeLabel, Trajectory
 
 TracksFormat = Literal["csv", "parquet"]
 
@@ -45,6 +47,30 @@ def write_tracks(trajectories: Sequence[Trajectory], path: str | Path, format: T
     return Path(path)
 
 
+def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
+    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track.
+
+    Raises:
+        UserError: the frames are not 0.1 s apart.
+    """
+    if len(trajectory) > 1 and abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
+        raise UserError(
+            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need {keys.PHYSICS_STEP_S} s; "
+            "record it at every physics step."
+        )
+    frames, vehicles = trajectory.x.shape
+    track = np.arange(vehicles) + TRACK_STRIDE * np.cumsum(trajectory.jumped(), axis=0)
+    columns = {
+        "vehicle": track,
+        "frame": np.broadcast_to(np.arange(frames)[:, None], (frames, vehicles)),
+        **{name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")},
+        "lane": trajectory.lane(),
+    }
+    shown = trajectory.valid
+    table = pl.DataFrame({"scene": [scene] * int(shown.sum()), **{k: v[shown] for k, v in columns.items()}})
+    return table.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items()).sort("scene", "vehicle", "frame")
+
+
 def scene_names(labels: Sequence[EpisodeLabel]) -> list[str]:
     """A name for each episode's scene, ``AGENT_TRAFFIC_SEED_EPISODE``; a number follows where two would be alike."""
     names: list[str] = []
@@ -56,7 +82,7 @@ def scene_names(labels: Sequence[EpisodeLabel]) -> list[str]:
 
 
 def scene_csv(tracks: pl.DataFrame, label: EpisodeLabel) -> pl.DataFrame:
-    """Tracks in the schema as a scene CSV's columns, which is what :func:`ganlane.data.read_scenes` turns back."""
+    """Tracks in the schema as the columns of a scene CSV."""
     left = (label.lanes - 1) * label.lane_width_m
     turned = tracks.with_columns(v=pl.col("speed"), lane=label.lanes - pl.col("lane"), y=pl.col("y") - left)
     return turned.select(COLUMNS.keys())

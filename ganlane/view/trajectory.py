@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import polars as pl
 import torch
 
 from ganlane import keys
-from ganlane.data.schema import SCHEMA, TRACK_STRIDE
 from ganlane.errors import UserError
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 ACTION_NAMES = ("keep", "left", "right")
-#: A vehicle that moves further than this between two frames was put elsewhere (recycled), m.
+#: A vehicle that moves further than this between two frames was recycled (placed elsewhere), m.
 JUMP_M = 30.0
 
 
 @dataclass(frozen=True)
 class EpisodeLabel:
-    """What an episode is: who drives where, and its numbers."""
+    """Agent, traffic, road and numbers of an episode."""
 
     agent: str = "ego"
     traffic: str = "traffic"
@@ -63,17 +61,16 @@ class Trajectory:
     action: IntArray
     #: Return up to the decision before, [T]; the last frame has the whole return.
     returns: FloatArray
-    #: How it ended: one of :data:`ganlane.keys.END_EVENTS`, or empty where it was cut off.
+    #: End event, one of :data:`ganlane.keys.END_EVENTS`; empty where the episode was cut off.
     outcome: str = ""
-    #: Values of the actions where the policy tells them, [T, A]; empty otherwise.
+    #: Action values of the policy, [T, A]; NaN before the first decision, empty if unknown.
     action_values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    #: Reward of the decision that a frame belongs to, [T]; not a number before the first; empty where nobody told it.
+    #: Reward of the decision that a frame belongs to, [T]; NaN before the first, empty if unknown.
     reward: FloatArray = field(default_factory=lambda: np.empty(0))
-    #: Jerk as it was driven, where frames before these were left out (:meth:`since`), m/s3, [T, M]; empty otherwise.
+    #: Jerk, m/s3, [T, M], where frames before these were left out (:meth:`since`); empty otherwise.
     driven_jerk: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
     def __len__(self) -> int:
-        """Number of frames."""
         return len(self.time_s)
 
     @property
@@ -92,14 +89,14 @@ class Trajectory:
         return nearest.clip(0, self.label.lanes - 1)
 
     def jumped(self) -> BoolArray:
-        """Whether a vehicle was put elsewhere since the frame before, [T, M]."""
+        """Whether a vehicle was recycled (placed elsewhere) since the frame before, [T, M]."""
         moved = np.abs(np.diff(self.x, axis=0, prepend=self.x[:1]))
         return moved > JUMP_M * max(1.0, self.frame_s)
 
     def jerk(self) -> FloatArray:
         """Change of the acceleration since the frame before, m/s3, [T, M].
 
-        0 in the episode's first two frames and after a jump: nobody has driven before the first.
+        0 in the episode's first two frames and after a jump.
         """
         if self.driven_jerk.size:
             return self.driven_jerk
@@ -108,11 +105,7 @@ class Trajectory:
         return np.where(begins | self.jumped(), 0.0, change)
 
     def comfort(self) -> dict[str, float]:
-        """How the ego's passengers fare.
-
-        Returns:
-            ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and ``rms_jerk``, m/s3.
-        """
+        """The ego's ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and ``rms_jerk``, m/s3."""
         acceleration, jerk = self.acceleration[:, 0], self.jerk()[:, 0]
         return {
             "rms_acceleration": round(float(np.sqrt(np.mean(acceleration**2))), 3),
@@ -129,10 +122,11 @@ class Trajectory:
         first = int(np.searchsorted(self.time_s, start_s - 1e-9))
         if first == len(self):
             raise UserError(f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it.")
-        told: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
-        told["driven_jerk"] = self.jerk()
-        later = {name: value[first:] for name, value in told.items() if isinstance(value, np.ndarray) and value.size}
-        return Trajectory(**{**told, **later})
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)} | {"driven_jerk": self.jerk()}
+        later: dict[str, Any] = {
+            name: value[first:] for name, value in arrays.items() if isinstance(value, np.ndarray) and value.size
+        }
+        return replace(self, **later)
 
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""
@@ -141,29 +135,3 @@ class Trajectory:
         others = {name: unused for name in keys.VEHICLE_FIELDS if name not in fields}
         everybody = Vehicles(**{**others, **fields, "valid": torch.as_tensor(self.valid)})
         return pair_overlaps(everybody).any(-1).numpy()
-
-
-def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
-    """The trajectory in the form of recorded traffic (:mod:`ganlane.data.schema`), so that it reads back as such.
-
-    A vehicle that was put elsewhere (recycled) begins a new track.
-
-    Raises:
-        UserError: the frames are not 0.1 s apart.
-    """
-    if len(trajectory) > 1 and abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
-        raise UserError(
-            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need {keys.PHYSICS_STEP_S} s; "
-            "record it at every physics step."
-        )
-    frames, vehicles = trajectory.x.shape
-    track = np.arange(vehicles) + TRACK_STRIDE * np.cumsum(trajectory.jumped(), axis=0)
-    columns = {
-        "vehicle": track,
-        "frame": np.broadcast_to(np.arange(frames)[:, None], (frames, vehicles)),
-        **{name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")},
-        "lane": trajectory.lane(),
-    }
-    shown = trajectory.valid
-    table = pl.DataFrame({"scene": [scene] * int(shown.sum()), **{k: v[shown] for k, v in columns.items()}})
-    return table.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items()).sort("scene", "vehicle", "frame")

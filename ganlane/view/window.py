@@ -1,4 +1,4 @@
-"""The window through which a frame shows the road: metres to pixels."""
+"""Metres to pixels, and what does not move: the road and its marks."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image, ImageDraw
 
 from ganlane.errors import UserError
+from ganlane.view import style
 
 HEADER_HEIGHT = 56
 FOOTER_HEIGHT = 24
 #: Below these the header and the road have no room, pixels.
 MIN_WIDTH, MIN_HEIGHT = 600, 160
+#: Lane marks: 6 m and a gap of 12 m, as on motorways.
+PERIOD_M = 18.0
+DASH_M = 6.0
+POST_EVERY_M = 50.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,6 @@ class WindowParameters:
     lateral_exaggeration: float = 1.5
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
         if self.width < MIN_WIDTH or self.height < MIN_HEIGHT:
             raise UserError(
                 f"picture of {self.width} x {self.height} pixels: at least {MIN_WIDTH} x {MIN_HEIGHT} are needed; "
@@ -47,7 +52,7 @@ class WindowParameters:
 
 @dataclass(frozen=True)
 class Window:
-    """The scale of a picture for a road of ``lanes`` lanes; ``y`` of the picture points down."""
+    """The scale of a picture for a road of ``lanes`` lanes; rows of the picture count downwards."""
 
     parameters: WindowParameters
     lanes: int
@@ -65,15 +70,11 @@ class Window:
         wanted = self.along * self.parameters.lateral_exaggeration
         return min(wanted, room / (self.lanes * self.lane_width_m + 2.0))
 
-    @property
-    def middle(self) -> float:
-        """Row of the road's middle."""
-        return HEADER_HEIGHT + (self.parameters.height - HEADER_HEIGHT - FOOTER_HEIGHT) / 2
-
     def row(self, y_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Picture rows of lateral positions, m."""
+        middle = HEADER_HEIGHT + (self.parameters.height - HEADER_HEIGHT - FOOTER_HEIGHT) / 2
         centre = 0.5 * (self.lanes - 1) * self.lane_width_m
-        return self.middle - (np.asarray(y_m, dtype=np.float64) - centre) * self.across
+        return middle - (np.asarray(y_m, dtype=np.float64) - centre) * self.across
 
     def column(self, x_m: npt.ArrayLike, ego_x_m: float) -> npt.NDArray[np.float64]:
         """Picture columns of positions along the road, m, with the ego at ``ego_x_m``."""
@@ -85,3 +86,44 @@ class Window:
         """Rows of the left (upper) and right (lower) edge of the road."""
         upper, lower = self.row([(self.lanes - 0.5) * self.lane_width_m, -0.5 * self.lane_width_m])
         return float(upper), float(lower)
+
+
+class Backdrop:
+    """Verges, asphalt, edge lines and dashed lane marks: drawn once, one period wider than the picture."""
+
+    def __init__(self, window: Window):
+        self.window = window
+        self.period = round(2 * PERIOD_M * window.along)
+        self.strip = self._draw()
+
+    def _draw(self) -> Image.Image:
+        """The strip; every second period's verge is a shade lighter so that movement shows."""
+        window, size = self.window, self.window.parameters
+        strip = Image.new("RGB", (size.width + self.period, size.height), style.VERGE)
+        draw = ImageDraw.Draw(strip)
+        half = self.period / 2
+        upper, lower = window.edges
+        starts = np.arange(0, strip.width, half)
+        for start in starts[::2]:
+            draw.rectangle((start, 0, start + half - 1, size.height), fill=style.VERGE_STRIPE)
+        draw.rectangle((0, upper - 5, strip.width, lower + 5), fill=style.ASPHALT)
+        for edge in (upper, lower):
+            draw.line((0, edge, strip.width, edge), fill=style.MARK, width=3)
+        for mark in window.row((np.arange(window.lanes - 1) + 0.5) * window.lane_width_m):
+            for start in starts:
+                draw.line((start, mark, start + DASH_M * window.along, mark), fill=style.MARK, width=2)
+        return strip
+
+    def at(self, ego_x_m: float) -> Image.Image:
+        """A fresh picture of the road around the ego, with posts that tell the distance from the start, m."""
+        shift = round(-float(self.window.column(0.0, ego_x_m))) % self.period
+        size, (_, lower) = self.window.parameters, self.window.edges
+        picture = self.strip.crop((shift, 0, shift + size.width, size.height))
+        start = ego_x_m - size.behind * size.length_m
+        first = np.ceil((start - 10.0) / POST_EVERY_M) * POST_EVERY_M
+        posts = np.arange(first, start + size.length_m + 10.0, POST_EVERY_M)
+        draw = ImageDraw.Draw(picture)
+        for metres, column in zip(posts, self.window.column(posts, ego_x_m)):
+            draw.line((column, lower + 7, column, lower + 20), fill=style.FAINT, width=2)
+            style.put_text(picture, (column + 7, lower + 8), f"{int(metres)} m", 12, style.FAINT)
+        return picture

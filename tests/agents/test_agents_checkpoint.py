@@ -1,17 +1,27 @@
-"""Trained agents as files."""
+"""Trained agents as files, and agents that start from them."""
 
 import pytest
 import torch
-from agents_small import agent, saved_in
+from agents_small import agent, same_weights, saved_in
 from tensordict import TensorDict
 
-from ganlane.agents import RainbowConfig, agent_file, checkpoint, load_agent, transfer
+from ganlane.agents import RainbowConfig, agent_file, checkpoint, load_agent, read_agent, save_agent, warm_start
+from ganlane.agents.checkpoint import load_moments
 from ganlane.errors import UserError
+from ganlane.parameters.removed import AGENT_OPTIONS, LAST_REVISION
 
 
 @pytest.fixture
 def saved(tmp_path):
     return saved_in(tmp_path)
+
+
+def start_from(learner, path):
+    weights, network, _ = read_agent(path)
+    warm_start(learner, path, weights, network)
+
+
+# --- files
 
 
 def test_a_loaded_agent_drives_like_the_saved_one(saved):
@@ -28,18 +38,17 @@ def test_another_observation_size_is_refused_naming_both(saved):
     with pytest.raises(UserError, match=r"\[5\].*\[9\]"):
         load_agent(saved, observation_size=9)
     with pytest.raises(UserError, match=r"\[5\].*\[9\]"):
-        transfer(agent(size=9), saved)
+        start_from(agent(size=9), saved)
 
 
 def test_a_truncated_or_foreign_file_is_refused(saved, tmp_path):
     whole = saved.read_bytes()
     saved.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UserError, match="checkpoint of kind agent"):
-        load_agent(saved)
     other = tmp_path / "notes.txt"
     other.write_text("hello")
-    with pytest.raises(UserError, match="checkpoint of kind agent"):
-        load_agent(other)
+    for path in (saved, other):
+        with pytest.raises(UserError, match="checkpoint of kind agent"):
+            load_agent(path)
 
 
 def test_an_unknown_agent_is_refused_with_the_names_there_are():
@@ -52,3 +61,104 @@ def test_shipped_agents_are_found_by_name(saved, monkeypatch):
     saved.rename(saved.with_name("agent_idm.safetensors"))
     assert agent_file("agent_idm") == agent_file("agent_idm@0")
     assert load_agent("agent_idm")[1]["observation"] == "table3"
+
+
+def test_removed_options_at_their_defaults_load_and_others_name_the_revision_that_had_them(tmp_path):
+    assert load_agent(saved_in(tmp_path, agent=AGENT_OPTIONS))[1]["agent"] == {}
+    for option, shown in (
+        ({"encoder": "shared"}, "encoder=shared"),
+        ({"decide_when_free": True}, "decide_when_free=true"),
+    ):
+        with pytest.raises(UserError, match=f"agent.{shown} was removed after revision {LAST_REVISION}; check out"):
+            load_agent(saved_in(tmp_path, agent={**AGENT_OPTIONS, **option}))
+
+
+# --- starting from one
+
+
+def test_a_warm_start_takes_the_saved_weights(saved):
+    fresh = agent(seed=3)
+    start_from(fresh, saved)
+    assert same_weights(fresh, agent())
+    pairs = zip(fresh.network.parameters(), fresh.loss.target_network.parameters())
+    assert all(torch.equal(online, target) for online, target in pairs)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"v_min": -10.0}, r"here: agent.v_min=-10\).*init.support=trained, set agent.v_min=-120,"),
+        ({"hidden": (8,), "atoms": 51}, r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or start"),
+    ],
+)
+def test_another_network_or_support_is_refused_naming_the_ways_out(options, message, saved):
+    with pytest.raises(UserError, match=message):
+        start_from(agent(**options), saved)
+
+
+def test_without_a_distribution_the_support_means_nothing(tmp_path):
+    path, plain = tmp_path / "agent.safetensors", {"distributional": False}
+    save_agent(path, agent(**plain), {})
+    start_from(agent(seed=1, v_min=-10.0, atoms=51, **plain), path)
+
+
+def descend(learner, seed):
+    """One step of its optimiser along a random gradient."""
+    generator = torch.Generator().manual_seed(seed)
+    for value in learner.network.parameters():
+        value.grad = torch.randn(value.shape, generator=generator)
+    learner.optimizer.step()
+
+
+def test_adam_goes_on_from_the_moments_that_it_is_given():
+    trained, warm, cold = agent(), agent(seed=1), agent(seed=2)
+    for seed in (1, 2, 3):
+        descend(trained, seed)
+    for fresh in (warm, cold):
+        fresh.load_weights(trained.weights())
+    load_moments(warm, trained.optimizer.state_dict()["state"])
+    for learner in (trained, warm, cold):  # in this order: the two must not share what they change
+        descend(learner, 4)
+    assert same_weights(trained, warm)
+    assert not same_weights(trained, cold)
+    descend(trained, 5)
+    descend(warm, 5)
+    assert same_weights(trained, warm)
+
+
+def test_only_moments_are_taken_over_the_rate_is_ones_own():
+    trained, fresh = agent(learning_rate=1e-2, adam_eps=1e-3), agent(learning_rate=1e-4, adam_eps=1e-8)
+    descend(trained, 1)
+    load_moments(fresh, trained.optimizer.state_dict()["state"])
+    (group,) = fresh.optimizer.param_groups
+    assert (group["lr"], group["eps"]) == (1e-4, 1e-8)
+
+
+def test_moments_kept_in_half_precision_come_back_as_floats():
+    trained, fresh = agent(), agent()
+    descend(trained, 1)
+    load_moments(fresh, trained.state_dict(with_replay=False)["optimizer"]["state"])
+    exact, rounded = (learner.optimizer.state_dict()["state"] for learner in (trained, fresh))
+    for row in exact:
+        assert rounded[row]["exp_avg_sq"].dtype == torch.float32
+        torch.testing.assert_close(rounded[row]["exp_avg"], exact[row]["exp_avg"], rtol=2**-8, atol=0.0)
+
+
+@pytest.mark.parametrize("damage", ["absent", "fewer", "another shape", "no step", "text"])
+def test_moments_of_another_network_are_refused(damage):
+    trained, fresh = agent(), agent()
+    descend(trained, 1)
+    moments = {row: dict(state) for row, state in trained.optimizer.state_dict()["state"].items()}
+    if damage == "absent":
+        del moments[0]
+    elif damage == "fewer":
+        del moments[1]["exp_avg_sq"]
+    elif damage == "another shape":
+        moments[0]["exp_avg"] = moments[0]["exp_avg"][:1]
+    elif damage == "no step":
+        del moments[0]["step"]
+    else:
+        moments[0] = "moments"
+    with pytest.raises(UserError, match="not those of its network"):
+        load_moments(fresh, moments)
+    assert fresh.optimizer.state_dict()["state"] == {}

@@ -48,10 +48,6 @@ def test_the_legal_random_driver_never_asks_for_a_lane_that_is_not_there():
         assert all(abs(shares[a] - 1 / len(legal)) < 0.06 for a in legal)
 
 
-def test_on_one_lane_the_legal_random_driver_keeps_it():
-    assert (RandomLegalDriver(Road(1))(states(32, lanes=1, m=5))["action"] == KEEP).all()
-
-
 def test_random_actions_depend_on_the_episode_and_not_on_the_batch():
     few, many = states(4), states(64)
     driver = RandomDriver(Road())

@@ -6,10 +6,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss
-from ganlane.agents.network import NetworkConfig, QNetwork
-from ganlane.agents.noise import redraw_noise
-from ganlane.agents.projection import outside_support, project
+from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, project
+from ganlane.agents.network import NetworkConfig, QNetwork, redraw_noise
 
 SIZE = 5
 
@@ -113,13 +111,6 @@ def test_the_projection_is_that_of_the_paper():
     torch.testing.assert_close(projected.sum(-1), torch.ones(20))
 
 
-def test_the_clamped_fraction_is_the_mass_outside_the_support():
-    support = torch.tensor([0.0, 1.0, 2.0])
-    values = torch.tensor([[-1.0, 1.0, 3.0], [0.0, 1.0, 2.0]])
-    probabilities = torch.tensor([[0.25, 0.5, 0.25], [0.3, 0.3, 0.4]])
-    assert torch.isclose(outside_support(values, probabilities, support), torch.tensor(0.25))
-
-
 def test_the_loss_reports_the_share_of_the_returns_that_its_support_does_not_cover():
     loss, data = LeanDistributionalLoss(network(), gamma=1.0), batch()
     data["next", "terminated"][:] = True
@@ -161,18 +152,6 @@ def test_the_targets_noise_can_be_drawn_anew_and_matters():
         redraw_noise(loss.target_network, generator)
         seen.append(loss(batch())["loss"].detach())
     assert not torch.equal(*seen)
-
-
-def test_the_target_follows_only_when_told():
-    net = network()
-    loss = LeanDistributionalLoss(net, gamma=0.97)
-    before = [value.clone() for value in loss.target_network.parameters()]
-    with torch.no_grad():
-        for value in net.parameters():
-            value.add_(1.0)
-    assert all(torch.equal(a, b) for a, b in zip(before, loss.target_network.parameters()))
-    loss.update_target()
-    assert all(torch.equal(a, b) for a, b in zip(net.parameters(), loss.target_network.parameters()))
 
 
 def test_the_target_network_is_torchrls_target_parameters():

@@ -73,17 +73,6 @@ def test_a_crash_after_the_first_step_is_seen_by_the_transitions_before_it():
     assert transition["steps_to_next_obs"].item() == 2
 
 
-def test_a_truncation_bootstraps_from_the_last_observation_of_its_episode():
-    steps = recorded(3, 1, 0)
-    for i, step in enumerate(steps):
-        step["next", "done"][:] = i == 0
-        step["next", "terminated"][:] = False
-    window = NStepWindow(3, 1.0)
-    transition = [window.push(step) for step in steps][-1]
-    assert not transition["next", "terminated"].item()
-    assert torch.equal(transition["next", "observation"], steps[0]["next", "observation"])
-
-
 def test_a_saved_window_goes_on_as_if_nothing_had_happened():
     steps = recorded(8, 3, 1)
     whole, first, second = NStepWindow(3, 0.9), NStepWindow(3, 0.9), NStepWindow(3, 0.9)

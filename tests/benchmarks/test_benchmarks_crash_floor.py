@@ -11,13 +11,12 @@ from benchmarks.crash_floor import driver_row, floor_rows, search_left, ways_of_
 from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
-from ganlane.evaluation.counts import clopper_pearson
-from ganlane.evaluation.rides import drive, replay
+from ganlane.evaluation import clopper_pearson, replay, roll_out
 from ganlane.keys import KEEP, LEFT, RIGHT
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.scenes import FixedScene, SceneVehicle
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic, TrafficModule
 from ganlane.transforms import RewardTransform
 
@@ -74,7 +73,7 @@ def test_who_is_chased_escapes_into_the_free_lane_and_only_there():
     assert plan.actions[0] == LEFT
     (ride,) = replay(env, {0: plan.actions}, seed=0)
     assert (ride.end, ride.actions, ride.reward) == ("goal", plan.actions, plan.reward)
-    (kept,) = drive(env, KeepLaneDriver(env.base_env.road), [0], seed=0)
+    (kept,) = roll_out(env, KeepLaneDriver(env.base_env.road), [0], seed=0)
     assert (kept.end, kept.contact, kept.changing) == ("hard_crash", "behind", False)
     (right,) = replay(env, {0: [RIGHT]}, seed=0)
     assert (right.end, right.changing) == ("hard_crash", True)
@@ -140,7 +139,7 @@ def test_every_way_that_was_found_is_driven_again_to_the_same_end():
 def test_choosing_by_reward_earns_no_less_than_keeping_the_lane():
     env = highway(None, 16, 400.0, IdmTraffic, vehicles=9)
     best = beam_search(env, range(4), 0, 4, by_reward=True)
-    kept = drive(env, KeepLaneDriver(env.base_env.road), range(4), 0)
+    kept = roll_out(env, KeepLaneDriver(env.base_env.road), range(4), 0)
     assert all(plan.reward >= ride.reward - 1e-3 for plan, ride in zip(best, kept, strict=True))
 
 
@@ -153,7 +152,7 @@ def test_a_search_leaves_automatic_resets_alone():
 
 def test_the_floor_lies_under_every_driver_and_falls_with_the_beam():
     env, episodes = crowded(16), range(20)
-    kept = drive(env, KeepLaneDriver(env.base_env.road), episodes, 1)
+    kept = roll_out(env, KeepLaneDriver(env.base_env.road), episodes, 1)
     ways = ways_of_drivers([kept], episodes)
     for beam in (1, 16):
         ways = search_left(env, ways, 1, beam)

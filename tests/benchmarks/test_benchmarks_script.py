@@ -1,29 +1,32 @@
-"""The frame of the benchmark scripts: when a document is refused, what stands in it, and the exit status."""
+"""What the scripts share: when a document is refused, what is written into it, and the exit status."""
 
 import pytest
 import torch
 
-from ganlane.benchmarks.script import ReportSection, add_report, parser_of, run_script
+from benchmarks import crash_floor, drawing
+from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.errors import UserError
 
 BEGIN, END = "<!-- begin -->", "<!-- end -->"
 
 
-def test_the_help_is_the_story_as_it_stands_and_names_the_markers(capsys):
-    parser = parser_of("What is measured.\n\n    python benchmarks/this.py --report FILE\n")
+def test_the_help_is_the_description_unchanged_and_names_the_markers(capsys):
+    parser = make_parser("What is measured.\n\n    python -m benchmarks.this --report FILE\n")
     add_report(parser, BEGIN, END)
     with pytest.raises(SystemExit, match="0"):
         parser.parse_args(["--help"])
-    told = capsys.readouterr().out
-    assert "\n    python benchmarks/this.py --report FILE\n" in told
-    assert BEGIN in told
-    assert END in told
+    shown = capsys.readouterr().out
+    assert "\n    python -m benchmarks.this --report FILE\n" in shown
+    assert BEGIN in shown
+    assert END in shown
 
 
-def test_only_what_stands_between_the_markers_is_written_anew(tmp_path):
+def test_only_the_text_between_the_markers_is_replaced(tmp_path, monkeypatch):
     document = tmp_path / "page.md"
     document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
     ReportSection(document, BEGIN, END).write("new")
+    assert document.read_text() == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
+    ReportSection(None, BEGIN, END).write("nowhere")
     assert document.read_text() == f"before\n{BEGIN}\nnew\n{END}\nafter\n"
 
 
@@ -35,23 +38,33 @@ def test_a_document_without_the_markers_is_refused_at_once(tmp_path):
     assert document.read_text() == "nothing here\n"
 
 
-def test_without_a_document_nothing_is_written(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    ReportSection(None, BEGIN, END).write("new")
-    assert list(tmp_path.iterdir()) == []
+def test_the_result_is_printed_and_a_users_mistake_is_one_sentence_and_status_2(capsys):
+    parser = make_parser(None)
+    parser.add_argument("--seed", type=int, default=0)
 
+    def measure(options):
+        if options.seed < 0:
+            raise UserError("seed=-1: expected 0 or more.")
+        return f"seed {options.seed}, {torch.get_num_threads()} thread"
 
-def test_what_was_measured_is_printed_and_ends_well(capsys):
-    parser = parser_of(None)
-    parser.add_argument("--seed", type=int)
-    told = parser.parse_args(["--seed", "3"])
-    assert run_script(lambda told: f"seed {told.seed}, {torch.get_num_threads()} thread", told) == 0
+    assert run_script(measure, parser.parse_args(["--seed", "3"])) == 0
     assert capsys.readouterr().out == "seed 3, 1 thread\n"
-
-
-def test_a_users_mistake_is_one_sentence_and_status_2(capsys):
-    def refuse(told):
-        raise UserError("seed=-1: expected 0 or more.")
-
-    assert run_script(refuse, parser_of(None).parse_args([])) == 2
+    assert run_script(measure, parser.parse_args(["--seed", "-1"])) == 2
     assert capsys.readouterr() == ("", "error: seed=-1: expected 0 or more.\n")
+
+
+@pytest.mark.parametrize("page", ["", "<!-- begin crash floor idm -->\n<!-- end crash floor idm -->\n", None])
+def test_nothing_is_driven_for_a_document_without_the_markers(page, tmp_path, monkeypatch, capsys):
+    document, driven = tmp_path / "page.md", []
+    if page is not None:
+        document.write_text(page)
+    monkeypatch.setattr(crash_floor, "rides_of", lambda *given: driven.append(given))
+    assert crash_floor.main(["--traffic", "gan", "--report", str(document)]) == 2
+    assert f"report={document}" in capsys.readouterr().err
+    assert not driven
+
+
+def test_more_frames_than_the_episode_has_are_refused(monkeypatch, capsys):
+    monkeypatch.setattr(drawing, "episode", lambda length_s: range(400))
+    assert drawing.main(["--frames", "80", "--rounds", "5"]) == 2
+    assert "the episode has 400 frames" in capsys.readouterr().err

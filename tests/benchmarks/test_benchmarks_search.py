@@ -1,12 +1,9 @@
 """The table of a search, on made-up run folders."""
 
 import csv
-import sys
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks.search import BEGIN, END, compact, differing, main, read_runs, table
 
 
@@ -119,5 +116,5 @@ def test_the_table_goes_into_a_document_and_a_csv_file(sweep, tmp_path, capsys):
 def test_a_folder_without_runs_is_one_sentence(tmp_path, capsys):
     assert main([str(tmp_path)]) == 2
     assert capsys.readouterr().err == (
-        f"search: {tmp_path}: no run there with config.yaml and metrics.csv; give the folder of a sweep.\n"
+        f"error: {tmp_path}: no run there with config.yaml and metrics.csv; give the folder of a sweep.\n"
     )

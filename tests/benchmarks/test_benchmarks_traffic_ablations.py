@@ -1,15 +1,11 @@
 """The table of what each option of the generated traffics does, on seconds of driving."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from benchmarks.ablations.networks import Bfloat16Generator, PlanningGenerator
-from benchmarks.ablations.variants import calibrated_variants, gan_variants
+from benchmarks.ablation_variants import Bfloat16Generator, PlanningGenerator, calibrated_variants, gan_variants
 from benchmarks.traffic_ablations import BEGIN, END, main
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.generator.networks import Observation
@@ -57,7 +53,7 @@ def test_the_table_stands_between_the_markers_with_its_command(tmp_path):
     assert text.endswith("after\n")
     assert "what stood here" not in text
     assert "| `gan`, without the guard | " in text
-    assert "python benchmarks/traffic_ablations.py --vehicle-km 0.05" in text
+    assert "python -m benchmarks.traffic_ablations --vehicle-km 0.05" in text
     assert str(document) not in text
 
 

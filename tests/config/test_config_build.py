@@ -13,12 +13,7 @@ from ganlane.agents.drivers import DRIVERS, MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.realism import RealismConfig
-from ganlane.config.traffic import (
-    HighwayEnvTrafficConfig,
-    IdmMobilTrafficConfig,
-    IdmTrafficConfig,
-    SumoTrafficConfig,
-)
+from ganlane.config.traffic import HighwayEnvTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, SumoTrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.parameters.observation import FORMS, ObservationConfig

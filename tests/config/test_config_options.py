@@ -12,21 +12,17 @@ import pytest
 from omegaconf import OmegaConf
 
 from ganlane.__main__ import COMMANDS
-from ganlane.agents import RainbowConfig, read_agent
+from ganlane.agents import read_agent
 from ganlane.config.command_line import check
-from ganlane.config.env import EnvConfig
 from ganlane.config.help import help_text, key_lines
 from ganlane.config.schemas import SCHEMAS, option_of, options_of
-from ganlane.config.train import check_agent
 from ganlane.errors import UserError
-from ganlane.generator import load_generator, preset_of, shipped_generator
-from ganlane.parameters.driving import EgoParameters
+from ganlane.files import conf_folder
+from ganlane.generator import load_generator, shipped_generator
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
-from ganlane.parameters.observation import FORMS, LISTS, MASKS, ObservationConfig, SensorParameters
+from ganlane.parameters.observation import FORMS, MASKS, ObservationConfig, SensorParameters
 from ganlane.parameters.reward import RewardParameters
-from ganlane.paths import conf_folder
-from ganlane.phases.description import describe
-from ganlane.phases.phase import phases_of
+from ganlane.training.phases import describe, phases_of
 from ganlane.transforms import OBSERVATIONS
 
 #: Group to a command that has it.
@@ -85,28 +81,6 @@ def test_help_shows_what_an_option_sets():
 
 def test_observation_forms_are_those_of_the_transform():
     assert set(FORMS) == set(OBSERVATIONS)
-
-
-def test_the_shared_encoder_can_be_chosen():
-    assert config_of("train", "agent.encoder=shared", "observation=table3").agent.encoder == "shared"
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_the_encoder_is_for_lists_of_vehicles_alone(form):
-    given = RainbowConfig(encoder="shared"), ObservationConfig(form=form), EnvConfig()
-    check_agent(RainbowConfig(), *given[1:])
-    if form in LISTS:
-        check_agent(*given)
-    else:
-        with pytest.raises(UserError, match=f"agent.encoder=shared with observation={form}"):
-            check_agent(*given)
-
-
-def test_who_learns_only_when_free_cannot_turn_back():
-    agent, observation = RainbowConfig(decide_when_free=True), ObservationConfig()
-    check_agent(agent, observation, EnvConfig())
-    with pytest.raises(UserError, match=r"env\.ego\.abort_lane_change=true"):
-        check_agent(agent, observation, EnvConfig(ego=EgoParameters(abort_lane_change=True)))
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -190,9 +164,9 @@ def test_yaml_files_explain_themselves():
         assert OmegaConf.load(path) is not None
 
 
-@pytest.mark.parametrize("config", [PaperConfig(), CalibratedConfig()], ids=preset_of)
+@pytest.mark.parametrize("config", [PaperConfig(), CalibratedConfig()], ids=lambda config: config.preset)
 def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(config):
-    preset = preset_of(config)
+    preset = config.preset
     shipped = load_generator(shipped_generator(preset), preset)[1]["config"]
     chosen = config_of("train_generator", f"generator={preset}").generator
     assert chosen == config
@@ -209,5 +183,5 @@ def test_a_training_is_told_whether_to_compile(value):
 @pytest.mark.parametrize(("version", "compiles"), [("2.11.0+cu130", False), ("2.13.0+cpu", True)])
 def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compiles, monkeypatch):
     monkeypatch.setattr("torch.__version__", version)
-    monkeypatch.setattr("ganlane.compiling.has_compiler", lambda: True)
+    monkeypatch.setattr("ganlane.runtime.has_compiler", lambda: True)
     assert config_of("train", "total_decisions=1000000").compiled().env.compile is compiles

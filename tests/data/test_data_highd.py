@@ -137,10 +137,3 @@ def test_resampling_agrees_with_interpolation_over_time(first, length, rate):
     assert new.frame[one].tolist() == inside
     expected = np.interp(0.1 * new.frame[one], frame[:length] / rate, values[:length])
     np.testing.assert_allclose(new.linear(values)[one], expected, atol=1e-9)
-
-
-def test_at_the_same_rate_resampling_changes_nothing():
-    frame = np.arange(5, 25)
-    new = resample(np.arange(20) == 0, frame, 10.0)
-    assert new.frame.tolist() == frame.tolist()
-    assert new.nearest(frame).tolist() == frame.tolist()

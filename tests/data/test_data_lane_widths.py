@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ganlane.data import lane_width
+from ganlane.data.lane_widths import lane_width
 
 
 @given(width=st.floats(3.0, 4.0), seed=st.integers(0, 10_000))

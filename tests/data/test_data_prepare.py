@@ -12,22 +12,20 @@ from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 from ganlane.data import (
     PooledStatistics,
     Scene,
-    SyntheticTraffic,
-    cut_into_scenes,
     driving_statistics,
-    long_report,
     prepare_recordings,
     read_recordings,
     read_scenes,
     scene_lane_widths,
-    short_report,
     synthetic_scenes,
     write_prepared,
     write_scene_csv,
 )
 from ganlane.data.prepare import whole_folder
+from ganlane.data.scenes import cut_into_scenes
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
+from ganlane.prepare import long_report, short_report
 
 TOO_LONG = "s" * 300
 
@@ -113,14 +111,6 @@ def test_a_recording_of_parked_cars_is_refused(tmp_path):
         prepare_recordings("scenes", tmp_path / "parked.parquet", tmp_path / "out")
 
 
-def test_prepared_scenes_of_the_same_name_do_not_overwrite_each_other(tmp_path):
-    write_prepared(synthetic_scenes(), tmp_path / "in" / "a.parquet")
-    write_prepared(synthetic_scenes(SyntheticTraffic(scenes=1)), tmp_path / "in" / "b.parquet")
-    with pytest.raises(UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
-        prepare_recordings("scenes", tmp_path / "in", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_names_that_differ_in_a_blank_alone_are_refused(tmp_path):
     scenes = synthetic_scenes().with_columns(
         pl.col("scene").replace({"synthetic-0": "my road", "synthetic-1": "my_road"})
@@ -128,13 +118,6 @@ def test_names_that_differ_in_a_blank_alone_are_refused(tmp_path):
     write_prepared(scenes, tmp_path / "a.parquet")
     with pytest.raises(UserError, match=r"a second scene that my_road.parquet is the file of"):
         prepare_recordings("scenes", tmp_path / "a.parquet", tmp_path / "out")
-
-
-def test_scenes_are_read_whole_as_they_are_one_by_one(tmp_path):
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3), seed=2), tmp_path / "mine.csv")
-    whole = read_recordings("scenes", tmp_path / "mine.csv")
-    assert whole.equals(read_scenes(tmp_path / "mine.csv"))
-    assert whole["scene"].unique(maintain_order=True).to_list() == ["synthetic-0", "synthetic-1", "synthetic-2"]
 
 
 def test_recordings_without_anybody_on_the_lanes_are_refused(tmp_path):

@@ -11,6 +11,7 @@ from ganlane.data import (
     read_scenes,
     scene_lane_counts,
     synthetic_scenes,
+    validate,
     write_prepared,
     write_scene_csv,
 )
@@ -157,3 +158,17 @@ def test_damaged_parquet_is_refused(tmp_path):
     write_prepared(made.with_columns(x=pl.lit(float("nan"))), path)
     with pytest.raises(UserError, match=r"x.parquet, row 0, column x: nan is not a finite number"):
         read_scenes(path)
+
+
+def test_the_validator_checks_frames_that_come_from_nowhere():
+    made = synthetic_scenes(SyntheticTraffic(scenes=1))
+    assert validate(made, "made").equals(made)
+    with pytest.raises(UserError, match="made: no column speed"):
+        validate(made.drop("speed"), "made")
+    with pytest.raises(UserError, match="made: no rows"):
+        validate(made.clear(), "made")
+    with pytest.raises(UserError, match="made, column x: String found, Float64 expected"):
+        validate(made.with_columns(x=pl.lit("here")), "made")
+    holed = made.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
+    with pytest.raises(UserError, match="made, line 9, column x: None is not a finite number"):
+        validate(holed, "made")

@@ -35,11 +35,6 @@ def test_nobody_comes_near_another_along_the_road(seed):
     assert leader_gaps(one_lane)["gap"].min() > 2.0
 
 
-def test_speed_is_the_rate_of_the_position():
-    made = synthetic_scenes().with_columns(pace=(pl.col("x").diff() / 0.1).over("scene", "vehicle"))
-    assert (made["pace"] - made["speed"]).abs().max() < 0.1
-
-
 def test_the_share_of_changing_vehicles_is_found_by_the_detector():
     widths = {"synthetic-0": 3.5}
     all_change = SyntheticTraffic(scenes=1, vehicles=40, changing_share=1.0, wander_m=0.0)

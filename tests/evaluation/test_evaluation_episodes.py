@@ -1,4 +1,4 @@
-"""Given episodes are run to their own ends, whatever the batch size."""
+"""Given episodes are run to their own ends; each is what it is alone, whatever drives in the other rows."""
 
 from __future__ import annotations
 
@@ -10,14 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 from tensordict.nn import TensorDictModule
-from torchrl.envs.utils import ExplorationType, check_env_specs, exploration_type
+from torchrl.envs import StepCounter
+from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 
+from ganlane import keys
+from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import GanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, ReplayTrafficConfig
+from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
+from ganlane.parameters.observation import ObservationConfig, SensorParameters
+from ganlane.traffic import IdmTraffic
 
-
-def test_the_toy_environment_is_a_proper_one():
-    check_env_specs(ToyEnv(3))
+SEED = 4
+#: Short and of different lengths: who drives at random also leaves the road and crashes.
+SHORT = EnvConfig(goal_m=90.0)
 
 
 def test_each_row_tells_what_the_episode_was():
@@ -51,13 +60,6 @@ def test_the_batch_size_makes_no_difference(batch, episodes, seed):
     assert_frame_equal(run_episodes(ToyEnv(batch), always(0), episodes, seed), pl.concat(alone))
 
 
-def test_short_episodes_do_not_push_out_long_ones():
-    # Rows that end early are reset and drive on; nothing of what follows may be counted.
-    frame = run_episodes(ToyEnv(8), always(1), range(8), seed=0)
-    assert frame["episode"].to_list() == list(range(8))
-    assert frame["decisions"].to_list() == [length(0, e) for e in range(8)]
-
-
 def test_progress_counts_up_to_all_episodes():
     seen = []
     run_episodes(ToyEnv(4), always(0), range(6), seed=0, on_progress=lambda done, total: seen.append((done, total)))
@@ -89,3 +91,168 @@ def test_an_end_that_the_environment_does_not_name_is_called_other():
 def test_no_episodes_is_a_users_mistake():
     with pytest.raises(UserError, match="episodes"):
         run_episodes(ToyEnv(2), always(0), [], seed=0)
+
+
+class Remade:
+    """Makes an environment of any size, and remembers the sizes that were asked for."""
+
+    def __init__(self, traffic, env=SHORT, sensors=None, wrap=lambda env: env):
+        self.traffic, self.env, self.wrap = make_traffic(traffic, env), env, wrap
+        self.observation = ObservationConfig(sensors=sensors)
+        self.sizes = []
+
+    def __call__(self, rows):
+        self.sizes.append(rows)
+        return self.wrap(make_env(self.traffic, self.env, self.observation, num_envs=rows))
+
+
+def alone(make, policy, episodes):
+    """Decisions, reward, distance and end of each episode, driven with nothing beside it and counted by hand."""
+    env, rows = make(1), []
+    for episode in episodes:
+        counters = {keys.SEED: torch.tensor([SEED]), keys.EPISODE: torch.tensor([episode])}
+        state = env.reset(env.reset().empty().update(counters))
+        reward, decisions, done = 0.0, 0, False
+        while not done:
+            after = env.step(policy(state))
+            state, decisions, done = step_mdp(after), decisions + 1, bool(after["next", "done"])
+            reward += float(after["next", "reward"])
+        ends = [name for name in keys.END_EVENTS if bool(state["events", name])]
+        distance = float(state["ego", "distance"])
+        rows.append((episode, decisions, reward, distance, ends[0] if ends else "other"))
+    return pl.DataFrame(rows, schema=["episode", "decisions", "reward", "distance_m", "reason"], orient="row")
+
+
+def compared(table):
+    return table.select("episode", "decisions", "reward", "distance_m", "reason")
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
+    return ReplayTrafficConfig(path=str(path))
+
+
+def sources(recordings):
+    return {
+        "idm_mobil": Remade(IdmMobilTrafficConfig()),
+        "recycled": Remade(IdmTrafficConfig(), EnvConfig(goal_m=90.0, recycle=True)),
+        "late sensors": Remade(IdmTrafficConfig(), sensors=SensorParameters(position_noise_m=2.0, delay_s=2.0)),
+        "replayed": Remade(recordings),
+        "cut short": Remade(IdmTrafficConfig(), wrap=lambda env: env.append_transform(StepCounter(max_steps=3))),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "driver"),
+    [
+        ("idm_mobil", "agent_idm"),
+        ("recycled", "random"),
+        ("late sensors", "agent_idm"),
+        ("replayed", "random"),
+        ("cut short", "random"),
+    ],
+)
+def test_every_episode_is_bit_for_bit_what_it_is_alone(name, driver, recordings, monkeypatch):
+    monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
+    make = sources(recordings)[name]
+    policy, episodes = make_driver(driver, make.env).policy, [*range(30, 47), 7, 3]
+    expected = alone(make, policy, episodes)
+    assert_frame_equal(compared(run_episodes(make(5), policy, episodes, SEED)), expected, check_exact=True)
+    make.sizes.clear()
+    wide = run_episodes(make(17), policy, episodes, SEED, make_smaller=make)
+    assert_frame_equal(compared(wide), expected, check_exact=True)
+    assert make.sizes[0] == 17
+    assert (expected["reason"] == "other").any() == (name == "cut short")
+
+
+def test_generated_traffic_is_the_same_up_to_rounding_when_rows_move():
+    make = Remade(GanTrafficConfig(), EnvConfig(goal_m=150.0))
+    policy, episodes = make_driver("random", make.env).policy, range(34)
+    one = run_episodes(make(34), policy, episodes, SEED)
+    make.sizes.clear()
+    other = run_episodes(make(34), policy, episodes, SEED, make_smaller=make)
+    assert len(make.sizes) > 1
+    assert one["reason"].to_list() == other["reason"].to_list()
+    assert one["distance_m"].to_list() == pytest.approx(other["distance_m"].to_list(), rel=1e-3)
+
+
+def test_the_last_episodes_move_to_ever_smaller_environments():
+    sizes = []
+
+    def smaller(rows):
+        sizes.append(rows)
+        return ToyEnv(rows)
+
+    policy = always(1)
+    policy.rows_must_stay = False
+    frame = run_episodes(ToyEnv(64), policy, range(64), seed=0, make_smaller=smaller)
+    assert frame["decisions"].to_list() == [length(0, e) for e in range(64)]
+    # Episodes last 3 to 13 decisions; after 8 of them those of 9 to 13 are left.
+    assert sizes == [sum(length(0, e) > 8 for e in range(64))]
+
+
+def test_a_policy_that_does_not_say_that_rows_may_move_keeps_them():
+    def smaller(rows):
+        raise AssertionError("moved")
+
+    run_episodes(ToyEnv(64), always(1), range(64), seed=0, make_smaller=smaller)
+
+
+class Watchful(IdmTraffic):
+    """Holds the episode of every row outside the tensordict, as a foreign simulator does."""
+
+    rows_must_stay = True
+
+    def __init__(self):
+        super().__init__()
+        self.seen = None
+        self.begun = []
+
+    def forward(self, tensordict):
+        now = torch.stack([tensordict[name] for name in (keys.SEED, keys.EPISODE)], dim=1)
+        fresh = tensordict[keys.STEP] == 0
+        if self.seen is not None:
+            assert now.shape == self.seen.shape
+            assert bool((fresh | (now == self.seen).all(1)).all()), "an episode changed its row"
+        self.begun += now[fresh, 1].tolist()
+        self.seen = now
+        return super().forward(tensordict)
+
+
+def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per_row():
+    def smaller(rows):
+        raise AssertionError("moved")
+
+    traffic = Watchful()
+    make = Remade(IdmTrafficConfig())
+    env = make_env(traffic, SHORT, num_envs=17)
+    policy = make_driver("random", SHORT).policy
+    table = run_episodes(env, policy, range(30), SEED, make_smaller=smaller)
+    moved = table.filter(pl.col("duration_s") > 0)["episode"]
+    assert set(moved) <= set(traffic.begun) <= set(range(30))
+    assert_frame_equal(table, run_episodes(make(17), policy, range(30), SEED), check_exact=True)
+
+
+def test_masked_rows_start_the_episodes_that_they_are_given():
+    env = make_env(IdmTraffic(), SHORT, num_envs=3)
+    state = env.reset()
+    state = step_mdp(env.step(state.set("action", torch.zeros(3, dtype=torch.int64))))
+    before = state.clone()
+    mask = torch.tensor([[True], [False], [True]])
+    after = env.reset(state.set("_reset", mask), next_episode=torch.tensor([70, 80, 5]))
+    assert after[keys.EPISODE].tolist() == [70, 1, 5]
+    assert after[keys.STEP].tolist() == [0, 10, 0]
+    assert torch.equal(after["vehicles", "x"][1], before["vehicles", "x"][1])
+    start = HighwayEnv(IdmTraffic(), num_envs=1, first_episode=70).reset()
+    assert torch.equal(after["vehicles", "x"][0], start["vehicles", "x"][0])
+
+
+def test_an_environment_that_ignores_the_episodes_it_is_given_is_refused():
+    class Stubborn(ToyEnv):
+        def _reset(self, tensordict=None, next_episode=None, **kwargs):
+            return super()._reset(tensordict, **kwargs)
+
+    with pytest.raises(UserError, match="next_episode"):
+        run_episodes(Stubborn(2), always(0), [0, 1, 5, 9], seed=0)

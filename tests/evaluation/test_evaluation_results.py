@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import ganlane
-from ganlane.evaluation import provenance, write_episodes, write_results
+from ganlane.evaluation import code_version, results, write_episodes, write_results
 
 
 @dataclass
@@ -58,5 +58,5 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
 
 
 def test_a_copy_in_somebody_elses_checkout_has_no_revision(monkeypatch, tmp_path):
-    monkeypatch.setattr(provenance, "PACKAGE", tmp_path)
-    assert provenance.code_version() == {"version": ganlane.__version__, "revision": None, "modified": None}
+    monkeypatch.setattr(results, "PACKAGE", tmp_path)
+    assert code_version() == {"version": ganlane.__version__, "revision": None, "modified": None}

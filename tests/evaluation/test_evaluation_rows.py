@@ -1,191 +1,289 @@
-"""Real episodes through the rows of an evaluation: each is what it is alone, whatever drives beside it."""
+"""An evaluation's numbers, entry by entry, from hand-made episodes; compared with SciPy and hand-worked values."""
 
 from __future__ import annotations
 
+import math
+import warnings
+from itertools import product
+
+import numpy as np
 import polars as pl
 import pytest
-import torch
-from evaluation_toy_env import ToyEnv, always, length
-from polars.testing import assert_frame_equal
-from torchrl.envs import StepCounter
-from torchrl.envs.utils import step_mdp
+from scipy import stats
 
-from ganlane import keys
-from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import GanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, ReplayTrafficConfig
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.evaluation import run_episodes
-from ganlane.parameters.observation import ObservationConfig, SensorParameters
-from ganlane.traffic import IdmTraffic
-
-SEED = 4
-#: Short and of different lengths: who drives at random also leaves the road and crashes.
-SHORT = EnvConfig(goal_m=90.0)
-
-
-class Remade:
-    """Makes an environment of any size, and remembers the sizes that were asked for."""
-
-    def __init__(self, traffic, env=SHORT, sensors=None, wrap=lambda env: env):
-        self.traffic, self.env, self.wrap = make_traffic(traffic, env), env, wrap
-        self.observation = ObservationConfig(sensors=sensors)
-        self.sizes = []
-
-    def __call__(self, rows):
-        self.sizes.append(rows)
-        return self.wrap(make_env(self.traffic, self.env, self.observation, num_envs=rows))
-
-
-def alone(make, policy, episodes):
-    """Decisions, reward, distance and end of each episode, driven with nothing beside it and counted by hand."""
-    env, rows = make(1), []
-    for episode in episodes:
-        counters = {keys.SEED: torch.tensor([SEED]), keys.EPISODE: torch.tensor([episode])}
-        state = env.reset(env.reset().empty().update(counters))
-        reward, decisions, done = 0.0, 0, False
-        while not done:
-            after = env.step(policy(state))
-            state, decisions, done = step_mdp(after), decisions + 1, bool(after["next", "done"])
-            reward += float(after["next", "reward"])
-        ends = [name for name in keys.END_EVENTS if bool(state["events", name])]
-        distance = float(state["ego", "distance"])
-        rows.append((episode, decisions, reward, distance, ends[0] if ends else "other"))
-    return pl.DataFrame(rows, schema=["episode", "decisions", "reward", "distance_m", "reason"], orient="row")
-
-
-def compared(table):
-    return table.select("episode", "decisions", "reward", "distance_m", "reason")
-
-
-@pytest.fixture(scope="module")
-def recordings(tmp_path_factory):
-    path = tmp_path_factory.mktemp("recordings") / "scenes.csv"
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, seconds=7.0), seed=0), path)
-    return ReplayTrafficConfig(path=str(path))
-
-
-def sources(recordings):
-    return {
-        "idm_mobil": Remade(IdmMobilTrafficConfig()),
-        "recycled": Remade(IdmTrafficConfig(), EnvConfig(goal_m=90.0, recycle=True)),
-        "late sensors": Remade(IdmTrafficConfig(), sensors=SensorParameters(position_noise_m=2.0, delay_s=2.0)),
-        "replayed": Remade(recordings),
-        "cut short": Remade(IdmTrafficConfig(), wrap=lambda env: env.append_transform(StepCounter(max_steps=3))),
-    }
-
-
-@pytest.mark.parametrize(
-    ("name", "driver"),
-    [
-        ("idm_mobil", "agent_idm"),
-        ("recycled", "random"),
-        ("late sensors", "agent_idm"),
-        ("replayed", "random"),
-        ("cut short", "random"),
-    ],
+from ganlane.evaluation import (
+    crashes_by_scene,
+    evaluation_rows,
+    normalized_percent,
+    paired_rows,
+    paired_table,
+    text_table,
 )
-def test_every_episode_is_bit_for_bit_what_it_is_alone(name, driver, recordings, monkeypatch):
-    monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
-    make = sources(recordings)[name]
-    policy, episodes = make_driver(driver, make.env).policy, [*range(30, 47), 7, 3]
-    expected = alone(make, policy, episodes)
-    assert_frame_equal(compared(run_episodes(make(5), policy, episodes, SEED)), expected, check_exact=True)
-    make.sizes.clear()
-    wide = run_episodes(make(17), policy, episodes, SEED, make_smaller=make)
-    assert_frame_equal(compared(wide), expected, check_exact=True)
-    assert make.sizes[0] == 17
-    assert (expected["reason"] == "other").any() == (name == "cut short")
 
 
-def test_generated_traffic_is_the_same_up_to_rounding_when_rows_move():
-    make = Remade(GanTrafficConfig(), EnvConfig(goal_m=150.0))
-    policy, episodes = make_driver("random", make.env).policy, range(34)
-    one = run_episodes(make(34), policy, episodes, SEED)
-    make.sizes.clear()
-    other = run_episodes(make(34), policy, episodes, SEED, make_smaller=make)
-    assert len(make.sizes) > 1
-    assert one["reason"].to_list() == other["reason"].to_list()
-    assert one["distance_m"].to_list() == pytest.approx(other["distance_m"].to_list(), rel=1e-3)
+def episodes(agent, rewards, reasons=None, traffic="idm"):
+    """Episodes of 5000 m in 200 s with two lane changes each."""
+    n = len(rewards)
+    reasons = reasons or ["goal"] * n
+    return pl.DataFrame(
+        {
+            "agent": [agent] * n,
+            "traffic": [traffic] * n,
+            "episode": range(n),
+            "seed": [7] * n,
+            "reason": reasons,
+            "soft_crash": [3 if i == 0 else 0 for i in range(n)],
+            "had_soft_crash": [i == 0 for i in range(n)],
+            "soft_crash_behind": [1] * n,
+            "reward": [float(reward) for reward in rewards],
+            "decisions": [200] * n,
+            "duration_s": [200.0] * n,
+            "distance_m": [5000.0] * n,
+            "mean_speed_mps": [25.0] * n,
+            "lane_changes": [2] * n,
+        }
+    )
 
 
-def test_the_last_episodes_move_to_ever_smaller_environments():
-    sizes = []
-
-    def smaller(rows):
-        sizes.append(rows)
-        return ToyEnv(rows)
-
-    policy = always(1)
-    policy.rows_must_stay = False
-    frame = run_episodes(ToyEnv(64), policy, range(64), seed=0, make_smaller=smaller)
-    assert frame["decisions"].to_list() == [length(0, e) for e in range(64)]
-    # Episodes last 3 to 13 decisions; after 8 of them those of 9 to 13 are left.
-    assert sizes == [sum(length(0, e) > 8 for e in range(64))]
+@pytest.fixture
+def rows():
+    agent = episodes("agent_idm", [20, 24, -80, 26], ["goal", "timeout", "hard_crash", "out_of_road"])
+    mobil = episodes("mobil", [30, 32, 34, 36])
+    random_legal = episodes("random_legal", [-10, -8, -6, -4])
+    return evaluation_rows(pl.concat([agent, mobil, random_legal]))
 
 
-def test_a_policy_that_does_not_say_that_rows_may_move_keeps_them():
-    def smaller(rows):
-        raise AssertionError("moved")
-
-    run_episodes(ToyEnv(64), always(1), range(64), seed=0, make_smaller=smaller)
-
-
-class Watchful(IdmTraffic):
-    """Holds the episode of every row outside the tensordict, as a foreign simulator does."""
-
-    rows_must_stay = True
-
-    def __init__(self):
-        super().__init__()
-        self.seen = None
-        self.begun = []
-
-    def forward(self, tensordict):
-        now = torch.stack([tensordict[name] for name in (keys.SEED, keys.EPISODE)], dim=1)
-        fresh = tensordict[keys.STEP] == 0
-        if self.seen is not None:
-            assert now.shape == self.seen.shape
-            assert bool((fresh | (now == self.seen).all(1)).all()), "an episode changed its row"
-        self.begun += now[fresh, 1].tolist()
-        self.seen = now
-        return super().forward(tensordict)
+def test_ends_are_counted_once_and_soft_crashes_by_episode(rows):
+    row = rows[0]
+    assert (row["agent"], row["traffic"], row["episodes"]) == ("agent_idm", "idm", 4)
+    ends = {"goal": 1, "hard_crash": 1, "out_of_road": 1, "timeout": 1, "scene_end": 0}
+    assert {name: row[name] for name in ends} == ends
+    assert row["soft_crash"] == 1
+    assert row["soft_crash_onsets"] == 3
+    assert row["soft_crash_behind_onsets"] == 4
+    assert row["soft_crash_behind_per_episode"] == 1.0
+    assert row["soft_crash_behind_per_episode_ci"] == [1.0, 1.0]
 
 
-def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per_row():
-    def smaller(rows):
-        raise AssertionError("moved")
-
-    traffic = Watchful()
-    make = Remade(IdmTrafficConfig())
-    env = make_env(traffic, SHORT, num_envs=17)
-    policy = make_driver("random", SHORT).policy
-    table = run_episodes(env, policy, range(30), SEED, make_smaller=smaller)
-    moved = table.filter(pl.col("duration_s") > 0)["episode"]
-    assert set(moved) <= set(traffic.begun) <= set(range(30))
-    assert_frame_equal(table, run_episodes(make(17), policy, range(30), SEED), check_exact=True)
-
-
-def test_masked_rows_start_the_episodes_that_they_are_given():
-    env = make_env(IdmTraffic(), SHORT, num_envs=3)
-    state = env.reset()
-    state = step_mdp(env.step(state.set("action", torch.zeros(3, dtype=torch.int64))))
-    before = state.clone()
-    mask = torch.tensor([[True], [False], [True]])
-    after = env.reset(state.set("_reset", mask), next_episode=torch.tensor([70, 80, 5]))
-    assert after[keys.EPISODE].tolist() == [70, 1, 5]
-    assert after[keys.STEP].tolist() == [0, 10, 0]
-    assert torch.equal(after["vehicles", "x"][1], before["vehicles", "x"][1])
-    start = HighwayEnv(IdmTraffic(), num_envs=1, first_episode=70).reset()
-    assert torch.equal(after["vehicles", "x"][0], start["vehicles", "x"][0])
+def test_rates_relate_to_the_distance_of_all_episodes(rows):
+    row = rows[0]
+    assert row["distance_km"] == pytest.approx(20.0)
+    assert row["mean_speed_mps"] == pytest.approx(25.0)
+    assert row["lane_changes_per_km"] == pytest.approx(8 / 20)
+    assert row["crashes_per_1000_km"] == pytest.approx(50.0)
+    assert row["crashes_per_1000_km_ci"] == pytest.approx([0.0253 * 50, 5.572 * 50], abs=0.1)
+    assert row["hard_crash_share"] == pytest.approx(0.25)
+    assert row["hard_crash_share_ci"] == pytest.approx([0.0063, 0.8059], abs=1e-3)
+    assert row["out_of_road_share"] == pytest.approx(0.25)
+    assert row["out_of_road_share_ci"] == pytest.approx([0.0063, 0.8059], abs=1e-3)
 
 
-def test_an_environment_that_ignores_the_episodes_it_is_given_is_refused():
-    class Stubborn(ToyEnv):
-        def _reset(self, tensordict=None, next_episode=None, **kwargs):
-            return super()._reset(tensordict, **kwargs)
+def test_the_score_runs_from_random_to_mobil(rows):
+    by_agent = {row["agent"]: row for row in rows}
+    assert by_agent["mobil"]["normalized_percent"] == pytest.approx(100.0)
+    assert by_agent["mobil"]["normalized_percent_ci"] == pytest.approx([100.0, 100.0])
+    assert by_agent["random_legal"]["normalized_percent"] == pytest.approx(0.0)
+    # The agent's mean is -2.5, MOBIL's 33, the random driver's -7.
+    assert by_agent["agent_idm"]["normalized_percent"] == pytest.approx(100 * 4.5 / 40)
 
-    with pytest.raises(UserError, match="next_episode"):
-        run_episodes(Stubborn(2), always(0), [0, 1, 5, 9], seed=0)
+
+def test_the_form_of_the_score_fits_both_rows_of_the_papers_table():
+    # R_0 = -25.0 and R_MOBIL = 26.0 are the two unknowns that Table VII's two rows determine.
+    for reward, percent in ((-22.33, 5.21), (33.62, 114.82)):
+        score = normalized_percent([reward] * 2, [26.0] * 2, [-25.0] * 2, resamples=10)
+        assert score.percent == pytest.approx(percent, abs=0.15)
+
+
+def test_the_score_is_computed_on_shared_episodes_whatever_their_order():
+    mobil, random_legal = episodes("mobil", [30, 32, 34, 36]), episodes("random_legal", [0, 2, 4, 6])
+    agent = episodes("a", [15, 17, 19, 21])
+    straight = evaluation_rows(pl.concat([agent, mobil, random_legal]))[0]
+    turned = evaluation_rows(pl.concat([agent.reverse(), mobil, random_legal.reverse()]))[0]
+    assert straight["normalized_percent"] == turned["normalized_percent"] == pytest.approx(50.0)
+    # Paired, the agent stands half-way in every single episode: no doubt is left.
+    assert straight["normalized_percent_ci"] == pytest.approx([50.0, 50.0])
+
+
+def test_without_the_drivers_of_the_scale_a_reason_replaces_the_score_and_nobody_leads_mobil():
+    rows = evaluation_rows(pl.concat([episodes("a", [1, 2, 3], traffic=name) for name in ("idm", "gan")]))
+    assert [row["traffic"] for row in rows] == ["idm", "gan"]
+    assert rows[0]["normalized_percent"] is rows[0]["minus_mobil"] is None
+    assert "mobil is missing" in rows[0]["normalized_percent_reason"]
+    text = text_table(rows)
+    assert text.splitlines()[-1].startswith("% of MOBIL on idm, gan: none, needs mobil")
+    assert "minus MOBIL" not in text
+
+
+def test_a_scale_without_length_gives_no_score():
+    score = normalized_percent([5.0, 6.0, 7.0, 8.0], [1.0, -2.0, 3.0, -1.0], [0.0, 0.0, 0.0, 0.0])
+    assert score.percent is None
+    assert "includes 0" in score.reason
+
+
+def test_the_text_table_is_aligned_and_leaves_out_what_never_happened(rows):
+    lines = text_table(rows).splitlines()
+    assert len({len(line) for line in lines[:5]}) == 1
+    assert "time-out" in lines[0]
+    assert "scene end" not in lines[0]
+    assert "agent_idm" in lines[2]
+    assert "-2.5 [" in lines[2]
+
+
+def test_the_lead_over_mobil_is_paired_by_episode_whatever_their_order():
+    mobil = episodes("mobil", [10, 200, 30, 400, 50])
+    agent = episodes("agent", [13, 203, 33, 403, 53]).reverse()
+    agent_row, mobil_row = evaluation_rows(pl.concat([agent, mobil]))
+    assert agent_row["minus_mobil"] == pytest.approx(3.0)
+    assert agent_row["minus_mobil_ci"] == pytest.approx([3.0, 3.0])
+    assert mobil_row["minus_mobil"] is None
+
+
+def test_resamples_without_a_lead_do_not_spoil_the_interval():
+    """In one of the four episodes MOBIL leads by nothing; a resample of that one alone has no scale."""
+    mobil, random_legal, agent = [10.0, 20.0, 30.0, 40.0], [10.0, 0.0, 0.0, 0.0], [10.0, 10.0, 15.0, 20.0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        score = normalized_percent(agent, mobil, random_legal, resamples=4000)
+    assert score.percent == pytest.approx(100.0 * 45.0 / 90.0)
+    assert score.interval is not None
+    # In the other episodes the agent is half way from random to MOBIL, and where all are equal it changes nothing.
+    assert score.interval == pytest.approx([50.0, 50.0])
+    assert all(map(math.isfinite, score.interval))
+
+
+def driven(agent, rewards, traffic="gan", first=0):
+    """The columns that a comparison reads, one row per episode."""
+    n = len(rewards)
+    return pl.DataFrame(
+        {
+            "agent": [agent] * n,
+            "traffic": [traffic] * n,
+            "seed": [3] * n,
+            "episode": range(first, first + n),
+            "reward": [float(reward) for reward in rewards],
+        }
+    )
+
+
+@pytest.fixture
+def rewards():
+    """Two drivers whose returns share most of their spread."""
+    generator = np.random.default_rng(2)
+    common = generator.normal(200.0, 80.0, 120)
+    return common + generator.normal(6.0, 15.0, 120), common
+
+
+def test_the_lead_is_the_mean_difference_with_scipys_interval(rewards):
+    (row,) = paired_rows(pl.concat([driven("trained", rewards[0]), driven("mobil", rewards[1])]))
+    difference = rewards[0] - rewards[1]
+    expected = stats.bootstrap((difference,), np.mean, n_resamples=10_000, method="BCa", random_state=1)
+    low, high = expected.confidence_interval
+    assert (row["agent"], row["over"], row["traffic"], row["episodes"]) == ("trained", "mobil", "gan", 120)
+    assert row["lead"] == pytest.approx(difference.mean())
+    assert row["lead_ci"] == pytest.approx([low, high], abs=0.05 * (high - low))
+    assert row["verdict"] == "above"
+
+
+def test_the_first_driver_is_held_against_every_other_on_every_traffic():
+    episodes = [
+        driven(agent, [base, base + 1.0], traffic)
+        for traffic in ("idm", "gan")
+        for agent, base in (("trained", 5.0), ("mobil", 7.0), ("keep_lane", 1.0))
+    ]
+    rows = paired_rows(pl.concat(episodes))
+    assert [(row["traffic"], row["over"], row["lead"], row["verdict"]) for row in rows] == [
+        ("idm", "mobil", -2.0, "below"),
+        ("idm", "keep_lane", 4.0, "above"),
+        ("gan", "mobil", -2.0, "below"),
+        ("gan", "keep_lane", 4.0, "above"),
+    ]
+
+
+def test_only_episodes_that_both_drove_count_in_whatever_order():
+    # Shared are the episodes 2, 3 and 4: differences of 2, 4 and 6.
+    other = driven("mobil", [10.0, 20.0, 30.0, 99.0], first=2).reverse()
+    (row,) = paired_rows(pl.concat([driven("a", [-50.0, -60.0, 12.0, 24.0, 36.0]), other]))
+    assert (row["episodes"], row["lead"]) == (3, pytest.approx(4.0))
+
+
+def test_a_lead_whose_interval_holds_zero_is_undecided():
+    (row,) = paired_rows(pl.concat([driven("a", [1.0, -1.0, 2.0, -2.0]), driven("b", [0.0, 0.0, 0.0, 0.1])]))
+    assert row["lead_ci"][0] < 0.0 < row["lead_ci"][1]
+    assert row["verdict"] == "undecided"
+
+
+def test_a_single_driver_and_a_single_episode_give_no_pairs():
+    assert paired_rows(driven("a", [1.0, 2.0])) == []
+    assert paired_rows(pl.concat([driven("a", [1.0]), driven("b", [2.0])])) == []
+
+
+def test_the_table_gives_the_sign_the_interval_and_the_verdict():
+    row = {"agent": "trained", "over": "mobil", "traffic": "gan", "episodes": 300}
+    above = {**row, "lead": 12.34, "lead_ci": [4.51, 20.1], "verdict": "above"}
+    below = {**row, "over": "agent_idm", "lead": -3.0, "lead_ci": [-5.0, -1.0], "verdict": "below"}
+    heading, _, first, second = paired_table([above, below]).splitlines()
+    assert heading.split() == ["paired", "lead", "traffic", "reward", "[95", "%]", "verdict"]
+    assert "trained over mobil " in first
+    assert "+12.3 [4.5, 20.1]" in first
+    assert first.endswith("above")
+    assert "-3.0 [-5.0, -1.0]" in second
+    assert second.endswith("below")
+
+
+def recorded(*rows: tuple[str, int, int, float]) -> tuple[pl.DataFrame, list[str]]:
+    """(scene, episodes, crashes, m per episode) as episodes and their scenes."""
+    reasons, distances, scenes = [], [], []
+    for scene, episodes, crashes, metres in rows:
+        reasons += ["hard_crash"] * crashes + ["scene_end"] * (episodes - crashes)
+        distances += [metres] * episodes
+        scenes += [scene] * episodes
+    return pl.DataFrame({"reason": reasons, "distance_m": distances}), scenes
+
+
+def test_the_rate_is_all_crashes_over_all_kilometres():
+    found = crashes_by_scene(*recorded(("b", 10, 1, 100.0), ("a", 5, 3, 400.0)))
+    assert found.per_km.value == pytest.approx(4 / 3.0)
+    assert [(row["scene"], row["episodes"], row["hard_crash"]) for row in found.rows] == [("a", 5, 3), ("b", 10, 1)]
+    assert [row["distance_km"] for row in found.rows] == pytest.approx([2.0, 1.0])
+    assert [row["crashes_per_km"] for row in found.rows] == pytest.approx([1.5, 1.0])
+    # Garwood's exact bounds for one event: 0.0253 and 5.572.
+    assert found.rows[1]["crashes_per_km_ci"] == pytest.approx([0.0253, 5.572], abs=1e-3)
+
+
+def test_the_interval_is_that_of_all_resamples_of_the_scenes():
+    scenes = [("a", 10, 2, 100.0), ("b", 10, 0, 300.0), ("c", 10, 5, 200.0)]
+    crashes, km = np.array([2.0, 0.0, 5.0]), np.array([1.0, 3.0, 2.0])
+    # All 27 resamples of three scenes are equally likely.
+    ratios = [crashes[list(drawn)].sum() / km[list(drawn)].sum() for drawn in product(range(3), repeat=3)]
+    low, high = np.quantile(np.repeat(ratios, 1000), [0.025, 0.975])
+    found = crashes_by_scene(*recorded(*scenes)).per_km
+    assert (found.low, found.high) == pytest.approx((low, high))
+    assert (low, high) == pytest.approx((0.0, 2.5))
+
+
+def test_more_episodes_of_the_same_scenes_do_not_narrow_the_interval():
+    few = crashes_by_scene(*recorded(("a", 10, 2, 100.0), ("b", 10, 1, 300.0), ("c", 10, 5, 200.0))).per_km
+    many = crashes_by_scene(*recorded(("a", 100, 20, 100.0), ("b", 100, 10, 300.0), ("c", 100, 50, 200.0))).per_km
+    assert (few.low, few.high) == pytest.approx((many.low, many.high))
+
+
+def test_no_crash_is_not_certainty():
+    found = crashes_by_scene(*recorded(("a", 10, 0, 100.0), ("b", 10, 0, 100.0))).per_km
+    assert (found.value, found.low) == (0.0, 0.0)
+    assert found.high == pytest.approx(3.689 / 2.0, abs=1e-3)
+
+
+def test_one_scene_has_no_interval_and_one_without_distance_no_rate():
+    assert crashes_by_scene(*recorded(("a", 10, 1, 100.0))).per_km.interval is None
+    found = crashes_by_scene(*recorded(("a", 10, 1, 100.0), ("b", 1, 0, 0.0)))
+    assert found.rows[1]["crashes_per_km"] is None
+    assert np.isfinite([found.per_km.low, found.per_km.high]).all()
+
+
+def test_what_does_not_fit_together_is_refused():
+    episodes, scenes = recorded(("a", 3, 1, 100.0))
+    with pytest.raises(UserError, match="2 scenes for 3 episodes"):
+        crashes_by_scene(episodes, scenes[:2])
+    with pytest.raises(UserError, match="nobody drove"):
+        crashes_by_scene(*recorded(("a", 3, 0, 0.0)))

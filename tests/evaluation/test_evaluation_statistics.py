@@ -1,4 +1,4 @@
-"""Bootstrap intervals against closed forms, SciPy and hand-worked values."""
+"""Intervals against closed forms, SciPy, tables and hand-worked values."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from ganlane.evaluation.statistics import (
+    Estimate,
     bootstrap_means,
-    interquartile_mean,
+    clopper_pearson,
+    entries,
     mean_interval,
     paired_difference,
-    probability_of_improvement,
+    poisson_interval,
     resample_counts,
 )
 
@@ -37,27 +39,13 @@ def test_the_bootstrapped_mean_spreads_like_the_standard_error(skewed):
     assert means.std() == pytest.approx(skewed.std() / np.sqrt(len(skewed)), rel=0.03)
 
 
-@pytest.mark.parametrize("method", ["percentile", "bca"])
-def test_the_interval_agrees_with_scipy(skewed, method):
-    ours = mean_interval(skewed, method)
-    theirs = stats.bootstrap(
-        (skewed,), np.mean, n_resamples=10_000, method=method.replace("bca", "BCa"), random_state=5
-    ).confidence_interval
+def test_the_interval_is_scipys_bca_and_repeats_with_its_seed(skewed):
+    ours = mean_interval(skewed)
+    theirs = stats.bootstrap((skewed,), np.mean, n_resamples=10_000, method="BCa", random_state=5).confidence_interval
     width = theirs.high - theirs.low
     assert ours.value == pytest.approx(skewed.mean())
-    assert ours.low == pytest.approx(theirs.low, abs=0.04 * width)
-    assert ours.high == pytest.approx(theirs.high, abs=0.04 * width)
-
-
-def test_bca_leans_towards_the_long_tail(skewed):
-    percentile, bca = mean_interval(skewed, "percentile"), mean_interval(skewed, "bca")
-    assert bca.low < percentile.low
-    assert bca.high < percentile.high
-
-
-def test_the_same_seed_gives_the_same_interval(skewed):
-    assert mean_interval(skewed, seed=4) == mean_interval(skewed, seed=4)
-    assert mean_interval(skewed, seed=4) != mean_interval(skewed, seed=5)
+    assert ours.interval == pytest.approx([theirs.low, theirs.high], abs=0.04 * width)
+    assert mean_interval(skewed, seed=4) == mean_interval(skewed, seed=4) != mean_interval(skewed, seed=5)
 
 
 def test_the_95_percent_interval_covers_the_mean_about_95_times_in_a_hundred():
@@ -74,6 +62,11 @@ def test_one_value_has_no_interval_and_equal_values_have_an_empty_one():
     assert not mean_interval([3.0]).excludes_zero()
 
 
+def test_a_rows_entries_are_none_where_there_is_no_number():
+    assert entries("rate", Estimate(2.0, 1.0, 3.0)) == {"rate": 2.0, "rate_ci": [1.0, 3.0]}
+    assert entries("rate", None) == entries("rate", Estimate(float("nan"))) == {"rate": None, "rate_ci": None}
+
+
 def test_pairing_removes_what_the_episodes_have_in_common():
     generator = np.random.default_rng(1)
     common = generator.normal(0, 100, 100)
@@ -86,31 +79,29 @@ def test_pairing_removes_what_the_episodes_have_in_common():
         paired_difference(common, common[1:])
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=40))
-def test_the_interquartile_mean_is_the_trimmed_mean(values):
-    expected = stats.trim_mean(values, 0.25)
-    assert interquartile_mean(values, resamples=10).value == pytest.approx(expected, abs=1e-9)
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_the_binomial_interval_agrees_with_scipy(data):
+    trials = data.draw(st.integers(1, 2000))
+    count = data.draw(st.integers(0, trials))
+    theirs = stats.binomtest(count, trials).proportion_ci(0.95, "exact")
+    assert clopper_pearson(count, trials).interval == pytest.approx([theirs.low, theirs.high], abs=1e-9)
 
 
-def test_the_interquartile_mean_ignores_rare_crashes(skewed):
-    estimate = interquartile_mean(skewed, resamples=2000)
-    assert estimate.low < estimate.value < estimate.high
-    assert estimate.value > 255 > skewed.mean()
+@pytest.mark.parametrize(("count", "bounds"), [(0, [0.0, 1 - 0.025 ** (1 / 50)]), (50, [0.025 ** (1 / 50), 1.0])])
+def test_none_and_all_of_fifty_have_bounds_in_closed_form(count, bounds):
+    assert clopper_pearson(count, 50).interval == pytest.approx(bounds)
 
 
-def test_the_probability_of_improvement_counts_pairs():
-    # Of the six pairs 2 beats 1 twice and ties once, 3 wins all three: (2 + 0.5 + 3) / 6.
-    assert probability_of_improvement([2.0, 3.0], [1.0, 1.0, 2.0]).value == pytest.approx(5.5 / 6)
+@pytest.mark.parametrize(
+    ("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.025, 5.572), (5, 1.623, 11.668), (10, 4.795, 18.390)]
+)
+def test_the_poisson_interval_is_garwoods_table(count, low, high):
+    assert poisson_interval(count).interval == pytest.approx([low, high], abs=1e-3)
 
 
-def test_the_probability_of_improvement_is_mann_whitneys_u(skewed):
-    other = skewed[:90] + 4.0
-    estimate = probability_of_improvement(other, skewed)
-    u = stats.mannwhitneyu(other, skewed).statistic
-    assert estimate.value == pytest.approx(u / (len(other) * len(skewed)))
-    assert estimate.low < estimate.value < estimate.high
-    # The bootstrap's spread against the usual standard error of U under no difference.
-    a, b = len(other), len(skewed)
-    expected = 2 * 1.96 * np.sqrt((a + b + 1) / (12 * a * b))
-    assert estimate.high - estimate.low == pytest.approx(expected, rel=0.15)
+def test_an_estimate_is_scaled_with_its_bounds():
+    rate = poisson_interval(5).scaled(1000.0, per=2500.0)
+    assert rate.value == pytest.approx(2.0)
+    assert rate.interval == pytest.approx([1.623 / 2.5, 11.668 / 2.5], abs=1e-3)
+    assert Estimate(4.0).scaled(0.5) == Estimate(2.0)

@@ -2,10 +2,10 @@
 
 import pytest
 
-from ganlane.generator.groups import VARIABLE
+from ganlane.generator.windows import CACHE_VARIABLE
 
 
 @pytest.fixture(autouse=True)
 def no_cache(monkeypatch):
     """Nothing is kept unless a test names a folder."""
-    monkeypatch.setenv(VARIABLE, "")
+    monkeypatch.setenv(CACHE_VARIABLE, "")

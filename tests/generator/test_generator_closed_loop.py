@@ -1,3 +1,5 @@
+"""One step of each preset in closed loop."""
+
 import math
 
 import pytest
@@ -9,22 +11,19 @@ from ganlane.generator.closed_loop import (
     DriverMemory,
     Plan,
     anchored_step,
-    bounded,
     displacement_of,
     inside_lane,
     moved_by,
     paper_step,
     start,
     wander,
-    washout,
 )
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
 from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.lanes import Visibility
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 ROAD = Road(3, 4.0)
@@ -60,11 +59,6 @@ def drive(generator, state, seconds, headway=1.27, noise=0.0):
     return state, memory
 
 
-def test_without_a_residual_a_lone_driver_reaches_its_desired_speed():
-    state, _ = drive(silent_generator(), vehicles([0.0], speed=15.0, desired=22.0), 50)
-    assert state.speed.item() == pytest.approx(22.0, abs=0.3)
-
-
 def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
     state = vehicles([0.0, 36.0], speed=18.0, desired=18.0)
     state = state.with_(desired_speed=torch.tensor([[25.0, 18.0]]).double())
@@ -95,16 +89,6 @@ def test_the_first_step_is_idm_and_the_lateral_law():
     assert after.y[0, 0].item() == pytest.approx(0.5 + 0.01 * 0.3 * -0.5, abs=1e-9)
 
 
-def test_the_washout_removes_a_constant():
-    mean = torch.zeros(1, 2)
-    constant = torch.tensor([[2.0, -1.0]])
-    first, mean = washout(constant, mean, 3.0)
-    for _ in range(300):
-        left, mean = washout(constant, mean, 3.0)
-    torch.testing.assert_close(first, constant * (1 - 0.1 / 3.0))
-    assert left.abs().max() < 1e-3
-
-
 def test_a_network_that_always_pushes_changes_the_speed_for_a_while_only():
     generator = silent_generator()
     generator.head.bias.copy_(torch.tensor([3.0, 0.0]))
@@ -126,12 +110,6 @@ def test_only_what_pushes_outwards_is_left_out():
     push = torch.tensor([0.5, -0.5, 0.5, 0.5])
     allowed = inside_lane(push, offset, still, room, damping=1.1)
     torch.testing.assert_close(allowed, torch.tensor([0.0, -0.5, 0.5, 0.0]))
-
-
-def test_the_residual_is_bounded():
-    limited = bounded(torch.tensor([1e6, -1e6]), ANCHOR.residual)
-    torch.testing.assert_close(limited, torch.tensor([4.0, -2.0]))
-    torch.testing.assert_close(bounded(torch.tensor([0.01, 0.01]), ANCHOR.residual), torch.tensor([0.01, 0.01]))
 
 
 def test_nobody_rolls_back_or_slides_sideways():

@@ -1,76 +1,85 @@
-"""``ganlane train_generator`` with folds, resuming and ablations, on recordings made up, in process."""
+"""``ganlane train_generator`` in process: on recordings as they are published, with folds, resuming and ablations."""
 
 import json
 from pathlib import Path
 
+import polars as pl
 import pytest
+from reference.file_server import Server
+from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic, write_highd
 
 import ganlane.evaluation
 import ganlane.generator
-from ganlane.config.folders import cleared_after_mistakes
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.generator.checkpoint import load_generator
+from ganlane.prepare import main as prepare
+from ganlane.realism.starts import check_folds_cover, fold_weights
 from ganlane.train_generator import main
 
-FEW = ["generator.loop.updates=4", "generator.loop.evaluate_every=4", "generator.batch=4", "generator.stride=6"]
+FEW = ["generator.loop.updates=2", "generator.loop.evaluate_every=1", "generator.batch=4", "generator.stride=6"]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """Runs in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("GANLANE_DATA", raising=False)
+    return tmp_path
 
 
 @pytest.fixture
-def recordings(tmp_path, monkeypatch):
+def recordings(here):
     """A scene CSV in the current folder."""
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "recordings.csv"
+    path = here / "recordings.csv"
     write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=5, seconds=4.0)), path)
     return f"data.path={path}"
 
 
-def run(capsys, *arguments) -> tuple[str, Path, dict]:
-    """What a run printed, its folder and its results."""
-    assert main(list(arguments)) == 0
-    out = capsys.readouterr().out
-    path = Path(out.splitlines()[-1].removeprefix("results: "))
-    return out, path.parent, json.loads(path.read_text())
+def run(*arguments: str, folder: str = "fit") -> dict:
+    """Results of a fit in ``folder``, whose weights can be loaded."""
+    assert main([*arguments, *FEW, f"hydra.run.dir={folder}"]) == 0
+    _, metadata = load_generator(Path(folder) / "generator_paper.safetensors", "paper")
+    results = json.loads((Path(folder) / "results.json").read_text())
+    assert metadata["data"] == results["data"]
+    assert results["ade_m"].keys() == results["fde_m"].keys() == {"mean", "single", "best_of_20", "constant_velocity"}
+    return results
 
 
 def test_errors_pooled_over_folds_stand_in_results_and_in_the_weights(recordings, capsys):
-    out, folder, results = run(capsys, recordings, "folds=2", *FEW)
+    results = run(recordings, "folds=2")
     pooled = results["folds"]["open_loop"]
     assert set(pooled["folds"]) == {"0", "1"}
     assert len(pooled["scenes"]) == 4
-    assert "ridge" in out
-    _, metadata = load_generator(folder / "generator_paper.safetensors", "paper")
+    assert "ridge" in capsys.readouterr().out
+    assert list(results["scenes"]) == results["data"]["held_out"]
+    _, metadata = load_generator(Path("fit") / "generator_paper.safetensors", "paper")
     assert metadata["folds"]["open_loop"]["ade_m"]["mean"] == pytest.approx(pooled["ade_m"]["mean"])
     assert metadata["config"]["seed"] == 0
     assert metadata["code"]["version"]
     assert metadata["data"]["validation"]
 
 
-def test_an_earlier_runs_fits_are_not_fitted_again(recordings, capsys):
-    _, folder, first = run(capsys, recordings, "folds=2", *FEW)
-    kept = {path: path.stat().st_mtime_ns for path in (folder / "fits").iterdir()}
-    _, other, again = run(capsys, recordings, "folds=2", f"resume={folder}", "hydra.run.dir=again", *FEW)
-    assert other != folder
+def test_an_earlier_runs_fits_are_not_fitted_again(recordings):
+    first = run(recordings, "folds=2")
+    kept = {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()}
+    again = run(recordings, "folds=2", "resume=fit", folder="again")
     assert again["folds"] == first["folds"]
     assert again["ade_m"] == first["ade_m"]
-    assert {path: path.stat().st_mtime_ns for path in (folder / "fits").iterdir()} == kept
+    assert {path: path.stat().st_mtime_ns for path in Path("fit/fits").iterdir()} == kept
+
+
+def test_the_folds_generators_are_kept_and_cover_every_scene(recordings):
+    run(recordings, "folds=3")
+    paths = [Path(f"fit/generator_paper_fold_{number}.safetensors") for number in (1, 2, 3)]
+    folds = fold_weights(paths)
+    assert [weights["paper"] for weights in folds.values()] == paths
+    check_folds_cover(list(folds), [f"synthetic-{scene}" for scene in range(4)])
 
 
 def test_ablations_stand_in_the_results(recordings, capsys):
-    out, _, results = run(capsys, recordings, "ablations=true", *FEW)
-    assert "without pooling" in out
+    results = run(recordings, "ablations=true")
+    assert "without pooling" in capsys.readouterr().out
     assert {"p_l = 4", "p_l = 12", "without pooling"} <= set(results["ablations"])
-
-
-@pytest.mark.parametrize(
-    ("argument", "part"),
-    [("folds=1", "folds=1"), ("folds=9", "folds=9"), ("resume=gone", "resume=gone"), ("folds=-1", "folds")],
-)
-def test_mistakes_are_told_in_one_sentence(argument, part, recordings, capsys, tmp_path):
-    assert main([recordings, argument, *FEW]) == 2
-    err = capsys.readouterr().err
-    assert part in err
-    assert err.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["recordings.csv"]
 
 
 def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monkeypatch, tmp_path):
@@ -84,23 +93,88 @@ def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monk
     assert len(list(tmp_path.rglob("generator_paper.safetensors"))) == 1
 
 
-@pytest.mark.parametrize("kept", ["fits/*.pt", "generator_*.safetensors"])
-def test_each_of_the_two_is_kept_by_itself(kept, tmp_path):
-    file = tmp_path / "run" / kept.replace("*", "paper")
-
-    def fit():
-        file.parent.mkdir(parents=True)
-        file.touch()
-        raise OSError("full")
-
-    with pytest.raises(OSError, match="full"), cleared_after_mistakes(tmp_path / "run"):
-        fit()
-    assert file.is_file()
-
-
 def test_too_many_folds_are_refused_before_ablations_are_fitted(recordings, capsys, monkeypatch):
     fitted = []
     monkeypatch.setattr(ganlane.generator, "ablate", lambda *given: fitted.append(given))
     assert main([recordings, "ablations=true", "folds=9", *FEW]) == 2
     assert "folds=9" in capsys.readouterr().err
     assert not fitted
+
+
+def three_periods() -> str:
+    """A portal CSV of three recordings."""
+    scenes = traffic(scenes=3).partition_by("scene", maintain_order=True)
+    return portal_csv(pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(scenes)))
+
+
+def test_the_periods_of_an_ngsim_file_are_the_scenes(here):
+    (here / "portal.csv").write_text(three_periods())
+    data = run("data=ngsim", "data.path=portal.csv")["data"]
+    assert (data["fitted"], data["validation"], data["held_out"]) == (["us-101-3"], ["us-101-1"], ["us-101-2"])
+    assert (data["rows"], data["tracks"]) == (3 * 9 * 60, 27)
+
+
+def test_the_directions_of_highd_are_the_scenes(here):
+    write_highd(here / "highd")
+    data = run("data=highd", "data.path=highd", "data.held_out=[highd-01-upper]")["data"]
+    assert (data["fitted"], data["held_out"]) == (["highd-01-lower"], ["highd-01-upper"])
+    assert (data["rows"], data["tracks"]) == (4 * 80, 4)
+
+
+def test_what_a_fit_reads_is_what_prepare_writes(here):
+    (here / "portal.csv").write_text(three_periods())
+    direct = run("data=ngsim", "data.path=portal.csv")
+    assert prepare(["data=ngsim", "data.path=portal.csv", "out=prepared"]) == 0
+    by_way_of_parquet = run("data.path=prepared")
+    for name in ("ade_m", "fde_m", "scenes"):
+        assert direct[name] == by_way_of_parquet[name]
+
+
+def test_a_users_csv_may_have_its_own_order_of_columns_and_more_of_them(here):
+    lines = ["note,lane,vehicle,scene,frame,x,y,v,width,length"]
+    for scene, speed in (("morning", 20), ("noon", 22)):
+        for vehicle, lane in ((7, 1), (3, 2)):
+            for frame in range(100, 140):
+                x = 30 * vehicle + speed * (frame - 100) / 10
+                lines.append(f"mine,{lane},{vehicle},{scene},{frame},{x},{4 - 4 * lane},{speed},2,5")
+    (here / "mine.csv").write_text("\n".join(lines) + "\n")
+    results = run("data.path=mine.csv", "data.held_out=[noon]")
+    assert (results["data"]["fitted"], results["data"]["held_out"]) == (["morning"], ["noon"])
+    # Everybody holds his speed and his lane.
+    assert results["ade_m"]["constant_velocity"] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_file_is_fetched_first_where_asked_for(here):
+    with Server(content=three_periods().encode()) as server:
+        results = run("data=ngsim", "data.path=got.csv", "data.download=true", f"data.url={server.url}")
+    assert (here / "got.csv").is_file()
+    assert results["data"]["file"] == "got.csv"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["data=ngsim"], "data=ngsim: which file is missing; give data.path=FILE."),
+        (["data=highd"], "data=highd: which file is missing; give data.path=FILE."),
+        (["data=ngsim", "data.path=gone.csv"], "gone.csv: no such file"),
+        (["data.path=gone.csv"], "gone.csv: no such file"),
+        (["data=highd", "data.path=one.txt"], "one.txt: expected highD's XX_tracks.csv or a folder of recordings."),
+        (["data=ngsim", "data.path=one.txt"], "recordings of one scene, one-1: one has to be fitted to and another"),
+        (["data=ngsim", "data.path=cut.txt"], "cut.txt, line 200"),
+        (["data=ngsim", "data.path=one.txt", "data.lanes=0"], "data.lanes=0: expected at least 1"),
+        (["data.path=one.txt"], "one.txt"),
+        (["data.path=recordings.csv", "data.held_out=[moon]"], "moon"),
+        (["data.path=recordings.csv", "folds=1"], "folds=1"),
+        (["data.path=recordings.csv", "folds=-1"], "folds"),
+        (["data.path=recordings.csv", "resume=gone"], "resume=gone"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, part, here, recordings, capsys):
+    text = raw_text(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0")))
+    (here / "one.txt").write_text(text)
+    (here / "cut.txt").write_text("\n".join(text.splitlines()[:200])[:-40])
+    assert main([*arguments, *FEW]) == 2
+    err = capsys.readouterr().err
+    assert part in err
+    assert err.count("\n") == 1
+    assert sorted(path.name for path in here.iterdir()) == ["cut.txt", "one.txt", "recordings.csv"]

@@ -1,4 +1,7 @@
+"""Fits of both presets: splits of scenes, losses, early stopping, resuming, stored weights."""
+
 import json
+import math
 from dataclasses import asdict, replace
 
 import pytest
@@ -8,9 +11,19 @@ from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
 from ganlane.files import save_weights
 from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.fit import fit_generator
+from ganlane.generator.fit import assign_folds, fit_generator, split_for_fit
+from ganlane.generator.fit_calibrated import CalibratedTask, energy_score, masked_mean
+from ganlane.generator.fit_paper import (
+    adversarial_loss,
+    discriminator_accuracy,
+    discriminator_loss,
+    distances,
+    variety_loss,
+)
 from ganlane.generator.loop import learning_rate
 from ganlane.generator.networks import Generator
+from ganlane.generator.segments import scene_tracks
+from ganlane.generator.windows import count_windows
 from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
@@ -55,12 +68,8 @@ def test_fitting_the_calibrated_preset_runs_and_reports(frame):
 
 
 def test_the_calibrated_loss_falls(frame):
-    from ganlane.data import scene_lane_widths
-    from ganlane.generator.fit_calibrated import CalibratedTask
-    from ganlane.generator.windows import scene_tracks
-
     fitted, held_out = scene_tracks(frame)
-    task = CalibratedTask([fitted], [held_out], scene_lane_widths(frame), calibrated_config(24))
+    task = CalibratedTask([fitted], [held_out], calibrated_config(24))
     for optimiser in task.optimisers.values():
         optimiser.param_groups[0]["lr"] = 5e-3
     losses = [task.update(0)["mean"] for _ in range(24)]
@@ -152,3 +161,97 @@ def test_the_learning_rate_rises_and_then_falls_to_nothing():
     assert rates[0] < rates[5] < rates[9]
     assert rates[10:] == sorted(rates[10:], reverse=True)
     assert rates[-1] < 1e-5
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Seven scenes of 2.5 to 8.5 s, so that they differ in their windows."""
+    every = []
+    for number in range(7):
+        frame = synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number), seed=number)
+        (scene,) = scene_tracks(frame)
+        every.append(type(scene)(**{**vars(scene), "name": f"scene-{number}"}))
+    return every
+
+
+@pytest.mark.parametrize("folds", [2, 3, 5, 7])
+def test_every_scene_is_reported_once_and_the_folds_are_about_equal(scenes, folds):
+    assigned = assign_folds(scenes, folds)
+    assert sorted(name for fold in assigned for name in fold) == [scene.name for scene in scenes]
+    sizes = {scene.name: count_windows(scene) for scene in scenes}
+    held = [sum(sizes[name] for name in fold) for fold in assigned]
+    assert max(held) - min(held) <= max(sizes.values())
+    assert assign_folds(scenes[::-1], folds) == assigned
+
+
+def test_reported_scenes_have_no_say_in_when_to_stop(scenes):
+    for held_out in assign_folds(scenes, 3):
+        split = split_for_fit(scenes, held_out)
+        names = split.names
+        assert sorted(name for part in names.values() for name in part) == [scene.name for scene in scenes]
+        assert tuple(names["held_out"]) == held_out
+        others = [*split.fitted, *split.validation]
+        held = sum(count_windows(scene) for scene in split.validation)
+        total = sum(count_windows(scene) for scene in others)
+        assert total / 12 <= held < total / 2
+
+
+def test_a_single_other_scene_is_fitted_to_and_chooses_when_to_stop(scenes):
+    split = split_for_fit(scenes[:2], ("scene-1",))
+    assert split.names == {"fitted": ["scene-0"], "validation": ["scene-0"], "held_out": ["scene-1"]}
+
+
+def test_more_folds_than_scenes_are_refused(scenes):
+    with pytest.raises(UserError, match="folds=8"):
+        assign_folds(scenes, 8)
+    with pytest.raises(UserError, match="at least 3 scenes"):
+        assign_folds(scenes[:2], 2)
+
+
+@pytest.mark.parametrize("held_out", [("nowhere",), (), tuple(f"scene-{number}" for number in range(7))])
+def test_a_split_without_two_parts_is_refused(scenes, held_out):
+    with pytest.raises(UserError, match=r"data\.held_out="):
+        split_for_fit(scenes, held_out)
+
+
+def test_distance_is_euclidean_and_accumulates():
+    predicted = torch.tensor([[[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]])
+    torch.testing.assert_close(distances(predicted, torch.zeros(1, 3, 2)), torch.tensor([[5.0, 5.0, 10.0]]))
+
+
+def test_the_gradient_of_a_perfect_prediction_is_finite():
+    predicted = torch.zeros(1, 8, 2, requires_grad=True)
+    distances(predicted, torch.zeros(1, 8, 2)).sum().backward()
+    assert predicted.grad.isfinite().all()
+
+
+def test_only_each_vehicles_best_sample_counts_for_variety():
+    errors = torch.tensor([[1.0, 9.0], [5.0, 3.0]])
+    assert variety_loss(errors).item() == pytest.approx(2.0)
+
+
+def test_masked_vehicles_do_not_count():
+    values = torch.tensor([[1.0, 100.0]])
+    assert masked_mean(values, torch.tensor([[True, False]])).item() == 1.0
+    assert masked_mean(values, torch.zeros(1, 2, dtype=torch.bool)).item() == 0.0
+
+
+def test_an_undecided_discriminator_loses_ln_2():
+    zeros = torch.zeros(1, 2)
+    assert discriminator_loss(zeros, zeros).item() == pytest.approx(math.log(2))
+    assert adversarial_loss(zeros).item() == pytest.approx(math.log(2))
+
+
+def test_accuracy_counts_both_kinds_alike():
+    assert discriminator_accuracy(torch.ones(1, 2), -torch.ones(1, 2)).item() == 1.0
+    assert discriminator_accuracy(torch.ones(1, 2), torch.ones(1, 2)).item() == 0.5
+
+
+def test_the_energy_score_is_least_for_the_right_spread():
+    torch.manual_seed(0)
+    recorded = torch.randn(20000, 2)
+    scores = {
+        spread: energy_score(spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded).mean().item()
+        for spread in (0.01, 0.5, 1.0, 1.5, 2.5)
+    }
+    assert min(scores, key=scores.get) == 1.0

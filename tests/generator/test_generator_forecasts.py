@@ -1,3 +1,5 @@
+"""Forecasts by both presets, IDM and baselines."""
+
 import numpy as np
 import pytest
 import torch
@@ -14,11 +16,10 @@ from ganlane.generator.forecasts import (
     paper_forecasts,
     repeated,
 )
-from ganlane.generator.groups import group_windows
 from ganlane.generator.networks import Generator
-from ganlane.generator.scores import displacement_errors, errors_of, window_errors
-from ganlane.generator.segments import segment_sources
-from ganlane.generator.windows import Windows, cut_windows, scene_tracks
+from ganlane.generator.scores import displacement_errors, errors_of, scene_metrics
+from ganlane.generator.segments import scene_tracks
+from ganlane.generator.windows import Windows, cut_windows, group_windows
 from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, GeneratorSizes
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
@@ -34,20 +35,15 @@ def scenes():
     return every
 
 
-@pytest.fixture(scope="module")
-def sources(scenes):
-    return segment_sources(scenes, {scene.name: 3.5 for scene in scenes})
-
-
 def small_generator(extra_inputs: int) -> Generator:
     torch.manual_seed(1)
     return Generator(GeneratorSizes(**SMALL, extra_inputs=extra_inputs))
 
 
 @pytest.mark.parametrize("horizon", [8, 20])
-def test_driven_windows_are_the_cut_windows_in_the_same_order(scenes, sources, horizon):
+def test_driven_windows_are_the_cut_windows_in_the_same_order(scenes, horizon):
     windows = cut_windows(scenes, STRIDE, 9 + horizon)
-    recorded = driven_windows(lambda stretch: stretch.future[None], sources, horizon, STRIDE)[0]
+    recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, STRIDE)[0]
     np.testing.assert_allclose(recorded, windows.future, atol=1e-4)
 
 
@@ -62,30 +58,33 @@ def test_the_best_of_the_samples_is_the_nearest_on_average():
     assert by_kind(samples[:2], recorded).keys() == {"mean", "single"}
 
 
-def test_forecasts_of_the_papers_preset_score_as_the_groups_do(scenes):
+def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scenes):
     generator, windows = small_generator(0), cut_windows(scenes, STRIDE)
-    forecasts = paper_forecasts(generator, windows, 4)
-    row = displacement_errors(errors_of({**forecasts, "constant_velocity": forecasts["mean"]}, windows.future))
-    groups = window_errors(generator, group_windows(windows, 4))["all"]
-    assert row["ade_m"]["mean"] == pytest.approx(groups["ade_m/mean"], rel=1e-3)
-    assert row["fde_m"]["mean"] == pytest.approx(groups["fde_m/mean"], rel=1e-3)
+    forecasts = paper_forecasts(generator, windows, group_windows(windows, 4))
+    forecasts["constant_velocity"] = repeated(windows.past[:, -1], 8)
+    row, metrics = displacement_errors(errors_of(forecasts, windows.future)), scene_metrics(windows, forecasts)
+    for kind in forecasts:
+        assert metrics["all"][f"ade_m/{kind}"] == row["ade_m"][kind]
+        assert metrics["all"][f"fde_m/{kind}"] == row["fde_m"][kind]
+    assert metrics.keys() == {"all", "synthetic-0", "synthetic-1"}
+    assert sum(metrics[scene.name]["windows"] for scene in scenes) == metrics["all"]["windows"] == len(windows)
     assert row["ade_m"]["best_of_20"] < row["ade_m"]["mean"] < 1.5 * row["ade_m"]["single"]
 
 
-def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes, sources):
+def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
     generator = small_generator(EXTRA_INPUTS)
     with torch.no_grad():
         generator.head.weight.zero_()
         generator.head.bias.zero_()
-    forecasts = calibrated_forecasts(generator, sources, 8, STRIDE, CalibratedConfig(), samples=3)
+    forecasts = calibrated_forecasts(generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3)
     np.testing.assert_allclose(forecasts["single"], forecasts["mean"], atol=1e-5)
     # without a residual the anchor alone drives: along the road that is IDM with the driver's own headway
-    idm = idm_forecasts(sources, 8, STRIDE)["idm_own_headway"]
+    idm = idm_forecasts(scenes, 8, STRIDE)["idm_own_headway"]
     np.testing.assert_allclose(forecasts["mean"][..., 0], idm[..., 0], atol=1e-3)
 
 
-def test_idm_keeps_the_lateral_position(sources):
-    for course in idm_forecasts(sources, 8, STRIDE).values():
+def test_idm_keeps_the_lateral_position(scenes):
+    for course in idm_forecasts(scenes, 8, STRIDE).values():
         np.testing.assert_allclose(course[..., 1], 0.0, atol=1e-5)
 
 

@@ -4,14 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from ganlane.data import default_scenes, read_scenes, scene_lane_widths
+from ganlane.data import default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import load_generator, shipped_generator
-from ganlane.generator.groups import group_windows
-from ganlane.generator.scores import rollout_errors, window_errors
-from ganlane.generator.segments import segment_sources
-from ganlane.generator.splits import split_scenes
-from ganlane.generator.windows import cut_windows, scene_tracks
+from ganlane.generator.fit import split_for_fit
+from ganlane.generator.fit_calibrated import rollout_errors
+from ganlane.generator.forecasts import paper_forecasts, repeated
+from ganlane.generator.scores import BASELINE, scene_metrics
+from ganlane.generator.segments import scene_tracks
+from ganlane.generator.windows import cut_windows, group_windows
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 
 CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}
@@ -94,9 +95,11 @@ def test_fitting_the_shipped_weights_took_less_than_half_an_hour(preset):
 def test_the_stated_errors_of_the_paper_preset_are_those_of_the_shipped_weights(recordings):
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
     config = PaperConfig()
-    _, held_out = split_scenes(scene_tracks(recordings), tuple(metadata["data"]["held_out"]))
-    groups = group_windows(cut_windows(held_out, config.held_out_stride), config.group_size, config.seed)
-    measured = window_errors(generator, groups, config.seed)["all"]
+    held_out = split_for_fit(scene_tracks(recordings), tuple(metadata["data"]["held_out"])).held_out
+    windows = cut_windows(held_out, config.held_out_stride)
+    forecasts = paper_forecasts(generator, windows, group_windows(windows, config.group_size, config.seed), samples=0)
+    forecasts[BASELINE] = repeated(windows.past[:, -1], 8)
+    measured = scene_metrics(windows, forecasts)["all"]
     stated = metadata["metrics"]["all"]
     for name in ("ade_m/mean", "fde_m/mean", "ade_m/constant_velocity", "windows"):
         assert measured[name] == pytest.approx(stated[name], rel=0.01), name
@@ -104,11 +107,8 @@ def test_the_stated_errors_of_the_paper_preset_are_those_of_the_shipped_weights(
 
 def test_the_stated_errors_of_the_calibrated_preset_are_those_of_the_shipped_weights(recordings):
     generator, metadata = load_generator(shipped_generator("calibrated"), "calibrated")
-    config, widths = CalibratedConfig(), scene_lane_widths(recordings)
-    _, held_out = split_scenes(scene_tracks(recordings), tuple(metadata["data"]["held_out"]))
-    sources = segment_sources(held_out, widths)
-    measured = rollout_errors(
-        generator, sources, config.held_out_horizon, config.held_out_stride, config.noise_period_s
-    )["all"]
+    config = CalibratedConfig()
+    held_out = split_for_fit(scene_tracks(recordings), tuple(metadata["data"]["held_out"])).held_out
+    measured = rollout_errors(generator, held_out, config)["all"]
     for name in ("ade_m/mean", "end_m/mean", "end_m/constant_velocity", "windows"):
         assert measured[name] == pytest.approx(metadata["metrics"]["all"][name], rel=0.01), name

@@ -3,13 +3,13 @@
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.realism.card import card_checks, quantity_rows
 from ganlane.realism.distances import ceiling
-from ganlane.realism.fit_speeds import drive, measure_recordings
 from ganlane.realism.long_runs import LongRunParameters, long_run
-from ganlane.realism.quantities import QUANTITIES
+from ganlane.realism.quantities import QUANTITIES, measure_recordings
 from ganlane.realism.recordings import recordings_of
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.realism.replay_starts import StartOptions
-from ganlane.sim.road import Road
+from ganlane.realism.starts import simulate
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"]
@@ -18,13 +18,10 @@ WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors():
     frame = synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2))
     recordings = recordings_of(frame, scene_lane_widths(frame))
-    units = [each.name for each in recordings]
-    measured = measure_recordings(recordings)
-    recorded = {name: measured.counts(units, name) for name in QUANTITIES}
+    recorded = measure_recordings(recordings).counts
     makers = {"cruise": ConstantVelocity, "random": RandomDriving, "constant_velocity": ConstantVelocity}
-    driven = {name: drive(make, recordings, StartOptions()) for name, make in makers.items()}
-    own = driven.pop("cruise")
-    rows = quantity_rows(own, {**driven, "rival": driven["random"]}, recorded, {}, resamples=100)
+    driven = {name: simulate(make, recordings, StartOptions()) for name, make in makers.items()}
+    rows = quantity_rows("cruise", {**driven, "rival": driven["random"]}, recorded, {}, resamples=100)
     assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
     assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
     assert rows["speed"]["against"].keys() == {"rival"}
@@ -35,9 +32,9 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors():
 def test_floors_that_were_not_driven_are_those_that_were_measured_before():
     frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=6.0))
     recordings = recordings_of(frame, scene_lane_widths(frame))
-    own, measured = drive(ConstantVelocity, recordings, StartOptions()), measure_recordings(recordings)
-    recorded = {"speed": measured.counts([each.name for each in recordings], "speed")}
-    rows = quantity_rows(own, {}, recorded, {"random": {"speed": 0.5}}, resamples=100)
+    own = simulate(ConstantVelocity, recordings, StartOptions())
+    recorded = {"speed": measure_recordings(recordings).counts["speed"]}
+    rows = quantity_rows("cruise", {"cruise": own}, recorded, {"random": {"speed": 0.5}}, resamples=100)
     assert rows.keys() == {"speed"}
     assert rows["speed"]["floor"] == 0.5
     assert rows["speed"]["constant_velocity"] is None
@@ -50,17 +47,14 @@ def test_checks_hold_runs_against_the_recordings():
         for name in ("speed_spread", "acceleration", "time_headway", "time_to_collision", "lane_change_duration")
     }
     quantiles = [{"acceleration": {"0.05": low, "0.95": 1.0}} for low in (-1.0, -1.2)]
-    rate = {"per_vehicle_km_ci": [0.7, 1.2]}
-    checks = card_checks(quantities, *quantiles, rate, 2.8, [run])
+    checks = card_checks(quantities, *quantiles, [0.7, 1.2], 2.8, [run])
     assert checks["acceleration_quantiles_within_30_percent"] is True
     assert checks["compared_with"]["rival"]["acceleration"] == "closer"
-    (told,) = checks["long_runs"]
-    assert told["nobody_off_the_road"] is told["overlaps_under_1_per_1000_vehicle_km"] is True
-    assert told["lane_changes_inside_recorded_interval"] is False
-    assert told["guard_under_5_percent"] is None
-    assert (
-        card_checks(quantities, quantiles[0], {"acceleration": {"0.05": -2.0, "0.95": 1.0}}, rate, 2.8, [])[
-            "acceleration_quantiles_within_30_percent"
-        ]
-        is False
-    )
+    (of_run,) = checks["long_runs"]
+    assert of_run["nobody_off_the_road"] is of_run["overlaps_under_1_per_1000_vehicle_km"] is True
+    assert of_run["lane_changes_inside_recorded_interval"] is False
+    assert of_run["guard_under_5_percent"] is None
+    far = {"acceleration": {"0.05": -2.0, "0.95": 1.0}}
+    checks = card_checks(quantities, quantiles[0], far, None, 2.8, [run])
+    assert checks["acceleration_quantiles_within_30_percent"] is False
+    assert checks["long_runs"][0]["lane_changes_inside_recorded_interval"] is None

@@ -46,25 +46,37 @@ def run(capsys, *arguments):
     return status, None if path is None else {**json.loads(path.read_text()), "folder": path.parent}, out, err
 
 
-def test_card_holds_every_quantity_with_its_scale_and_the_rival(recordings, capsys):
-    status, results, out, _ = run(
-        capsys, "traffic=idm", f"data.path={recordings}", "data.held_out=[synthetic-1,synthetic-2]"
-    )
+def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordings, capsys, tmp_path):
+    document, figures = tmp_path / "page.md", tmp_path / "figures"
+    figures.mkdir()
+    document.write_text("before\n<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\nafter\n")
+    asked = ["scenes=all", f"report={document}", f"figures={figures}", "long_against=true"]
+    held_out = "data.held_out=[synthetic-1]"
+    status, results, out, _ = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *asked)
     assert status == 0
     assert results["traffic"] == "idm"
-    assert results["scenes"] == ["synthetic-1", "synthetic-2"]
     assert results["quantities"].keys() == QUANTITIES.keys()
     row = results["quantities"]["speed"]
     assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
     assert row["ceiling"] is not None
     assert row["floor"] is not None
     assert row["against"]["idm_mobil"]["verdict"] in ("closer", "farther", "undecided")
+    assert results["quantities_held_out"]["speed"]["samples"] < row["samples"]
     for key in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km_ci", "off_road", "checks", "machine"):
         assert results[key] is not None
     assert results["long_runs"][0]["vehicle_km"] >= 0.5
+    assert results["long_runs_against"].keys() == {"idm_mobil"}
     assert "changes per vehicle-km" in out
+    text = document.read_text()
+    assert text.startswith("before\n<!-- begin realism idm all -->\n")
+    assert text.endswith("<!-- end realism idm all -->\nafter\n")
+    assert "former" not in text
+    for part in ("python -m ganlane.realism quick=true", "held-out scenes alone", "idm_mobil, long runs"):
+        assert part in text
+    assert text.count("```text") == 6
     for name in ("distributions.png", "distances.png", "drift.png"):
         assert Image.open(results["folder"] / name).width > 400
+        assert (figures / f"realism_{name}").read_bytes() == (results["folder"] / name).read_bytes()
 
 
 def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recordings, capsys):
@@ -73,30 +85,9 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
     _, results, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *arguments)
     assert "idm: fitting desired speeds on 3 scenes" in err
     assert results["desired_above_mps"].keys() == {"idm"}
+    assert results["scenes"] == ["synthetic-1"]
     assert results["long_runs"] == []
     assert results["overlaps_per_1000_vehicle_km"] is None
-
-
-def test_tables_and_figures_go_where_a_document_wants_them(recordings, capsys, tmp_path):
-    document, figures = tmp_path / "page.md", tmp_path / "figures"
-    figures.mkdir()
-    document.write_text("before\n<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\nafter\n")
-    held_out = "data.held_out=[synthetic-1]"
-    asked = ["scenes=all", f"report={document}", f"figures={figures}", "long_against=true", held_out]
-    status, results, _, _ = run(capsys, "traffic=idm", f"data.path={recordings}", *asked)
-    assert status == 0
-    text = document.read_text()
-    assert text.startswith("before\n<!-- begin realism idm all -->\n")
-    assert text.endswith("<!-- end realism idm all -->\nafter\n")
-    assert "former" not in text
-    assert "python -m ganlane.realism quick=true" in text
-    assert "held-out scenes alone" in text
-    assert "idm_mobil, long runs" in text
-    assert text.count("```text") == 6
-    assert results["quantities_held_out"]["speed"]["samples"] < results["quantities"]["speed"]["samples"]
-    assert results["long_runs_against"].keys() == {"idm_mobil"}
-    names = {"realism_distributions.png", "realism_distances.png", "realism_drift.png"}
-    assert {path.name for path in figures.iterdir()} == names
 
 
 def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):

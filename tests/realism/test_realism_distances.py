@@ -23,13 +23,6 @@ def test_distance_is_that_of_scipy(rows):
     assert jensen_shannon(rows[0], rows[1]) == pytest.approx(0.0 if math.isnan(expected) else expected, abs=1e-7)
 
 
-@given(COUNTS)
-def test_distance_is_symmetric_and_between_0_and_1(rows):
-    there, back = jensen_shannon(rows[0], rows[1]), jensen_shannon(rows[1], rows[0])
-    assert there == pytest.approx(float(back), abs=1e-12)
-    assert 0.0 <= there <= 1.0
-
-
 def test_equal_shapes_are_at_0_and_disjoint_ones_at_1():
     assert jensen_shannon(np.array([1.0, 3.0]), np.array([10.0, 30.0])) == pytest.approx(0.0, abs=1e-7)
     assert jensen_shannon(np.array([5.0, 0.0]), np.array([0.0, 2.0])) == pytest.approx(1.0)
@@ -68,11 +61,6 @@ def test_one_scene_gives_no_interval_and_no_verdict():
     one = distance(scenes(0.1, 0, 1), scenes(0.0, 1, 1))
     assert one.interval is None
     assert verdict(Estimate(-0.5, None, None)) == "undecided"
-
-
-def test_interval_holds_the_distance_of_scenes_that_differ():
-    estimate = distance(scenes(0.15, 6), scenes(0.0, 7), resamples=400)
-    assert estimate.low < estimate.value < estimate.high
 
 
 def draws(shift, number, trials=40):

@@ -9,15 +9,16 @@ import torch
 from tensordict import TensorDict
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
+from ganlane.generator.rollout import balanced_headway
 from ganlane.realism.distances import pooled_distance
-from ganlane.realism.fit_speeds import drive, measure_recordings
+from ganlane.realism.quantities import measure_recordings
 from ganlane.realism.recordings import Recording, recorded_frame, recordings_of
 from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
-from ganlane.realism.replay_starts import StartOptions, balanced_headways, drive_recordings, with_recorded_headways
-from ganlane.sim.following import following_acceleration
+from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways
+from ganlane.realism.starts import simulate
+from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmMobilTraffic, TrafficModule
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 
@@ -50,11 +51,11 @@ def test_constant_velocity_repeats_a_recording_of_constant_velocity():
 def test_its_distance_is_then_0_in_every_quantity():
     recordings = [steady()]
     recorded = measure_recordings(recordings)
-    driven = drive(ConstantVelocity, recordings, StartOptions())
+    driven = simulate(ConstantVelocity, recordings, StartOptions())
     for name in ("speed", "gap", "time_headway"):
         # Speeds of 10 m/s lie on an edge of the bins, which rounding may cross; compare at the middle.
-        assert driven.measured.quantile(name, 0.5) == pytest.approx(recorded.quantile(name, 0.5), abs=1e-2)
-    assert pooled_distance(driven.counts["gap"], recorded.counts(["steady"], "gap")) < 0.15
+        assert driven.quantile(name, 0.5) == pytest.approx(recorded.quantile(name, 0.5), abs=1e-2)
+    assert pooled_distance(driven.counts["gap"], recorded.counts["gap"]) < 0.15
 
 
 def test_a_vehicle_enters_when_it_was_recorded_first_and_leaves_when_last():
@@ -128,7 +129,7 @@ def test_every_traffic_stays_finite_from_recorded_starts(make):
 
 
 def test_the_floor_drives_neither_backwards_nor_smoothly():
-    there = drive(RandomDriving, [steady()], StartOptions(repeats=20)).measured
+    there = simulate(RandomDriving, [steady()], StartOptions(repeats=20))
     assert there.quantile("acceleration", 0.95) > 1.0
     assert there.quantile("speed", 0.0) >= 0.0
 
@@ -150,7 +151,7 @@ def queue(x, speed=10.0, desired=20.0):
 
 
 def headways(vehicles):
-    return balanced_headways(vehicles, ROAD, torch.full_like(vehicles.x, DRAWN))[0, 1:].tolist()
+    return balanced_headway(vehicles, ROAD, torch.full_like(vehicles.x, DRAWN))[0, 1:].tolist()
 
 
 def test_a_follower_at_20_m_and_10_m_per_s_shows_a_headway_of_1_74_s():
@@ -162,7 +163,7 @@ def test_a_follower_at_20_m_and_10_m_per_s_shows_a_headway_of_1_74_s():
 
 def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
     vehicles = queue([0.0, 12.0, 40.0, 60.0])
-    shown = balanced_headways(vehicles, ROAD, torch.ones_like(vehicles.x))
+    shown = balanced_headway(vehicles, ROAD, torch.ones_like(vehicles.x))
     acceleration = following_acceleration(perceive(vehicles, ROAD), headway_s=shown)
     assert acceleration[0, 1:4].abs().max() < 1e-4
 

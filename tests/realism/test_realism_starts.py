@@ -1,4 +1,4 @@
-"""Everybody from the same recorded scenes, and from some of them alone."""
+"""Everybody from the same recorded scenes, from some of them alone, and with fitted desired speeds."""
 
 import numpy as np
 import pytest
@@ -8,10 +8,11 @@ from ganlane.errors import UserError
 from ganlane.realism.card import card_rows
 from ganlane.realism.distances import ceiling
 from ganlane.realism.long_runs import LongRunParameters
+from ganlane.realism.recordings import Recording
 from ganlane.realism.references import ConstantVelocity
 from ganlane.realism.replay_starts import StartOptions
-from ganlane.realism.starts import Fold, recorded_starts, spawned_frame
-from ganlane.sim.road import Road
+from ganlane.realism.starts import Fold, fit_excess, recorded_starts, spawned_frame
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 NAMES = [f"synthetic-{number}" for number in range(4)]
@@ -24,12 +25,11 @@ def frame():
 
 
 def starts_of(frame, *folds, fit=False):
-    said = []
-    return recorded_starts(folds, frame, StartOptions(), fit, "made up", said.append), said
+    return recorded_starts(folds, frame, StartOptions(), fit, "made up")
 
 
 def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
-    starts, _ = starts_of(frame, Fold(MAKERS, NAMES, NAMES[1:3]))
+    starts = starts_of(frame, Fold(MAKERS, NAMES, NAMES[1:3]))
     assert starts.separately_held_out == NAMES[1:3]
     alone = card_rows(starts.restricted_to(starts.separately_held_out), "cruise", 100)
     for name in ("speed", "gap"):
@@ -38,17 +38,17 @@ def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
         assert alone[name]["recorded_samples"] == starts.recorded[name][1:3].sum()
 
 
-def test_folds_are_driven_one_by_one_and_told_together(frame):
+def test_folds_are_driven_one_by_one_and_joined(frame):
     folds = Fold(MAKERS, NAMES[:2], NAMES[:2]), Fold(MAKERS, NAMES[2:], NAMES[2:])
-    apart, _ = starts_of(frame, *folds)
-    whole, _ = starts_of(frame, Fold(MAKERS, NAMES, []))
+    apart = starts_of(frame, *folds)
+    whole = starts_of(frame, Fold(MAKERS, NAMES, []))
     assert apart.scenes == whole.scenes == NAMES
     assert apart.separately_held_out == []
     assert np.array_equal(apart.driven["cruise"].counts["speed"], whole.driven["cruise"].counts["speed"])
 
 
 def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(frame):
-    starts, _ = starts_of(frame, Fold(MAKERS, [], []), Fold(MAKERS, NAMES[:2], []))
+    starts = starts_of(frame, Fold(MAKERS, [], []), Fold(MAKERS, NAMES[:2], []))
     assert starts.scenes == NAMES[:2]
     with pytest.raises(UserError, match="no scene to start from"):
         starts_of(frame, Fold(MAKERS, [], []))
@@ -60,3 +60,23 @@ def test_spawned_trajectories_are_whole_tracks_in_the_schema():
     frame = spawned_frame(IdmTraffic, Road(), LongRunParameters(5, most_s=10.0), 2)
     assert frame.height == 2 * 5 * 101
     assert frame["unit"].unique().sort().to_list() == ["spawned-0", "spawned-1"]
+
+
+def test_the_excess_that_was_used_is_the_one_that_is_fitted():
+    def eager(road):
+        return Eager(road)
+
+    class Eager(ConstantVelocity):
+        """Drives at its desired speed at once."""
+
+        def move(self, vehicles, memory, key, step):
+            return super().move(vehicles.with_(speed=vehicles.desired_speed), memory, key, step)
+
+    time = np.arange(80)[:, None] * 0.1
+    random = np.random.default_rng(0)
+    speed = 10.0 + 8.0 * random.uniform(size=30)
+    x = 100.0 * np.arange(30) + speed * time
+    shown = np.broadcast_to(np.where(np.arange(80)[:, None] == 0, 10.0, speed), x.shape).copy()
+    size = np.ones(30)
+    scene = Recording("a", "a", 1, 3.5, x, 0 * x, shown, x >= 0, 4 * size, 2 * size, size > 0)
+    assert fit_excess(eager, [scene], StartOptions(repeats=1), (1.0, 4.0, 8.0)) == 4.0

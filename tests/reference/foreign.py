@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from ganlane import keys
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Vehicles
 
 
 def start(env, episodes, seed=0):

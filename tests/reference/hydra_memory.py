@@ -22,7 +22,7 @@ from omegaconf import open_dict
 
 from ganlane.config.command_line import VERSION_BASE
 from ganlane.config.schemas import register
-from ganlane.paths import conf_folder
+from ganlane.files import conf_folder
 
 CONFIGS: dict[tuple[str, tuple[str, ...]], Any] = {}
 LOAD = ConfigLoaderImpl.load_configuration

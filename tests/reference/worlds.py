@@ -15,8 +15,7 @@ from ganlane.parameters.driving import EgoParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 

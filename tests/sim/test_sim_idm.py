@@ -6,11 +6,9 @@ import pytest
 import torch
 from reference.worlds import DOUBLE, vehicles
 
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import desired_gap, equilibrium_gap, idm_acceleration
+from ganlane.sim.idm import desired_gap, equilibrium_gap, following_acceleration, idm_acceleration
 from ganlane.sim.neighbours import FREE_GAP_M, perceive
-from ganlane.sim.road import Road
-from ganlane.traffic.idm_mobil import IdmTraffic
+from ganlane.sim.state import Road
 
 # 2 sqrt(a b) = 2 sqrt(0.7 * 1.7) = 2.181742423; (20 / 25)^4 = 0.4096
 BY_HAND = [
@@ -45,19 +43,6 @@ def test_nobody_accelerates_at_the_equilibrium_gap():
     assert idm_acceleration(speed, 25.0, gap, speed).abs().max() < 1e-12
     # (2 + 15 * 1.6) / sqrt(1 - 0.6^4) = 26 / sqrt(0.8704)
     assert equilibrium_gap(torch.tensor(15.0, dtype=DOUBLE), 25.0).item() == pytest.approx(27.868520)
-
-
-def test_a_platoon_settles_at_the_equilibrium_gap():
-    """Four drivers who would like 25 m/s behind one who drives 15 m/s."""
-    road = Road(lanes=1)
-    cars = [{"x": -40.0 * k, "speed": 18.0, "desired_speed": 15.0 if k == 0 else 25.0} for k in range(5)]
-    scene, traffic = vehicles(*cars), IdmTraffic(road)
-    memory = traffic.fresh_memory(scene, torch.zeros(1, dtype=torch.int64))
-    for step in range(2500):
-        scene, memory = traffic.move(scene, memory, torch.zeros(1).long(), torch.tensor([step]))
-    gaps = scene.x[0, :-1] - scene.x[0, 1:] - 4.5
-    assert (scene.speed - 15.0).abs().max() < 1e-3
-    assert (gaps - equilibrium_gap(scene.speed[0, 1:], 25.0)).abs().max() < 0.01
 
 
 def test_in_the_middle_of_a_change_the_more_demanding_leader_counts():

@@ -9,9 +9,9 @@ import torch
 from reference.worlds import DOUBLE, vehicles
 
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.lanes import body_lanes, presence, settled, with_target
+from ganlane.sim.lanes import body_lanes, lane_change_done, presence, with_target
 from ganlane.sim.neighbours import FREE_GAP_M, follower, leader, perceive
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 
 ROAD = Road(lanes=3)
 
@@ -66,7 +66,7 @@ def test_an_invalid_car_is_nowhere():
 
 def test_a_change_is_complete_within_0_3_m_of_the_centre():
     scene = vehicles(*({"x": 0.0, "y": y, "target_lane": 1} for y in (3.69, 3.71, 4.29, 4.31)))
-    assert settled(scene, ROAD).tolist() == [[False, True, True, False]]
+    assert lane_change_done(scene, ROAD).tolist() == [[False, True, True, False]]
 
 
 # Leaders and followers

@@ -12,15 +12,14 @@ from ganlane.sim.mobil import (
     TABLE_IV,
     Change,
     MobilParameters,
+    lane_accelerations,
     mobil_changes,
+    mobil_criterion,
     mobil_wishes,
-    prospect,
     safe_change,
-    weigh,
 )
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 # The subject drives 20 m/s and would like 25; 50 m ahead (bumper to bumper) somebody drives 15 m/s.
 SUBJECT = {"x": 0.0, "lane": 0, "speed": 20.0, "desired_speed": 25.0}
@@ -38,9 +37,11 @@ def wish(*cars, lanes: int = 2, mobil: MobilParameters = TABLE_IV) -> int:
 def change_to_the_left(scene) -> Change:
     """Of the first car, from lane 0 to lane 1."""
     lanes = torch.tensor([0.0, 1.0]).expand(*scene.vehicles.x.shape, 2)
-    both = prospect(scene, lanes, TABLE_V)
+    both = lane_accelerations(scene, lanes, TABLE_V)
     assert both.own[0, 0, 0].item() == pytest.approx(OWN, abs=1e-5)
-    return Change(*(number[..., 0] for number in weigh(both.of(slice(1, 2)), both.of(slice(0, 1)), TABLE_IV)))
+    return Change(
+        *(number[..., 0] for number in mobil_criterion(both.of(slice(1, 2)), both.of(slice(0, 1)), TABLE_IV))
+    )
 
 
 def fast_follower(gap: float) -> dict:

@@ -22,8 +22,7 @@ from ganlane.sim import mobil as mobil_module
 from ganlane.sim.idm import TABLE_V, idm_acceleration
 from ganlane.sim.mobil import TABLE_IV, mobil_changes, mobil_wishes, without_ego
 from ganlane.sim.neighbours import FREE_GAP_M, perceive
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 B_SAFE = TABLE_IV.safe_deceleration

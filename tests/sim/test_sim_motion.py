@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.worlds import DOUBLE
 
-from ganlane.sim.bicycle import WHEELBASE_M, advance, slip_angle
-from ganlane.sim.steering import steer
+from ganlane.sim.dynamics import WHEELBASE_M, advance, slip_angle, steer
 
 
 def number(value: float) -> torch.Tensor:

@@ -11,12 +11,11 @@ import torch
 from reference.worlds import DOUBLE
 
 from ganlane.parameters.driving import Visibility
-from ganlane.sim import following, lanes
+from ganlane.sim import idm, lanes
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import idm_acceleration
 from ganlane.sim.lanes import ARRIVED_M, LaneRange, body_lanes, spanned, with_target
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 CHANGES, SLOWER = 0, 1
@@ -98,7 +97,7 @@ def test_who_changes_two_lanes_in_a_row_does_not_touch_the_slower_car_in_between
 )
 def test_with_the_lowest_and_the_highest_lane_alone_it_would(lane_width_m, before, monkeypatch):
     """The figures of docs/simulator.md: so the test above can fail."""
-    monkeypatch.setattr(following, "spanned", lowest_and_highest)
+    monkeypatch.setattr(idm, "spanned", lowest_and_highest)
     scenes, overlaps, _ = drive(lane_width_m)
     assert scenes == 15_937
     assert overlaps == pytest.approx(before, abs=3)
@@ -107,4 +106,4 @@ def test_with_the_lowest_and_the_highest_lane_alone_it_would(lane_width_m, befor
 def test_the_lanes_of_a_range_are_its_ends_and_the_one_after_the_lowest():
     low, high = torch.tensor([1.0, 1.0, 1.0]), torch.tensor([1.0, 2.0, 3.0])
     assert spanned(LaneRange(low, high)).tolist() == [[1, 1, 1], [1, 2, 2], [1, 2, 3]]
-    assert lanes.spanned is following.spanned
+    assert lanes.spanned is idm.spanned

@@ -14,8 +14,7 @@ from reference.worlds import DOUBLE
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import desired_gap, equilibrium_gap
 from ganlane.sim.neighbours import FREE_GAP_M
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 DESIRED, FOLLOWERS, LENGTH_M = 25.0, 9, 4.5

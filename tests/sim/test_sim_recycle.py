@@ -14,12 +14,10 @@ from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.recycle import RANGE_M, SAFE_DECELERATION, recycle
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 
 ROAD = Road(lanes=3)
 EGO = {"x": 1000.0, "lane": 1}

@@ -16,8 +16,7 @@ from reference.worlds import DOUBLE
 
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import idm_acceleration
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 CARS = 50

@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.braking import can_brake, highest_speed, least_gap, needed_deceleration
-from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
+from ganlane.sim.feasibility import can_brake, highest_speed, least_gap, needed_deceleration
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Stream, episode_key
-from ganlane.sim.road import Road
 from ganlane.sim.scene_files import read_scene
-from ganlane.sim.scenes import RandomScenes
-from ganlane.sim.spawn import check_start
+from ganlane.sim.scenes import FixedScene, SceneVehicle
+from ganlane.sim.spawn import RandomScenes, check_start
+from ganlane.sim.state import Road
 
 DOUBLE = torch.float64
 ROAD = Road(2)

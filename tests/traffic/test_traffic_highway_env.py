@@ -14,8 +14,7 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import HighwayEnvTraffic
 
 KEEP = torch.zeros(1, dtype=torch.int64)

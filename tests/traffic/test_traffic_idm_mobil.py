@@ -8,8 +8,7 @@ from reference.worlds import DOUBLE, environment, same_bits, step, vehicles
 
 from ganlane import keys
 from ganlane.parameters.driving import MobilParameters
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 
@@ -102,7 +101,7 @@ def test_the_state_at_t_is_never_written(kind):
 
 def test_the_memory_is_as_its_spec_says():
     traffic, scene = IdmMobilTraffic(ROAD), vehicles(*CARS)
-    memory = traffic.init_memory(scene, torch.ones_like(scene.valid), torch.zeros(1).long())
+    memory = traffic.init_memory(scene, torch.zeros(1).long())
     spec = traffic.memory_spec(1, 3, DOUBLE)
     assert {name: (tuple(value.shape), value.dtype) for name, value in memory.items()} == spec
     assert spec == {"steering": ((1, 3), DOUBLE)}

@@ -8,7 +8,6 @@ from tensordict import TensorDict
 
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim import Road, Vehicles, pair_overlaps
-from ganlane.sim.hazard import distance_hazard, literal_hazard, random_side
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.traffic import (
     AccelerationOverlay,
@@ -21,6 +20,7 @@ from ganlane.traffic import (
     TrafficModule,
     TrafficSequential,
 )
+from ganlane.traffic.lane_change import distance_hazard, literal_hazard, random_side
 
 
 class Drift(TrafficModule):
@@ -135,7 +135,7 @@ def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_da
     vehicles["speed"][:] = 20.0
     view = TensorDict({"vehicles": vehicles, "moved": vehicles.clone()}, [200])
     view["seed"], view["episode"] = torch.zeros(200, dtype=torch.int64), torch.arange(200)
-    view["traffic"] = overlay.init_memory(Vehicles.of(vehicles), vehicles["valid"], view["episode"])
+    view["traffic"] = overlay.init_memory(Vehicles.of(vehicles), view["episode"])
     record = []
     for step in range(300):
         view["step"], view["moved"] = torch.full((200,), step), vehicles.clone()

@@ -14,8 +14,7 @@ from ganlane.generator import shipped_generator
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.traffic import Guard
-from ganlane.traffic.fitted import sudden_accelerations
-from ganlane.traffic.presets import SIMULATED_ANCHOR, gan_calibrated_traffic, gan_traffic
+from ganlane.traffic.presets import SIMULATED_ANCHOR, gan_calibrated_traffic, gan_traffic, sudden_accelerations
 
 
 def drive(traffic, n, decisions, visit, first_episode=0):

@@ -14,14 +14,14 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps
 from ganlane.traffic import IdmMobilTraffic, IdmRandomTraffic, RandomDrivers
-from ganlane.traffic.idm_random import Traits, start_braking
+from ganlane.traffic.idm_random import DriverParams, start_braking
 
 #: Everybody drives by Tables IV and V.
 ALIKE = RandomDrivers((1.6, 1.6), (0.7, 0.7), (1.7, 1.7), (20.0, 20.0), (1, 1), (1, 1), (0, 0), (0, 0), (10, 10))
 
 
-def traits_of(td) -> Traits:
-    return Traits(*td[keys.TRAFFIC, "traits"].unbind(-1))
+def params_of(td) -> DriverParams:
+    return DriverParams(*td[keys.TRAFFIC, "traits"].unbind(-1))
 
 
 def test_the_defaults_of_the_command_line_are_those_of_the_traffic():
@@ -29,7 +29,7 @@ def test_the_defaults_of_the_command_line_are_those_of_the_traffic():
 
 
 def test_drivers_differ_and_lie_within_the_ranges():
-    own, d = traits_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset()), RandomDrivers()
+    own, d = params_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset()), RandomDrivers()
     for value, (low, high) in (
         (own.headway, d.headway_s),
         (own.max_acceleration, d.max_acceleration),
@@ -89,7 +89,7 @@ def test_drivers_who_are_all_alike_drive_as_idm_mobil():
 def test_nobody_brakes_harder_than_it_can():
     env = environment(num_envs=64, traffic=IdmRandomTraffic())
     td, hardest = env.reset(), []
-    limit = traits_of(td).strongest_braking
+    limit = params_of(td).strongest_braking
 
     def record(now: Vehicles, running: torch.Tensor) -> None:
         assert (now.acceleration >= -limit - 1e-9)[:, 1:].all()

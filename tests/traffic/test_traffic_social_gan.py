@@ -8,10 +8,9 @@ from ganlane.errors import UserError
 from ganlane.generator.networks import Generator
 from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
-from ganlane.sim.road import Road
 from ganlane.sim.spawn import spawn
-from ganlane.traffic.calibrated_gan import AnchoredGanTraffic
-from ganlane.traffic.social_gan import SocialGanTraffic
+from ganlane.sim.state import Road
+from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 ROAD = Road(3, 4.0)
@@ -39,7 +38,7 @@ def begin(module, rows=4, vehicles=9, seed=5):
     key = episode_key(module.stream, seed, episode)
     state = spawn(key, vehicles, 3, 4.0)
     counters = {"seed": seed, "episode": episode, "step": torch.zeros_like(seed)}
-    memory = module.init_memory(state, state.valid, key)
+    memory = module.init_memory(state, key)
     return TensorDict({"vehicles": TensorDict(state.as_dict(), [rows]), "traffic": memory, **counters}, [rows])
 
 
@@ -99,9 +98,9 @@ def test_a_vehicle_that_enters_alone_changes_nobody_elses_memory(make):
     who = torch.zeros(4, 9, dtype=torch.bool)
     who[1, 4] = True
     key = episode_key(module.stream, td["seed"], td["episode"])
-    from ganlane.sim.vehicles import Vehicles
+    from ganlane.sim.state import Vehicles
 
-    fresh = module.init_memory(Vehicles.of(td["vehicles"]), who, key)
+    fresh = module.init_memory(Vehicles.of(td["vehicles"]), key)
     for name, leaf in fresh.items():
         assert leaf.shape[:2] == (4, 9), name
     speed = td["vehicles", "speed"][1, 4]

@@ -17,8 +17,7 @@ from ganlane.evaluation import run_episodes
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import body_lanes
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmTraffic, SumoTraffic
 
 LEFT, RIGHT = 1, 2

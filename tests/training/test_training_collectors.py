@@ -24,15 +24,20 @@ from ganlane.config.traffic import IdmTrafficConfig
 from ganlane.config.train import MultiCollectorConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.parameters.observation import ObservationConfig
-from ganlane.phases import identity, make_source, phases_of
 from ganlane.training import TrainingConfig, train
-from ganlane.training.collectors import MultiSource, RaySource, SingleSource, Team, source_of
-from ganlane.training.collectors.ray_cluster import knock
-from ganlane.training.collectors.remote import EPISODES_PER_WORKER, noise_seed
-from ganlane.training.collectors.signals import shielded_children
-from ganlane.training.collectors.workers import WorkerSource
+from ganlane.training.checkpoint import TrainingState
 from ganlane.training.loop import collect
-from ganlane.training.run import Run
+from ganlane.training.phases import identity, make_collector, phases_of
+from ganlane.training.signals import shielded_children
+from ganlane.training.workers import (
+    EPISODES_PER_WORKER,
+    ClusterCollector,
+    ProcessCollector,
+    WorkerCollector,
+    WorkerPool,
+    check_reachable,
+    noise_seed,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)")
@@ -61,7 +66,9 @@ class Here:
 
     def __init__(self, environments, policies, frames):
         self.workers = [
-            Collector(env, policy_factory=policy, frames_per_batch=frames, trust_policy=True, **QUIET)
+            Collector(
+                env, policy_factory=policy, frames_per_batch=frames // len(policies), trust_policy=True, **QUIET
+            )
             for env, policy in zip(environments, policies)
         ]
         self.handed_over = []
@@ -80,14 +87,11 @@ class Here:
             worker.shutdown()
 
 
-class HereSource(WorkerSource):
+class HereCollector(WorkerCollector):
     name = "here"
 
     def start(self, environments, policies, frames):
         return Here(environments, policies, frames)
-
-    def arranged(self, batch):
-        return batch
 
     def failure(self, error):
         return None
@@ -101,7 +105,7 @@ def steps(source, learner, count):
 
 
 def test_steps_come_in_the_order_of_time_across_batches():
-    source = HereSource(road, Team(2, 3, weights_every=18))
+    source = HereCollector(road, WorkerPool(2, 3, weights_every=18))
     seen = steps(source, agent(), 10)
     assert seen.batch_size == (10, 6)
     going = ~seen["next", "done"][:-1, :, 0]
@@ -112,7 +116,7 @@ def test_steps_come_in_the_order_of_time_across_batches():
 
 
 def test_no_two_workers_drive_the_same_episode():
-    source = HereSource(road, Team(3, 2, weights_every=60))
+    source = HereCollector(road, WorkerPool(3, 2, weights_every=60))
     episodes = steps(source, agent(), 40)[keys.EPISODE]
     assert torch.equal(episodes[0], torch.tensor([w * EPISODES_PER_WORKER + i for w in range(3) for i in range(2)]))
     driven = [set(episodes[:, row].tolist()) for row in range(6)]
@@ -121,7 +125,7 @@ def test_no_two_workers_drive_the_same_episode():
 
 
 def test_workers_explore_each_in_its_own_way():
-    source = HereSource(toy, Team(2, 64, weights_every=1))
+    source = HereCollector(toy, WorkerPool(2, 64, weights_every=1))
     learner = agent(4, epsilon_start=1.0)
     first, second = source.step(learner)[keys.ACTION].split(64)
     assert not torch.equal(first, second)
@@ -130,7 +134,7 @@ def test_workers_explore_each_in_its_own_way():
 
 
 def test_workers_drive_with_the_weights_of_the_last_handover():
-    source = HereSource(toy, Team(2, 4, weights_every=32))
+    source = HereCollector(toy, WorkerPool(2, 4, weights_every=32))
     learner = agent(4, noisy=False, epsilon_start=0.0, epsilon=0.0)
     source.step(learner)
     with torch.no_grad():
@@ -144,12 +148,12 @@ def test_workers_drive_with_the_weights_of_the_last_handover():
 
 @pytest.mark.parametrize(("every", "expected"), [(1, 1), (8, 1), (23, 2), (800, 100)])
 def test_weights_are_handed_over_every_so_many_decisions_in_whole_steps(every, expected):
-    assert Team(2, 4, every).steps == expected
+    assert WorkerPool(2, 4, every).steps == expected
 
 
 def test_the_share_of_random_actions_travels_with_the_weights():
-    source = HereSource(toy, Team(1, 4, weights_every=4))
-    run = Run(source, agent(4, epsilon_start=1.0, epsilon=0.0, epsilon_decisions=8))
+    source = HereCollector(toy, WorkerPool(1, 4, weights_every=4))
+    run = TrainingState(source, agent(4, epsilon_start=1.0, epsilon=0.0, epsilon_decisions=8))
     for _ in range(3):
         collect(run)
     assert [given[0][1] for given in source.collector.handed_over] == [1.0, 0.5, 0.0]
@@ -161,7 +165,7 @@ def test_the_share_of_random_actions_travels_with_the_weights():
 def test_a_run_with_workers_learns_what_a_run_without_does(tmp_path):
     learner = agent(4, **{"gamma": 0.8, "v_min": -10.0, "v_max": 10.0, "learning_rate": 3e-3})
     config = TrainingConfig(6000, log_every=1000, progress=False)
-    source = HereSource(toy, Team(2, 8, weights_every=64))
+    source = HereCollector(toy, WorkerPool(2, 8, weights_every=64))
     result = train(source, learner, config, tmp_path)
     assert result.decisions == 6000
     assert result.updates == pytest.approx((6000 - 32) / 8, abs=8)
@@ -172,10 +176,10 @@ def test_a_run_with_workers_learns_what_a_run_without_does(tmp_path):
 
 def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(tmp_path, capsys):
     config = TrainingConfig(400, log_every=200, progress=False)
-    source = HereSource(road, Team(2, 4, weights_every=80))
+    source = HereCollector(road, WorkerPool(2, 4, weights_every=80))
     first = train(source, agent(), config, tmp_path)
     begun = source._last[keys.EPISODE].reshape(2, 4)
-    resumed, again = agent(), HereSource(road, Team(2, 4, weights_every=80))
+    resumed, again = agent(), HereCollector(road, WorkerPool(2, 4, weights_every=80))
     result = train(again, resumed, TrainingConfig(480, progress=False), tmp_path, resume=first.checkpoint)
     assert "the workers begin the next ones; not bit-exact" in capsys.readouterr().err
     assert again.first_episodes == [int(last) + 1 for last in begun.amax(1)]
@@ -184,18 +188,10 @@ def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(
 
 
 def test_another_number_of_workers_is_refused_on_resume(tmp_path):
-    first = train(HereSource(toy, Team(2, 4, 8)), agent(4), TrainingConfig(80, progress=False), tmp_path)
-    for other in (HereSource(toy, Team(3, 4, 8)), ToyRoad(4)):
+    first = train(HereCollector(toy, WorkerPool(2, 4, 8)), agent(4), TrainingConfig(80, progress=False), tmp_path)
+    for other in (HereCollector(toy, WorkerPool(3, 4, 8)), ToyRoad(4)):
         with pytest.raises(UserError, match=r"shape \[8\], this run has"):
             train(other, agent(4), TrainingConfig(160, progress=False), tmp_path, resume=first.checkpoint)
-
-
-def test_an_environment_is_a_source_of_its_own():
-    env = ToyRoad(4)
-    source = source_of(env)
-    assert isinstance(source, SingleSource)
-    assert source.env is env
-    assert source_of(source) is source
 
 
 # --- options
@@ -205,9 +201,9 @@ def test_a_phase_collects_as_the_option_says(monkeypatch):
     collector = MultiCollectorConfig(num_envs=3, workers=5, weights_every=60)
     config = TrainConfig(collector=collector, traffic=IdmTrafficConfig(), env=ROAD)
     (phase,) = phases_of(config, Path("nowhere"))
-    source = make_source(config, phase)
-    assert isinstance(source, MultiSource)
-    assert source.team == Team(5, 3, 60)
+    source = make_collector(config, phase)
+    assert isinstance(source, ProcessCollector)
+    assert source.pool == WorkerPool(5, 3, 60)
     assert collector.environments == source.environments == 15
     assert source.make_env(2, 70).reset()[keys.EPISODE].tolist() == [70, 71]
     assert identity(config, phase)["collector"] == {"num_envs": 3, "workers": 5, "weights_every": 60}
@@ -216,7 +212,7 @@ def test_a_phase_collects_as_the_option_says(monkeypatch):
 def test_a_missing_ray_is_named_with_the_command_that_mends_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"pip install 'ganlane\[ray\]'"):
-        RaySource(toy, Team(1, 1, 1))
+        ClusterCollector(toy, WorkerPool(1, 1, 1))
 
 
 # --- signals
@@ -261,7 +257,7 @@ def alive(number):
 
 
 def test_a_dead_worker_ends_the_run_in_one_sentence_and_takes_the_others_along():
-    source, learner = MultiSource(road, Team(2, 2, weights_every=8)), agent()
+    source, learner = ProcessCollector(road, WorkerPool(2, 2, weights_every=8)), agent()
     threads = torch.get_num_threads()
     try:
         seen = steps(source, learner, 4)
@@ -293,7 +289,7 @@ def carried_along():
 @NO_RAY
 @pytest.mark.slow
 def test_two_ray_workers_collect_and_a_dead_one_is_told_in_one_sentence(carried_along):
-    source, learner = RaySource(road, Team(2, 2, weights_every=8)), agent()
+    source, learner = ClusterCollector(road, WorkerPool(2, 2, weights_every=8)), agent()
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
         seen = steps(source, learner, 6)
@@ -315,18 +311,18 @@ def test_two_ray_workers_collect_and_a_dead_one_is_told_in_one_sentence(carried_
 def test_nobody_at_an_address_is_found_out_at_once():
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        knock(f"127.0.0.1:{port}")
-        knock(f"ray://127.0.0.1:{port}")
+        check_reachable(f"127.0.0.1:{port}")
+        check_reachable(f"ray://127.0.0.1:{port}")
     for address in (f"127.0.0.1:{port}", "ray://127.0.0.1:1", "127.0.0.1:99999"):
         with pytest.raises(ConnectionError):
-            knock(address)
-    knock("auto")
+            check_reachable(address)
+    check_reachable("auto")
 
 
 @NO_RAY
 @pytest.mark.slow
 def test_an_address_without_a_cluster_is_named(carried_along):
-    source = RaySource(road, Team(1, 1, 1), address="127.0.0.1:1")
+    source = ClusterCollector(road, WorkerPool(1, 1, 1), address="127.0.0.1:1")
     with pytest.raises(UserError, match=r"no Ray cluster answers at collector.address=127.0.0.1:1"):
         source.step(agent())
     source.close()
@@ -377,15 +373,15 @@ def test_on_a_gpu_nothing_of_a_run_is_elsewhere():
     traffic = make_traffic(IdmTrafficConfig(), ROAD)
     env = make_env(traffic, ROAD, ObservationConfig(), num_envs=32, device="cuda")
     learner = Rainbow(RainbowConfig(**SMALL), 29, device="cuda")
-    run = Run(env, learner)
+    run = TrainingState(env, learner)
     for _ in range(4):
         step = collect(run)
         learner.store(run.window.push(step))
     learner.update()
     tensors = [
-        *run.source.carrier.values(True, True),
+        *run.collector.env_state.values(True, True),
         *step.values(True, True),
         *learner.replay[:].values(True, True),
     ]
-    tensors += [*learner.network.parameters(), *run.meter.sums.values(), run.meter.returns]
+    tensors += [*learner.network.parameters(), *run.stats.sums.values(), run.stats.returns]
     assert {tensor.device.type for tensor in tensors} == {"cuda"}

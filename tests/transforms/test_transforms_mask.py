@@ -22,7 +22,7 @@ from ganlane.errors import UserError
 from ganlane.parameters.observation import MASKS as OFFERED
 from ganlane.parameters.observation import MaskParameters
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.transforms import MASKS, ActionMaskTransform
 from ganlane.transforms.mask import braking_demand, obeyed_actions, on_road_actions
 

@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 from ganlane import keys
 from ganlane.agents.drivers import RandomDriver
 from ganlane.env import HighwayEnv
-from ganlane.sim.fixed_scene import FixedScene, SceneVehicle
+from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.traffic import IdmMobilTraffic, IdmTraffic
 from ganlane.transforms import RewardParameters, RewardTransform
 from ganlane.transforms.reward import speed_reward

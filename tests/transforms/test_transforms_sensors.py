@@ -29,7 +29,7 @@ from ganlane.sim import Road, Vehicles
 from ganlane.sim.random import Stream, episode_key
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.train import main as train
-from ganlane.training.checkpoints import pack, unpack
+from ganlane.training.collectors import pack, unpack
 from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform
 from ganlane.transforms.sensors import measure
 

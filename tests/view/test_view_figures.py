@@ -15,7 +15,6 @@ from view_scenes import run_folder
 
 from ganlane.data import Bins, Histogram, PooledStatistics, Scene, SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
-from ganlane.view import read_run
 from ganlane.view.figures import (
     COLOURS,
     add_legend,
@@ -24,6 +23,10 @@ from ganlane.view.figures import (
     draw_runs,
     palette,
     plot_line,
+    read_metrics,
+    read_run,
+    read_runs,
+    running_mean,
     save_figure,
 )
 
@@ -84,11 +87,8 @@ def test_a_smoothed_line_is_drawn_over_its_values(runs):
     assert smooth.get_ydata()[4:] == pytest.approx(np.arange(3.0, 29.0))
 
 
-def test_columns_of_ones_choice_take_the_place_of_the_panels(runs):
+def test_columns_of_ones_choice_take_the_place_of_the_panels_and_unknown_ones_are_named(runs):
     assert list(panels(draw_runs(runs, ["loss", "evaluation_mean_reward"]))) == ["loss", "evaluation mean reward"]
-
-
-def test_what_cannot_be_drawn_is_named(runs):
     with pytest.raises(UserError, match=r"column nothing: .* choose among mean_return, crash_rate"):
         draw_runs(runs, ["nothing"])
     with pytest.raises(UserError, match="foreign: no numbers"):
@@ -175,3 +175,35 @@ def test_a_program_s_own_matplotlib_settings_stay(runs, tmp_path):
         own = dict(matplotlib.rcParams)
         save_figure(draw_runs(runs), tmp_path / "curves.svg")
         assert dict(matplotlib.rcParams) == own
+
+
+def test_a_runs_evaluations_are_merged_with_its_metrics(runs):
+    frame = runs["a"]
+    assert frame.height == 33
+    evaluated = frame.drop_nulls("evaluation_crash_rate")
+    assert evaluated["decisions"].to_list() == [100_000, 200_000, 300_000]
+    assert evaluated["evaluation_mean_reward"].to_list() == [1.0, 3.0, 2.0]
+    assert runs["b"].height == 30
+
+
+def test_runs_are_called_by_the_shortest_ends_that_tell_them_apart(tmp_path):
+    one, two, other = (run_folder(tmp_path / name) for name in ("x/one", "x/two", "y/one"))
+    assert list(read_runs([one, two])) == list(read_runs([other, two])) == ["one", "two"]
+    assert list(read_runs([one, other])) == ["x/one", "y/one"]
+    assert list(read_runs([one / "metrics.csv"])) == ["one"]
+    with pytest.raises(UserError, match="twice"):
+        read_runs([one, one])
+
+
+def test_the_running_mean_skips_gaps():
+    values = np.array([1.0, 3.0, np.nan, 5.0, 9.0])
+    assert running_mean(values, 2) == pytest.approx([1.0, 2.0, np.nan, 5.0, 7.0], nan_ok=True)
+
+
+def test_what_is_no_metrics_file_is_named(tmp_path):
+    with pytest.raises(UserError, match="no such file"):
+        read_metrics(tmp_path)
+    for content, message in ((b"step,loss\n1,2\n", "decisions"), (b"\xff\xfe\x00broken", r"metrics\.csv")):
+        (tmp_path / "metrics.csv").write_bytes(content)
+        with pytest.raises(UserError, match=message):
+            read_metrics(tmp_path)

@@ -17,10 +17,10 @@ from view_scenes import straight
 
 from ganlane.errors import UserError
 from ganlane.view import EpisodeLabel, player_page, write_player
-from ganlane.view.player.encoding import UNITS, episode_data, series, steps
+from ganlane.view.player import UNITS, episode_data, series, steps
 
 
-def told(page):
+def data_of(page):
     """The data in a page."""
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
 
@@ -39,7 +39,7 @@ def test_steps_are_the_changes_alone():
 
 def test_the_page_says_where_everybody_is():
     episode = straight([0, 30], [1, 2], frames=40)
-    data = told(player_page([episode]))
+    data = data_of(player_page([episode]))
     (shown,) = data["episodes"]
     assert (shown["agent"], shown["traffic"], shown["lanes"]) == ("mobil", "idm", 3)
     x = np.array(list(accumulate(shown["x"][1]))) * data["units"]["x"]
@@ -76,8 +76,8 @@ def test_a_name_cannot_become_part_of_the_page(name):
     episode = replace(straight([0], [1]), label=EpisodeLabel(name, "{{style}}"))
     plain = player_page([straight([0], [1])])
     page = player_page([episode])
-    assert told(page)["episodes"][0]["agent"] == name
-    assert told(page)["episodes"][0]["traffic"] == "{{style}}"
+    assert data_of(page)["episodes"][0]["agent"] == name
+    assert data_of(page)["episodes"][0]["traffic"] == "{{style}}"
     for mark in ("<script", "</script", "<!--", "<img"):
         assert page.count(mark) == plain.count(mark), mark
 
@@ -116,7 +116,7 @@ def test_a_page_that_is_too_large_takes_fewer_samples_and_keeps_the_last():
     episode = noisy(600)
     whole = player_page([episode])
     page = player_page([episode], max_bytes=len(whole) // 2)
-    (shown,) = told(page)["episodes"]
+    (shown,) = data_of(page)["episodes"]
     times = np.array(list(accumulate(shown["time"]))) * UNITS["time"]
     assert len(page) < len(whole) // 2
     assert np.diff(times)[:-1].min() > 0.1

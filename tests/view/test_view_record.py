@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import polars as pl
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
-from view_scenes import straight
 
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
-from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic import Recordings, ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
-from ganlane.view import record_episode, to_tracks
+from ganlane.view import record_episode
 
 
 def always(action):
@@ -52,6 +48,7 @@ def test_the_recording_has_a_frame_per_physics_step():
     assert trajectory.x[-1] == pytest.approx(state["vehicles", "x"][0].double().numpy())
     assert trajectory.x[-1, 0] >= 150.0 > trajectory.x[-2, 0]
     assert trajectory.outcome == "goal"
+    assert trajectory.action.tolist() == [-1] + [0] * (len(trajectory) - 1)
     assert (trajectory.label.agent, trajectory.label.lanes, trajectory.label.lane_width_m) == ("keep_lane", 3, 4.0)
 
 
@@ -81,12 +78,6 @@ def test_frames_are_one_step_of_driving_apart():
     assert not trajectory.jumped().any()
 
 
-def test_the_action_belongs_to_the_frames_it_led_to():
-    trajectory = record_episode(highway(goal_m=40.0), always(0), seed=0, episode=0)
-    assert trajectory.action[0] == -1
-    assert set(trajectory.action[1:]) == {0}
-
-
 def test_a_command_off_the_road_ends_the_recording_at_once():
     trajectory = record_episode(highway(lanes=1), always(1), seed=0, episode=0)
     assert trajectory.outcome == "out_of_road"
@@ -105,33 +96,6 @@ def test_a_recording_can_be_cut_off():
     trajectory = record_episode(highway(goal_m=5000.0), always(0), seed=0, episode=0, max_time_s=3.0)
     assert trajectory.outcome == ""
     assert trajectory.time_s[-1] == pytest.approx(3.0)
-
-
-def test_tracks_have_the_form_of_recorded_traffic():
-    trajectory = straight([0, 30], [0, 2], frames=12)
-    tracks = to_tracks(trajectory, "film")
-    assert tracks.schema == SCHEMA
-    assert validate(tracks, "film").height == 24
-    second = tracks.filter(tracks["vehicle"] == 1)
-    assert second["x"].to_list() == pytest.approx(trajectory.x[:, 1].tolist())
-    assert second["frame"].to_list() == list(range(12))
-    assert set(second["lane"]) == {2}
-
-
-def test_a_recycled_vehicle_begins_a_new_track_and_padding_is_left_out():
-    trajectory = straight([0, 30, 60], [0, 1, 2], frames=12)
-    x, valid = trajectory.x.copy(), trajectory.valid.copy()
-    x[5:, 1] += 300.0
-    valid[:, 2] = False
-    tracks = to_tracks(replace(trajectory, x=x, valid=valid))
-    assert set(tracks["vehicle"]) == {0, 1, 1 + TRACK_STRIDE}
-    assert tracks.filter(tracks["vehicle"] == 1).height == 5
-
-
-def test_tracks_need_frames_a_tenth_of_a_second_apart():
-    coarse = straight([0], [0])
-    with pytest.raises(UserError, match="physics step"):
-        to_tracks(replace(coarse, time_s=coarse.time_s * 10))
 
 
 def test_an_environment_without_the_hook_cannot_be_recorded():

@@ -12,11 +12,11 @@ from tensordict.nn import TensorDictModule
 from view_scenes import straight
 
 from ganlane.data import read_scenes, scene_lane_widths
-from ganlane.data.schema import SCHEMA
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
-from ganlane.sim.road import Road
+from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
 from ganlane.view.tracks import scene_names
@@ -80,3 +80,24 @@ def test_what_cannot_be_tracks_leaves_no_file(tmp_path):
     with pytest.raises(UserError, match="physics step"):
         write_tracks([replace(scene, time_s=10 * scene.time_s)], tmp_path / "a.parquet", "parquet")
     assert not list(tmp_path.iterdir())
+
+
+def test_tracks_have_the_form_of_recorded_traffic():
+    trajectory = straight([0, 30], [0, 2], frames=12)
+    tracks = to_tracks(trajectory, "film")
+    assert tracks.schema == SCHEMA
+    assert validate(tracks, "film").height == 24
+    second = tracks.filter(tracks["vehicle"] == 1)
+    assert second["x"].to_list() == pytest.approx(trajectory.x[:, 1].tolist())
+    assert second["frame"].to_list() == list(range(12))
+    assert set(second["lane"]) == {2}
+
+
+def test_a_recycled_vehicle_begins_a_new_track_and_padding_is_left_out():
+    trajectory = straight([0, 30, 60], [0, 1, 2], frames=12)
+    x, valid = trajectory.x.copy(), trajectory.valid.copy()
+    x[5:, 1] += 300.0
+    valid[:, 2] = False
+    tracks = to_tracks(replace(trajectory, x=x, valid=valid))
+    assert set(tracks["vehicle"]) == {0, 1, 1 + TRACK_STRIDE}
+    assert tracks.filter(tracks["vehicle"] == 1).height == 5

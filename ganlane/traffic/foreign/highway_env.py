@@ -12,8 +12,7 @@ from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.foreign.packages import require
 
@@ -23,27 +22,27 @@ _MOVING = ("x", "y", "heading", "speed")
 _EXPONENT = 8
 #: HighwayEnv's own bounds for the exponent of a driver's free acceleration (``IDMVehicle.DELTA_RANGE``).
 _EXPONENTS = (3.5, 4.5)
-#: From where to where HighwayEnv's lanes go, m, and their speed limit, m/s, which is out of everybody's way.
+#: Start and end of HighwayEnv's lanes, m, and their speed limit, m/s, above all desired speeds.
 _FROM_M, _TO_M, _LIMIT_MPS = -10_000.0, 200_000.0, 70.0
 
 
 class HighwayEnvTraffic(TrafficModule):
-    """Others who are driven by HighwayEnv's ``IDMVehicle``: its IDM, MOBIL and steering, its explicit Euler step.
+    """The others driven by HighwayEnv's ``IDMVehicle``: its IDM, MOBIL and steering, its explicit Euler step.
 
     The parameters are HighwayEnv's own (1.5 s, 3 and -5 m/s2, distances from centre to centre, an egoistic MOBIL
     once a second); desired speeds are Table II's, and the exponent differs from driver to driver as HighwayEnv draws
     it. Its vehicles do not react to crashes here. One whose speed would fall below 0 stands still.
 
-    What HighwayEnv knows of a vehicle is in ``vehicles`` and in this module's memory (the time since its driver last
-    thought of a lane change, s), and is written into HighwayEnv's objects in every step. So this traffic is a
-    function of the state like the others: an episode is the same in any batch and can be saved and branched. It is
-    slow: a Python loop over rows and vehicles.
+    HighwayEnv's state of a vehicle is in ``vehicles`` and in this module's memory (the time since the driver's last
+    lane change decision, s), and is written into HighwayEnv's objects in every step. So this traffic is a function of
+    the state like the others: an episode is the same in any batch and can be saved and branched. It is slow: a Python
+    loop over rows and vehicles.
 
     Raises:
         UserError: highway-env is not installed, or the road is a ring.
     """
 
-    #: As HighwayEnv's drivers see each other: in a lane from 1 m beyond its edge on.
+    #: HighwayEnv's drivers see a vehicle in a lane from 1 m beyond its edge on.
     visibility = Visibility.BODY
     memory_fields = {"timer": ((), None)}  # noqa: RUF012
 
@@ -68,10 +67,10 @@ class HighwayEnvTraffic(TrafficModule):
         self._highway = _Highway(self.road.lanes, float(self.road.lane_width_m))
 
     def compile_graphs(self) -> None:
-        """Nothing here is a graph."""
+        """Nothing can be compiled."""
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """As HighwayEnv staggers its drivers: by where they start."""
+        """HighwayEnv's staggering of drivers by their initial positions."""
         return {"timer": torch.remainder((vehicles.x + vehicles.y) * torch.pi, 1.0)}
 
     def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
@@ -80,14 +79,14 @@ class HighwayEnvTraffic(TrafficModule):
         fields = torch.stack([getattr(vehicles, name) for name in _MOVING], dim=-1).double().cpu().numpy()
         low, high = _EXPONENTS
         exponent = low + (high - low) * uniform(key, 0, m, [Purpose.FOREIGN_DRIVER + _EXPONENT], like.dtype)[..., 0]
-        traits = torch.stack((vehicles.desired_speed, exponent, memory["timer"]), dim=-1).double().cpu().numpy()
+        driver = torch.stack((vehicles.desired_speed, exponent, memory["timer"]), dim=-1).double().cpu().numpy()
         size = torch.stack((vehicles.length, vehicles.width), dim=-1).double().cpu().numpy()
         target, valid = vehicles.target_lane.cpu().numpy().copy(), vehicles.valid.cpu().numpy()
         signals = (vehicles.visibility[:, EGO_INDEX] == int(Visibility.SIGNALLED)).tolist()
-        timer = traits[..., 2]
+        timer = driver[..., 2]
         for row in range(len(fields)):
             present = np.flatnonzero(valid[row])
-            mine = (fields[row], size[row], traits[row], target[row])
+            mine = (fields[row], size[row], driver[row], target[row])
             self._highway.drive(present, *mine, bool(signals[row]), self.dt)
         moving = torch.as_tensor(fields).to(like.device, like.dtype)
         named = dict(zip(_MOVING, moving.unbind(-1)))
@@ -97,7 +96,7 @@ class HighwayEnvTraffic(TrafficModule):
 
 
 class _Highway:
-    """One road of HighwayEnv with objects that are filled with one row after another."""
+    """One road of HighwayEnv whose objects are filled with one row after another."""
 
     def __init__(self, lanes: int, lane_width_m: float) -> None:
         from highway_env.road.lane import StraightLane
@@ -123,7 +122,7 @@ class _Highway:
         self._driver, self._cars = IDMVehicle, [ControlledVehicle(self.road, [0.0, 0.0])]
 
     def drive(
-        self, present: Any, fields: Any, size: Any, traits: Any, target: Any, ego_signals: bool, dt: float
+        self, present: Any, fields: Any, size: Any, driver: Any, target: Any, ego_signals: bool, dt: float
     ) -> None:
         """Move the vehicles ``present`` of one row by ``dt`` seconds, in place.
 
@@ -131,9 +130,9 @@ class _Highway:
             present: their indices.
             fields: x, y, heading, speed, [M, 4] float64.
             size: length, width, [M, 2].
-            traits: desired speed, exponent, timer, [M, 3].
+            driver: desired speed, exponent, timer, [M, 3].
             target: lanes, [M] int64.
-            ego_signals: whether the others know the lane that the ego is moving to.
+            ego_signals: whether the others see the ego's target lane.
             dt: s.
         """
         while len(self._cars) < len(fields):
@@ -145,7 +144,7 @@ class _Highway:
             vehicle.position = np.array([x, y])
             vehicle.LENGTH, vehicle.WIDTH = size[i].tolist()
             vehicle.on_state_update()
-            vehicle.target_speed, vehicle.DELTA, vehicle.timer = traits[i].tolist()
+            vehicle.target_speed, vehicle.DELTA, vehicle.timer = driver[i].tolist()
             vehicle.target_lane_index = ("a", "b", int(target[i]))
         if not ego_signals:
             self._cars[EGO_INDEX].target_lane_index = self._cars[EGO_INDEX].lane_index
@@ -155,5 +154,5 @@ class _Highway:
                 vehicle = self._cars[i]
                 vehicle.step(dt)
                 fields[i] = (*vehicle.position, vehicle.heading, max(vehicle.speed, 0.0))
-                traits[i, 2] = vehicle.timer
+                driver[i, 2] = vehicle.timer
                 target[i] = vehicle.target_lane_index[2]

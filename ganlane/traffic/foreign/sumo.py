@@ -1,4 +1,4 @@
-"""``traffic=sumo``: the others are SUMO's, the ego is ours."""
+"""``traffic=sumo``: the others are driven by SUMO, some of them lorries; the ego is ours."""
 
 from __future__ import annotations
 
@@ -15,35 +15,84 @@ from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.parameters.traffic import SumoParameters
+from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.ego import ego_scene, move_ego
-from ganlane.sim.following import following_acceleration
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.lanes import body_lanes, presence, with_target
 from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.road import Road
-from ganlane.sim.scenes import RandomScenes, Scenes
-from ganlane.sim.spawn import TABLE_II
-from ganlane.sim.steering import STEERING, SteeringParameters
-from ganlane.sim.vehicles import Vehicles
+from ganlane.sim.scenes import Scenes
+from ganlane.sim.spawn import TABLE_II, RandomScenes
+from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.foreign.lorries import LorryScenes
 from ganlane.traffic.foreign.sumo_roads import Array, Place, SumoDriver, SumoRoads, require_libsumo
 
 #: Vehicles of this length (m) and more are driven as lorries.
 LORRY_M = 7.0
-#: A vehicle moves across its lane, m per step, above this. SUMO's slowest lane change has ten times as much.
+#: Lateral motion above this, m per step, is a lane change; SUMO's slowest one has ten times as much.
 _SIDEWAYS_M = 1e-3
-#: Steepest heading that is shown, rad: SUMO moves a vehicle sideways even where it hardly drives.
+#: Bound of the heading, rad: SUMO moves a vehicle sideways even where it hardly drives.
 _STEEPEST_RAD = 0.2
 #: Physics steps between two changes of a driver's desired speed.
 _PACE_STEPS = 10
-#: Columns of :attr:`ganlane.sim.random.Purpose.FOREIGN_DRIVER`, after those of the lorries.
-_TAU, _ACCEL, _DECEL, _MIN_GAP, _PACE_PERIOD, _PACE_PHASE = range(2, 8)
+#: Columns of :attr:`ganlane.sim.random.Purpose.FOREIGN_DRIVER`: the first two of the initial scene, then a driver's.
+_IS_LORRY, _DESIRED, _TAU, _ACCEL, _DECEL, _MIN_GAP, _PACE_PERIOD, _PACE_PHASE = range(8)
+
+
+@dataclass(frozen=True)
+class LorryScenes:
+    """:class:`ganlane.sim.spawn.RandomScenes` with lorries among the others, at the same net gaps.
+
+    A lorry takes more of its lane, so whoever drives ahead of it there starts so much further ahead: nobody has to
+    brake harder than in the scene of cars.
+
+    Attributes:
+        cars: the scenes to start from.
+        share: of the others, 0 to 1; each is a lorry or not by itself.
+        length_m: of a lorry; its width is that of a car.
+        desired_speed_mps: (low, high) of a lorry's desired speed; 80 to 90 km/h.
+    """
+
+    cars: RandomScenes
+    share: float = 0.15
+    length_m: float = 12.0
+    desired_speed_mps: tuple[float, float] = (22.0, 25.0)
+
+    @property
+    def vehicles(self) -> int:
+        """M, the ego included."""
+        return self.cars.vehicles
+
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest vehicle that there may be, m."""
+        return max(self.cars.longest_m, self.length_m) if self.share > 0 else self.cars.longest_m
+
+    def check(self, road: Road, idm: IdmParameters) -> None:
+        """As :meth:`RandomScenes.check`."""
+        self.cars.check(road, idm)
+
+    def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
+        """Vehicles [N, M] at the start of the episodes with ``key`` [N]; the ego at index 0 and x = 0."""
+        scene = self.cars(key, dtype)
+        u = uniform(key, 0, self.vehicles, [Purpose.FOREIGN_DRIVER + _IS_LORRY, Purpose.FOREIGN_DRIVER + _DESIRED])
+        is_lorry = (u[..., 0] < self.share) & (torch.arange(self.vehicles, device=key.device) != EGO_INDEX)
+        length = torch.where(is_lorry, max(self.length_m, self.cars.parameters.length_m), scene.length)
+        low, high = self.desired_speed_mps
+        desired = torch.where(is_lorry, (low + u[..., 1] * (high - low)).to(dtype), scene.desired_speed)
+        x = scene.x + _room_taken(scene, length - scene.length)
+        return scene.with_(x=x - x[:, EGO_INDEX, None], length=length, desired_speed=desired)
+
+
+def _room_taken(scene: Vehicles, extra: Tensor) -> Tensor:
+    """How far forward each centre moves, m, [N, M], where bodies are longer by ``extra`` and net gaps stay."""
+    same = scene.target_lane[:, :, None] == scene.target_lane[:, None, :]
+    behind = scene.x[:, None, :] < scene.x[:, :, None]
+    return (extra[:, None, :] * (same & behind)).sum(-1) + 0.5 * extra
 
 
 @dataclass(frozen=True)
 class DriverRanges:
-    """From what range (low, high) each driver draws its numbers: s, m/s2, m. SUMO's defaults lie within."""
+    """Ranges (low, high) of the drivers' parameters: s, m/s2, m. SUMO's defaults lie within."""
 
     tau: tuple[float, float] = (0.9, 1.6)
     accel: tuple[float, float] = (1.5, 3.0)
@@ -57,7 +106,7 @@ LORRIES = DriverRanges(tau=(1.2, 2.0), accel=(0.8, 1.3), decel=(3.0, 4.5), min_g
 
 
 class SumoTraffic(TrafficModule):
-    """Others who are driven by SUMO: Krauss along the road, LC2013 across it, some of them lorries.
+    """The others driven by SUMO: Krauss along the road, LC2013 across it, some of them lorries.
 
     The ego moves as in every traffic. In SUMO a stand-in drives in its place, in every lane in which the others see
     the ego, and arrives at the end of a step where the ego does, so they follow and give way to it as to any vehicle.
@@ -65,17 +114,17 @@ class SumoTraffic(TrafficModule):
     follow from (stream, seed, episode). SUMO's own dawdling (``sigma``) is off: it draws from a generator that all
     vehicles share, so an episode would depend on the batch.
 
-    SUMO's state is not in the TensorDict, and a process has one simulation. So an episode can only be driven on from
-    where it was left. It cannot be branched, and two modules cannot take turns; either is refused.
+    SUMO's state is not in the TensorDict, and a process has one simulation. So an episode can only continue where it
+    was left. It cannot be branched, and two modules cannot take turns; both are refused.
 
     Args:
         road, stream, idm, steering: as for every traffic module; idm and steering are the ego's.
         spawn: Table II, for the first scenes.
         truck_share: of the others, 0 to 1, where ``spawn`` has none.
         truck_length_m: length of a lorry.
-        lane_change_s: how long a lane change takes.
+        lane_change_s: duration of a lane change.
         keep_right: LC2013's ``lcKeepRight``.
-        speed_wander: how far a desired speed strays from its mean, as a share of it; the periods are 20 to 60 s.
+        speed_wander: amplitude of a desired speed's variation, as a share of it; the periods are 20 to 60 s.
 
     Raises:
         UserError: libsumo is not installed, or the road is a ring.
@@ -114,7 +163,7 @@ class SumoTraffic(TrafficModule):
         return {**self.__dict__, "_roads": None, "_episodes": None}
 
     def compile_graphs(self) -> None:
-        """Nothing here is a graph."""
+        """Nothing can be compiled."""
 
     def scenes(
         self, vehicles: int, ego_visibility: int = Visibility.BODY, ego_desired_speed_mps: float = 25.0
@@ -244,7 +293,7 @@ class SumoTraffic(TrafficModule):
                     roads.set_desired_speed(name, speed)
 
     def _moved(self, roads: SumoRoads, driving: NDArray[np.bool_], vehicles: Vehicles, seen: _Seen) -> Vehicles:
-        """What SUMO has made of it, as our fields; rows that do not drive stay as they are."""
+        """SUMO's state as our fields; rows that do not drive stay as they are."""
         rows, index, front, speeds = roads.read()
         index = index + 1
         x, y, speed, heading, acceleration = (
@@ -278,7 +327,7 @@ class SumoTraffic(TrafficModule):
 
 
 class _Seen:
-    """The fields of vehicles that are looked at here, as arrays [N, M] on the CPU."""
+    """The used fields of vehicles as arrays [N, M] on the CPU."""
 
     def __init__(self, vehicles: Vehicles) -> None:
         def array(field: Tensor) -> Any:
@@ -311,7 +360,7 @@ class _Seen:
 
 
 class _Episodes:
-    """What is remembered of the rows beside SUMO's state; [N] or [N, M]."""
+    """State of the rows outside SUMO; [N] or [N, M]."""
 
     def __init__(self, n: int, m: int) -> None:
         self.shape = (n, m)
@@ -344,6 +393,6 @@ def _driver(u: Array, seen: _Seen, row: int, i: int) -> SumoDriver:
 
 
 def _stand_in(seen: _Seen, row: int) -> SumoDriver:
-    """How SUMO's drivers take the ego to brake: an ordinary car."""
+    """The ego's stand-in: an ordinary car for SUMO's drivers."""
     length, width = float(seen.length[row, EGO_INDEX]), float(seen.width[row, EGO_INDEX])
     return SumoDriver(float(seen.desired_speed[row, EGO_INDEX]), length, width, 1.0, 2.6, 4.5, 9.0, 2.5)

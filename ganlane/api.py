@@ -1,0 +1,396 @@
+"""The commands as typed calls for notebooks and scripts.
+
+::
+
+    import ganlane
+
+    agent = ganlane.load_agent("agent_idm")
+    env = ganlane.make_env(traffic="gan", num_envs=64, observation=agent.observation, mask=agent.mask)
+    rollout = env.rollout(100, agent.policy)
+    table = ganlane.api.evaluate([agent, "mobil", "random_legal"], ["idm_mobil", "gan"], episodes=100)
+
+Options are names, mappings or config dataclasses (:mod:`ganlane.options`), checked as on the command line. A mistake
+ends in :class:`ganlane.errors.UserError`, one sentence. docs/python_api.md puts calls and commands side by side.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import polars as pl
+import torch
+from omegaconf import OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Transform, TransformedEnv
+
+from ganlane import build
+from ganlane.build import Driver
+from ganlane.compare import compare_configured
+from ganlane.config.app import Stopped
+from ganlane.config.env import check_reward
+from ganlane.config.evaluate import EvaluateConfig
+from ganlane.config.folders import CONFIG, cleared_after_mistakes, put_back_after_mistakes
+from ganlane.config.run import RunConfig
+from ganlane.config.schemas import SCHEMAS
+from ganlane.config.traffic import TrafficConfig, all_traffics
+from ganlane.errors import UserError
+from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
+from ganlane.evaluation.results import plain
+from ganlane.files import write_bytes
+from ganlane.options import Option, command_config, option
+from ganlane.parameters.checks import did_you_mean
+from ganlane.runtime import set_threads
+from ganlane.sim.random import Stream
+
+__all__ = ["Driver", "Run", "TrainingRun", "evaluate", "load_agent", "make_env", "render", "run", "train"]
+
+#: A driver's name, a loaded driver, or a policy of your own (named by its class).
+Agent: TypeAlias = str | Driver | TensorDictModuleBase
+#: Families of episodes: to train on, to choose on, to report on.
+STREAMS = {stream.name.lower(): stream for stream in Stream}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished command: its run folder and the content of ``results.json``."""
+
+    folder: Path
+    results: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class TrainingRun(Run):
+    """A finished training: also the agent's file and the table of the final evaluation."""
+
+    agent: Path
+    table: pl.DataFrame
+
+
+def make_env(
+    traffic: Option = "idm_mobil",
+    num_envs: int = 1,
+    *,
+    env: Option = "highway",
+    observation: Option = "lane_view_overlap",
+    reward: Option = "paper",
+    mask: Option = "none",
+    transforms: Sequence[Transform] = (),
+    seed: int = 0,
+    stream: str = "train",
+    device: str = "cpu",
+    **overrides: Any,
+) -> TransformedEnv:
+    """A batched TorchRL environment with observation and reward.
+
+    ``make_env("gan", 256, lanes=4, recycle=True)`` is ``traffic=gan collector.num_envs=256 env.lanes=4
+    env.recycle=true`` on the command line.
+
+    Args:
+        traffic: an option of the group ``traffic``, such as ``idm_mobil`` or ``{"name": "gan", "noise_scale": 0.5}``;
+            or the import path or the class of a model of your own.
+        num_envs: N, environments side by side, 1 to 65536.
+        env: ``highway``, ``dense``, or a scenario such as ``cut_in``.
+        observation: an option of the group ``observation`` (docs/agent.md), or a mapping.
+        reward: ``paper``, ``considerate``, or a mapping of what differs from ``paper``, ``{"hard_crash": -200}``.
+        mask: ``none``, ``legal`` or ``safe`` (writes ``action_mask`` [N, 3] bool), or a mapping.
+        transforms: your own, after observation and reward.
+        seed: base of the random numbers.
+        stream: family of the episodes: ``train``, ``select`` or ``report`` (that of ``evaluate``).
+        device: ``cpu`` or ``cuda``.
+        overrides: keys of the environment (:class:`ganlane.config.env.EnvConfig`), ``lanes=4, idm={"headway_s": 1}``.
+
+    Raises:
+        UserError: an unknown name or key, a value of the wrong type or out of range.
+    """
+    config, rewards = option("env", env, overrides), option("reward", reward)
+    check_reward(config, rewards)
+    checked = RunConfig(seed=_whole("seed", seed), device=device)
+    rows = _whole("num_envs", num_envs)
+    if not 1 <= rows <= 65536:
+        raise UserError(f"num_envs={rows}: expected a number from 1 to 65536; give for instance num_envs=64.")
+    made = build.make_env(
+        build.make_traffic(option("traffic", traffic), config, _stream(stream)),
+        config,
+        option("observation", observation),
+        rewards,
+        rows,
+        checked.seed,
+        checked.device,
+        mask=option("mask", mask),
+    )
+    for transform in transforms:
+        made.append_transform(transform)
+    return made
+
+
+def load_agent(
+    name: str = "agent_general",
+    *,
+    env: Option = "highway",
+    stream: str = "report",
+    device: str = "cpu",
+    **overrides: Any,
+) -> Driver:
+    """A driver of the ego: its ``policy``, the ``observation`` it reads (None: the raw state) and its ``mask``.
+
+    Args:
+        name: a shipped agent, a rule-based driver (``mobil``, ``mobil_egoistic``, ``keep_lane``, ``random_legal``,
+            ``random``), the path of an agent's ``.safetensors``, or the import path of a policy of your own.
+        env, overrides: the environment it drives in, as in :func:`make_env`; a network must fit.
+        stream: of its random numbers, if it draws any.
+        device: of its network.
+
+    Raises:
+        UserError: no such driver, or its network takes another observation.
+    """
+    config = option("env", env, overrides)
+    return build.make_driver(str(name), config, _stream(stream), RunConfig(device=device).device)
+
+
+def evaluate(
+    agents: Sequence[Agent] = ("mobil", "keep_lane", "random_legal", "agent_idm"),
+    traffics: Sequence[Option] | Mapping[str, Option] = ("idm", "idm_mobil", "gan", "gan_calibrated"),
+    episodes: int = 100,
+    *,
+    seed: int = 0,
+    per_episode: bool = False,
+    folder: str | Path | None = None,
+    **keys: Any,
+) -> pl.DataFrame:
+    """Every agent on every traffic, on the same episodes; one row for each pair.
+
+    Args:
+        agents: names, drivers from :func:`load_agent`, or policies of your own; ``mobil`` and ``random_legal`` are
+            needed for the normalised score.
+        traffics: options as in :func:`make_env`, or a mapping that gives them names of your own.
+        episodes: the episodes 0 to ``episodes - 1`` of the seed, on the stream kept for reports.
+        seed: of the episodes.
+        per_episode: one row per episode instead (:func:`ganlane.evaluation.run_episodes`).
+        folder: write ``results.json`` and ``episodes.parquet`` there, as the command does.
+        keys: further options (``env``, ``reward``; ``observation`` and ``mask`` for policies that name none), keys of
+            the command (``num_envs``, ``device``, ``stream``) or of the environment.
+
+    Returns:
+        The columns of :func:`ganlane.evaluation.evaluation_rows`; null where there is no number.
+
+    Raises:
+        UserError: an unknown name, a wrong value, or a policy that does not fit.
+    """
+    chosen = _named_traffics(traffics)
+    keys |= {"agents": [_agent_name(agent) for agent in agents], "traffics": list(chosen)}
+    keys |= {"episodes": episodes, "seed": seed, "traffic_options": {**all_traffics(), **chosen}}
+    config: EvaluateConfig = command_config("evaluate", keys)
+    with _torch_threads(config.threads):
+        drivers = [_driver(agent, name, config) for agent, name in zip(agents, config.agents)]
+        table = compare_configured(drivers, config)
+    rows = plain(evaluation_rows(table))
+    if folder is not None:
+        seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        write_episodes(Path(folder), table)
+        write_results(Path(folder), {"rows": rows, "paired": paired_rows(table)}, asdict(config), seeds)
+    return table if per_episode else pl.DataFrame(rows, infer_schema_length=None)
+
+
+def train(
+    traffic: Option = "gan",
+    init: Option = "idm_ckpt",
+    *,
+    total_decisions: int = 600_000,
+    seed: int = 0,
+    num_envs: int = 512,
+    evaluation: Mapping[str, Any] | None = None,
+    pretrain: Mapping[str, Any] | None = None,
+    folder: str | Path | None = None,
+    resume: bool = False,
+    **keys: Any,
+) -> TrainingRun:
+    """Train an agent on a traffic, then evaluate it beside others on the same episodes.
+
+    Args:
+        traffic: as in :func:`make_env`.
+        init: ``idm_ckpt`` (the agent that ships), ``none``, or ``{"path": FILE}`` (docs/training.md, 'Transfer').
+        total_decisions: of all environments together.
+        seed: of everything.
+        num_envs: environments side by side.
+        evaluation: keys of the final evaluation: ``agents, episodes, num_envs, traffic``.
+        pretrain: a first phase, ``{"traffic": "idm_mobil", "total_decisions": 10_000_000}``.
+        folder: the run's; None: a new one below ``outputs/train``.
+        resume: go on with the run in ``folder``; the other arguments must be those that it was started with.
+        keys: further options (``env``, ``observation``, ``reward``, ``mask``, ``agent``, ``logger``), keys of the
+            command (``evaluate_every``, ``log_every``, ``device``, ...) or of the environment.
+
+    Raises:
+        UserError: a wrong value, an agent or checkpoint that does not fit.
+        KeyboardInterrupt: stopped by Ctrl-C; the run is saved, ``resume=True`` goes on from there.
+    """
+    if resume and folder is None:
+        raise UserError("resume=True: which run? give its folder, for instance folder='outputs/train/RUN'.")
+    keys |= {"traffic": traffic, "init": init, "total_decisions": total_decisions, "seed": seed}
+    keys |= {"collector": {"num_envs": num_envs}, "resume": str(folder) if resume else None}
+    keys |= {"evaluation": _with_traffic(evaluation), "pretrain": _with_traffic(pretrain)}
+    try:
+        done = run("train", folder, **keys)
+    except Stopped as stop:
+        raise KeyboardInterrupt("the run was saved; go on with its folder and resume=True") from stop
+    table = pl.DataFrame(done.results["rows"], infer_schema_length=None)
+    return TrainingRun(done.folder, done.results, Path(done.results["agent"]), table)
+
+
+def render(
+    agent: str | Sequence[str] = "mobil",
+    traffic: Option = "idm_mobil",
+    episode: int | Sequence[int] = 0,
+    *,
+    out: str | Path | None = None,
+    run: str | Path | Sequence[str | Path] | None = None,
+    film: Mapping[str, Any] | None = None,
+    **keys: Any,
+) -> Path:
+    """Episodes as a film, page or table, or the learning curves of runs; the file's path.
+
+    Args:
+        agent: as ``name`` in :func:`load_agent`; several for html, csv and parquet.
+        traffic: as in :func:`make_env`.
+        episode: number of the episode, which is that of ``evaluate``; several as for ``agent``.
+        out: file to write; None: into a new folder below ``outputs/render``.
+        run: folders of training runs; their learning curves are drawn instead of an episode.
+        film: keys of the film: ``fps, speedup, start_s, end_s, width, height, ...``.
+        keys: further options (``env``, ``observation``, ``reward``, ``mask``), keys of the command (``seed``;
+            ``format``, by default the ending of ``out``, else ``gif``) or of the environment.
+
+    Raises:
+        UserError: a wrong value.
+        OSError: a file that cannot be written.
+    """
+    keys |= {"driver": agent} if isinstance(agent, str) else {"agents": list(agent)}
+    keys |= {"episode": episode} if isinstance(episode, int) else {"episodes": list(episode)}
+    if run is not None:
+        keys["run"] = [str(each) for each in ([run] if isinstance(run, str | Path) else run)]
+    config = command_config("render", {**keys, "traffic": traffic, "film": film or {}, "out": out})
+    command = _function("render")
+    if out is None:
+        _, line = _run_in(None, "render", command, config)
+    else:
+        with _torch_threads():
+            line = command(config, Path(out).parent)
+    return Path(line.partition(": ")[2])
+
+
+def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
+    """Any command that writes ``results.json``: ``prepare``, ``train_generator``, ``realism``, ``bench`` ...
+
+    ``run("prepare", data={"name": "ngsim", "path": "raw.txt"}, out="us101")`` is ``ganlane prepare data=ngsim
+    data.path=raw.txt out=us101`` on the command line.
+
+    Args:
+        command: its name; ``ganlane COMMAND --help`` lists its options and keys.
+        folder: of the run; None: a new one below ``outputs/COMMAND``.
+        keys: options by group (``data=``, ``traffic=``), keys of the command and, where it has one, of the
+            environment. Defaults are the command's.
+
+    Raises:
+        UserError: no such command, a wrong value, or recordings that cannot be read.
+    """
+    known = [name for name in SCHEMAS[""] if name != "render"]  # which writes a picture and no results
+    if command not in known:
+        hint = did_you_mean(command, known)
+        raise UserError(f"run({command!r}): no such command{hint}; choose one of {', '.join(known)}.")
+    if command == "bench" and keys.get("report") is not None:
+        raise UserError("report: tables go into a document with the command only; run ganlane bench report=FILE.")
+    home, _ = _run_in(folder, command, _function(command), command_config(command, keys))
+    return Run(home, json.loads((home / "results.json").read_text()))
+
+
+def _function(command: str) -> Callable[[Any, Path], str]:
+    """The command itself: it takes its config and run folder, and returns the line that names its result."""
+    return getattr(importlib.import_module(f"ganlane.{command}"), command)
+
+
+def _run_in(
+    folder: str | Path | None, name: str, function: Callable[[Any, Path], str], config: Any
+) -> tuple[Path, str]:
+    """Run a command in ``folder`` (None: a new one below ``outputs/NAME``); the folder and the command's last line.
+
+    A mistake does not leave a new folder behind.
+    """
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
+    home = Path("outputs") / name / now if folder is None else Path(folder)
+    with cleared_after_mistakes(home), put_back_after_mistakes(home), _torch_threads():
+        home.mkdir(parents=True, exist_ok=True)
+        write_bytes(home / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)).encode())
+        return home, function(config, home)
+
+
+@contextmanager
+def _torch_threads(threads: int = 0) -> Iterator[None]:
+    """Torch's threads as the commands set them, and afterwards as the caller's session had them."""
+    before = torch.get_num_threads()
+    set_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _agent_name(agent: Agent) -> str:
+    """The agent's name in the table."""
+    if isinstance(agent, (str, Path)):
+        return str(agent)
+    if isinstance(agent, Driver):
+        return agent.name
+    if isinstance(agent, TensorDictModuleBase):
+        return type(agent).__name__
+    raise UserError(
+        f"agents: {agent!r} is no driver; give a name, what load_agent returned, or a TensorDictModule that writes "
+        "'action'."
+    )
+
+
+def _driver(agent: Agent, name: str, config: EvaluateConfig) -> Driver:
+    if isinstance(agent, Driver):
+        return agent
+    if isinstance(agent, TensorDictModuleBase):
+        return Driver(name, agent)
+    return build.make_driver(name, config.env, device=config.device)
+
+
+def _named_traffics(traffics: Sequence[Option] | Mapping[str, Option]) -> dict[str, TrafficConfig]:
+    """Traffics by their names in the table."""
+    if isinstance(traffics, Mapping):
+        return {name: option("traffic", chosen) for name, chosen in traffics.items()}
+    made = [option("traffic", chosen) for chosen in traffics]
+    labels = [config.label() for config in made]
+    if len(set(labels)) < len(labels):
+        raise UserError(
+            f"traffics={labels}: one name twice; give names of your own, traffics={{'mine': ..., 'other': ...}}."
+        )
+    return dict(zip(labels, made))
+
+
+def _with_traffic(keys: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Keys of a phase, its traffic as a config."""
+    given = dict(keys or {})
+    if given.get("traffic") is not None:
+        given["traffic"] = option("traffic", given["traffic"])
+    return given
+
+
+def _stream(name: str) -> Stream:
+    if name not in STREAMS:
+        raise UserError(f"stream={name}: expected one of {', '.join(STREAMS)}; choose one of them.")
+    return STREAMS[name]
+
+
+def _whole(name: str, value: Any) -> int:
+    """``value`` as an int; NumPy's integers are allowed."""
+    if isinstance(value, bool) or not hasattr(value, "__index__"):
+        raise UserError(f"{name}={value!r}: expected a whole number; give for instance {name}=1.")
+    return int(value)

@@ -1,0 +1,177 @@
+"""Systems as cases: the bare physics, the environment with all around it, and HighwayEnv on the same road."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import TransformedEnv
+
+from ganlane import keys
+from ganlane.bench.measure import COMPILED, Case, Runner, Suite
+from ganlane.build import make_env, make_traffic
+from ganlane.config.bench import BenchConfig
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import TrafficConfig
+from ganlane.env import HighwayEnv
+from ganlane.env.decision import run_decision
+from ganlane.parameters.observation import ObservationConfig
+from ganlane.parameters.reward import RewardParameters
+from ganlane.sim.random import episode_key
+from ganlane.sim.state import Vehicles
+
+#: Random actions are drawn before the clock starts and used again after so many decisions.
+_DRAWN = 64
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """All that makes an environment but its batch, device and mode; can be pickled."""
+
+    env: EnvConfig
+    traffic: TrafficConfig
+    observation: ObservationConfig
+    reward: RewardParameters
+    seed: int = 0
+
+    @classmethod
+    def of(cls, config: BenchConfig, traffic: TrafficConfig | None = None) -> Scenario:
+        """That of the command's configuration, with another traffic if one is given."""
+        return cls(config.env, traffic or config.traffic, config.observation, config.reward, config.seed)
+
+    def build(self, mode: str, device: str, batch: int) -> TransformedEnv:
+        """The environment."""
+        env = replace(self.env, compile=mode == COMPILED)
+        traffic = make_traffic(self.traffic, env)
+        return make_env(traffic, env, self.observation, self.reward, batch, self.seed, device)
+
+
+def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Runner:
+    """Traffic, ego dynamics, soft crashes and collision test alone; every turn starts from the first scene.
+
+    The ego keeps its lane, and goal and time-out are out of reach, so that in rule-driven traffic no episode ends and
+    every step moves every environment.
+    """
+    env = scenario.build(mode, device, batch)
+    state, base = env.reset(), env.base_env
+    substeps = base.rules.episode.substeps()
+
+    def run(decisions: int) -> int:
+        _, step = bare_steps(base, state, decisions * substeps)
+        return int((step - state.get(keys.STEP)).sum())
+
+    return run
+
+
+def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehicles, Tensor]:
+    """``steps`` physics steps from ``state`` as one long decision: the vehicles, and the counter of steps [N].
+
+    The rules keep their decision period, so that graphs compiled for one length serve all.
+    """
+    rules = env.rules._replace(episode=replace(env.rules.episode, goal_m=1e9, timeout_s=1e9))
+    vehicles, ego = Vehicles.of(state.get(keys.VEHICLES)), dict(state.get(keys.EGO).items())
+    keep = torch.full_like(state.get(keys.STEP), keys.KEEP)
+    start, _ = env.physics.begin(rules, keep, vehicles, ego, state.get(keys.STEP))
+    key = episode_key(env.stream, state.get(keys.SEED), state.get(keys.EPISODE))
+    end, _ = run_decision(env.traffic, env.physics, rules, state, start, key, substeps=steps)
+    return end.vehicles, end.step
+
+
+class EnvironmentRunner:
+    """Steps a TorchRL environment with automatic resets; each turn continues where the last one ended.
+
+    Physics steps are counted as they are simulated: an episode that ends within a decision is not simulated further,
+    and one that leaves the road not at all.
+
+    Args:
+        env: what is stepped.
+        actions: of consecutive decisions, used again from the first one on, [decisions, N].
+    """
+
+    def __init__(self, env: Any, actions: Tensor) -> None:
+        self.env, self.actions = env, actions.to(env.device).unbind(0)
+        self.state = env.reset()
+        self.decisions = 0
+
+    def __call__(self, decisions: int) -> int:
+        """See :data:`~ganlane.bench.measure.Runner`."""
+        simulated = torch.zeros((), dtype=torch.int64, device=self.env.device)
+        for _ in range(decisions):
+            self.decisions += 1
+            self.state.set(keys.ACTION, self.actions[self.decisions % len(self.actions)])
+            before, self.state = self.env.step_and_maybe_reset(self.state)
+            simulated += (before["next", keys.STEP] - before[keys.STEP]).sum()
+        return int(simulated)
+
+
+def start_environment(scenario: Scenario, mode: str, device: str, batch: int) -> Runner:
+    """The environment with observation, reward and automatic resets, driven by uniformly random actions."""
+    generator = torch.Generator().manual_seed(scenario.seed)
+    actions = torch.randint(3, (_DRAWN, batch), generator=generator)
+    return EnvironmentRunner(scenario.build(mode, device, batch), actions)
+
+
+def installed_version(package: str) -> str | None:
+    """Of a package; None where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def highway_env_settings(env: EnvConfig) -> dict[str, Any]:
+    """``config`` of ``highway-v0`` for the same road; what is not named here keeps HighwayEnv's default.
+
+    ``vehicles_count`` counts the others. Episodes end with a crash or after ``duration`` seconds.
+    """
+    return {
+        "lanes_count": env.lanes,
+        "vehicles_count": env.vehicles - 1,
+        "simulation_frequency": round(1 / keys.PHYSICS_STEP_S),
+        "policy_frequency": 1 / env.decision_period_s,
+        "duration": env.timeout_s,
+        "observation": {"type": "Kinematics"},
+        "action": {"type": "DiscreteMetaAction"},
+    }
+
+
+class HighwayEnvRunner:
+    """``highway-v0`` without rendering and gymnasium's checks: random actions, a reset after every end."""
+
+    def __init__(self, settings: dict[str, Any], seed: int) -> None:
+        import gymnasium
+        import highway_env
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # In some releases the import registers the environments, in others this function; both do no harm.
+            getattr(highway_env, "register_highway_envs", lambda: None)()
+            made = gymnasium.make("highway-v0", config=settings, disable_env_checker=True)
+        self.env: Any = made.unwrapped
+        self.env.reset(seed=seed)
+        self.random = np.random.default_rng(seed)
+        self.steps_per_decision = int(settings["simulation_frequency"] // settings["policy_frequency"])
+
+    def __call__(self, decisions: int) -> int:
+        """See :data:`~ganlane.bench.measure.Runner`."""
+        for action in self.random.integers(self.env.action_space.n, size=decisions):
+            _, _, terminated, truncated, _ = self.env.step(int(action))
+            if terminated or truncated:
+                self.env.reset()
+        return decisions * self.steps_per_decision
+
+
+def highway_env_case(suite: Suite) -> Case:
+    """HighwayEnv on the suite's road; it does not use torch, so one thread is all it has."""
+    config = suite.config
+    labels = suite.labels(
+        f"HighwayEnv {installed_version('highway-env')}", "its IDM and MOBIL", "eager", 1, 1, dtype="float64"
+    )
+    return Case(labels, partial(HighwayEnvRunner, highway_env_settings(config.env), config.seed))

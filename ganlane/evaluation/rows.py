@@ -1,0 +1,257 @@
+"""The numbers of an evaluation, from one row per episode: by driver and traffic, by pair of drivers, by scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from ganlane import keys
+from ganlane.errors import UserError
+from ganlane.evaluation.statistics import (
+    RESAMPLES,
+    TAIL_LEVELS,
+    Array,
+    Estimate,
+    bootstrap_means,
+    clopper_pearson,
+    entries,
+    mean_interval,
+    paired_difference,
+    poisson_interval,
+    resample_counts,
+)
+
+#: The two drivers that give the normalised score its scale.
+SCALE_TOP, SCALE_BOTTOM = "mobil", "random_legal"
+#: What two drivers' episodes are matched by.
+_EPISODE = ["seed", "episode"]
+_CRASH = "hard_crash"
+
+Row = dict[str, Any]
+
+
+def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
+    """Rows of the ``evaluate`` command, in the order in which agents and traffics first appear.
+
+    Args:
+        episodes: what :func:`ganlane.evaluation.run_episodes` returns, with ``agent`` and ``traffic`` added,
+            for every pair, one below the other.
+
+    Returns:
+        Per pair ``agent, traffic, episodes``; the counts ``goal, hard_crash, out_of_road, timeout,
+        scene_end`` (how episodes ended) and ``soft_crash`` (episodes with at least one),
+        ``soft_crash_onsets``, ``soft_crash_behind_onsets`` and the latter's mean ``soft_crash_behind_per_episode``;
+        ``mean_reward`` and ``reward_sd``;
+        ``mean_speed_mps`` (distance over time of all episodes together); ``lane_changes_per_km``;
+        ``distance_km``; ``hard_crash_share`` and ``out_of_road_share`` of the episodes (exact intervals);
+        ``crashes_per_1000_km`` (hard crashes);
+        ``minus_mobil`` (paired difference of the mean reward to MOBIL's on the same episodes);
+        ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with ``_ci``
+        holds the 95 % interval of its namesake as ``[low, high]``, or None.
+    """
+    pairs = episodes.partition_by(["agent", "traffic"], maintain_order=True)
+    return [_row(pair, episodes.filter(pl.col("traffic") == pair["traffic"][0])) for pair in pairs]
+
+
+def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
+    """The row of one agent on one traffic; ``same_traffic`` also holds the drivers that give the scale."""
+    ended = {reason: int((pair["reason"] == reason).sum()) for reason in keys.END_EVENTS}
+    returns = pair["reward"].to_numpy()
+    distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
+    crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m) if distance_m > 0.0 else None
+    score = _score(pair, same_traffic)
+    return {
+        "agent": pair["agent"][0],
+        "traffic": pair["traffic"][0],
+        "episodes": pair.height,
+        "goal": ended["goal"],
+        "hard_crash": ended["hard_crash"],
+        "soft_crash": int(pair["had_soft_crash"].sum()),
+        "out_of_road": ended["out_of_road"],
+        "timeout": ended["timeout"],
+        "scene_end": ended["scene_end"],
+        "soft_crash_onsets": int(pair["soft_crash"].sum()),
+        "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
+        **entries("soft_crash_behind_per_episode", mean_interval(pair["soft_crash_behind"].to_numpy())),
+        **entries("mean_reward", mean_interval(returns)),
+        "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
+        "mean_speed_mps": distance_m / duration_s if duration_s > 0 else None,
+        "lane_changes_per_km": int(pair["lane_changes"].sum()) / distance_m * 1000.0 if distance_m > 0 else None,
+        "distance_km": distance_m / 1000.0,
+        **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
+        **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
+        **entries("crashes_per_1000_km", crashes),
+        **entries("minus_mobil", _lead_over_mobil(pair, same_traffic)),
+        "normalized_percent": score.percent,
+        "normalized_percent_ci": score.interval,
+        "normalized_percent_reason": score.reason,
+    }
+
+
+def _lead_over_mobil(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Estimate | None:
+    """None for MOBIL itself, and without it."""
+    mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
+    return None if pair["agent"][0] == SCALE_TOP or mobil.height == 0 else paired_lead(pair, mobil)[0]
+
+
+def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
+    """The returns of each of ``drivers`` on the episodes that all of them drove, in one order, each [E]."""
+    shared = drivers[0].select(_EPISODE)
+    for column, driver in enumerate(drivers):
+        shared = shared.join(driver.select(*_EPISODE, pl.col("reward").alias(str(column))), on=_EPISODE)
+    ordered = shared.sort(_EPISODE)
+    return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
+
+
+def paired_lead(driver: pl.DataFrame, other: pl.DataFrame) -> tuple[Estimate | None, int]:
+    """Mean return of ``driver`` minus that of ``other``, and the number of episodes that both drove.
+
+    No estimate for fewer than two episodes.
+    """
+    first, second = _paired_rewards(driver, other)
+    return (paired_difference(first, second) if len(first) > 1 else None), len(first)
+
+
+def paired_rows(episodes: pl.DataFrame) -> list[Row]:
+    """The first driver against each of the others, traffic by traffic.
+
+    Args:
+        episodes: as for :func:`evaluation_rows`.
+
+    Returns:
+        Per traffic and other driver ``agent, over, traffic, episodes`` (driven by both), ``lead`` (mean return of
+        ``agent`` minus that of ``over``), ``lead_ci`` (95 %) and ``verdict``: ``above`` or ``below`` where the
+        interval lies on one side of 0, else ``undecided``. Pairs that share fewer than two episodes are left out.
+    """
+    first, rows = episodes["agent"][0], []
+    for (traffic,), there in episodes.group_by("traffic", maintain_order=True):
+        own = there.filter(pl.col("agent") == first)
+        for (other,), driven in there.group_by("agent", maintain_order=True):
+            lead, shared = paired_lead(own, driven) if other != first else (None, 0)
+            if lead is not None:
+                row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
+                verdict = ("above" if lead.value > 0.0 else "below") if lead.excludes_zero() else "undecided"
+                rows.append({**row, **entries("lead", lead), "verdict": verdict})
+    return rows
+
+
+@dataclass(frozen=True)
+class NormalizedScore:
+    """Percent of the way from the random driver to MOBIL; without a value, the reason why there is none."""
+
+    percent: float | None = None
+    interval: list[float] | None = None
+    reason: str | None = None
+
+
+def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
+    """The normalised score of one agent, from the episodes that it shares with the two drivers of the scale."""
+    drivers = [pair]
+    for name in (SCALE_TOP, SCALE_BOTTOM):
+        driver = same_traffic.filter(pl.col("agent") == name)
+        if driver.height == 0:
+            return NormalizedScore(reason=f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing")
+        drivers.append(driver)
+    agent, mobil, random_legal = _paired_rewards(*drivers)
+    if len(agent) < 2:
+        return NormalizedScore(reason="fewer than two episodes are shared by the drivers")
+    return normalized_percent(agent, mobil, random_legal)
+
+
+def normalized_percent(
+    agent: npt.ArrayLike, mobil: npt.ArrayLike, random_legal: npt.ArrayLike, resamples: int = RESAMPLES, seed: int = 0
+) -> NormalizedScore:
+    """The paper's '% of MOBIL', ``100 (R - R_0) / (R_MOBIL - R_0)``: 0 for ``random_legal``, 100 for MOBIL.
+
+    This form fits both rows of the paper's Table VII; a plain ratio of mean rewards has no meaning where rewards can
+    be negative. Returns [E] of the three drivers are on the same episodes, in the same order. The interval resamples
+    episodes, all drivers together; resamples in which MOBIL's lead over the random driver is exactly 0 are left out.
+    There is no score where the paired interval of that lead includes 0: the scale would have no length.
+    """
+    returns = np.stack([np.asarray(values, dtype=np.float64) for values in (agent, mobil, random_legal)], axis=1)
+    lead = paired_difference(returns[:, 1], returns[:, 2], resamples, seed)
+    if lead.interval is None:
+        return NormalizedScore(reason="fewer than two episodes")
+    if not lead.excludes_zero():
+        interval = f"{lead.low:.1f} to {lead.high:.1f}"
+        return NormalizedScore(reason=f"the interval of mobil's lead over random_legal includes 0 ({interval})")
+    means = bootstrap_means(returns, resamples, seed)
+    low, high = np.quantile(_percent_of_way(means[means[:, 1] != means[:, 2]]), TAIL_LEVELS)
+    return NormalizedScore(float(_percent_of_way(returns.mean(axis=0))), [float(low), float(high)])
+
+
+def _percent_of_way(means: Array) -> Array:
+    """``100 (R - R_0) / (R_MOBIL - R_0)`` from means [..., 3] of agent, MOBIL and random driver."""
+    return 100.0 * (means[..., 0] - means[..., 2]) / (means[..., 1] - means[..., 2])
+
+
+@dataclass(frozen=True)
+class CrashesByScene:
+    """Hard crashes per km.
+
+    Attributes:
+        per_km: of all scenes together, with the 95 % interval of the bootstrap over scenes; no interval with fewer
+            than two scenes. Where nobody crashed the upper bound is Poisson's exact one for the distance driven,
+            since resampling zeros gives zero.
+        rows: one per scene, by name: ``scene, episodes, hard_crash, distance_km, crashes_per_km`` (None where
+            nothing was driven) and ``crashes_per_km_ci`` (exact, Poisson, as if its episodes were independent).
+    """
+
+    per_km: Estimate
+    rows: list[Row]
+
+
+def crashes_by_scene(
+    episodes: pl.DataFrame, scenes: Sequence[str], resamples: int = RESAMPLES, seed: int = 0
+) -> CrashesByScene:
+    """Crashes per km on recorded scenes, in all and by scene, with intervals that know how few scenes there are.
+
+    Episodes of one scene start a tenth of a second apart among the same drivers, so they are no independent
+    observations: whole scenes are resampled, and the ratio (all crashes over all km) is taken anew in each resample.
+
+    Args:
+        episodes: ``reason`` and ``distance_m`` per episode (:func:`ganlane.evaluation.run_episodes`), of one driver.
+        scenes: the scene of each of them (:meth:`ganlane.traffic.ReplayTraffic.scenes_of_episodes`).
+        resamples, seed: of the bootstrap.
+
+    Raises:
+        UserError: not one scene per episode, or nobody drove.
+    """
+    if len(scenes) != episodes.height:
+        raise UserError(f"{len(scenes)} scenes for {episodes.height} episodes: expected one for each.")
+    by_scene = (
+        episodes.select("reason", "distance_m", pl.Series("scene", scenes, pl.String))
+        .group_by("scene")
+        .agg(
+            pl.len().alias("episodes"),
+            (pl.col("reason") == _CRASH).sum().alias(_CRASH),
+            (pl.col("distance_m").cast(pl.Float64).sum() / 1000.0).alias("distance_km"),
+        )
+        .sort("scene")
+    )
+    crashes, km = (by_scene[name].to_numpy().astype(np.float64) for name in (_CRASH, "distance_km"))
+    if not km.sum() > 0.0:
+        raise UserError("crashes per km: nobody drove; give episodes that last at least one decision.")
+    rows = []
+    for row in by_scene.to_dicts():
+        rate = poisson_interval(row[_CRASH]).scaled(per=row["distance_km"]) if row["distance_km"] > 0.0 else None
+        rows.append({**row, **entries("crashes_per_km", rate)})
+    return CrashesByScene(_ratio(crashes, km, resamples, seed), rows)
+
+
+def _ratio(crashes: Array, km: Array, resamples: int, seed: int) -> Estimate:
+    """All ``crashes`` [S] over all ``km`` [S], with its percentile interval over resampled scenes."""
+    value = float(crashes.sum() / km.sum())
+    if len(km) < 2:
+        return Estimate(value)
+    if crashes.sum() == 0:
+        return Estimate(value, 0.0, (poisson_interval(0).high or 0.0) / float(km.sum()))
+    driven = km.clip(min=np.finfo(np.float64).tiny)
+    ratios = [counts @ crashes / (counts @ driven) for counts in resample_counts(len(km), resamples, seed)]
+    low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
+    return Estimate(value, float(low), float(high))

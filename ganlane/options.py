@@ -1,0 +1,131 @@
+"""From names, mappings and keyword arguments to config dataclasses, with the checks of the command line."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from omegaconf import OmegaConf
+
+from ganlane.config.messages import CONFIG_ERRORS, sentence
+from ganlane.config.schemas import SCHEMAS, made, node_of, option_of, options_of
+from ganlane.config.traffic import TrafficConfig
+from ganlane.errors import UserError
+from ganlane.files import conf_folder
+from ganlane.parameters.checks import did_you_mean
+
+#: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
+Option: TypeAlias = str | Mapping[str, Any] | Any
+#: Meaning of None, and of a mapping without a name, outside a command; a command's YAML has defaults of its own.
+DEFAULTS = {
+    "env": "highway",
+    "traffic": "idm_mobil",
+    "observation": "lane_view_overlap",
+    "mask": "none",
+    "reward": "paper",
+}
+
+
+def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = None, default: str | None = None) -> Any:
+    """The config dataclass of ``group`` that ``chosen`` means, with ``overrides`` on top.
+
+    Args:
+        group: ``env``, ``traffic``, ``observation``, ``reward`` ...
+        chosen: see :data:`Option`; None: ``default``; for ``traffic`` also an import path or a class.
+        overrides: values by key, nested ones as mappings.
+        default: name of the option where none is given; None: that of :data:`DEFAULTS`.
+
+    Raises:
+        UserError: no such option or key, a value of the wrong type or out of range.
+    """
+    if is_dataclass(chosen) and not isinstance(chosen, type):
+        return typed(group, chosen, overrides or {})
+    if chosen is None or isinstance(chosen, str) or inspect.isclass(chosen):
+        given = {} if chosen is None else {"name": chosen}
+    elif isinstance(chosen, Mapping):
+        given = dict(chosen)
+    else:
+        raise UserError(
+            f"{group}={chosen!r}: expected a name, a mapping of its keys (with its name as 'name') or a config "
+            "dataclass; give one of these."
+        )
+    name = given.pop("name", default or DEFAULTS[group])
+    kind, own = _named(group, name)
+    return typed(group, kind, {**own, **given, **(overrides or {})})
+
+
+def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
+    """Dataclass of an option and the values that its name stands for."""
+    if group == "traffic" and inspect.isclass(name):
+        return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
+    if group == "traffic" and isinstance(name, str) and "." in name:
+        return TrafficConfig, {"_target_": name}
+    known = options_of(group)
+    if name not in known:
+        hint = did_you_mean(str(name), known)
+        raise UserError(f"{group}={name}: no such option{hint}; choose one of {', '.join(known)}.")
+    return option_of(group, name)
+
+
+def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
+    """``config`` (a dataclass or one of its objects) with ``values``, types and ranges checked.
+
+    Args:
+        where: key of the config in messages, for instance ``env``; empty at the root.
+        config: what the values are put on top of.
+        values: by key; nested ones as mappings.
+
+    Raises:
+        UserError: an unknown key, a value of the wrong type or out of range.
+    """
+    try:
+        node = node_of(config)
+        holder: Any = OmegaConf.create({where: node}) if where else node
+        given = {name: _plain(value) for name, value in values.items()}
+        merged: Any = OmegaConf.merge(holder, {where: given} if where else given)
+        return made(merged.get(where) if where else merged, where)
+    except CONFIG_ERRORS as error:
+        raise UserError(sentence(error).replace("; run the command with --help to see all keys", "")) from error
+
+
+def _plain(value: Any) -> Any:
+    """``value`` as OmegaConf takes it: paths as text, NumPy's and torch's numbers as Python's."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return node_of(value)
+    if isinstance(value, Path):
+        return str(value)
+    return value.item() if hasattr(value, "item") else value
+
+
+def default_options(command: str) -> dict[str, str]:
+    """Group to option that the command's YAML chooses."""
+    listed: Any = OmegaConf.to_container(OmegaConf.load(conf_folder() / f"{command}.yaml"))
+    pairs = [pair for entry in listed["defaults"] if isinstance(entry, dict) for pair in entry.items()]
+    return {group: name for group, name in pairs if name is not None and "@" not in group}
+
+
+def command_config(command: str, keys: Mapping[str, Any]) -> Any:
+    """Root config of a command.
+
+    Args:
+        command: ``train``, ``evaluate`` ...
+        keys: options by group, keys of the root and, where the command has an environment, keys of that.
+
+    Raises:
+        UserError: see :func:`option`.
+    """
+    kind, defaults = SCHEMAS[""][command], default_options(command)
+    # Outside train_generator, 'generator' only feeds interpolations of the YAML files, which a call does not read.
+    own = {known.name for known in fields(kind)} - ({"generator"} - set(defaults))
+    of_env = {name: value for name, value in keys.items() if name not in own} if "env" in defaults else {}
+    values = {name: value for name, value in keys.items() if name not in of_env}
+    for group, name in defaults.items():
+        values[group] = option(group, values.get(group), of_env if group == "env" else None, name)
+    return typed("", kind, values)

@@ -1,0 +1,98 @@
+"""How the process runs: compiled functions, kept memory, threads.
+
+Torch is imported inside the functions: the command line reads this module before it needs torch.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from ganlane.errors import UserError
+
+F = TypeVar("F", bound=Callable)
+#: Graphs that one function may have: one per batch size, road and set of parameters in a process.
+GRAPHS_PER_FUNCTION = 64
+#: With torch 2.11 on Python 3.12 a NamedTuple that leaves a compiled graph is empty; 2.13 is right.
+TRIED_FROM = (2, 13)
+COMPILERS = ("c++", "g++", "clang++", "cl")
+#: From glibc's malloc.h.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+#: Bytes; blocks up to this size come from the heap, and as much free memory is kept at its end.
+KEPT_BYTES = 2**28
+_STATUS = Path("/proc/self/status")
+
+
+def has_compiler() -> bool:
+    """Whether torch would find a C++ compiler: the one that ``CXX`` names, or one of :data:`COMPILERS`."""
+    named = os.environ.get("CXX")
+    return any(shutil.which(name) for name in ((named,) if named else COMPILERS))
+
+
+def can_compile() -> bool:
+    """Whether compiling is known to work here: a C++ compiler, and a torch from :data:`TRIED_FROM` on."""
+    import torch
+
+    version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
+    return has_compiler() and version >= TRIED_FROM
+
+
+def check_compiler() -> None:
+    """Raise :class:`UserError` where torch would find no C++ compiler."""
+    if not has_compiler():
+        named = os.environ.get("CXX")
+        looked = f"CXX={named}" if named else ", ".join(COMPILERS)
+        raise UserError(
+            f"compile=true needs a C++ compiler, and there is none (looked for {looked}); install one "
+            "(Debian: apt install g++) or set compile=false."
+        )
+
+
+def compiled(function: F) -> F:
+    """``function``, a pure function on tensors without branches on their values, as one graph per shape."""
+    import torch
+
+    torch._dynamo.config.cache_size_limit = max(torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION)
+    return torch.compile(function, dynamic=False, fullgraph=True)  # type: ignore[return-value]
+
+
+def set_threads(threads: int) -> None:
+    """Let torch use so many threads; 0 takes one, which is fastest for batches of the sizes used here."""
+    import torch
+
+    torch.set_num_threads(threads or 1)
+
+
+def keep_freed_memory() -> bool:
+    """Let the process keep the memory it frees; whether that could be done (on Linux with glibc alone).
+
+    By default glibc hands every large block back to the system as soon as it is free, and taking it again costs a
+    page fault per 4 kB: with thousands of environments more than the arithmetic. The peak does not change. It is a
+    choice for a whole process, so the commands make it and the library does not.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is None:
+        return False
+    return bool(mallopt(_M_MMAP_THRESHOLD, KEPT_BYTES)) and bool(mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES))
+
+
+def peak_resident_bytes() -> int | None:
+    """The most memory that this process has held so far; None where the system does not report it.
+
+    Linux's ``ru_maxrss`` is not used: a fresh process inherits its parent's.
+    """
+    if _STATUS.is_file():
+        peaks = [line.split() for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM")]
+        return int(peaks[0][1]) * 1024 if peaks else None
+    if sys.platform == "darwin":
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return None

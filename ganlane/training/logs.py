@@ -1,0 +1,276 @@
+"""Where the figures of a run go: CSV files and the progress always, TensorBoard or Weights & Biases if asked for."""
+
+from __future__ import annotations
+
+import csv
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import monotonic
+from typing import Any, Protocol, TextIO
+
+from tqdm import tqdm
+
+from ganlane.config.train import LoggerConfig
+from ganlane.errors import UserError
+from ganlane.files import atomic_path
+
+#: Columns of ``metrics.csv``; an action's share follows for each action.
+COLUMNS = (
+    *("decisions", "updates", "wall_s", "decisions_per_s", "episodes"),
+    *("mean_return", "mean_discounted_return", "mean_return_to_go", "mean_value"),
+    *("goal_rate", "crash_rate", "out_of_road_rate", "timeout_rate", "lane_changes_per_km"),
+    *("loss", "mean_q", "clamped_fraction", "priority", "gradient_norm", "sigma", "epsilon"),
+)
+#: Figures shown beside the rate, and how.
+SHOWN = {
+    "mean_return": "return {:.1f}",
+    "crash_rate": "crashes {:.1%}",
+    "out_of_road_rate": "off the road {:.1%}",
+    "goal_rate": "goals {:.1%}",
+}
+#: The bar: the rate is that of the last seconds, the time left follows from it.
+BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} decisions, {rate_noinv_fmt}, {remaining} left{postfix}"
+
+
+class Log(Protocol):
+    """Takes rows of figures, one per logging interval."""
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Keep one row; it holds ``decisions``."""
+
+    def close(self) -> None:
+        """Finish."""
+
+
+class Logs:
+    """All logs of a run: ``metrics.csv``, ``evaluation.csv``, the progress, and the ``further`` ones.
+
+    Args:
+        folder: of the run.
+        actions: A, for the columns of their shares.
+        decisions: where the run starts (a resumed one).
+        total: decisions of the whole run, for the progress; None shows no progress.
+        further: more logs for the rows of ``metrics.csv`` and of the evaluations.
+    """
+
+    def __init__(
+        self, folder: str | Path, actions: int, decisions: int, total: int | None, further: Sequence[Log] = ()
+    ) -> None:
+        self.evaluation_file, self.first = Path(folder) / "evaluation.csv", decisions
+        shares = [f"action_{i}_share" for i in range(actions)]
+        metrics = CsvLog(Path(folder) / "metrics.csv", [*COLUMNS, *shares], decisions)
+        self.progress = None if total is None else Progress(total, decisions)
+        self.further = list(further)
+        self.of_metrics: list[Log] = [metrics, *([] if self.progress is None else [self.progress]), *further]
+        self.evaluation: CsvLog | None = None
+        before = read_rows(self.evaluation_file)
+        if before:  # of a resumed run; rows beyond its checkpoint go
+            self.evaluation = CsvLog(self.evaluation_file, list(before[0]), decisions)
+        self._last, self._last_s = decisions, monotonic()
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """A row of metrics; the rate since the last one is added."""
+        now = monotonic()
+        rate = (row["decisions"] - self._last) / max(now - self._last_s, 1e-9)
+        self._last, self._last_s = int(row["decisions"]), now
+        for log in self.of_metrics:
+            log.write({**row, "decisions_per_s": rate})
+
+    def write_evaluation(self, row: Mapping[str, float]) -> None:
+        """A row of evaluation figures; the columns of ``evaluation.csv`` are the first row's."""
+        if self.evaluation is None:
+            self.evaluation = CsvLog(self.evaluation_file, list(row), self.first)
+        self.evaluation.write(row)
+        for log in self.further:
+            log.write({name if name == "decisions" else f"evaluation/{name}": value for name, value in row.items()})
+
+    def advance(self, decisions: int) -> None:
+        """Move the progress bar."""
+        if self.progress is not None:
+            self.progress.advance(decisions)
+
+    def say(self, text: str) -> None:
+        """A line to the user, above the bar if there is one."""
+        tqdm.write(text, file=sys.stderr)
+
+    def close(self) -> None:
+        """Close all of them."""
+        for log in [*self.of_metrics, *([] if self.evaluation is None else [self.evaluation])]:
+            log.close()
+
+
+class CsvLog:
+    """A CSV file with fixed columns, one line per row, complete after every row.
+
+    Args:
+        path: the file; if it exists, its whole rows up to ``decisions`` are kept: a resumed run goes on where the
+            checkpoint was made, not where the interrupted run had got to.
+        columns: in this order; a row's other entries are dropped, missing ones left empty.
+        decisions: where the run starts.
+    """
+
+    def __init__(self, path: str | Path, columns: Sequence[str], decisions: int = 0) -> None:
+        self.path, self.columns = Path(path), list(columns)
+        rows = [row for row in read_rows(self.path) if float(row["decisions"]) <= decisions]
+        with atomic_path(self.path) as part, part.open("w", newline="") as file:
+            self._writer(file).writeheader()
+            self._writer(file).writerows(rows)
+        self._file = self.path.open("a", newline="")
+
+    def _writer(self, file: object) -> csv.DictWriter:
+        return csv.DictWriter(file, self.columns, extrasaction="ignore", lineterminator="\n")  # type: ignore[arg-type]
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Append one line."""
+        short = {name: format(value, ".6g") if isinstance(value, float) else value for name, value in row.items()}
+        self._writer(self._file).writerow(short)
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file that :class:`CsvLog` wrote; none if it is absent.
+
+    A row that a full disk or a kill has torn is left out: its last figure may have lost digits.
+    """
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        whole = [line for line in file if line.endswith("\n")]
+    # DictReader gives what a short row lacks as None, and what a long one has too much under None.
+    rows = [row for row in csv.DictReader(whole) if None not in row and None not in row.values()]
+    return [row for row in rows if row.get("decisions")]
+
+
+class Progress:
+    """Shows decisions per second, time left, mean return and ends of the episodes: a bar, or a line per row.
+
+    Figures that a row lacks, since no episode ended in its interval, are shown as they were last.
+
+    Args:
+        total: decisions of the whole run.
+        done: decisions already made (a resumed run).
+        stream: where to; a terminal gets the bar.
+    """
+
+    def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
+        self.total, self.stream = total, sys.stderr if stream is None else stream
+        self.known: dict[str, float] = {}
+        self._bar = None
+        if self.stream.isatty():
+            options = {"unit": "", "unit_scale": True, "dynamic_ncols": True, "bar_format": BAR, "file": self.stream}
+            self._bar = tqdm(total=total, initial=done, desc="train", **options)
+
+    def advance(self, decisions: int) -> None:
+        """Move the bar to ``decisions``."""
+        if self._bar is not None:
+            self._bar.update(decisions - self._bar.n)
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Show the figures of one row."""
+        self.known |= {name: row[name] for name in SHOWN if name in row}
+        shown = [form.format(self.known[name]) for name, form in SHOWN.items() if name in self.known]
+        if self._bar is not None:
+            self._bar.set_postfix_str(", ".join(shown))
+            return
+        rate = max(row.get("decisions_per_s", 0.0), 1e-9)
+        left = max(self.total - row["decisions"], 0.0) / rate
+        head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {duration(left)} left"
+        print(", ".join([head, *shown]), file=self.stream, flush=True)
+
+    def close(self) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def duration(seconds: float) -> str:
+    """``1:02:03`` for 3723 s."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"
+
+
+def make_logs(options: LoggerConfig, folder: str | Path, about: Mapping[str, Any] | None = None) -> list[Log]:
+    """The further logs that ``logger=...`` asks for; ``about``: JSON-serialisable settings of the run, to be shown.
+
+    Raises:
+        UserError: the package that one of them needs is not installed.
+    """
+    if options.kind == "tensorboard":
+        return [TensorBoardLog(Path(folder) / "tensorboard")]
+    if options.kind == "wandb":
+        return [WandbLog(folder, options.project, about)]
+    return []
+
+
+class TensorBoardLog:
+    """TensorBoard event files in ``folder`` (extra ``tensorboard``)."""
+
+    def __init__(self, folder: str | Path) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise UserError(
+                "logger=tensorboard: tensorboard is not installed; run `pip install 'ganlane[tensorboard]'` or use "
+                "logger=csv."
+            ) from error
+        self._writer = SummaryWriter(str(folder))
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Add every figure as a scalar over the decisions."""
+        for name, value in row.items():
+            if name != "decisions":
+                self._writer.add_scalar(name, value, int(row["decisions"]))
+
+    def close(self) -> None:
+        """Flush and close."""
+        self._writer.close()
+
+
+class WandbLog:
+    """A run of Weights & Biases below ``folder/wandb`` (extra ``wandb``), named after ``folder``'s last two parts.
+
+    Offline, unless the environment variable ``WANDB_MODE`` asks for something else (``online``, ``disabled``);
+    ``wandb sync FOLDER/wandb/offline-run-*`` uploads it later. A resumed training run is a further run there, which
+    starts at the decisions of the checkpoint. ``about`` are JSON-serialisable settings, shown beside the figures.
+
+    Raises:
+        UserError: wandb is not installed, or does not start (``WANDB_MODE=online`` without an account, for instance).
+    """
+
+    def __init__(self, folder: str | Path, project: str = "ganlane", about: Mapping[str, Any] | None = None) -> None:
+        try:
+            import wandb
+        except ImportError as error:
+            raise UserError(
+                "logger=wandb: wandb is not installed; run `pip install 'ganlane[wandb]'` or use logger=csv."
+            ) from error
+        mode = os.environ.get("WANDB_MODE") or "offline"
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        name = "/".join(folder.absolute().parts[-2:])
+        options: dict[str, Any] = {"project": project, "name": name, "dir": str(folder), "mode": mode}
+        try:
+            # Without W&B's console, which would take the progress bar's stream away.
+            settings = wandb.Settings(console="off")
+            self._run = wandb.init(config=dict(about or {}), settings=settings, **options)
+        except (wandb.Error, ValueError) as error:
+            raise UserError(
+                f"logger=wandb with WANDB_MODE={mode}: W&B did not start ({error}); use WANDB_MODE=offline or "
+                "logger=csv."
+            ) from error
+
+    def write(self, row: Mapping[str, float]) -> None:
+        """Add every figure over the decisions."""
+        figures = {name: value for name, value in row.items() if name != "decisions"}
+        self._run.log(figures, step=int(row["decisions"]))
+
+    def close(self) -> None:
+        """Write out what is left."""
+        self._run.finish()

@@ -1,0 +1,383 @@
+"""The phases of ``ganlane train``: one or two runs of the loop, the second from the first one's agent.
+
+:func:`phases_of` a config are one or two :class:`Phase`; :func:`run_phase` makes collector and agent, trains, and
+leaves the agent in the folder of the phase.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ganlane.agents import (
+    GreedyPolicy,
+    NetworkConfig,
+    Rainbow,
+    RainbowConfig,
+    read_agent,
+    save_agent,
+    warm_start,
+)
+from ganlane.agents.checkpoint import SHIPPED, SUPPORT
+from ganlane.agents.drivers import legal_actions
+from ganlane.agents.network import load_parameters
+from ganlane.build import make_env, make_road, make_traffic, observation_of
+from ganlane.config.traffic import TrafficConfig
+from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
+from ganlane.errors import UserError
+from ganlane.evaluation import code_version, run_episodes
+from ganlane.parameters.observation import ObservationConfig
+from ganlane.parameters.removed import RemovedOption, without_removed
+from ganlane.runtime import keep_freed_memory, set_threads
+from ganlane.sim.random import Stream
+from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint
+from ganlane.training.collectors import Collector, SingleCollector
+from ganlane.training.logs import make_logs
+from ganlane.training.loop import Evaluate, TrainingConfig, TrainingResult, train
+from ganlane.training.workers import ClusterCollector, ProcessCollector, WorkerPool
+from ganlane.transforms import observation_size
+
+#: The trained agent, in the folder of its phase; its presence says that the phase is over.
+AGENT_FILE = "agent.safetensors"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of training on one traffic: where its files go, what it starts from (None: random weights)."""
+
+    name: str
+    folder: Path
+    traffic: TrafficConfig
+    total_decisions: int
+    init: str | None
+
+
+def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
+    """The phases that ``config`` asks for, in order."""
+    main = Phase("train", folder, config.traffic, config.total_decisions, config.init.path)
+    before = config.pretrain
+    if before.total_decisions == 0 or before.traffic is None:
+        return [main]
+    first = Phase("pretrain", folder / "pretrain", before.traffic, before.total_decisions, config.init.path)
+    return [first, replace(main, init=str(first.folder / AGENT_FILE))]
+
+
+def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | None:
+    """Decisions, updates and wall time of a first phase that is over; None if it is not, or is no first phase.
+
+    Raises:
+        UserError: it had another length or traffic than ``config`` asks for.
+    """
+    path = phase.folder / AGENT_FILE
+    if phase.name != "pretrain" or not path.is_file():
+        return None
+    training = read_agent(path)[2]["training"]
+    done, asked = training["decisions"], phase.total_decisions
+    if not asked <= done < asked + config.collector.environments:
+        raise UserError(
+            f"pretrain.total_decisions={asked}: this phase is over, after {done} decisions; resume with what the run "
+            "was started with."
+        )
+    if flat(training["traffic"]) != flat(phase.traffic.description()):
+        raise UserError("traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same.")
+    return {name: training[name] for name in ("decisions", "updates", "wall_s")}
+
+
+def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = None) -> TrainingResult:
+    """Train the agent of one phase and write its :data:`AGENT_FILE`, unless a signal stopped it early.
+
+    Args:
+        config: of the whole run.
+        phase: which part of it.
+        resume: checkpoint to go on from.
+
+    Raises:
+        UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
+    """
+    config, agent = make_initial_agent(config, phase, resume)
+    metadata = describe(config, phase)
+    schedule = TrainingConfig(
+        phase.total_decisions,
+        config.log_every,
+        config.evaluate_every,
+        checkpoint_every_s=config.checkpoint_every_s,
+        checkpoint_replay=config.checkpoint_replay,
+        progress=config.logger.progress,
+    )
+    with closing(make_collector(config, phase)) as collector:
+        result = train(
+            collector,
+            agent,
+            schedule,
+            phase.folder,
+            evaluate=make_selection(config, phase) if config.evaluate_every else None,
+            logs=make_logs(config.logger, phase.folder, metadata),
+            metadata=metadata,
+            resume=resume,
+            identity=identity(config, phase),
+        )
+    if result.stopped_by is None:
+        save_final_agent(agent, config, phase, result)
+    return result
+
+
+# --- the environments
+
+
+def make_collector(config: TrainConfig, phase: Phase) -> Collector:
+    """What steps the environments of a phase: ``collector=single``, ``multi`` or ``ray``.
+
+    Raises:
+        UserError: the environments cannot be made, or Ray is not installed.
+    """
+    collector = config.collector
+    if not isinstance(collector, MultiCollectorConfig):
+        return SingleCollector(training_env(config, phase, collector.num_envs, device=config.device))
+    training_env(config, phase, 1)  # a mistake shows here, before there are workers
+    pool = WorkerPool(collector.workers, collector.num_envs, collector.weights_every)
+    make_worker_env = partial(worker_env, config, phase)
+    if isinstance(collector, RayCollectorConfig):
+        return ClusterCollector(make_worker_env, pool, collector.address)
+    return ProcessCollector(make_worker_env, pool)
+
+
+def training_env(
+    config: TrainConfig, phase: Phase, rows: int, first_episode: int = 0, device: str = "cpu"
+) -> EnvBase:
+    """``rows`` environments of the training stream; row i begins with episode ``first_episode + i``."""
+    traffic = make_traffic(phase.traffic, config.env, Stream.TRAIN)
+    parts = (traffic, config.env, config.observation, config.reward)
+    return make_env(*parts, rows, config.seed, device, first_episode, config.mask)
+
+
+def worker_env(config: TrainConfig, phase: Phase, rows: int, first_episode: int) -> EnvBase:
+    """The same in a process of its own, on its CPU."""
+    set_threads(config.threads)
+    keep_freed_memory()
+    return training_env(config, phase, rows, first_episode)
+
+
+def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
+    """Drives the greedy policy through episodes of the stream kept for selection, on which nothing is trained."""
+    traffic = make_traffic(phase.traffic, config.env, Stream.SELECT)
+    rows = min(config.selection_episodes, config.evaluation.num_envs)
+    parts = (traffic, config.env, config.observation, config.reward)
+    make = partial(make_env, *parts, seed=config.seed, device=config.device, mask=config.mask)
+    env, smaller = make(rows), None if config.env.compile else make
+
+    def evaluate(policy: GreedyPolicy) -> dict[str, float]:
+        table = run_episodes(env, policy, range(config.selection_episodes), config.seed, make_smaller=smaller)
+        return selection_figures(table)
+
+    return evaluate
+
+
+def selection_figures(table: pl.DataFrame) -> dict[str, float]:
+    """Mean reward, its standard error, crashes and lane changes of the episodes of ``table``, one per row."""
+    total = table.select("reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash").sum()
+    reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
+    spread = float(np.std(table["reward"].to_numpy()))
+    return {
+        "mean_reward": reward / table.height,
+        "standard_error": spread / math.sqrt(table.height),
+        "crash_rate": crashes / table.height,
+        "lane_changes_per_km": 1000.0 * changes / max(distance_m, 1.0),
+    }
+
+
+# --- the agent
+
+
+@dataclass(frozen=True)
+class Start:
+    """A trained agent to start from; ``moments`` are Adam's by parameter, None where the file has weights alone."""
+
+    name: str
+    weights: Mapping[str, Tensor]
+    network: NetworkConfig
+    observation: ObservationConfig
+    moments: Mapping[int, Any] | None = None
+
+
+def read_start(name: str, key: str = "init.path") -> Start:
+    """The agent that ``init.path`` means.
+
+    Args:
+        name: a shipped agent or a ``.safetensors`` file; or a training run's folder or its ``last.pt``, for the agent
+            as the run last saved it, with its moments.
+        key: of the command line that gave ``name``.
+
+    Raises:
+        UserError: nothing of the sort is there, or it cannot be read.
+    """
+    path = Path(name)
+    if path.suffix != ".pt" and (not path.is_dir() or name in SHIPPED):
+        weights, network, metadata = read_agent(name)
+        return Start(name, weights, network, observation_of(metadata))
+    path = path / LAST if path.is_dir() else path
+    if not path.is_file():
+        raise UserError(f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's file.")
+    try:
+        state = load_checkpoint(path)
+        agent, seen = state["agent"], state["identity"]["observation"]
+        observation = ObservationConfig(**{name: seen[name] for name in ("form", "range_m", "speed_mps")})
+        size = observation_size(observation.form, state["identity"]["env"]["vehicles"])
+        rainbow = RainbowConfig(**without_removed(agent["config"], f"{key}={path}"))
+        weights = {name: value.detach() for name, value in agent["network"].items()}
+        return Start(str(path), weights, NetworkConfig.of(rainbow, size), observation, agent["optimizer"]["state"])
+    except RemovedOption:
+        raise
+    except (AttributeError, KeyError, TypeError, ValueError, UserError) as error:
+        raise UserError(
+            f"{key}={path}: not a training checkpoint that this version of ganlane can read; give a run's folder, "
+            f"its {LAST}, or an agent's .safetensors file."
+        ) from error
+
+
+def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
+    """A fresh agent for the observation of ``config``; one about to be given trained weights explores little."""
+    rainbow = config.agent.for_phase(phase.total_decisions)
+    if phase.init is not None:
+        rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
+    size = observation_size(config.observation.form, config.env.vehicles)
+    legal = partial(legal_actions, road=make_road(config.env))
+    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal)
+
+
+def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | None) -> tuple[TrainConfig, Rainbow]:
+    """The agent with which ``phase`` begins, and ``config`` with the support of returns that it has.
+
+    With ``resume``, an agent ready to be restored: what the run once started from may be gone.
+
+    Raises:
+        UserError: the agent to start from does not fit.
+    """
+    if phase.init is None:
+        return config, make_agent(config, phase)
+    if resume is not None:
+        if config.init.support == "trained":
+            config = with_support(config, read_start(str(resume), "resume"))
+        return config, make_agent(config, phase)
+    start = read_start(phase.init)
+    check_observation(start, config)
+    if config.init.support == "trained":
+        config = with_support(config, start)
+    agent = make_agent(config, phase)
+    # A second phase starts from the best agent of the first, whose moments are not kept.
+    with_moments = config.init.optimizer and phase.init == config.init.path
+    if with_moments and not start.moments:
+        raise UserError(
+            f"init.optimizer=true: {start.name} holds no moments of the optimiser; give init.path a training run's "
+            f"folder or its {LAST}, saved after its first update, or init.optimizer=false."
+        )
+    warm_start(agent, start.name, start.weights, start.network, start.moments if with_moments else None)
+    return config, agent
+
+
+def with_support(config: TrainConfig, start: Start) -> TrainConfig:
+    """``config`` with the atoms, v_min and v_max of ``start``."""
+    support = {name: getattr(start.network, name) for name in SUPPORT}
+    return replace(config, agent=replace(config.agent, **support))
+
+
+def check_observation(start: Start, config: TrainConfig) -> None:
+    """Refuse to start from an agent that was trained on another observation."""
+    theirs = asdict(config.observation.read_by(start.observation))
+    ours = asdict(config.observation)
+    for key, value in theirs.items():
+        if value != ours[key]:
+            option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
+            raise UserError(
+                f"init.path={start.name}: this agent was trained with {option}, the run has {ours[key]}; "
+                f"give {option} or start with init=none."
+            )
+
+
+def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
+    """Write the agent of the phase: the best one where the run chose among several, else the last.
+
+    Its metadata hold, beside the description, the length of the run and, for the best one, its figures on the
+    stream kept for selection.
+    """
+    best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)
+    if result.best is not None and best.is_file():
+        weights, _, known = read_agent(best)
+        load_parameters(agent.network, weights)
+        chosen = {name: value for name, value in known["training"].items() if name not in metadata["training"]}
+        metadata["selected"] = {**chosen, "episodes": config.selection_episodes, "stream": "select"}
+    metadata["training"] |= {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
+    save_agent(phase.folder / AGENT_FILE, agent, metadata)
+
+
+# --- what is written down
+
+
+def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
+    """What a resumed run must share with the one that was stopped."""
+    parts = {"env": config.env, "reward": config.reward, "collector": config.collector}
+    return {
+        # Of a run that was begun before there was an option, the default of the option is known.
+        DEFAULTS: {
+            f"{name}.{key}": value for name, part in parts.items() for key, value in defaults_of(part).items()
+        },
+        "env": plain(config.env),
+        "traffic": phase.traffic.description(),
+        "observation": asdict(config.observation),
+        "reward": asdict(config.reward),
+        # Left out where there is none, as in the runs of versions that knew no masks.
+        **({"mask": asdict(config.mask)} if config.mask.form != "none" else {}),
+        "init": config.init.path,
+        "collector": {name: value for name, value in asdict(config.collector).items() if name != "address"},
+        "seed": config.seed,
+    }
+
+
+def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
+    """Metadata of the agent's files."""
+    return {
+        "observation": config.observation.form,
+        "observation_scale": asdict(config.observation.scale()),
+        "mask": asdict(config.mask),
+        "sensors": asdict(config.observation)["sensors"],
+        "environment": {"vehicles": config.env.vehicles, "lanes": config.env.lanes},
+        "env": plain(config.env),
+        "num_envs": config.collector.environments,
+        "code": code_version(),
+        "agent": plain(config.agent),
+        "reward": asdict(config.reward),
+        "training": {
+            "phase": phase.name,
+            "init": phase.init,
+            "seed": config.seed,
+            "traffic": phase.traffic.description(),
+        },
+    }
+
+
+def plain(config: Any) -> dict[str, Any]:
+    """A dataclass by its fields' names, as JSON has it: with lists in place of tuples."""
+    values: dict[str, Any] = json.loads(json.dumps(asdict(config)))
+    return values
+
+
+def defaults_of(config: Any) -> dict[str, Any]:
+    """The defaults of a dataclass's fields by dotted name; nested dataclasses by their own fields."""
+    found: dict[str, Any] = {}
+    for known in fields(config):
+        default = known.default if known.default_factory is MISSING else known.default_factory()
+        if is_dataclass(default):
+            found |= {f"{known.name}.{name}": value for name, value in defaults_of(default).items()}
+        elif default is not MISSING:
+            found[known.name] = list(default) if isinstance(default, tuple) else default
+    return found

@@ -1,0 +1,137 @@
+"""What happens while training, summed up on tensors and read out only when it is logged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ganlane import keys
+
+#: Ends that are counted per finished episode, and the column that reports their share.
+RATES = {
+    "goal": "goal_rate",
+    "hard_crash": "crash_rate",
+    "out_of_road": "out_of_road_rate",
+    "timeout": "timeout_rate",
+}
+#: Sums over the running episode of every environment.
+RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
+
+
+class EpisodeStats:
+    """Statistics of the finished episodes and of the updates since the last :meth:`read`.
+
+    Keys that an environment or a policy does not write (``events``, ``ego``, ``chosen_action_value``) are left out.
+
+    **Q-values against realised returns.** ``mean_return_to_go`` is the discounted return from a decision to the end
+    of its episode, averaged over all decisions of the finished episodes; ``mean_value`` is the mean of the values
+    that the policy gave its actions at the same decisions. The two agree where the values are right (an episode that
+    is cut off by time has no return beyond).
+
+    Args:
+        environments: N.
+        actions: A, for the shares of the actions.
+        gamma: discount per decision.
+        device: of the sums.
+    """
+
+    def __init__(self, environments: int, actions: int, gamma: float, device: torch.device | str = "cpu") -> None:
+        self.gamma = gamma
+        self.returns, self.discounted, self.to_go, self.lengths, self.values = (
+            torch.zeros(environments, device=device) for _ in RUNNING
+        )
+        self.discount = torch.ones(environments, device=device)
+        #: How often, discounted, the next reward counts in the returns from all decisions of the episode so far.
+        self.weight = torch.ones(environments, device=device)
+        self.actions = torch.arange(actions, device=device)
+        self.sums: dict[str, Tensor] = {}
+        self.updates: dict[str, Tensor] = {}
+        self.update_count = 0
+
+    @torch.no_grad()
+    def step(self, step: TensorDictBase) -> None:
+        """Add one step of the environments, batch [N]."""
+        after = step.get("next")
+        reward, done = after.get("reward").squeeze(-1), after.get("done").squeeze(-1)
+        self.returns += reward
+        self.discounted += self.discount * reward
+        self.discount *= self.gamma
+        self.to_go += self.weight * reward
+        self.weight = 1.0 + self.gamma * self.weight
+        self.lengths += 1.0
+        chosen = step.get(keys.CHOSEN_VALUE, None)
+        if chosen is not None:
+            self.values += chosen.reshape(-1)
+        self._finish(after, done, chosen is not None)
+        self._add("actions", (step.get(keys.ACTION)[:, None] == self.actions).sum(0))
+
+    def _finish(self, after: TensorDictBase, done: Tensor, has_values: bool) -> None:
+        """Count the episodes that ended and start their sums afresh."""
+        self._add("episodes", done.sum())
+        for name in RUNNING if has_values else RUNNING[:-1]:
+            self._add(name, (getattr(self, name) * done).sum())
+        events, ego = after.get(keys.EVENTS, {}), after.get(keys.EGO, None)
+        for name in RATES.keys() & events.keys():
+            self._add(name, (events.get(name).squeeze(-1) & done).sum())
+        if ego is not None:
+            for name in ("distance", "lane_changes"):
+                self._add(name, (ego.get(name) * done).sum())
+        going = ~done
+        for name in RUNNING:
+            setattr(self, name, getattr(self, name) * going)
+        self.discount, self.weight = (torch.where(done, 1.0, value) for value in (self.discount, self.weight))
+
+    def update(self, metrics: Mapping[str, Tensor]) -> None:
+        """Add the 0-dim ``metrics`` of one update."""
+        self.update_count += 1
+        for name, value in metrics.items():
+            self.updates[name] = self.updates[name] + value if name in self.updates else value
+
+    def _add(self, name: str, value: Tensor) -> None:
+        value = value.double()
+        self.sums[name] = self.sums[name] + value if name in self.sums else value
+
+    def read(self) -> dict[str, float]:
+        """Means since the last call; the sums start afresh. Means over no episode or no update are absent."""
+        sums: dict[str, Any] = {name: value.tolist() for name, value in self.sums.items()}
+        row = {name: float(value) / self.update_count for name, value in self.updates.items()}
+        shares = sums.pop("actions", [])
+        row |= {f"action_{i}_share": share / max(sum(shares), 1) for i, share in enumerate(shares)}
+        self.sums, self.updates, self.update_count = {}, {}, 0
+        return row | _per_episode(sums)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Sums of the running episodes and of the present interval."""
+        names = (*RUNNING, "discount", "weight", "sums", "updates", "update_count")
+        return {name: _copy(getattr(self, name)) for name in names}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        for name, value in state.items():
+            setattr(self, name, _copy(value))
+
+
+def _per_episode(sums: dict[str, float]) -> dict[str, float]:
+    """Means and rates over the finished episodes."""
+    episodes = sums.get("episodes", 0.0)
+    row = {"episodes": episodes}
+    if episodes == 0.0:
+        return row
+    row |= {"mean_return": sums["returns"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
+    row["mean_return_to_go"] = sums["to_go"] / sums["lengths"]
+    if "values" in sums:
+        row["mean_value"] = sums["values"] / sums["lengths"]
+    row |= {column: sums[name] / episodes for name, column in RATES.items() if name in sums}
+    if sums.get("distance", 0.0) > 0.0:
+        row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]
+    return row
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.clone()
+    return {name: tensor.clone() for name, tensor in value.items()} if isinstance(value, dict) else value

@@ -1,0 +1,41 @@
+import sys
+
+import pytest
+
+from ganlane import runtime
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator is on Linux alone")
+def test_a_process_that_keeps_its_memory_is_not_given_new_pages_at_every_step():
+    torch = pytest.importorskip("torch")
+    import resource
+
+    def faults() -> int:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(20):
+            a = torch.zeros(2_000_000)
+            a = (a + 1.0) * 2.0
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    without = faults()
+    if not runtime.keep_freed_memory():
+        pytest.skip("this libc has no mallopt")
+    faults()
+    assert faults() < max(without, 1) / 10
+
+
+def test_elsewhere_nothing_happens(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert not runtime.keep_freed_memory()
+
+
+def test_the_peak_stays_when_memory_is_given_back():
+    torch = pytest.importorskip("torch")
+    before = runtime.peak_resident_bytes()
+    if before is None:
+        pytest.skip("this system does not report a process's peak memory")
+    size = before + 50_000_000
+    held = torch.ones(size, dtype=torch.uint8)
+    assert runtime.peak_resident_bytes() >= size
+    del held
+    assert runtime.peak_resident_bytes() >= size

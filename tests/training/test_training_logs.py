@@ -1,0 +1,190 @@
+"""CSV files, the progress, TensorBoard, and Weights & Biases."""
+
+import csv
+import io
+import sys
+import types
+
+import pytest
+
+from ganlane.config.train import LoggerConfig
+from ganlane.errors import UserError
+from ganlane.training.logs import CsvLog, Progress, TensorBoardLog, WandbLog, duration, make_logs, read_rows
+
+# --- CSV
+
+
+def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(tmp_path):
+    path = tmp_path / "metrics.csv"
+    first = CsvLog(path, ["decisions", "loss"])
+    for decisions in (100, 200, 300):
+        first.write({"decisions": decisions, "loss": 1.0 / 3.0, "unknown": 5.0})
+    first.close()
+    second = CsvLog(path, ["decisions", "loss"], decisions=200)
+    second.write({"decisions": 260})
+    second.close()
+    with path.open() as file:
+        found = list(csv.reader(file))
+    assert found == [["decisions", "loss"], ["100", "0.333333"], ["200", "0.333333"], ["260", ""]]
+
+
+def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(tmp_path):
+    path = tmp_path / "metrics.csv"
+    log = CsvLog(path, ["loss", "decisions"])  # the last column is the one that can be cut unseen
+    rows = [{"loss": "0.5", "decisions": str(decisions)} for decisions in (100_000, 200_000, 300_000)]
+    for row in rows:
+        log.write(row)
+    log.close()
+    whole = path.read_bytes()
+    for size in range(len(whole) + 1):
+        path.write_bytes(whole[:size])
+        complete = max(0, whole[:size].count(b"\n") - 1)
+        assert read_rows(path) == rows[:complete]
+        CsvLog(path, ["loss", "decisions"], decisions=250_000).close()
+        assert read_rows(path) == rows[: min(complete, 2)]
+
+
+@pytest.mark.parametrize("torn", ["20", "20,0.", "20,0.5,1,30,0.5,1", "20,0.530,0.5,1"])
+def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
+    path = tmp_path / "metrics.csv"
+    path.write_text(f"decisions,loss,sigma\n10,0.5,1\n{torn}\n40,0.5,\n")
+    assert [row["decisions"] for row in read_rows(path)] == ["10", "40"]
+
+
+# --- progress
+
+
+def test_progress_off_a_terminal_is_a_line_per_row_with_the_last_known_figures():
+    stream = io.StringIO()
+    progress = Progress(1_000_000, stream=stream)
+    progress.advance(5)
+    progress.write({"decisions": 100_000, "decisions_per_s": 5000.0, "mean_return": 12.34, "crash_rate": 0.125})
+    progress.write({"decisions": 200_000, "decisions_per_s": 10_000.0})
+    assert stream.getvalue().splitlines() == [
+        "100,000 of 1,000,000 decisions, 5,000/s, 0:03:00 left, return 12.3, crashes 12.5%",
+        "200,000 of 1,000,000 decisions, 10,000/s, 0:01:20 left, return 12.3, crashes 12.5%",
+    ]
+
+
+def test_progress_on_a_terminal_is_a_bar_with_rate_time_left_return_and_crashes():
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    progress = Progress(100_000, stream=stream)
+    progress.advance(10_000)
+    progress.write({"decisions": 10_000, "mean_return": 3.0, "crash_rate": 0.25})
+    progress.close()
+    last = stream.getvalue().splitlines()[-1].rpartition("\r")[2]
+    assert "10.0k/100k decisions" in last
+    assert "/s, " in last
+    assert " left, return 3.0, crashes 25.0%" in last
+
+
+def test_durations_are_read_as_hours_minutes_seconds():
+    assert duration(3723.4) == "1:02:03"
+
+
+# --- TensorBoard, Weights & Biases
+
+
+class FakeRun:
+    def __init__(self):
+        self.rows, self.finished = [], False
+
+    def log(self, figures, step):
+        self.rows.append((step, figures))
+
+    def finish(self):
+        self.finished = True
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """A wandb that remembers what it was given; no process, no network."""
+    module = types.ModuleType("wandb")
+    module.Error = type("Error", (Exception,), {})
+    module.Settings = lambda **options: options
+    module.run, module.options = FakeRun(), {}
+
+    def init(**options):
+        module.options.update(options)
+        return module.run
+
+    module.init = init
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    return module
+
+
+def test_wandb_is_offline_unless_the_environment_says_otherwise(fake, tmp_path, monkeypatch):
+    WandbLog(tmp_path)
+    assert fake.options["mode"] == "offline"
+    monkeypatch.setenv("WANDB_MODE", "online")
+    WandbLog(tmp_path)
+    assert fake.options["mode"] == "online"
+
+
+def test_wandb_writes_below_the_run_folder_and_is_named_after_it(fake, tmp_path):
+    folder = tmp_path / "sweep" / "3"
+    WandbLog(folder, "mine", {"seed": 7})
+    assert fake.options["dir"] == str(folder)
+    assert folder.is_dir()  # wandb falls back to a temporary folder otherwise
+    assert (fake.options["project"], fake.options["name"]) == ("mine", "sweep/3")
+    assert fake.options["config"] == {"seed": 7}
+
+
+def test_wandb_gets_every_figure_over_the_decisions_and_is_finished(fake, tmp_path):
+    log = WandbLog(tmp_path)
+    log.write({"decisions": 100, "loss": 0.5, "mean_return": 3.0})
+    log.close()
+    assert fake.run.rows == [(100, {"loss": 0.5, "mean_return": 3.0})]
+    assert fake.run.finished
+
+
+@pytest.mark.parametrize(
+    ("log", "module", "extra"),
+    [(WandbLog, "wandb", "wandb"), (TensorBoardLog, "torch.utils.tensorboard", "tensorboard")],
+)
+def test_a_missing_package_is_named_with_the_command_that_mends_it(log, module, extra, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'.*logger=csv\.$"):
+        log(tmp_path)
+
+
+def test_a_wandb_that_does_not_start_is_one_sentence(fake, tmp_path, monkeypatch):
+    def refuse(**options):
+        raise fake.Error("api_key not configured")
+
+    monkeypatch.setattr(fake, "init", refuse)
+    monkeypatch.setenv("WANDB_MODE", "online")
+    with pytest.raises(UserError, match=r"WANDB_MODE=online.*api_key not configured.*WANDB_MODE=offline"):
+        WandbLog(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_real_wandb_keeps_an_offline_run(tmp_path, monkeypatch):
+    pytest.importorskip("wandb", reason="the extra wandb is not installed")
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    log = WandbLog(tmp_path)
+    log.write({"decisions": 100, "loss": 0.5})
+    log.write({"decisions": 100, "evaluation/mean_reward": 2.0})
+    log.close()
+    (stored,) = tmp_path.glob("wandb/offline-run-*/*.wandb")
+    assert b"evaluation/mean_reward" in stored.read_bytes()
+
+
+def test_the_option_chooses_the_logs(fake, tmp_path):
+    pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
+    assert make_logs(LoggerConfig(), tmp_path) == []
+    (board,) = make_logs(LoggerConfig(kind="tensorboard"), tmp_path)
+    assert isinstance(board, TensorBoardLog)
+    board.write({"decisions": 100, "loss": 0.5})
+    board.close()
+    assert any(path.name.startswith("events") for path in (tmp_path / "tensorboard").iterdir())
+    (wandb,) = make_logs(LoggerConfig(kind="wandb", project="mine"), tmp_path, {"seed": 1})
+    assert isinstance(wandb, WandbLog)
+    assert (fake.options["project"], fake.options["config"]) == ("mine", {"seed": 1})
+
+
+def test_an_unknown_logger_is_refused():
+    with pytest.raises(UserError, match=r"logger.kind=mlflow.*csv, tensorboard, wandb"):
+        LoggerConfig(kind="mlflow")

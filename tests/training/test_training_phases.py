@@ -1,0 +1,406 @@
+"""Phases: what a run starts from and takes over, what it may go on from, and what its agent is told of it."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import entry_tiny
+import pytest
+import torch
+
+import ganlane
+from ganlane.agents import read_agent, save_agent
+from ganlane.build import make_driver
+from ganlane.config.command_line import check
+from ganlane.config.env import EnvConfig
+from ganlane.config.train import InitConfig, NoInitConfig
+from ganlane.errors import UserError
+from ganlane.files import conf_folder
+from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.removed import LAST_REVISION, without_removed_overrides
+from ganlane.runtime import COMPILERS
+from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
+from ganlane.training.phases import (
+    AGENT_FILE,
+    check_observation,
+    describe,
+    length_if_finished,
+    make_agent,
+    make_initial_agent,
+    phases_of,
+    read_start,
+    run_phase,
+)
+
+TINY = [*entry_tiny.TINY, "logger.progress=false"]
+WITHOUT_INIT = [option for option in entry_tiny.TINY if option != "init=none"]
+
+
+def run(folder, *options, resume=None):
+    """A tiny training, the phase of it that ``folder`` gets."""
+    config = check("train", [*TINY, *options]).config
+    run_phase(config, phases_of(config, folder)[0], resume)
+    return folder
+
+
+def start(folder, path, *options, resume=None):
+    """Config and agent of a run in ``folder`` that is about to begin, from the agent at ``path``."""
+    given = [*WITHOUT_INIT, "init=idm_ckpt", f"init.path={path}", *options]
+    config = check("train", given).config
+    return make_initial_agent(config, phases_of(config, folder)[0], resume)
+
+
+def equal(one, other):
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def same_agent(one, other):
+    """Whether the runs in two folders ended with the same weights."""
+    return equal(*(read_agent(folder / AGENT_FILE)[0] for folder in (one, other)))
+
+
+# --- what a run takes over: weights always, support and moments where asked
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of a finished run."""
+    return run(tmp_path_factory.mktemp("runs") / "first")
+
+
+@pytest.fixture(scope="module")
+def last(trained):
+    """What its last checkpoint holds of the agent."""
+    return load_checkpoint(trained / LAST)["agent"]
+
+
+@pytest.mark.parametrize("place", ["", str(LAST), AGENT_FILE])
+def test_a_run_starts_from_a_folder_a_checkpoint_or_an_agents_file(place, trained, last, tmp_path):
+    """This run chose among no agents: the one it left is the last one."""
+    _, agent = start(tmp_path, trained / place)
+    assert equal(agent.weights(), last["network"])
+    assert agent.optimizer.state_dict()["state"] == {}
+    assert len(agent.replay) == agent.updates == 0
+
+
+def test_moments_are_taken_over_where_asked(trained, last, tmp_path):
+    _, agent = start(tmp_path, trained, "init.optimizer=true")
+    theirs, ours = last["optimizer"]["state"], agent.optimizer.state_dict()["state"]
+    assert theirs.keys() == ours.keys()
+    assert all(equal(theirs[row], ours[row]) for row in theirs)
+    assert ours[0]["step"] == last["updates"] > 0
+    assert agent.updates == 0
+
+
+def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
+    fall = ["agent.learning_rate_end=1e-5"]
+    folder = run(tmp_path, *fall, "total_decisions=160")
+    with pytest.raises(UserError, match=r"agent\.learning_rate_decisions=320: the saved agent has 160"):
+        run(folder, *fall, "total_decisions=320", resume=folder / LAST)
+    run(folder, *fall, "agent.learning_rate_decisions=160", "total_decisions=320", resume=folder / LAST)
+    state = load_checkpoint(folder / LAST)
+    assert state["counters"]["decisions"] == 320
+    assert state["agent"]["optimizer"]["param_groups"][0]["lr"] == 1e-5
+
+
+def test_a_file_of_weights_has_no_moments_to_take_over(trained, tmp_path):
+    with pytest.raises(UserError, match=r"agent\.safetensors holds no moments.*last\.pt.*init\.optimizer=false"):
+        start(tmp_path, trained / AGENT_FILE, "init.optimizer=true")
+
+
+OTHER_SUPPORT = ["agent.v_min=-50", "agent.v_max=60", "agent.atoms=21"]
+
+
+@pytest.mark.parametrize("place", ["", AGENT_FILE])
+def test_another_support_is_refused_unless_the_trained_one_is_asked_for(place, trained, last, tmp_path):
+    with pytest.raises(UserError, match=r"give init\.support=trained, set agent\.atoms=101 agent\.v_min=-120"):
+        start(tmp_path, trained / place, *OTHER_SUPPORT)
+    config, agent = start(tmp_path, trained / place, "init.support=trained", *OTHER_SUPPORT)
+    assert (agent.config.atoms, agent.config.v_min, agent.config.v_max) == (101, -120.0, 100.0)
+    assert (config.agent.atoms, config.agent.v_min, config.agent.v_max) == (101, -120.0, 100.0)
+    assert torch.equal(agent.network.support, torch.linspace(-120.0, 100.0, 101))
+    assert equal(agent.weights(), last["network"])
+
+
+def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(tmp_path):
+    """And ends as it would have in a piece: here the start lies in a file that is then gone."""
+    first = run(tmp_path / "first", "total_decisions=160")
+    options = ["init=idm_ckpt", f"init.path={first}", "init.support=trained", "init.optimizer=true", *OTHER_SUPPORT]
+    whole = run(tmp_path / "whole", *options, "total_decisions=320")
+    parts = run(tmp_path / "parts", *options, "total_decisions=160")
+    (first / LAST).unlink()
+    run(parts, *options, "total_decisions=320", resume=parts / LAST)
+    one, network, metadata = read_agent(parts / AGENT_FILE)
+    assert equal(one, read_agent(whole / AGENT_FILE)[0])
+    assert (network.v_min, network.atoms) == (-120.0, 101)
+    assert metadata["agent"]["v_min"] == -120.0
+
+
+def test_a_second_phase_begins_with_a_fresh_optimiser(trained, tmp_path):
+    given = [*WITHOUT_INIT, "init=idm_ckpt", f"init.path={trained}", "init.optimizer=true"]
+    given += ["traffic@pretrain.traffic=idm_mobil", "pretrain.total_decisions=16"]
+    config = check("train", given).config
+    first, second = phases_of(config, tmp_path)
+    assert make_initial_agent(config, first, None)[1].optimizer.state_dict()["state"]
+    run_phase(config, first)
+    _, agent = make_initial_agent(config, second, None)
+    assert equal(agent.weights(), read_agent(first.folder / AGENT_FILE)[0])
+    assert agent.optimizer.state_dict()["state"] == {}
+
+
+def test_another_observation_is_refused_from_a_checkpoint_too(trained, tmp_path):
+    with pytest.raises(UserError, match="give observation=table3_progress or start"):
+        start(tmp_path, trained, "observation=table3")
+    with pytest.raises(UserError, match=r"give observation\.range_m=200"):
+        start(tmp_path, trained, "observation.range_m=100")
+
+
+def damaged(damage, good: Path, path: Path):
+    """A last.pt that is none."""
+    state = load_checkpoint(good)
+    if damage == "text":
+        path.write_text("hello")
+    elif damage == "truncated":
+        path.write_bytes(good.read_bytes()[:1000])
+    elif damage == "another kind":
+        torch.save({"kind": "notes"}, path)
+    elif damage == "no state":
+        save_checkpoint(path, None)
+    elif damage == "no agent":
+        save_checkpoint(path, {**state, "agent": None})
+    elif damage == "unknown option":
+        save_checkpoint(path, {**state, "agent": {**state["agent"], "config": {"wheels": 4}}})
+    elif damage == "no observation":
+        save_checkpoint(path, {**state, "identity": {}})
+    else:
+        save_checkpoint(path, {**state, "agent": {**state["agent"], "network": {"head.weight": 3}}})
+
+
+DAMAGES = ["text", "truncated", "another kind", "no state", "no agent", "unknown option", "no observation", "numbers"]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_is_refused_in_one_sentence(damage, trained, tmp_path):
+    path = tmp_path / "last.pt"
+    damaged(damage, trained / LAST, path)
+    with pytest.raises(UserError, match=r"^init\.path=.*last\.pt: not a training checkpoint .*; give a run's folder"):
+        read_start(str(path))
+
+
+def test_weights_that_are_not_those_of_the_network_are_refused(trained, tmp_path):
+    state, path = load_checkpoint(trained / LAST), tmp_path / "last.pt"
+    state["agent"]["network"].popitem()
+    save_checkpoint(path, state)
+    with pytest.raises(UserError, match="the weights do not fit the network"):
+        start(tmp_path, path)
+
+
+@pytest.mark.parametrize("name", ["", "gone.pt"])
+def test_a_folder_without_a_checkpoint_is_refused(name, tmp_path):
+    with pytest.raises(UserError, match=r"last\.pt: no such file|gone\.pt: no such file"):
+        read_start(str(tmp_path / name))
+
+
+def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("agent_idm").mkdir()
+    assert read_start("agent_idm").moments is None
+
+
+@pytest.mark.parametrize("kind", [NoInitConfig, lambda **given: InitConfig(path=None, **given)])
+@pytest.mark.parametrize("given", [{"optimizer": True}, {"support": "trained"}])
+def test_who_starts_afresh_has_nothing_to_take_over(kind, given):
+    with pytest.raises(UserError, match=r"of which agent\? give init=idm_ckpt"):
+        kind(**given)
+
+
+def test_another_word_for_the_support_is_refused():
+    with pytest.raises(UserError, match=r"init\.support=mine: expected one of run, trained"):
+        InitConfig(support="mine")
+
+
+# --- experiments, lengths, learning rates
+
+EXPERIMENTS = sorted(
+    str(path.relative_to(conf_folder() / "experiment").with_suffix(""))
+    for path in (conf_folder() / "experiment").rglob("*.yaml")
+)
+
+
+@pytest.mark.parametrize("overrides", [[], *([f"experiment={name}"] for name in EXPERIMENTS)], ids=str)
+def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(overrides):
+    config = check("train", overrides).config
+    if config.init.path is not None:
+        check_observation(read_start(config.init.path), config)
+
+
+def test_a_first_phase_that_is_over_must_be_the_one_asked_for(tmp_path):
+    config = check("train", ["experiment=paper", "pretrain.total_decisions=5000"]).config
+    phase = phases_of(config, tmp_path)[0]
+    metadata = describe(config, phase)
+    metadata["training"] |= {"decisions": 5120, "updates": 3, "wall_s": 1.0}
+    save_agent(phase.folder / AGENT_FILE, make_agent(config, phase), metadata)
+    assert length_if_finished(config, phase)["decisions"] == 5120
+    with pytest.raises(UserError, match="after 5120 decisions"):
+        length_if_finished(config, replace(phase, total_decisions=9000))
+    with pytest.raises(UserError, match="on other traffic"):
+        length_if_finished(config, replace(phase, traffic=config.traffic))
+
+
+def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_path):
+    told = ["experiment=paper", "agent.learning_rate_end=1e-5", "pretrain.total_decisions=5000", "total_decisions=90"]
+    config = check("train", told).config
+    lengths = [make_agent(config, phase).config.learning_rate_decisions for phase in phases_of(config, tmp_path)]
+    assert lengths == [5000, 90]
+    config.agent = replace(config.agent, learning_rate_decisions=300)
+    assert make_agent(config, phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300
+
+
+# --- masks
+
+MOBIL, SAFE = "traffic=idm_mobil", "mask=safe"
+
+
+@pytest.fixture(scope="module")
+def masked(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("masked"), MOBIL, SAFE, "mask.safe_deceleration=3")
+
+
+def test_an_agent_drives_behind_the_mask_that_it_was_trained_with(masked):
+    driver = make_driver(str(masked / AGENT_FILE), EnvConfig())
+    assert driver.mask == MaskParameters("safe", 3.0)
+    assert make_driver(f"{masked / AGENT_FILE}+safe", EnvConfig()).mask == driver.mask
+    assert make_driver(f"{masked / AGENT_FILE}+legal", EnvConfig()).mask == MaskParameters("legal")
+
+
+def test_the_mask_of_the_next_state_is_kept_with_every_transition(masked):
+    rows = load_checkpoint(masked / LAST)["agent"]["replay"]["rows"]
+    mask = rows["next.action_mask"]
+    assert mask.shape == (len(rows["action"]), 3)
+    assert bool(mask[:, 0].all())
+    assert not bool(mask[:, 1:].all())
+
+
+def test_a_masked_run_stopped_and_resumed_ends_with_the_same_bits(masked, tmp_path):
+    given = [MOBIL, SAFE, "mask.safe_deceleration=3"]
+    half = run(tmp_path / "half", *given, "total_decisions=160")
+    assert same_agent(masked, run(half, *given, resume=half / LAST))
+
+
+@pytest.mark.parametrize("other", ["mask=legal", "mask.safe_deceleration=4"])
+def test_a_run_is_not_resumed_behind_another_mask(masked, other):
+    with pytest.raises(UserError, match="mask"):
+        run(masked, MOBIL, SAFE, "mask.safe_deceleration=3", other, resume=masked / LAST)
+
+
+def test_runs_without_a_mask_have_the_identity_that_they_always_had(tmp_path):
+    """Those of versions that knew no masks can be resumed."""
+    assert "mask" not in load_checkpoint(run(tmp_path, MOBIL, "mask=none") / LAST)["identity"]
+
+
+@pytest.mark.parametrize(("now", "refused"), [([], False), (["env.truck_share=0.5"], True)])
+def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(now, refused, tmp_path):
+    half = run(tmp_path, "total_decisions=160")
+    state = load_checkpoint(half / LAST)
+    del state["identity"]["env"]["truck_share"]
+    save_checkpoint(half / LAST, state)
+    if refused:
+        with pytest.raises(UserError, match="truck_share"):
+            run(half, *now, resume=half / LAST)
+    else:
+        assert run(half, *now, resume=half / LAST)
+
+
+# --- what was removed
+
+
+@pytest.mark.parametrize("stored", ["agent.encoder=shared", "agent.decide_when_free=true", "observation=fixed_order"])
+def test_a_command_line_with_a_removed_option_names_the_revision_that_had_it(stored):
+    with pytest.raises(UserError, match=f"^run: {stored} was removed after revision {LAST_REVISION}"):
+        without_removed_overrides(["seed=1", stored], "run")
+    with pytest.raises(UserError, match=LAST_REVISION):
+        without_removed_overrides(["experiment=search/base"], "run")
+
+
+def test_removed_options_at_their_defaults_are_left_out_of_a_command_line():
+    stored = ["agent.encoder=none", "agent.encoder_width=32", "agent.decide_when_free=false", "agent.hidden=[8,8]"]
+    assert without_removed_overrides(stored, "run") == ["agent.hidden=[8,8]"]
+
+
+def test_a_checkpoint_with_a_removed_option_names_the_revision_that_had_it(trained, tmp_path):
+    state, path = load_checkpoint(trained / LAST), tmp_path / "last.pt"
+    state["agent"]["config"]["encoder"] = "shared"
+    save_checkpoint(path, state)
+    with pytest.raises(UserError, match=f"^init.path=.*encoder=shared was removed after revision {LAST_REVISION}"):
+        read_start(str(path))
+    with pytest.raises(UserError, match=f"encoder=shared was removed after revision {LAST_REVISION}"):
+        run(tmp_path / "next", "total_decisions=480", resume=path)
+    state["agent"]["config"]["encoder"] = "none"
+    state["identity"]["observation"]["form"] = "fixed_order"
+    save_checkpoint(path, state)
+    with pytest.raises(UserError, match=f"fixed_order: it was removed after revision {LAST_REVISION}"):
+        read_start(str(path))
+
+
+# --- env.compile=true: a run that is stopped goes on, in a process of its own, to the weights of one in a piece
+
+#: A phase alone, without the evaluation that a command makes at its end: that would compile as much again.
+SCRIPT = """
+import sys
+from pathlib import Path
+from ganlane.config.command_line import check
+from ganlane.training.phases import phases_of, run_phase
+
+if __name__ == "__main__":
+    folder, resume, *told = sys.argv[1:]
+    config = check("train", told).config
+    run_phase(config, phases_of(config, Path(folder))[0], resume or None)
+"""
+#: Decisions that nobody waits for.
+TOO_LONG = 64_000
+
+
+def begin(folder: Path, total: int, resume: Path | str = "") -> subprocess.Popen:
+    """A training run in ``folder``, under way; what the compiler leaves is shared by the runs beside it."""
+    own = {
+        "PYTHONPATH": str(Path(ganlane.__file__).parents[1]),
+        "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"),
+    }
+    command = [
+        sys.executable,
+        "-c",
+        SCRIPT,
+        str(folder),
+        str(resume),
+        *TINY,
+        "env.compile=true",
+        f"total_decisions={total}",
+    ]
+    return subprocess.Popen(command, env={**os.environ, **own, "OMP_NUM_THREADS": "1"})
+
+
+def stop_after_a_row(run: subprocess.Popen, metrics: Path) -> None:
+    """SIGTERM in the middle: in the loop, some steps after the first figures."""
+    while run.poll() is None and not (metrics.is_file() and len(metrics.read_text().splitlines()) > 1):
+        time.sleep(0.1)
+    run.send_signal(signal.SIGTERM)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, COMPILERS)), reason="no C++ compiler")
+def test_a_compiled_run_stopped_and_resumed_ends_with_the_same_bits(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    first = begin(parts, TOO_LONG)
+    stop_after_a_row(first, parts / "metrics.csv")
+    assert first.wait() == 0
+    reached = load_checkpoint(parts / LAST)["counters"]["decisions"]
+    assert 160 <= reached < TOO_LONG
+    assert not (parts / AGENT_FILE).exists()
+    assert begin(parts, reached + 480, resume=parts / LAST).wait() == 0
+    assert begin(whole, reached + 480).wait() == 0
+    assert same_agent(parts, whole)

@@ -21,6 +21,7 @@ from ganlane.config.command_line import (
     parse_arguments,
     quoted,
     typed,
+    with_shares_replaced,
     without_repetitions,
 )
 from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
@@ -98,7 +99,7 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
         if flags.multirun:
             # The folder's name holds the time: given here, so that it is the one that was looked at.
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
-            _hydra(command, task, ["-m", *swept])
+            _hydra(command, task, ["-m", *with_shares_replaced(swept)])
         else:
             folder.mkdir(parents=True, exist_ok=True)
             asked = [each for each in without_repetitions(overrides) if not each.startswith("hydra")]

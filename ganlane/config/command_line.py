@@ -106,6 +106,16 @@ def without_repetitions(overrides: Sequence[str]) -> list[str]:
     return list(last.values())
 
 
+def with_shares_replaced(overrides: Sequence[str]) -> list[str]:
+    """The overrides, each ``traffic.shares=...`` after a null: Hydra would merge it into an experiment's shares."""
+    replaced = []
+    for override in parse(overrides):
+        key = override.key_or_group
+        replaced += [f"{key}=null"] if key.endswith("traffic.shares") else []
+        replaced.append(str(override.input_line))
+    return replaced
+
+
 def single_runs(overrides: Sequence[str], multirun: bool) -> list[list[str]]:
     """The overrides of every run: one, or all combinations of a sweep."""
     if not multirun:
@@ -160,7 +170,7 @@ def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Che
 
 
 def _check_one(command: str, overrides: Sequence[str]) -> Checked:
-    composed = compose(command, overrides=list(overrides), return_hydra_config=True)
+    composed = compose(command, overrides=with_shares_replaced(overrides), return_hydra_config=True)
     with open_dict(composed):
         composed.hydra.job.num = 0
         folders = [Path(str(composed.hydra[mode].dir)) for mode in ("run", "sweep")]

@@ -187,8 +187,8 @@ REACTING: dict[str, type[TrafficConfig]] = {
 class MixedTrafficConfig(TrafficConfig):
     """``traffic=mixed`` (:class:`ganlane.traffic.MixedTraffic`).
 
-    ``shares`` is null rather than its value, since a command line would add to names that are there; for the same
-    reason the type is free.
+    ``shares`` is null rather than its value, and of a free type, since a YAML file would add to names that are there.
+    A command line replaces them (:func:`ganlane.config.command_line.with_shares_replaced`).
 
     Attributes:
         shares: options of this group (not replay), or import paths of your own models, with whole numbers: how many

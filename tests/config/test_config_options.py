@@ -185,3 +185,13 @@ def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compil
     monkeypatch.setattr("torch.__version__", version)
     monkeypatch.setattr("ganlane.runtime.has_compiler", lambda: True)
     assert config_of("train", "total_decisions=1000000").compiled().env.compile is compiles
+
+
+@pytest.mark.parametrize("shares", [{"idm": 1}, {"idm": 1, "gan_calibrated": 2}], ids=["fewer", "new"])
+def test_shares_on_the_command_line_replace_those_of_an_experiment(shares):
+    given = ", ".join(f"{name}: {share}" for name, share in shares.items())
+    assert config_of("train", "experiment=general", f"traffic.shares={{{given}}}").traffic.shares == shares
+
+
+def test_an_experiment_on_top_of_another_sets_its_own_shares():
+    assert config_of("train", "experiment=general_continued").traffic.shares["gan"] == 4

@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from ganlane.config.messages import CONFIG_ERRORS, sentence
 from ganlane.config.schemas import SCHEMAS, made, node_of, option_of, options_of
@@ -83,12 +83,27 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
     """
     try:
         node = node_of(config)
-        holder: Any = OmegaConf.create({where: node}) if where else node
         given = {name: _plain(value) for name, value in values.items()}
+        _add_entries(node, given)
+        holder: Any = OmegaConf.create({where: node}) if where else node
         merged: Any = OmegaConf.merge(holder, {where: given} if where else given)
         return made(merged.get(where) if where else merged, where)
     except CONFIG_ERRORS as error:
         raise UserError(sentence(error).replace("; run the command with --help to see all keys", "")) from error
+
+
+def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
+    """Give ``node`` the entries of ``values`` that a mapping of dataclasses in it lacks.
+
+    OmegaConf would make them itself, but those of frozen dataclasses read-only, and then refuse their values.
+    """
+    for name, value in values.items():
+        if not isinstance(value, (Mapping, DictConfig)) or not isinstance(node, DictConfig) or node._is_none():
+            continue
+        if name in node:
+            _add_entries(node._get_node(name), value)
+        elif is_dataclass(kind := node._metadata.element_type):
+            node[name] = value if isinstance(value, DictConfig) else node_of(kind)
 
 
 def _plain(value: Any) -> Any:

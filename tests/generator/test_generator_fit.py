@@ -44,7 +44,7 @@ def calibrated_config(updates: int) -> CalibratedConfig:
     loop = LoopConfig(updates=updates, evaluate_every=3, learning_rate=5e-3, warmup=1)
     sizes = replace(SIZES, extra_inputs=4)
     return CalibratedConfig(
-        sizes, loop, horizons=(4, 6), shares=(1, 1), held_out_horizon=6, batch=3, held_out_stride=20
+        sizes, loop, horizons=(4, 6), shares=(1, 1), held_out_horizon=8, batch=3, held_out_stride=20
     )
 
 

@@ -26,11 +26,11 @@ from torchrl.envs import TransformedEnv
 from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.env import HighwayEnv
 from ganlane.native import EgoState, Kernel, Outcome
 from ganlane.native.library import VARIANTS, best_variant
 from ganlane.parameters.episode import SpawnParameters
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 

@@ -44,9 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _output_refused(error: OSError) -> int:
     """The exit status where standard output takes no more, as :func:`ganlane.config.app.run_command` has it."""
-    from ganlane.config.app import READER_LEFT, USER_ERROR
-    from ganlane.config.disk import file_sentence, is_users_matter
-    from ganlane.config.streams import let_go_of_streams
+    from ganlane.config.app import READER_LEFT, USER_ERROR, let_go_of_streams
+    from ganlane.config.messages import file_sentence, is_users_matter
 
     if let_go_of_streams() and isinstance(error, BrokenPipeError):
         return READER_LEFT

@@ -34,12 +34,12 @@ from ganlane import build
 from ganlane.build import Driver
 from ganlane.compare import compare_configured
 from ganlane.config.app import Stopped
-from ganlane.config.env import check_pay
-from ganlane.config.evaluate import EvaluateConfig, all_traffics
+from ganlane.config.env import check_reward
+from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.folders import CONFIG, cleared_after_mistakes, put_back_after_mistakes
 from ganlane.config.run import RunConfig
-from ganlane.config.store import SCHEMAS
-from ganlane.config.traffic import TrafficConfig
+from ganlane.config.schemas import SCHEMAS
+from ganlane.config.traffic import TrafficConfig, all_traffics
 from ganlane.errors import UserError
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
 from ganlane.evaluation.results import plain
@@ -110,7 +110,7 @@ def make_env(
         UserError: an unknown name or key, a value of the wrong type or out of range.
     """
     config, rewards = option("env", env, overrides), option("reward", reward)
-    check_pay(config, rewards)
+    check_reward(config, rewards)
     checked = RunConfig(seed=_whole("seed", seed), device=device)
     rows = _whole("num_envs", num_envs)
     if not 1 <= rows <= 65536:

@@ -23,13 +23,12 @@ from ganlane.agents.checkpoint import SHIPPED
 from ganlane.agents.drivers import DRIVERS
 from ganlane.agents.policy import MaskedPolicy
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.targets import call_with, import_target
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.parameters.observation import MASKS, MaskParameters
+from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream

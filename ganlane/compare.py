@@ -15,7 +15,6 @@ from tqdm import tqdm
 from ganlane.build import Driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.evaluation import (
     crashes_by_scene,
@@ -28,7 +27,7 @@ from ganlane.evaluation import (
     write_results,
 )
 from ganlane.evaluation.statistics import entries
-from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic, TrafficModule

@@ -8,17 +8,14 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from ganlane.config.messages import CONFIG_ERRORS, sentence
-from ganlane.config.nodes import made, node_of
-from ganlane.config.observation import FORMS
-from ganlane.config.store import SCHEMAS
+from ganlane.config.schemas import SCHEMAS, made, node_of, option_of, options_of
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.checks import did_you_mean
-from ganlane.parameters.observation import MASKS
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
@@ -66,24 +63,11 @@ def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
         return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
     if group == "traffic" and isinstance(name, str) and "." in name:
         return TrafficConfig, {"_target_": name}
-    yaml_names = sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
-    further = [each for each in yaml_names if each not in SCHEMAS[group]]
-    known = {"observation": FORMS, "mask": MASKS}.get(group) or (*SCHEMAS[group], *further)
+    known = options_of(group)
     if name not in known:
         hint = did_you_mean(str(name), known)
         raise UserError(f"{group}={name}: no such option{hint}; choose one of {', '.join(known)}.")
-    if group in ("observation", "mask"):
-        return SCHEMAS[group][group], {"form": name}
-    return _from_yaml(group, name)
-
-
-def _from_yaml(group: str, name: str) -> tuple[Any, dict[str, Any]]:
-    """Dataclass of an option, and what its YAML sets on top where the dataclass is another option's."""
-    if name in SCHEMAS[group]:
-        return SCHEMAS[group][name], {}
-    values: Any = OmegaConf.to_container(OmegaConf.load(conf_folder() / group / f"{name}.yaml"))
-    kind, inherited = _from_yaml(group, values.pop("defaults")[0])
-    return kind, {**inherited, **values}
+    return option_of(group, name)
 
 
 def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
@@ -99,12 +83,27 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
     """
     try:
         node = node_of(config)
-        holder: Any = OmegaConf.create({where: node}) if where else node
         given = {name: _plain(value) for name, value in values.items()}
+        _add_entries(node, given)
+        holder: Any = OmegaConf.create({where: node}) if where else node
         merged: Any = OmegaConf.merge(holder, {where: given} if where else given)
         return made(merged.get(where) if where else merged, where)
     except CONFIG_ERRORS as error:
         raise UserError(sentence(error).replace("; run the command with --help to see all keys", "")) from error
+
+
+def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
+    """Give ``node`` the entries of ``values`` that a mapping of dataclasses in it lacks.
+
+    OmegaConf would make them itself, but those of frozen dataclasses read-only, and then refuse their values.
+    """
+    for name, value in values.items():
+        if not isinstance(value, (Mapping, DictConfig)) or not isinstance(node, DictConfig) or node._is_none():
+            continue
+        if name in node:
+            _add_entries(node._get_node(name), value)
+        elif is_dataclass(kind := node._metadata.element_type):
+            node[name] = value if isinstance(value, DictConfig) else node_of(kind)
 
 
 def _plain(value: Any) -> Any:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ganlane.config.app import run_command
-from ganlane.config.prepare import PrepareConfig
+from ganlane.config.recordings import PrepareConfig
 
 if TYPE_CHECKING:
     from ganlane.data import Preparation, SceneSummary
@@ -39,10 +39,10 @@ _SHOWN_LEVELS: Final = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 def prepare(config: PrepareConfig, folder: Path) -> str:
     """Fetch where asked to, read, write, measure, report."""
-    from ganlane.config.data import NgsimDataConfig
     from ganlane.data import ByteProgress, default_scenes, download, prepare_recordings
     from ganlane.evaluation import write_results
     from ganlane.files import write_bytes
+    from ganlane.parameters.data import NgsimDataConfig
     from ganlane.view.figures import draw_recordings, save_figure
 
     begun = time.perf_counter()

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
-from ganlane.config.overrides import quoted
+from ganlane.config.command_line import quoted
 from ganlane.config.render import FILMS, RenderConfig
 
 if TYPE_CHECKING:

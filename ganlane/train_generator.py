@@ -17,14 +17,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ganlane.config.app import run_command
-from ganlane.config.data import DataConfig, NgsimDataConfig
-from ganlane.config.train_generator import TrainGeneratorConfig
+from ganlane.config.recordings import TrainGeneratorConfig
 from ganlane.errors import UserError
+from ganlane.parameters.data import DataConfig, NgsimDataConfig
 
 if TYPE_CHECKING:
     import polars as pl
@@ -42,7 +42,8 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
 
     set_threads(config.threads)
     source, frame = _recordings(config.data)
-    preset, fit_config = config.generator.preset_name(), config.generator.fit_config(config.seed)
+    fit_config: Any = replace(config.generator, seed=config.seed)
+    preset = fit_config.preset
     scenes = generator.scene_tracks(frame)
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
     split = generator.split_for_fit(scenes, held_out)
@@ -80,7 +81,8 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     print(f"weights: {weights}")
     numbers = results_of(result) | further | {"weights": str(weights)}
     context = {"seed": config.seed, "held_out": held_out}
-    return f"results: {write_results(folder, numbers, asdict(config), context)}"
+    used = asdict(replace(config, generator=fit_config))
+    return f"results: {write_results(folder, numbers, used, context)}"
 
 
 def _recordings(data: DataConfig) -> tuple[Path, pl.DataFrame]:

@@ -16,6 +16,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import GanTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
+from ganlane.options import option
 from ganlane.traffic import IdmTraffic
 
 #: Blocks of the documentation that take longer, or need recordings.
@@ -57,6 +58,12 @@ def test_options_come_as_names_mappings_configs_and_classes():
     assert isinstance(ganlane.make_env(IdmTraffic).base_env.traffic, IdmTraffic)
     assert ganlane.make_env("idm", env="cut_in", scene={"gap_m": 15.0}).base_env.vehicles > 1
     assert ganlane.make_env("idm", env="dense", vehicles=40).base_env.vehicles == 40
+
+
+def test_a_mixture_takes_parts_of_your_own_names():
+    part = {"mine": option("traffic", {"name": "gan", "noise_scale": 0.5})}
+    mixed = option("traffic", {"name": "mixed", "shares": {"mine": 1, "idm": 1}, "options": part})
+    assert mixed.options["mine"].noise_scale == 0.5
 
 
 def test_a_loaded_agent_drives_an_environment():

@@ -24,11 +24,12 @@ from reference.hydra_memory import composed, own_part
 from safetensors.torch import save_file
 
 from ganlane.__main__ import COMMANDS, main
-from ganlane.config.compose import typed
-from ganlane.config.store import SCHEMAS
+from ganlane.config.command_line import typed
+from ganlane.config.schemas import SCHEMAS
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, conf_folder, load_weights, save_weights
+from ganlane.parameters.checks import NO_KEY
 
 ROOT = Path(__file__).resolve().parents[1]
 AGENT, GENERATOR = CHECKPOINTS / "agent_idm.safetensors", CHECKPOINTS / "generator_paper.safetensors"
@@ -92,6 +93,8 @@ def keys_of(config: Any, command: str, chosen: tuple[str, ...] = (), prefix: str
     kinds = get_type_hints(type(config))
     for field in dataclasses.fields(config):
         value, name = getattr(config, field.name), f"{prefix}{field.name}"
+        if field.metadata == NO_KEY:
+            continue
         if dataclasses.is_dataclass(value):
             yield from keys_of(value, command, chosen, f"{name}.")
         elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):

@@ -10,8 +10,7 @@ import pytest
 from ganlane.build import make_driver
 from ganlane.compare import compare, publish, recorded_crashes
 from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.config.traffic_replay import ReplayTrafficConfig
+from ganlane.config.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.evaluation import crashes_by_scene
 from ganlane.sim.random import Stream

@@ -9,7 +9,7 @@ import torch
 from reference.worlds import environment, step
 
 from ganlane import keys
-from ganlane.config.env import EnvConfig, check_pay
+from ganlane.config.env import EnvConfig, check_reward
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
@@ -102,7 +102,7 @@ def test_an_ego_meant_to_drive_no_faster_than_15_mps_would_be_paid_for_crawling_
     standing = torch.zeros(1)
     assert speed_reward(standing + 1.0, standing + 1.0, standing).item() == pytest.approx(1.0)
     with pytest.raises(UserError, match="ego_desired_speed_mps=1"):
-        check_pay(EnvConfig(ego_desired_speed_mps=1.0), RewardParameters())
+        check_reward(EnvConfig(ego_desired_speed_mps=1.0), RewardParameters())
 
 
 #: Stop and go, m/s at the end of each second: 0.7 m/s2 up, 2.1 m/s2 down.

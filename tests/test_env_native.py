@@ -13,12 +13,11 @@ from torchrl.envs.utils import check_env_specs
 from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.env import native_step
 from ganlane.errors import UserError
 from ganlane.native import why_not
 from ganlane.parameters.driving import EgoParameters, IdmParameters
-from ganlane.parameters.observation import MaskParameters, SensorParameters
+from ganlane.parameters.observation import MaskParameters, ObservationConfig, SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic

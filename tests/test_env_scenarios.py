@@ -9,7 +9,7 @@ import torch
 
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.compose import check
+from ganlane.config.command_line import check
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,

@@ -19,10 +19,10 @@ from ganlane.bench.measure import COMPILED, Case, Runner, Suite
 from ganlane.build import make_env, make_traffic
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.decision import run_decision
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Vehicles

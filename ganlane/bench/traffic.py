@@ -12,8 +12,8 @@ import torch
 from ganlane import keys
 from ganlane.bench.measure import Case, Group, Row, Runner, Suite, best_rows, speed_table
 from ganlane.bench.systems import EnvironmentRunner, Scenario
-from ganlane.config.observation import ObservationConfig
 from ganlane.evaluation.table import Table
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SYSTEM = "ganlane traffic"

@@ -1,17 +1,14 @@
-"""Configuration of the commands: one dataclass per option; the YAML at the same place under conf/ holds the values.
+"""Configuration of the commands: one dataclass per option; ``conf/GROUP/NAME.yaml`` holds what differs from it.
 
-The options of ``agent``, ``reward`` and ``mask`` are records of :mod:`ganlane.parameters` as they stand. ``env``,
-``traffic``, ``init``, ``observation``, ``collector``, ``logger``, ``data`` and ``generator`` hold the options of the
-groups of these names, with such records in them or as their bases; ``train``, ``evaluate``, ``render``, ``prepare``,
-``train_generator``, ``realism`` and ``bench`` the root of each command; ``experiment`` needs no schema, since its
-options only set the keys of the others. Environments that start in a scene set by hand stand in ``scenarios``,
-``scene`` and ``scene_file``, traffics with faults and recorded traffic in ``traffic_faults`` and
-``traffic_replay``. The dataclasses are plain, and a notebook uses them without Hydra. Making one checks its ranges
-(:mod:`ganlane.parameters.checks`).
+The numbers themselves are declared in :mod:`ganlane.parameters`. The options of ``agent``, ``observation``, ``mask``,
+``reward``, ``data`` and ``generator`` are those records as they are. ``env`` with ``scenarios`` and ``traffic`` hold
+the options of these groups, ``train`` also those of ``init``, ``collector`` and ``logger``. ``train``, ``evaluate``,
+``render``, ``recordings``, ``realism`` and ``bench`` hold the commands' roots, and ``run`` what these share.
+``experiment`` needs no schema: its options only set the keys of the others. A notebook uses the dataclasses without
+Hydra.
 
-``app`` is the frame around every command: ``overrides`` reads the command line, ``resume`` adds that of the run to go
-on with, ``compose`` composes and checks (with ``store``), all before ``folders`` makes anything; ``messages`` says in
-a sentence what is wrong, ``disk`` what the file system refuses, ``streams`` lets go of an output that nobody reads,
-``help`` explains, ``completion`` completes in a shell, ``targets`` imports a user's own parts by name, ``nodes``
-turns dataclasses into OmegaConf's nodes and back, and ``plain`` hands values on to the packages below.
+``app`` runs a command: ``command_line`` reads the arguments and composes and checks the configuration with
+``schemas``, ``resume`` adds the command line of the run to go on with, all before ``folders`` makes anything.
+``messages`` turns errors into sentences, ``help`` explains, ``completion`` completes in a shell, and ``targets``
+imports a user's own parts by name.
 """

@@ -7,22 +7,28 @@ stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the 
 from __future__ import annotations
 
 import os
+import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
-from ganlane.config.compose import VERSION_BASE, check, typed
-from ganlane.config.disk import is_users_matter, numbered_refusals
+from ganlane.config.command_line import (
+    VERSION_BASE,
+    check,
+    parse_arguments,
+    quoted,
+    typed,
+    with_shares_replaced,
+    without_repetitions,
+)
 from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
 from ganlane.config.help import print_help
-from ganlane.config.messages import CONFIG_ERRORS, sentence
-from ganlane.config.overrides import parse_arguments, quoted, without_repetitions
+from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
 from ganlane.config.resume import with_resumed
-from ganlane.config.store import register
-from ganlane.config.streams import let_go_of_streams
+from ganlane.config.schemas import register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.runtime import keep_freed_memory
@@ -80,46 +86,56 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     flags = parse_arguments(command, arguments)
     if flags.help:
         print_help(command)
-    elif flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
+        return
+    if flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
         as_given = parse_arguments("", arguments).overrides
         hydras = dict(zip(as_given, flags.overrides))
         _hydra(command, task, [hydras.get(argument, argument) for argument in arguments])
-    else:
-        overrides = with_resumed(command, flags.overrides, flags.multirun)
-        checked = check(command, overrides, flags.multirun)
-        folder = checked.sweep_folder if flags.multirun else checked.run_folder
-        mode = "sweep" if flags.multirun else "run"
-        # The folder's name holds the time: given here, so that it is the one that was looked at.
-        overrides = without_repetitions([*overrides, f"hydra.{mode}.dir={quoted(folder)}"])
-        with cleared_after_mistakes(folder):
-            _hydra(command, task, [*(["-m"] if flags.multirun else []), *overrides])
+        return
+    overrides = with_resumed(command, flags.overrides, flags.multirun)
+    checked = check(command, overrides, flags.multirun)
+    folder = (checked.sweep_folder if flags.multirun else checked.run_folder).absolute()
+    with cleared_after_mistakes(folder):
+        if flags.multirun:
+            # The folder's name holds the time: given here, so that it is the one that was looked at.
+            swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
+            _hydra(command, task, ["-m", *with_shares_replaced(swept)])
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            asked = [each for each in without_repetitions(overrides) if not each.startswith("hydra")]
+            _do(task, checked.config, folder, checked.composed, asked)
+
+
+def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) -> None:
+    """The task in its folder, in which its configuration is written down first."""
+    with put_back_after_mistakes(folder):
+        write_down(composed, asked, folder)
+        with numbered_refusals():
+            last_line = task(config, folder)
+    if last_line:
+        print(last_line, flush=True)
 
 
 def _hydra(command: str, task: Task, arguments: list[str]) -> None:
-    """Let Hydra compose, make the folder and launch; errors come out as they are."""
+    """Let Hydra show the configuration, or sweep; errors come out as they are."""
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
-    # A run has composed once already, to be checked; --cfg and --info come here first.
     register()
     mistakes: list[Exception] = []
     here = os.getpid()
 
     def job(composed: Any) -> None:
         folder = Path(HydraConfig.get().runtime.output_dir)
+        asked = [str(override) for override in HydraConfig.get().overrides.task]
         try:
-            with cleared_after_mistakes(folder, existed=any(folder.iterdir())), put_back_after_mistakes(folder):
-                write_down(composed, folder)
-                with numbered_refusals():
-                    last_line = task(typed(composed), folder)
+            with cleared_after_mistakes(folder, existed=any(folder.iterdir())):
+                _do(task, typed(composed), folder, composed, asked)
         except (UserError, OSError) as error:
             # Kept rather than raised, since Hydra would print a line of its own; a worker process has to raise.
             mistakes.append(error)
             if os.getpid() != here:
                 raise
-            return
-        if last_line:
-            print(last_line, flush=True)
 
     application = hydra.main(version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command)(job)
     with _process([f"ganlane {command}", *arguments]):
@@ -162,3 +178,35 @@ def _sigterm_as_exception() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def let_go_of_streams() -> bool:
+    """Send nowhere what can no longer be written; whether a reader has left.
+
+    Python would try again when it ends, complain, and end with a status of its own.
+    """
+    left = [_has_no_reader(stream) for stream in (sys.stdout, sys.stderr)]
+    for stream, gone in zip((sys.stdout, sys.stderr), left):
+        if gone or not _takes_what_is_left(stream):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+    return any(left)
+
+
+def _has_no_reader(stream: TextIO) -> bool:
+    """Whether the stream is a pipe that nobody reads; there is no telling on Windows."""
+    try:
+        looked = select.poll()
+        looked.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # no such call, or no file behind the stream, as in a notebook
+        return False
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in looked.poll(0))
+
+
+def _takes_what_is_left(stream: TextIO) -> bool:
+    try:
+        stream.flush()
+    except OSError:
+        return False
+    return True

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ganlane.config.env import EnvConfig, check_pay
-from ganlane.config.evaluate import NAMES, all_traffics
-from ganlane.config.observation import ObservationConfig
-from ganlane.config.traffic import TrafficConfig
+from ganlane.config.env import EnvConfig, check_reward
+from ganlane.config.run import NAMES, has_cuda
+from ganlane.config.traffic import TrafficConfig, all_traffics, chosen_traffics
 from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.checks import Rule, between, check, every, one_of
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SUITES = ("sim", "traffic", "train")
@@ -30,7 +30,32 @@ def _different(rule: Rule) -> Rule:
 
 @dataclass
 class BenchConfig:
-    """What to measure, how often, and where to write it down."""
+    """What to measure, how often, and where to write it down.
+
+    Attributes:
+        suite: sim: the simulator, bare and as a whole environment; traffic: every traffic model; train: the training
+            loop, compared with stable-baselines3 on HighwayEnv.
+        quick: true: a check that it runs: small batches, two short repetitions, no memory, training in one mode.
+        batches: environments side by side.
+        modes: compiled: env.compile=true.
+        threads: torch's threads; a GPU is measured with the first number alone.
+        devices: [cpu], [cuda] or both; null: the CPU, and a GPU where there is one.
+        vehicle_counts: for the growth with the vehicles, at the density of env=dense.
+        scaling_batch: the batch at which that is measured.
+        linear_from: batches from here on are measured side by side for the growth with the batch.
+        memory_batches: memory per environment is measured between these two, each in a fresh process.
+        traffics: of suite=traffic: options of the group traffic.
+        traffic_batches: environments side by side, of suite=traffic.
+        train_traffics: of suite=train: options of the group traffic.
+        train_batches: environments side by side, of suite=train.
+        train_stored: transitions in the replay buffer when the clock starts.
+        repetitions: turns of every case; cases of a group take turns, medians are reported.
+        seconds: a turn lasts about so long, or as long as one decision does, s.
+        peers: a peer's simulator or learner in every group, if it is installed (extra 'bench').
+        memory: peak memory of every case, each in a fresh process.
+        report: a document whose tables to rewrite, for instance docs/performance.md.
+        seed: of all random numbers.
+    """
 
     suite: str = "sim"
     quick: bool = False
@@ -63,7 +88,6 @@ class BenchConfig:
         sizes = between(1, 2**20)
         check(
             self,
-            "",
             suite=one_of(SUITES),
             batches=_different(sizes),
             modes=_different(one_of(MODES)),
@@ -87,15 +111,15 @@ class BenchConfig:
         self._check_stored()
         self.chosen_traffics()
         self.chosen_train_traffics()
-        check_pay(self.env, self.reward)
+        check_reward(self.env, self.reward)
 
     def chosen_traffics(self) -> dict[str, TrafficConfig]:
         """Those of ``suite=traffic``, by name."""
-        return _known("traffics", self.traffics)
+        return chosen_traffics("traffics", self.traffics, all_traffics(), own=False)
 
     def chosen_train_traffics(self) -> dict[str, TrafficConfig]:
         """Those of ``suite=train``, by name."""
-        return _known("train_traffics", self.train_traffics)
+        return chosen_traffics("train_traffics", self.train_traffics, all_traffics(), own=False)
 
     def _check_stored(self) -> None:
         least, most = self.agent.batch_size, self.agent.capacity
@@ -108,15 +132,15 @@ class BenchConfig:
     def _check_devices(self) -> None:
         if self.devices is None:
             return
-        check(self, "", devices=_different(one_of(DEVICES)))
-        if "cuda" in self.devices and not _has_cuda():
+        check(self, devices=_different(one_of(DEVICES)))
+        if "cuda" in self.devices and not has_cuda():
             raise UserError("devices: torch sees no CUDA device here; leave cuda out or install torch for CUDA.")
 
     def chosen_devices(self) -> tuple[str, ...]:
         """Those asked for; by default the CPU, and a GPU where there is one."""
         if self.devices is not None:
             return tuple(self.devices)
-        return DEVICES if _has_cuda() else DEVICES[:1]
+        return DEVICES if has_cuda() else DEVICES[:1]
 
     def shortened(self) -> BenchConfig:
         """With ``quick``, at most seconds of measuring: small batches, two short repetitions, no memory.
@@ -139,18 +163,3 @@ class BenchConfig:
             seconds=min(self.seconds, 0.01),
             memory=False,
         )
-
-
-def _known(key: str, names: list[str]) -> dict[str, TrafficConfig]:
-    """The traffics of these names."""
-    known = all_traffics()
-    for name in names:
-        if name not in known:
-            raise UserError(f"{key}={name}: no such traffic; choose among {', '.join(known)}.")
-    return {name: known[name] for name in names}
-
-
-def _has_cuda() -> bool:
-    import torch
-
-    return torch.cuda.is_available()

@@ -9,8 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
@@ -20,7 +19,7 @@ ACTIONS = ("install", "uninstall", "query")
 PROGRAM = "ganlane"
 #: Any command will do where only the script of the shell is wanted.
 _ANY = "train"
-#: Ending of the names of schemas (``ganlane.config.store``, which takes long to import).
+#: Ending of the names of schemas (``ganlane.config.schemas``, which takes long to import).
 _SUFFIX = "_schema"
 #: What Hydra leaves out: zsh needs its layer for bash's completion, and bash keeps pointing at the removed function.
 _BEFORE = {
@@ -83,38 +82,14 @@ def _completed(command: str, rest: str) -> list[str]:
     from hydra._internal.core_plugins.bash_completion import BashCompletion
     from hydra.core.global_hydra import GlobalHydra
 
-    from ganlane.config.compose import VERSION_BASE
+    from ganlane.config.command_line import VERSION_BASE
+    from ganlane.config.schemas import SUFFIX, register
 
-    with _empty_schemas(), initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
+    register()
+    with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
         plugin = BashCompletion(GlobalHydra.instance().config_loader())
         found = plugin._query(config_name=command, line=rest.lstrip())
-    return [word for word in found if not word.endswith(_SUFFIX) and not word.startswith("hydra")]
-
-
-@contextmanager
-def _empty_schemas() -> Iterator[None]:
-    """In place of the dataclasses, whose checks import torch: the keys and their values stand in the YAML anyway."""
-    from hydra.core.config_store import ConfigStore
-
-    store, made = ConfigStore.instance(), []
-    for group, name in _schemas():
-        if name + ".yaml" not in (store.repo.get(group, {}) if group else store.repo):
-            store.store(group=group or None, name=name, node={})
-            made.append((group, name + ".yaml"))
-    try:
-        yield
-    finally:
-        for group, name in made:
-            del (store.repo[group] if group else store.repo)[name]
-
-
-def _schemas() -> set[tuple[str, str]]:
-    """Group (empty at the root) and name of every schema that an option is made from."""
-    found = set()
-    for path in conf_folder().rglob("*.yaml"):
-        group = path.parent.relative_to(conf_folder()).as_posix().removeprefix(".")
-        found |= {(group, name) for name in re.findall(rf"\w+{_SUFFIX}\b", path.read_text())}
-    return found
+    return [word for word in found if not word.endswith(SUFFIX) and not word.startswith("hydra")]
 
 
 def _script(action: str, shell: str) -> None:
@@ -122,7 +97,7 @@ def _script(action: str, shell: str) -> None:
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
 
-    from ganlane.config.compose import VERSION_BASE
+    from ganlane.config.command_line import VERSION_BASE
 
     print(_BEFORE.get((action, shell), ""))
     before = sys.argv

@@ -1,15 +1,14 @@
-"""``env=...``: the road, who drives on it, and when an episode ends."""
+"""``env=highway`` and ``env=dense``: the road, who drives on it, random first scenes, and the end of an episode."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from ganlane.errors import UserError
-from ganlane.parameters.checks import above, between, check, one_of
+from ganlane.errors import ParameterError
+from ganlane.parameters.checks import above, assign, between, check, one_of, part_of
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.parameters.episode import KERNELS, EpisodeParameters, SpawnParameters
-from ganlane.parameters.records import assign, part_of
 from ganlane.parameters.reward import RewardParameters
 
 if TYPE_CHECKING:
@@ -20,18 +19,20 @@ if TYPE_CHECKING:
 class EnvConfig(SpawnParameters, EpisodeParameters):
     """``env=highway``: the paper's highway (section IV, Tables II, IV and V); m, s, m/s.
 
-    The first scene's keys and those of the episode's end stand in it beside the road's.
-
     Attributes:
         vehicles: M, the ego included, 2 (Table III has no entry for fewer) to 1000.
         lanes: 1 to 20.
-        lane_width_m: above the vehicles' width; the paper gives none.
-        recycle: whether vehicles that the ego leaves behind return ahead of it, and the reverse.
+        lane_width_m: above the vehicles' width; the paper gives none. In narrower lanes noise alone makes cars of
+            2.5 m touch.
+        recycle: true: vehicles that the ego leaves 200 m behind return ahead of it, and the reverse.
         recycle_share: share of the episodes in which they do, 0 to 1.
-        compile: whether physics and traffic run as compiled graphs.
-        kernel: drives a decision: the tensor code (``torch``), the native kernel (``native``), which does the same
-            up to rounding for ``traffic=idm`` and ``idm_mobil`` on a CPU, or the kernel where it can (``auto``).
-        ego, idm, mobil: how the ego drives, how all follow, and how the others change lanes.
+        compile: true: physics and traffic as compiled graphs (needs a C++ compiler); faster in large batches, after a
+            minute or so of compiling, and the same up to rounding (docs/performance.md).
+        kernel: what drives a decision: the tensor code (torch), the native kernel (native), which does the same up to
+            rounding for traffic=idm and idm_mobil on a CPU, or the kernel where it can (auto).
+        ego: how the ego drives.
+        idm: how all follow, Table V.
+        mobil: how the others change lanes, Table IV.
     """
 
     vehicles: int = 9
@@ -56,22 +57,26 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         for name in ("width_m", "truck_width_m") if self.truck_share > 0 else ("width_m",):
             width = getattr(self, name)
             if self.lane_width_m <= width:
-                raise UserError(
-                    f"env.lane_width_m={self.lane_width_m:g}: expected more than env.{name}={width:g}, or vehicles "
+                raise ParameterError(
+                    f"{{lane_width_m}}={self.lane_width_m:g}: expected more than {{{name}}}={width:g}, or vehicles "
                     "in neighbouring lanes touch; widen the lanes."
                 )
         if self.timeout_s < self.decision_period_s:
-            raise UserError(
-                f"env.timeout_s={self.timeout_s:g}: expected at least env.decision_period_s="
+            raise ParameterError(
+                f"{{timeout_s}}={self.timeout_s:g}: expected at least {{decision_period_s}}="
                 f"{self.decision_period_s:g}, or every episode ends in its first step."
             )
         self._check_start()
 
     def _check_start(self) -> None:
         """Refuse first scenes that do not fit on the road, or from which nobody could drive on."""
+        # The defaults need no check, which loads torch: so a mistake anywhere else is reported without it.
+        asked = (self.spawn_parameters(), self.vehicles, self.lanes, self.idm)
+        if asked == (SpawnParameters(), EnvConfig.vehicles, EnvConfig.lanes, IdmParameters()):
+            return
         from ganlane.sim.spawn import check_start
 
-        check_start(self, self.vehicles, self.lanes, self.idm)
+        check_start(*asked)
 
     def scenes(self, others_visibility: int | None = None) -> Scenes | None:
         """Where an episode's vehicles start: None for Table II; ``others_visibility`` is the traffic's."""
@@ -86,21 +91,25 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         return part_of(self, EpisodeParameters)
 
 
-def check_pay(env: EnvConfig, reward: RewardParameters) -> None:
+def check_reward(env: EnvConfig, reward: RewardParameters) -> None:
     """The speed reward runs from 0 at its base speed to 1 at the ego's desired speed, so that must be the higher."""
     if env.ego_desired_speed_mps <= reward.base_speed_mps:
-        raise UserError(
-            f"env.ego_desired_speed_mps={env.ego_desired_speed_mps:g}: expected more than reward.base_speed_mps="
-            f"{reward.base_speed_mps:g}, where the speed reward is 0; raise the one or lower the other."
+        raise ParameterError(
+            f"{{env.ego_desired_speed_mps}}={env.ego_desired_speed_mps:g}: expected more than "
+            f"{{reward.base_speed_mps}}={reward.base_speed_mps:g}, where the speed reward is 0; raise the one or "
+            "lower the other."
         )
 
 
 @dataclass(frozen=True)
 class DenseEnvConfig(EnvConfig):
-    """``env=dense``: more vehicles, with a spread that grows with their number at the paper's density."""
+    """``env=dense``: more vehicles, with a spread that grows with their number at the paper's density.
+
+    Attributes:
+        metres_per_vehicle: spread_m is at least this times vehicles, m; Table II has 200 m for 9.
+    """
 
     vehicles: int = 30
-    #: Metres of road per vehicle; Table II has 200 m for 9.
     metres_per_vehicle: float = 22.3
 
     def __post_init__(self) -> None:

@@ -4,38 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ganlane.config.env import EnvConfig, check_pay
-from ganlane.config.observation import ObservationConfig
-from ganlane.config.run import GeneratorFile, RunConfig
-from ganlane.config.traffic import TrafficConfig
-from ganlane.config.traffic_foreign import HighwayEnvTrafficConfig, SumoTrafficConfig
-from ganlane.config.traffic_mixed import MixedTrafficConfig, reacting_traffics
-from ganlane.config.traffic_replay import ReplayTrafficConfig
-from ganlane.errors import UserError
-from ganlane.parameters.checks import Rule, at_least, between, check, did_you_mean, one_of
-from ganlane.parameters.observation import MaskParameters
+from ganlane.config.env import EnvConfig, check_reward
+from ganlane.config.run import NAMES, GeneratorFile, RunConfig
+from ganlane.config.traffic import TrafficConfig, all_traffics, chosen_traffics
+from ganlane.parameters.checks import at_least, between, check, one_of
+from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 #: Families of episodes that can be driven for a table: to choose on, to report on.
 STREAMS = ("report", "select")
-#: A list of names without repetitions.
-NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
-
-
-def all_traffics() -> dict[str, TrafficConfig]:
-    """The options of the group ``traffic``, by name."""
-    return {
-        **reacting_traffics(),
-        "mixed": MixedTrafficConfig(),
-        "replay": ReplayTrafficConfig(),
-        "sumo": SumoTrafficConfig(),
-        "highway_env": HighwayEnvTrafficConfig(),
-    }
 
 
 @dataclass
 class EvaluateConfig(RunConfig):
-    """Agents x traffics, the same episodes for all of them."""
+    """Agents x traffics, the same episodes for all of them.
+
+    Attributes:
+        agents: mobil, mobil_egoistic, keep_lane, random_legal, random; agent_idm and others that ship; a checkpoint's
+            path; the import path of a policy of your own. The normalised score needs mobil and random_legal.
+        traffics: options of the group traffic, or the import path of a traffic model of your own.
+        episodes: the episodes 0 to episodes - 1 of the seed and stream.
+        num_envs: episodes driven side by side, at most.
+        stream: select: the episodes kept for choosing among recipes, never for a reported figure.
+        generator: weights of generated traffic.
+        traffic_options: the traffics' keys.
+    """
 
     agents: list[str] = field(default_factory=lambda: ["mobil", "keep_lane", "random_legal", "agent_idm"])
     traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
@@ -51,18 +44,11 @@ class EvaluateConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "", agents=NAMES, traffics=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
-        check(self, "", stream=one_of(STREAMS))
-        check_pay(self.env, self.reward)
+        check(self, agents=NAMES, traffics=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+        check(self, stream=one_of(STREAMS))
+        check_reward(self.env, self.reward)
         self.chosen_traffics()
 
     def chosen_traffics(self) -> dict[str, TrafficConfig]:
         """The traffics asked for, by name: options of the group, or import paths of a user's own."""
-        for name in self.traffics:
-            if name not in self.traffic_options and "." not in name:
-                known = ", ".join(self.traffic_options)
-                raise UserError(
-                    f"traffics={name}: no such traffic{did_you_mean(name, self.traffic_options)}; choose among "
-                    f"{known}, or give the import path of a model of your own."
-                )
-        return {name: self.traffic_options.get(name) or TrafficConfig(_target_=name) for name in self.traffics}
+        return chosen_traffics("traffics", self.traffics, self.traffic_options)

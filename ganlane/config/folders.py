@@ -63,13 +63,11 @@ def _remove_empty(folders: list[Path]) -> None:
             folder.rmdir()
 
 
-def write_down(composed: Any, folder: Path) -> None:
+def write_down(composed: Any, asked: list[str], folder: Path) -> None:
     """What was asked for, in the run folder: ``config.yaml`` has all values, ``overrides.yaml`` the command line."""
-    from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
     from ganlane.files import write_bytes
 
-    asked = [str(override) for override in HydraConfig.get().overrides.task]
     write_bytes(folder / CONFIG, OmegaConf.to_yaml(composed, resolve=True).encode())
     write_bytes(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(asked)).encode())

@@ -1,14 +1,23 @@
-"""``--help``: what a command does, its options and its keys, read from the files that hold them."""
+"""``--help``: what a command does, its options and its keys, from the commands' and dataclasses' docstrings."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
 import re
-from pathlib import Path
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from typing import Any
 
+from ganlane.config.schemas import SCHEMAS, option_of, options_of
+from ganlane.errors import as_typed
 from ganlane.files import conf_folder
+from ganlane.parameters.checks import NO_KEY
 
+#: Column at which the meanings of keys begin, and where their lines end.
+_COLUMN, _END = 34, 118
 _FLAGS = """flags
   -m, --multirun       a sweep over values with commas, each run in its own folder: ganlane {command} -m seed=0,1
   --cfg job            print the whole configuration and stop; with --resolve its references filled in
@@ -20,21 +29,17 @@ exit status: 0 done, 2 a mistake in configuration, file or checkpoint or a disk 
 
 def help_text(command: str) -> str:
     """All that ``ganlane COMMAND --help`` prints."""
-    folder = conf_folder()
-    root = (folder / f"{command}.yaml").read_text()
-    chosen = chosen_options(root)
-    story = inspect.getdoc(importlib.import_module(f"ganlane.{command}")) or ""
+    chosen = chosen_options((conf_folder() / f"{command}.yaml").read_text())
+    groups = {mount: option for mount, option in chosen.items() if "@" not in mount}
     parts = [
-        story,
-        "options (GROUP=NAME; * is the default)\n"
-        + "\n".join(_group(folder, *mounted) for mounted in chosen.items()),
-        "keys (KEY=VALUE)\n" + indented(keys_of(root), 2),
+        inspect.getdoc(importlib.import_module(f"ganlane.{command}")) or "",
+        "options (GROUP=NAME; * is the default)\n" + "\n".join(_options(*mounted) for mounted in chosen.items()),
+        "keys (KEY=VALUE)\n" + "\n".join(key_lines(SCHEMAS[""][command], {}, 2, {*groups, "traffic_options"})),
     ]
-    parts += [
-        _option_keys(folder, mount, option)
-        for mount, option in chosen.items()
-        if option != "null" and "@" not in mount
-    ]
+    for group, option in groups.items():
+        if option != "null":
+            lines = key_lines(*option_of(group, option), 4)
+            parts.append("\n".join([f"keys of {group}={option}", f"  {group}:", *lines]))
     return "\n\n".join([*parts, _FLAGS.format(command=command)])
 
 
@@ -44,50 +49,70 @@ def print_help(command: str) -> None:
 
 
 def chosen_options(root: str) -> dict[str, str]:
-    """Mounted group to default option, in the order of the ``defaults`` list; mounts below one key appear once."""
-    found: dict[str, str] = {}
-    for mount, option in re.findall(r"^  - ([\w@.]+): (\w+)", root, flags=re.MULTILINE):
-        found.setdefault(mount, option)
-    return found
+    """Mounted group to default option, in the order of the ``defaults`` list."""
+    return dict(re.findall(r"^  - ([\w@.]+): (\w+)", root, flags=re.MULTILINE))
 
 
-def _group(folder: Path, mount: str, default: str) -> str:
-    """A group's options with their first lines."""
+def _options(mount: str, default: str) -> str:
+    """A group's options with the first lines of their YAML."""
     group, _, place = mount.partition("@")
     if place.startswith("traffic_options."):
         return f"  {place}.KEY: the keys of traffic={default} (ganlane train --help shows some)"
-    lines = [f"  {mount}"]
-    for path in sorted((folder / group).glob("*.yaml")):
-        mark = "*" if path.stem == default else " "
-        lines.append(f"   {mark} {path.stem:<18}{summary(path)}")
-    return "\n".join(lines)
+    if place:
+        return f"  {mount}: the options of {group}; {default} by default"
+    lines = [f"   {'*' if name == default else ' '} {name:<18}{summary(group, name)}" for name in options_of(group)]
+    return "\n".join([f"  {mount}", *lines])
 
 
-def summary(path: Path) -> str:
-    """The first comment of a YAML file that is not a directive."""
-    comments = [line[1:].strip() for line in path.read_text().splitlines() if line.startswith("#")]
+def summary(group: str, name: str) -> str:
+    """The first comment of an option's YAML that is not a directive."""
+    text = (conf_folder() / group / f"{name}.yaml").read_text()
+    comments = [line[1:].strip() for line in text.splitlines() if line.startswith("#")]
     return next((comment for comment in comments if not comment.startswith("@package")), "")
 
 
-def _option_keys(folder: Path, group: str, option: str) -> str:
-    """The keys of an option below its group's name."""
-    body = keys_of((folder / group / f"{option}.yaml").read_text())
-    return f"keys of {group}={option}\n  {group}:\n" + indented(body, 4)
+def key_lines(
+    kind: Any, values: Mapping[str, Any], indent: int, without: set[str] | frozenset[str] = frozenset()
+) -> Iterator[str]:
+    """A line for every key of a dataclass: its default, or its value in ``values``, and what it means."""
+    for field in fields(kind):
+        if field.name in without or field.metadata == NO_KEY:
+            continue
+        value = values[field.name] if field.name in values else _default(field)
+        key, meaning = f"{' ' * indent}{field.name}:", _meaning(kind, field.name)
+        if is_dataclass(value):
+            yield from _lines(key, meaning)
+            own = {known.name: getattr(value, known.name) for known in fields(value)}
+            yield from key_lines(type(value), own, indent + 2)
+        elif not (isinstance(value, dict) and any(map(is_dataclass, value.values()))):
+            yield from _lines(f"{key} {as_typed(value)}", meaning)
 
 
-def keys_of(text: str) -> str:
-    """A YAML file without its first comment, its ``defaults`` and what concerns Hydra alone."""
-    kept, skipping = [], False
-    for number, line in enumerate(text.splitlines()):
-        if re.match(r"(defaults|hydra):", line):
-            skipping = True
-        elif line and not line[0].isspace() and not line.startswith("-"):
-            skipping = False
-        if not skipping and not (line.startswith("#") and number < 2):
-            kept.append(line)
-    return "\n".join(kept).strip("\n")
+def _lines(key: str, meaning: str) -> Iterator[str]:
+    """The key, and in a column of its own what it means."""
+    first, *rest = textwrap.wrap(meaning, _END - _COLUMN - 2) or [""]
+    yield f"{key:<{_COLUMN - 1}} # {first}" if first else key
+    yield from (f"{'':<{_COLUMN}}# {line}" for line in rest)
 
 
-def indented(text: str, by: int) -> str:
-    """``text`` moved to the right."""
-    return "\n".join(" " * by + line if line else line for line in text.splitlines())
+def _default(field: Field[Any]) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
+
+
+def _meaning(kind: Any, name: str) -> str:
+    """The first sentence on a field in the docstring of its class, or of the base that says something of it."""
+    return next((found for base in kind.__mro__ if (found := _attributes(base).get(name))), "")
+
+
+@cache
+def _attributes(kind: type) -> dict[str, str]:
+    """First sentences of the section ``Attributes`` of a class's own docstring, by field."""
+    _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
+    items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, flags=re.MULTILINE)
+    joined = {name: " ".join(text.split()) for name, text in items}
+    return {name: _plain(re.split(r"\.(?= [A-Z])", text)[0].rstrip(".")) for name, text in joined.items()}
+
+
+def _plain(text: str) -> str:
+    """Without the marks of a docstring: ``:data:`~ganlane.NAME``` becomes NAME."""
+    return re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text).replace("``", "")

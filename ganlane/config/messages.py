@@ -1,15 +1,21 @@
-"""Errors of Hydra, OmegaConf and the file system as one sentence: the value, what was expected, what to do."""
+"""Errors of Hydra, OmegaConf and the file system as one sentence: the value, what was expected, what to do.
+
+A connection that is refused or a process that is gone is an OSError, too, but none that a user can mend: it keeps its
+traceback.
+"""
 
 from __future__ import annotations
 
+import errno
+import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from ganlane.config.disk import file_sentence
 from ganlane.errors import UserError
 from ganlane.parameters.checks import did_you_mean
 
@@ -19,6 +25,21 @@ CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
 #: OmegaConf's names of types in words.
 _TYPES = {"Integer": "a whole number", "Float": "a number", "bool": "true or false", "String": "a text"}
 _HELP = "run the command with --help to see all keys"
+_ROOM = "make room there, or write to another disk"
+_RIGHTS = "check the permissions, or name a place where you may write"
+_PATH = "check the path"
+_LATER = "close other programs and run the command again"
+
+#: Error number to what to do.
+ADVICE = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), _RIGHTS),
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY), _PATH),
+    **dict.fromkeys((errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.ENXIO, errno.ENODEV), _PATH),
+    **dict.fromkeys((errno.EBUSY, errno.ETXTBSY, errno.EMFILE, errno.ENFILE, errno.ENOMEM), _LATER),
+    errno.EIO: "the disk does not work as it should; check it",
+    errno.ESTALE: "the network drive is gone; mount it again",
+}
 
 
 def sentence(error: BaseException) -> str:
@@ -100,3 +121,30 @@ def _unknown_key(key: str, error: OmegaConfBaseException) -> str:
     where = f"{parent} has" if parent else "known are"
     listed = f"; {where} {', '.join(known)}" if known else f"; {_HELP}"
     return f"{key}: no such key{did_you_mean(name, known)}{listed}."
+
+
+def is_users_matter(error: BaseException) -> bool:
+    """Whether the error is about a path, a place or a disk that the user can do something about."""
+    return isinstance(error, OSError) and error.errno in ADVICE
+
+
+def file_sentence(error: OSError) -> str:
+    """The path, what is wrong, and what to do."""
+    number = error.errno or 0
+    where = error.filename2 or error.filename or "a file or standard output"
+    return f"{where}: {error.strerror or os.strerror(number)}; {ADVICE.get(number, _PATH)}."
+
+
+@contextmanager
+def numbered_refusals() -> Iterator[None]:
+    """Raise as an OSError with its number what a library tells in its text alone.
+
+    polars says "No space left on device (os error 28)" in errors of several types, without a number or a name.
+    """
+    try:
+        yield
+    except Exception as error:
+        told = re.search(r"\(os error (\d+)\)", str(error))
+        if told is None or getattr(error, "errno", None) is not None or isinstance(error, UserError):
+            raise
+        raise OSError(int(told[1]), os.strerror(int(told[1]))) from error

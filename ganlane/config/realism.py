@@ -4,35 +4,52 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ganlane.config.data import DataConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.evaluate import all_traffics
 from ganlane.config.run import GeneratorFile, RunConfig
-from ganlane.config.traffic import TrafficConfig
+from ganlane.config.traffic import REACTING, TrafficConfig, chosen_traffics
 from ganlane.errors import UserError
-from ganlane.parameters.checks import at_least, between, check, did_you_mean, every, one_of, optional
+from ganlane.parameters.checks import at_least, between, check, every, one_of, optional
+from ganlane.parameters.data import DataConfig
 
-#: Names that the ends of the scale have.
-_TAKEN = ("random", "constant_velocity")
-#: The traffic that is the recordings themselves.
-_RECORDED = "replay"
-#: Those that drive around an ego of ours only; a card has none.
-_FOREIGN = ("sumo", "highway_env")
-#: No traffic of its own: its parts have cards.
-_MIXED = "mixed"
+#: Names of the card's own references.
+_REFERENCES = ("random", "constant_velocity")
+#: Traffics that cannot have a card, and why.
+_WITHOUT_CARD = {
+    "replay": "it is the recordings themselves; choose a traffic that drives",
+    "mixed": "a card is of one traffic; make one of each of its parts",
+    **dict.fromkeys(
+        ("sumo", "highway_env"),
+        "a foreign simulator drives around an ego only, and a card has none; choose one of our own",
+    ),
+}
 _QUICK_KM = 5.0
 _QUICK_S = 30.0
 
 
-def drivable() -> dict[str, TrafficConfig]:
-    """The options of the group ``traffic`` that can have a card, by name: neither recordings nor mixtures, no ego."""
-    without = (_RECORDED, _MIXED, *_FOREIGN)
-    return {name: traffic for name, traffic in all_traffics().items() if name not in without}
-
-
 @dataclass
 class RealismConfig(RunConfig):
-    """A traffic, what it is compared with, the recordings, and how much is driven."""
+    """A traffic, what it is compared with, the recordings, and how much is driven.
+
+    Attributes:
+        against: further traffics from the same starts: options of the group traffic, or the import path of a model of
+            your own.
+        scenes: starts: held_out (data.held_out) or all, those that the generator was fitted to too.
+        repeats: times that every scene is driven, with other random numbers.
+        desired_above_mps: mean excess of desired speeds over the speed at entry, m/s; null: fitted per traffic.
+        long_vehicles: long runs without an ego, with so many vehicles each.
+        vehicle_km: at least so many in every long run; 0 leaves them out.
+        long_s: no episode of a long run lasts longer, s.
+        long_against: true: long runs of the traffics of against, too.
+        i80: whether the I-80 files beside the scenes are used; null: if they are there.
+        resamples: of the bootstrap over scenes.
+        quick: true: a check that it runs, in seconds.
+        publish: true (maintainers): write the histograms that ship from these recordings.
+        report: write the tables into this document, between the markers of this card.
+        figures: write the figures into this folder too, as realism_NAME.png.
+        generator: weights of generated traffic.
+        fold_weights: generators of k folds: every scene is driven by the one that was fitted without it.
+        traffic_options: the keys of the traffics of against.
+    """
 
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     against: list[str] = field(default_factory=lambda: ["idm_mobil"])
@@ -53,13 +70,14 @@ class RealismConfig(RunConfig):
     data: DataConfig = field(default_factory=DataConfig)
     generator: GeneratorFile = field(default_factory=GeneratorFile)
     fold_weights: list[str] = field(default_factory=list)
-    traffic_options: dict[str, TrafficConfig] = field(default_factory=drivable)
+    traffic_options: dict[str, TrafficConfig] = field(
+        default_factory=lambda: {name: kind() for name, kind in REACTING.items()}
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check(
             self,
-            "",
             scenes=one_of(("held_out", "all")),
             repeats=between(1, 1000),
             desired_above_mps=optional(at_least(0)),
@@ -70,15 +88,8 @@ class RealismConfig(RunConfig):
         )
         if self.device != "cpu":
             raise UserError(f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu.")
-        if self.traffic.label() == _RECORDED:
-            raise UserError("traffic=replay: it is the recordings themselves; choose a traffic that drives.")
-        if self.traffic.label() in _FOREIGN:
-            raise UserError(
-                f"traffic={self.traffic.label()}: a foreign simulator drives around an ego only, and a card has "
-                "none; choose one of our own."
-            )
-        if self.traffic.label() == _MIXED:
-            raise UserError("traffic=mixed: a card is of one traffic; make one of each of its parts.")
+        if self.traffic.label() in _WITHOUT_CARD:
+            raise UserError(f"traffic={self.traffic.label()}: {_WITHOUT_CARD[self.traffic.label()]}.")
         if self.data.format != "scenes":
             raise UserError(
                 f"data={self.data.format}: the card reads scenes; run ganlane prepare data={self.data.format} first, "
@@ -96,16 +107,9 @@ class RealismConfig(RunConfig):
         """The traffics to compare with, by name; the traffic itself is left out."""
         names = [name for name in self.against if name != self.traffic.label()]
         for name in [*names, self.traffic.label()]:
-            if name in _TAKEN:
+            if name in _REFERENCES:
                 raise UserError(f"against={name}: every card holds it anyway; leave it out.")
-        for name in names:
-            if name not in self.traffic_options and "." not in name:
-                known = ", ".join(self.traffic_options)
-                raise UserError(
-                    f"against={name}: no such traffic{did_you_mean(name, self.traffic_options)}; choose among "
-                    f"{known}, or give the import path of a model of your own."
-                )
-        return {name: self.traffic_options.get(name) or TrafficConfig(_target_=name) for name in names}
+        return chosen_traffics("against", names, self.traffic_options)
 
     def shortened(self) -> RealismConfig:
         """With ``quick``, a check that it runs: one repeat, nothing fitted, few vehicle-km, I-80 if asked for."""

@@ -6,13 +6,12 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ganlane.config.env import EnvConfig, check_pay
-from ganlane.config.observation import ObservationConfig
+from ganlane.config.env import EnvConfig, check_reward
 from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.errors import UserError
+from ganlane.errors import ParameterError, UserError
 from ganlane.parameters.checks import Rule, above, at_least, between, check, every, optional, text
-from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 #: Films of one episode; pages and tables of any number of episodes.
@@ -25,7 +24,22 @@ MOST_EPISODES = 12
 
 @dataclass
 class FilmConfig:
-    """``film``: which part of the episode, how fast, how large. s, m, pixels."""
+    """``film``: which part of the episode, how fast, how large.
+
+    Attributes:
+        fps: frames per second.
+        speedup: simulated seconds per second of film.
+        start_s: part of the episode, for every format, s.
+        end_s: null: to its end.
+        width: pixels.
+        height: pixels.
+        road_m: length of road in the picture, m.
+        trail_s: length of the trails, s; 0: none.
+        speeds: numbers on the roofs.
+        leader_line: a line to the leader, with the gap.
+        scale: size of the film, as a share of the picture's.
+        max_bytes: gif: size and frame rate are lowered until it fits; html: the rate of samples.
+    """
 
     fps: float = 20.0
     speedup: float = 1.0
@@ -43,7 +57,6 @@ class FilmConfig:
     def __post_init__(self) -> None:
         check(
             self,
-            "film",
             fps=between(1, 120),
             speedup=above(0),
             start_s=at_least(0),
@@ -56,25 +69,41 @@ class FilmConfig:
             max_bytes=optional(at_least(10_000)),
         )
         if self.end_s is not None and self.end_s <= self.start_s:
-            raise UserError(f"film.end_s={self.end_s:g}: expected more than film.start_s={self.start_s:g}.")
+            raise ParameterError(f"{{end_s}}={self.end_s:g}: expected more than {{start_s}}={self.start_s:g}.")
 
 
 @dataclass
 class CurvesConfig:
-    """``curves``: how the figures of training runs are drawn."""
+    """``curves``: how the figures of training runs are drawn.
+
+    Attributes:
+        columns: of metrics.csv and evaluation_NAME of evaluation.csv; null: the ones that matter most.
+        smooth: rows that a running mean takes in.
+    """
 
     columns: list[str] | None = None
     smooth: int = 1
 
     def __post_init__(self) -> None:
-        check(self, "curves", columns=optional(every(text())), smooth=at_least(1))
+        check(self, columns=optional(every(text())), smooth=at_least(1))
 
 
 @dataclass
 class RenderConfig(RunConfig):
     """Episodes of agents on one traffic, as a film, page or table; or the learning curves of runs.
 
-    ``agents`` and ``episodes`` take the place of ``driver`` and ``episode`` where there are several.
+    Attributes:
+        driver: agent=NAME says the same: a name, path or import path as in ganlane evaluate.
+        episode: of the seed, on the stream kept for reports: the episodes of ganlane evaluate.
+        agents: html, csv, parquet: several instead of driver, for instance agents=[mobil,agent_idm].
+        episodes: html, csv, parquet: several instead of episode, for instance episodes=[0,1,2].
+        run: instead of an episode: learning curves of runs, run=FOLDER or run=FOLDER,FOLDER.
+        format: gif, mp4 (needs the extra 'video'), png (a strip of four frames), html (a player), csv or parquet
+            (trajectories); null: the ending of out, else gif.
+        out: file to write; null: into the run folder.
+        generator: weights of generated traffic.
+        film: how a film looks.
+        curves: how learning curves look.
     """
 
     driver: str = "agent_general"
@@ -96,10 +125,10 @@ class RenderConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         number = between(0, 2**53)
-        check(self, "", episode=number, format=_FORMAT, run=optional(every(text())))
-        check(self, "", agents=optional(_DIFFERENT), episodes=optional(_DIFFERENT))
-        check(self, "", episodes=optional(every(number)))
-        check_pay(self.env, self.reward)
+        check(self, episode=number, format=_FORMAT, run=optional(every(text())))
+        check(self, agents=optional(_DIFFERENT), episodes=optional(_DIFFERENT))
+        check(self, episodes=optional(every(number)))
+        check_reward(self.env, self.reward)
         if self.out is not None:
             _check_out(Path(self.out))
         self._check_kind()

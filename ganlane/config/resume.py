@@ -9,8 +9,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from ganlane.config.command_line import parse, quoted, without_repetitions
 from ganlane.config.folders import CONFIG, OVERRIDES
-from ganlane.config.overrides import parse, quoted, without_repetitions
 from ganlane.errors import UserError
 from ganlane.parameters.removed import without_removed_overrides
 

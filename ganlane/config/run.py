@@ -1,36 +1,49 @@
-"""What every command has: seed, threads, device."""
+"""What the commands share: seed, threads, device, and the file of the generated traffic."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from ganlane.errors import UserError
-from ganlane.parameters.checks import at_least, between, check, one_of
+from ganlane.parameters.checks import Rule, at_least, between, check, one_of
+
+#: A list of names without repetitions.
+NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
 
 
 @dataclass
 class RunConfig:
-    """Seed of all random numbers, torch's threads (0: chosen), device."""
+    """What every command has.
+
+    Attributes:
+        seed: of all random numbers.
+        threads: torch's threads; 0: one, which measured fastest (more are far slower where other work runs).
+        device: cpu or cuda.
+    """
 
     seed: int = 0
     threads: int = 0
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        check(self, "", seed=between(0, 2**53), threads=at_least(0), device=one_of(("cpu", "cuda")))
-        if self.device == "cuda":
-            _require_cuda()
+        check(self, seed=between(0, 2**53), threads=at_least(0), device=one_of(("cpu", "cuda")))
+        if self.device == "cuda" and not has_cuda():
+            raise UserError("device=cuda: torch sees no CUDA device here; use device=cpu or install torch for CUDA.")
 
 
-def _require_cuda() -> None:
+def has_cuda() -> bool:
+    """Whether torch sees a CUDA device."""
     import torch
 
-    if not torch.cuda.is_available():
-        raise UserError("device=cuda: torch sees no CUDA device here; use device=cpu or install torch for CUDA.")
+    return torch.cuda.is_available()
 
 
 @dataclass
 class GeneratorFile:
-    """``generator.path``: weights for ``traffic=gan`` and ``gan_calibrated``; null takes the ones that ship."""
+    """``generator``: which weights generated traffic drives with.
+
+    Attributes:
+        path: weights for gan and gan_calibrated; null: the ones that ship.
+    """
 
     path: str | None = None

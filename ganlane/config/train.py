@@ -1,47 +1,169 @@
-"""Root of ``ganlane train``."""
+"""``ganlane train``: its root, and the groups ``init``, ``collector`` and ``logger``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from ganlane.config.collector import CollectorConfig
-from ganlane.config.env import EnvConfig, check_pay
-from ganlane.config.evaluate import NAMES
-from ganlane.config.init import InitConfig
-from ganlane.config.logger import LoggerConfig
-from ganlane.config.observation import ObservationConfig
-from ganlane.config.run import GeneratorFile, RunConfig
+from ganlane.config.env import EnvConfig, check_reward
+from ganlane.config.run import NAMES, GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.errors import UserError
+from ganlane.errors import ParameterError
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.checks import at_least, between, check, one_of
-from ganlane.parameters.observation import MaskParameters
+from ganlane.parameters.checks import at_least, between, check, one_of, optional, text
+from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 COMPILE = ("auto", "always", "never")
 #: Compiling takes one to two minutes, which a training of so many decisions gets back.
 WORTH_COMPILING = 300_000
+#: Whose support of returns: that of the run's own ``agent``, or that of the trained agent.
+SUPPORTS = ("run", "trained")
+
+
+@dataclass
+class InitConfig:
+    """``init=idm_ckpt``: start from a trained agent.
+
+    Attributes:
+        path: a shipped agent's name, a .safetensors file, or a training run's folder or last.pt.
+        support: trained: its atoms, v_min and v_max instead of those of agent; run: both must agree.
+        optimizer: true: Adam's moments too; they are in a run's last.pt, not in a .safetensors file.
+    """
+
+    path: str | None = "agent_idm"
+    support: str = "run"
+    optimizer: bool = False
+
+    def __post_init__(self) -> None:
+        check(self, support=one_of(SUPPORTS))
+        asked = "{optimizer}=true" if self.optimizer else "{support}=trained"
+        if self.path is None and (self.optimizer or self.support == "trained"):
+            raise ParameterError(
+                f"{asked}: of which agent? give init=idm_ckpt, and {{path}}=PATH unless the shipped one."
+            )
+
+
+@dataclass
+class NoInitConfig(InitConfig):
+    """``init=none``: start from random weights."""
+
+    path: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.path is not None:
+            raise ParameterError(
+                f"{{path}}={self.path}: init=none starts afresh; use init=idm_ckpt {{path}}={self.path}."
+            )
+        super().__post_init__()
+
+
+@dataclass
+class CollectorConfig:
+    """``collector=single``: one process steps all environments side by side.
+
+    Attributes:
+        num_envs: environments of the process, 1 to 65536; a step of the loop has a decision of each.
+    """
+
+    num_envs: int = 512
+
+    def __post_init__(self) -> None:
+        check(self, num_envs=between(1, 65536))
+
+    @property
+    def environments(self) -> int:
+        """Decisions per step of the loop, over all processes."""
+        return self.num_envs
+
+
+@dataclass
+class MultiCollectorConfig(CollectorConfig):
+    """``collector=multi``: worker processes on this machine.
+
+    Attributes:
+        num_envs: environments of each worker; a step of the loop has workers * num_envs decisions.
+        workers: processes, with one thread each.
+        weights_every: decisions, over all workers, between two updates of the workers' weights.
+    """
+
+    num_envs: int = 64
+    workers: int = 2
+    weights_every: int = 1024
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, workers=between(1, 1024), weights_every=at_least(1))
+
+    @property
+    def environments(self) -> int:
+        """Decisions per step of the loop, over all workers."""
+        return self.workers * self.num_envs
+
+
+@dataclass
+class RayCollectorConfig(MultiCollectorConfig):
+    """``collector=ray``: the same on a Ray cluster.
+
+    Attributes:
+        address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own here.
+    """
+
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, address=optional(text()))
+
+
+@dataclass
+class LoggerConfig:
+    """``logger=...``: where the figures of a training run go in addition to ``metrics.csv``.
+
+    Attributes:
+        kind: csv: nowhere else; tensorboard: event files in the run folder; wandb: Weights & Biases.
+        progress: a bar on a terminal, plain lines elsewhere.
+        project: of Weights & Biases.
+    """
+
+    kind: str = "csv"
+    progress: bool = True
+    project: str = "ganlane"
+
+    def __post_init__(self) -> None:
+        check(self, kind=one_of(("csv", "tensorboard", "wandb")), project=text())
 
 
 @dataclass
 class PretrainConfig:
-    """``pretrain``: a first phase on other traffic, whose agent the main phase starts from."""
+    """``pretrain``: a first phase on other traffic, whose agent the main phase starts from.
+
+    Attributes:
+        total_decisions: 0: no such phase.
+        traffic: traffic@pretrain.traffic=idm_mobil.
+    """
 
     total_decisions: int = 0
     traffic: TrafficConfig | None = None
 
     def __post_init__(self) -> None:
-        check(self, "pretrain", total_decisions=at_least(0))
+        check(self, total_decisions=at_least(0))
         if self.total_decisions > 0 and self.traffic is None:
-            raise UserError(
-                f"pretrain.total_decisions={self.total_decisions}: on which traffic? give for instance "
+            raise ParameterError(
+                f"{{total_decisions}}={self.total_decisions}: on which traffic? give for instance "
                 "traffic@pretrain.traffic=idm_mobil."
             )
 
 
 @dataclass
 class FinalEvaluationConfig:
-    """``evaluation``: the trained agent beside others, on the same episodes, when training is over."""
+    """``evaluation``: the trained agent and others on the same episodes, when training is over.
+
+    Attributes:
+        agents: to compare the trained one with.
+        traffic: traffic@evaluation.traffic=NAME for another traffic than that of training.
+        episodes: the episodes 0 to episodes - 1 of the seed, on the stream kept for reports.
+        num_envs: episodes driven side by side, at most.
+    """
 
     agents: list[str] = field(default_factory=lambda: ["mobil", "agent_idm", "random_legal"])
     traffic: TrafficConfig | None = None
@@ -49,16 +171,27 @@ class FinalEvaluationConfig:
     num_envs: int = 512
 
     def __post_init__(self) -> None:
-        check(self, "evaluation", agents=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+        check(self, agents=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
 
 
 @dataclass
 class TrainConfig(RunConfig):
-    """Everything that ``ganlane train`` can be told.
+    """Inputs of a training run.
 
-    ``compile``: whether the training is compiled (the final evaluation is with ``env.compile=true`` alone). ``auto``:
-    where compiling is known to work (:func:`ganlane.runtime.can_compile`) and the training is long enough to gain
-    by it (:data:`WORTH_COMPILING`).
+    Attributes:
+        total_decisions: of all environments together.
+        compile: always, never; auto: where compiling is known to work (:func:`ganlane.runtime.can_compile`) and the
+            training is long enough to gain by it (:data:`WORTH_COMPILING`). The final evaluation is compiled with
+            ``env.compile=true`` alone.
+        log_every: decisions between two rows of metrics.csv.
+        evaluate_every: decisions between two evaluations while training (0: none); the best agent is kept.
+        selection_episodes: of each of those, on the stream kept for model selection.
+        checkpoint_every_s: seconds between two resume checkpoints.
+        checkpoint_replay: with the replay buffer: needed for a resumed run to be exact.
+        resume: PATH of a run's folder or checkpoint to go on with, or auto (the newest unfinished run).
+        generator: weights of generated traffic.
+        pretrain: a first phase on other traffic.
+        evaluation: when training is over.
     """
 
     total_decisions: int = 600_000
@@ -86,7 +219,6 @@ class TrainConfig(RunConfig):
         super().__post_init__()
         check(
             self,
-            "",
             total_decisions=at_least(1),
             compile=one_of(COMPILE),
             log_every=at_least(1),
@@ -94,7 +226,7 @@ class TrainConfig(RunConfig):
             selection_episodes=at_least(1),
             checkpoint_every_s=at_least(0),
         )
-        check_pay(self.env, self.reward)
+        check_reward(self.env, self.reward)
 
     def compiled(self) -> TrainConfig:
         """The same with ``env.compile`` as ``compile`` says."""

@@ -12,7 +12,7 @@ from ganlane.data.download import ByteProgress, data_folder, default_scenes, dow
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lane_changes import Tracks, find_lane_changes, lane_changes_of_arrays, tracks_of_frame
 from ganlane.data.lane_widths import scene_lane_counts, scene_lane_widths
-from ganlane.data.ngsim import NgsimParameters, ngsim_scenes
+from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.prepare import PooledStatistics, Preparation, SceneSummary, prepare_recordings, read_recordings
 from ganlane.data.scenes import read_scenes, write_prepared
 from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, TRACK_STRIDE, RowCount, Scene, sort, validate
@@ -25,6 +25,7 @@ from ganlane.data.statistics import (
     survival_curve,
 )
 from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.parameters.data import NgsimParameters
 
 __all__ = [
     "FRAME_S",

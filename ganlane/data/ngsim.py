@@ -25,7 +25,6 @@ import polars as pl
 from ganlane.data.lane_widths import lane_grid
 from ganlane.data.schema import SCHEMA, RowCount, Scene, number_tracks, sort
 from ganlane.data.tables import (
-    BLOCK_BYTES,
     LINE,
     OnProgress,
     TextTable,
@@ -37,6 +36,7 @@ from ganlane.data.tables import (
     read_blocks,
 )
 from ganlane.errors import UserError
+from ganlane.parameters.data import MOTORWAYS, NgsimParameters
 
 FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100
@@ -60,8 +60,7 @@ COLUMNS: Final = {
     "lane_id": pl.Int64,
 }
 LOCATION: Final = "location"
-#: Locations in the portal's file: motorways, and streets with intersections.
-MOTORWAYS: Final = ("us-101", "i-80")
+#: Further locations in the portal's file: streets with intersections.
 STREETS: Final = ("lankershim", "peachtree")
 #: A file has about six periods; a damaged column of times or frames makes hundreds.
 MAX_PERIODS: Final = 500
@@ -75,22 +74,6 @@ LENGTHS_FT: Final = (8.0, 40.0)
 PACE: Final = (0.94, 1.06)
 #: The pace is measured on tracks of at least 2 s at 10 ft/s or more.
 _PACE_FRAMES, _PACE_FT_S = 20, 10.0
-
-
-@dataclass(frozen=True)
-class NgsimParameters:
-    """Which rows of an NGSIM file are read.
-
-    Attributes:
-        locations: locations to keep, where the file names them.
-        lanes: number of lanes kept, counted from the left; on US-101 and I-80 lanes 1 to 6 are the main lanes (and
-            US-101's auxiliary lane), higher numbers are ramps.
-        block_bytes: bytes read at once.
-    """
-
-    locations: tuple[str, ...] = MOTORWAYS
-    lanes: int = 6
-    block_bytes: int = BLOCK_BYTES
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import polars as pl
 from ganlane.data.download import name_in_errors
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lane_changes import LaneChanges, find_lane_changes, tracks_of_frame
-from ganlane.data.ngsim import NgsimParameters, ngsim_scenes
+from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.scenes import cut_into_scenes, parquet_name, read_scenes, scene_csv_scenes, write_prepared
 from ganlane.data.schema import FRAME_S, TRACK, RowCount, Scene, sort
 from ganlane.data.statistics import (
@@ -36,6 +36,7 @@ from ganlane.data.statistics import (
 )
 from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
+from ganlane.parameters.data import NgsimParameters
 
 #: Bins of each quantity in m/s, m/s2, s or m; quantiles are accurate to a bin's width.
 QUANTITIES: Final = {

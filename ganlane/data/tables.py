@@ -15,11 +15,10 @@ from typing import Final
 import polars as pl
 
 from ganlane.errors import UserError
+from ganlane.parameters.data import BLOCK_BYTES
 
 #: Line of the first row of data below a header, which is line 1.
 FIRST_LINE: Final = 2
-#: Bytes read at once: about 300,000 rows of NGSIM, which take a few times as much memory.
-BLOCK_BYTES: Final = 32 * 2**20
 #: Column that holds each row's line number in the file.
 LINE: Final = "line"
 #: ``1,118,846,980,200``: commas that separate thousands, unlike a decimal comma.

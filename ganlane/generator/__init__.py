@@ -13,12 +13,11 @@ from ganlane.generator.checkpoint import FitResult, Preset, load_generator, ship
 from ganlane.generator.closed_loop import ANCHOR, AnchorParameters
 from ganlane.generator.cross_validation import ablate, cross_validate
 from ganlane.generator.fit import HELD_OUT, assign_folds, fit_generator, fit_key, split_for_fit
-from ganlane.generator.fit_calibrated import CalibratedConfig
-from ganlane.generator.fit_paper import LossWeights, PaperConfig
-from ganlane.generator.loop import LoopConfig, Progress
-from ganlane.generator.networks import Discriminator, Generator, GeneratorSizes
+from ganlane.generator.loop import Progress
+from ganlane.generator.networks import Discriminator, Generator
 from ganlane.generator.rollout import headway_quantiles
 from ganlane.generator.segments import scene_tracks
+from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 
 __all__ = [
     "ANCHOR",

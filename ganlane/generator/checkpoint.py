@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -13,12 +13,11 @@ from torch import Tensor
 from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, load_weights, save_weights
-from ganlane.generator.closed_loop import EXTRA_INPUTS
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.networks import Generator
 from ganlane.generator.scores import Metrics
+from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
 
 KIND = "generator"
-Preset = Literal["paper", "calibrated"]
 #: Inputs in addition to the motion, by preset.
 PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
 #: Sizes that older files do not have; they get their defaults.

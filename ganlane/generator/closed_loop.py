@@ -27,6 +27,7 @@ from torch import Tensor
 
 from ganlane.generator.networks import Generator, Observation
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import IdmParameters, following_acceleration
 from ganlane.sim.neighbours import Scene, leader, perceive
 from ganlane.sim.state import Road, Vehicles
@@ -38,8 +39,6 @@ _SLOWEST_MPS = 1e-3
 _TINY = 1e-6
 #: The body keeps this distance from the lane's edge; outward residuals fade over the distance before it, m.
 _MARGIN_M, _FADE_M = 0.1, 0.3
-#: Inputs per vehicle in addition to its motion: IDM's acceleration, gap, closing speed, offset to the target lane.
-EXTRA_INPUTS = 4
 
 
 class History(NamedTuple):
@@ -163,8 +162,8 @@ class AnchorParameters:
     lane_stiffness: float = 0.3
     lane_damping: float = 1.1
     residual: tuple[float, float] = (4.0, 2.0)
-    washout_s: float = 3.0
-    further_inputs: bool = True
+    washout_s: float = CalibratedConfig.washout_s
+    further_inputs: bool = CalibratedConfig.further_inputs
 
 
 ANCHOR = AnchorParameters()

@@ -18,7 +18,7 @@ import polars as pl
 from ganlane.files import atomic_path
 from ganlane.generator.checkpoint import FitResult
 from ganlane.generator.fit import Config, Split, Task, assign_folds, fit_key, fit_result, fit_task, split_for_fit
-from ganlane.generator.fit_calibrated import CalibratedConfig, CalibratedTask
+from ganlane.generator.fit_calibrated import CalibratedTask
 from ganlane.generator.forecasts import baseline_forecasts, calibrated_forecasts, idm_forecasts, paper_forecasts
 from ganlane.generator.loop import FitLoop, OnProgress
 from ganlane.generator.scores import (
@@ -32,6 +32,7 @@ from ganlane.generator.scores import (
 )
 from ganlane.generator.segments import OBSERVED_POSITIONS, scene_tracks
 from ganlane.generator.windows import Windows, cut_windows, group_windows, join_windows, save_arrays
+from ganlane.parameters.generator import CalibratedConfig
 
 #: Frames between the starts of two scored windows, the same for both presets.
 STRIDE = 3

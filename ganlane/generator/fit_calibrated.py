@@ -6,84 +6,25 @@ both are divided, step by step, by the error of constant velocity.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import ClassVar
-
 import torch
 from torch import Tensor, nn
 
-from ganlane.errors import UserError
-from ganlane.generator.checkpoint import Preset
-from ganlane.generator.closed_loop import ANCHOR, EXTRA_INPUTS, AnchorParameters
-from ganlane.generator.loop import LoopConfig, descend
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.loop import descend
+from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
-    DriverParams,
     common_driver_params,
+    evaluation_params,
+    fit_anchor,
     rollout,
     sampled_driver_params,
-    typical_driver_params,
 )
 from ganlane.generator.scores import BASELINE, Metrics, distance
 from ganlane.generator.segments import SceneTracks, Segments, cut_segments, segment_batches, segment_starts
 from ganlane.generator.windows import PREDICTED_STEPS
+from ganlane.parameters.generator import CalibratedConfig
 
 #: Segments in one forward pass of an evaluation; bounds the memory.
 _SEGMENTS = 16
-
-
-@dataclass(frozen=True)
-class CalibratedConfig:
-    """Settings of the calibrated fit.
-
-    Attributes:
-        sizes: of the generator.
-        loop: the schedule.
-        horizons: steps rolled out; every update draws one of them.
-        shares: relative frequency of each horizon.
-        held_out_horizon: steps rolled out in evaluation.
-        batch: segments per update.
-        held_out_stride: frames between the starts of the segments in evaluation.
-        noise_period_s: time constant of each driver's latent vector.
-        mirror: swap left and right in half of the updates.
-        washout_s: time constant of the residual's mean, which is subtracted; infinite is without washout. The
-            simulation uses the value stored with the weights.
-        further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane offset.
-        traits: whether every driver has its own headway and desired speed.
-        seed: of weights, batches, traits and noise.
-    """
-
-    preset: ClassVar[Preset] = "calibrated"
-    sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS))
-    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40))
-    horizons: tuple[int, ...] = (8, 16, 29)
-    shares: tuple[float, ...] = (3.0, 1.0, 1.0)
-    held_out_horizon: int = 29
-    batch: int = 6
-    held_out_stride: int = 3
-    noise_period_s: float = 5.0
-    mirror: bool = True
-    washout_s: float = ANCHOR.washout_s
-    further_inputs: bool = True
-    traits: bool = True
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if len(self.shares) != len(self.horizons) or sum(self.shares) <= 0:
-            raise UserError(
-                f"shares={list(self.shares)}: give one share of the updates for each of the horizons "
-                f"{list(self.horizons)}, not all 0."
-            )
-
-    @property
-    def anchor(self) -> AnchorParameters:
-        """The anchor with this fit's washout and inputs."""
-        return replace(ANCHOR, washout_s=self.washout_s, further_inputs=self.further_inputs)
-
-    @property
-    def evaluation_params(self) -> DriverParams:
-        """Headways and desired speeds for evaluation."""
-        return typical_driver_params if self.traits else common_driver_params
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -119,11 +60,11 @@ def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: Cali
     for scene in scenes:
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
-            headway, desired = config.evaluation_params(segments)
+            headway, desired = evaluation_params(config)(segments)
             fresh = torch.randn(1 + horizon, 2, *headway.shape, generator.sizes.noise, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
             mean, one, other = rollout(
-                generator, segments, headway, desired, noise, config.noise_period_s, config.anchor
+                generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config)
             )
             future = segments.future
             errors = {
@@ -189,7 +130,9 @@ class CalibratedTask:
         sampled = number % 2 == 1
         shape = (1 + segments.future.shape[1], 2 if sampled else 1, *headway.shape, config.sizes.noise)
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
-        positions = rollout(self.generator, segments, headway, desired, noise, config.noise_period_s, config.anchor)
+        positions = rollout(
+            self.generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config)
+        )
         if sampled:
             name, losses = "energy", energy_score(positions[0], positions[1], segments.future)
         else:

@@ -5,77 +5,18 @@ Losses after Gupta et al. (2018), with the changes that the fit needs here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ganlane.generator.checkpoint import Preset
 from ganlane.generator.forecasts import paper_forecasts, repeated
-from ganlane.generator.loop import LoopConfig, descend
-from ganlane.generator.networks import (
-    DIFFERENCE_SCALE_M,
-    Discriminator,
-    Generator,
-    GeneratorSizes,
-    displacements_of,
-)
+from ganlane.generator.loop import descend
+from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
 from ganlane.generator.scores import BASELINE, Metrics, distance, scene_metrics
 from ganlane.generator.segments import SceneTracks
 from ganlane.generator.windows import Groups, Windows, cut_windows, group_windows
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Weights of the generator's terms; a weight of 0 switches a term off.
-
-    Attributes:
-        variety: the best of the samples (variety alone makes a single sample worse than constant velocity).
-        single: the mean over the samples.
-        mean: the prediction for z = 0.
-        adversarial: cross-entropy of the discriminator's logits.
-    """
-
-    variety: float = 1.6
-    single: float = 1.0
-    mean: float = 1.0
-    adversarial: float = 0.02
-
-
-@dataclass(frozen=True)
-class PaperConfig:
-    """Settings of the paper's fit.
-
-    Attributes:
-        sizes: of the generator.
-        weights: of the loss terms.
-        loop: the schedule.
-        group_size: approximate number of vehicles per k-means group.
-        stride: frames between the starts of two windows, in fitting.
-        held_out_stride: the same on validation and held-out scenes.
-        history_noise: in fitting, standard deviation of noise on the observed displacements, in units of a typical
-            difference (0.04 m along and 0.02 m across the road); 0 is no noise.
-        samples: samples per update; the best counts in the variety term.
-        batch: groups per update.
-        mirror: swap left and right in half of the groups.
-        seed: of weights, batches, noise and k-means.
-    """
-
-    preset: ClassVar[Preset] = "paper"
-    sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
-    weights: LossWeights = field(default_factory=LossWeights)
-    loop: LoopConfig = field(default_factory=LoopConfig)
-    group_size: int = 9
-    stride: int = 1
-    held_out_stride: int = 3
-    samples: int = 6
-    history_noise: float = 0.0
-    batch: int = 48
-    mirror: bool = True
-    seed: int = 0
+from ganlane.parameters.generator import PaperConfig
 
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:

@@ -17,12 +17,13 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from ganlane.generator.closed_loop import displacement_of, moved_by
-from ganlane.generator.fit_calibrated import CalibratedConfig
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
     DriverParams,
     common_driver_params,
     driven_positions,
+    evaluation_params,
+    fit_anchor,
     rollout,
     typical_driver_params,
 )
@@ -37,6 +38,7 @@ from ganlane.generator.segments import (
 )
 from ganlane.generator.windows import Groups, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.state import Vehicles
@@ -105,10 +107,10 @@ def calibrated_forecasts(
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        headway, desired = config.evaluation_params(segments)
+        headway, desired = evaluation_params(config)(segments)
         noise = torch.randn(1 + horizon, 1 + samples, *headway.shape, generator.sizes.noise, generator=random)
         noise[:, 0] = 0.0
-        return rollout(generator, segments, headway, desired, noise, config.noise_period_s, config.anchor)
+        return rollout(generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config))
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]

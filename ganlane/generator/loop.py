@@ -15,29 +15,7 @@ from torch import Tensor, nn
 
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
-
-
-@dataclass(frozen=True)
-class LoopConfig:
-    """How long to fit.
-
-    Attributes:
-        updates: updates at most; the learning rate falls to 0 over them.
-        evaluate_every: updates between two evaluations on the validation scenes.
-        patience: evaluations without improvement before stopping.
-        learning_rate: of Adam, after the warm-up.
-        warmup: updates over which the learning rate rises.
-        largest_gradient: norm at which gradients are clipped.
-        max_seconds: stop after this long; None is never.
-    """
-
-    updates: int = 1200
-    evaluate_every: int = 150
-    patience: int = 8
-    learning_rate: float = 4e-3
-    warmup: int = 100
-    largest_gradient: float = 1.0
-    max_seconds: float | None = None
+from ganlane.parameters.generator import LoopConfig
 
 
 @dataclass(frozen=True)

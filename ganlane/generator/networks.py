@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
+
+from ganlane.parameters.generator import GeneratorSizes
 
 #: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the networks' units.
 DISPLACEMENT_SCALE_M = (1.0, 0.05)
@@ -188,37 +189,6 @@ class PairPooling(nn.Module):
         first = (others - own[..., None, :]).relu_()
         second = apply(self.second, first).add_(~real[..., None], alpha=-_MASKED)
         return torch.relu(second.amax(dim=-2))
-
-
-@dataclass(frozen=True)
-class GeneratorSizes:
-    """Widths of the generator; stored with its weights.
-
-    Attributes:
-        embedding: width of the motions' embedding (the paper's ``s_MLP``).
-        hidden: width H of both LSTMs.
-        pooling: width of the pooling's first layer.
-        pooled: width of its result.
-        context: width of the layer between encoder and decoder.
-        noise: width Z of the latent vector; below ``hidden``.
-        neighbours: how many of the nearest vehicles are pooled; 0 is no pooling (an ablation).
-        extra_inputs: inputs per vehicle in addition to its motion (0 for the paper's preset, positions only).
-        observed: displacements that are observed (the paper's ``o_l``).
-        predicted: displacements that are predicted (the paper's ``p_l``).
-        differences: whether the displacements' differences are inputs too; false is for an ablation.
-    """
-
-    embedding: int = 64
-    hidden: int = 32
-    pooling: int = 48
-    pooled: int = 32
-    context: int = 64
-    noise: int = 8
-    neighbours: int = 8
-    extra_inputs: int = 0
-    observed: int = 8
-    predicted: int = 8
-    differences: bool = True
 
 
 class Observation(NamedTuple):

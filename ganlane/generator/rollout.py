@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from ganlane.generator.closed_loop import ANCHOR, AnchorParameters, DriverMemory
 from ganlane.generator.networks import Generator
 from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.lanes import ENTRY_M, Visibility
 from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
@@ -171,3 +173,13 @@ def typical_driver_params(segments: Segments) -> tuple[Tensor, Tensor]:
     desired = now.speed + 0.5 * sum(DESIRED_EXCESS_MPS)
     median = torch.full_like(desired, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
     return balanced_headway(now.with_(desired_speed=desired), segments.road, median), desired
+
+
+def fit_anchor(config: CalibratedConfig) -> AnchorParameters:
+    """The anchor with a fit's washout and inputs."""
+    return replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
+
+
+def evaluation_params(config: CalibratedConfig) -> DriverParams:
+    """Headways and desired speeds for evaluation."""
+    return typical_driver_params if config.traits else common_driver_params

@@ -5,8 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import Rule, above, at_least, between, check, every, number, optional
-from ganlane.parameters.records import lists_to_tuples
+from ganlane.parameters.checks import (
+    Rule,
+    above,
+    at_least,
+    between,
+    check,
+    every,
+    lists_to_tuples,
+    number,
+    optional,
+)
 
 _DISCOUNT = Rule(lambda value: 0.0 < value <= 1.0, "a number above 0, at most 1")
 
@@ -15,12 +24,36 @@ _DISCOUNT = Rule(lambda value: 0.0 < value <= 1.0, "a number above 0, at most 1"
 class RainbowConfig:
     """Hyperparameters of Rainbow (Hessel et al. 2018); the values are for one update of 256 per 64 decisions.
 
-    Switches: ``noisy, dueling, distributional, double, prioritised``, and ``n_step=1``. ``gamma`` is per decision.
-    ``target_period`` and ``beta_updates`` count updates, ``epsilon_decisions`` decisions; epsilon is the share of
-    random legal actions, drawn beside the noise (docs/agent.md). ``adam_eps=None`` stands for
-    0.005 / ``batch_size``. The learning rate falls to ``learning_rate_end``, if one is given, within
-    ``learning_rate_decisions`` (0: those of the phase, :meth:`for_phase`). ``warmup`` is the number of transitions
-    before the first update.
+    Attributes:
+        hidden: widths of the hidden layers.
+        noisy: noisy layers; epsilon explores in addition to them.
+        dueling: value and advantages in streams of their own.
+        distributional: a distribution over returns (C51).
+        double: double Q-learning.
+        prioritised: prioritised replay.
+        n_step: steps of the returns; 1: no multi-step returns.
+        gamma: discount per decision.
+        atoms: of the distribution over returns, 2 or more.
+        v_min: lowest discounted return; what is below is clamped (metrics: clamped_fraction).
+        v_max: highest discounted return.
+        noisy_sigma: initial noise.
+        batch_size: transitions per update.
+        capacity: transitions in the replay buffer.
+        warmup: transitions before the first update.
+        decisions_per_update: decisions between two updates.
+        target_period: updates between two copies of the target network.
+        learning_rate: of Adam.
+        learning_rate_end: it falls to this in a straight line; null: it stays.
+        learning_rate_decisions: within so many decisions; 0: those of the phase (:meth:`for_phase`).
+        adam_eps: of Adam; null: 0.005 / batch_size.
+        gradient_clip: norm at which gradients are clipped.
+        alpha: strength of the priorities, 0 to 1.
+        beta_start: importance weights, rises to 1.
+        beta_updates: within so many updates.
+        kl_priority: priority by KL divergence, else by the expected error.
+        epsilon_start: share of random legal actions at first; a trained agent (init=...) starts with epsilon.
+        epsilon: share of random legal actions in the end (docs/agent.md).
+        epsilon_decisions: decisions in which the one falls to the other.
     """
 
     hidden: tuple[int, ...] = (256, 256)

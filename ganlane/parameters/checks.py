@@ -1,14 +1,18 @@
-"""Range checks of parameters, as rules with names."""
+"""Range checks of parameters as rules with names, and help for frozen dataclasses."""
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, fields
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
-from ganlane.errors import ParameterError
+from ganlane.errors import ParameterError, as_typed
+
+Record = TypeVar("Record")
+#: Metadata of a field that is set from Python alone: OmegaConf leaves such fields out of a schema.
+NO_KEY: Final[Mapping[str, Any]] = {"omegaconf_ignore": True}
 
 
 class Rule(NamedTuple):
@@ -24,28 +28,28 @@ def _finite(value: Any) -> bool:
 
 def at_least(low: float) -> Rule:
     """Finite and not below ``low``."""
-    return Rule(lambda value: _finite(value) and value >= low, f"at least {_shown(low)}")
+    return Rule(lambda value: _finite(value) and value >= low, f"at least {as_typed(low)}")
 
 
 def above(low: float) -> Rule:
     """Finite and above ``low``."""
-    return Rule(lambda value: _finite(value) and value > low, f"a number above {_shown(low)}")
+    return Rule(lambda value: _finite(value) and value > low, f"a number above {as_typed(low)}")
 
 
 def below(high: float) -> Rule:
     """Finite and below ``high``."""
-    return Rule(lambda value: _finite(value) and value < high, f"a number below {_shown(high)}")
+    return Rule(lambda value: _finite(value) and value < high, f"a number below {as_typed(high)}")
 
 
 def at_most(high: float) -> Rule:
     """Finite and not above ``high``."""
-    return Rule(lambda value: _finite(value) and value <= high, f"at most {_shown(high)}")
+    return Rule(lambda value: _finite(value) and value <= high, f"at most {as_typed(high)}")
 
 
 def between(low: float, high: float) -> Rule:
     """From ``low`` to ``high``, both included."""
     return Rule(
-        lambda value: _finite(value) and low <= value <= high, f"a number from {_shown(low)} to {_shown(high)}"
+        lambda value: _finite(value) and low <= value <= high, f"a number from {as_typed(low)} to {as_typed(high)}"
     )
 
 
@@ -91,43 +95,46 @@ def optional(rule: Rule) -> Rule:
     return Rule(lambda value: value is None or rule.holds(value), f"null or {rule.expected}")
 
 
-def check(config: Any, where: str = "", /, **rules: Rule) -> None:
-    """Hold fields of a dataclass against ``rules``.
-
-    Args:
-        config: the dataclass.
-        where: key of the record on the command line, where it has only one; empty for the records of
-            :mod:`ganlane.parameters`, which do not know theirs, and at the root.
-        rules: by field name.
+def check(record: Any, **rules: Rule) -> None:
+    """Check fields of a dataclass against ``rules``, given by field name.
 
     Raises:
-        ParameterError: for the first value that will not do; names field, value, what was expected, and a value
-            that does.
+        ParameterError: for the first value out of range; names field, value, what was expected, and a valid value.
     """
-    known = {field.name: field for field in fields(config)}
+    known = {field.name: field for field in fields(record)}
     for name, rule in rules.items():
-        value = getattr(config, name)
+        value = getattr(record, name)
         if not rule.holds(value):
             advice = _advice(known[name])
-            raise ParameterError(f"{{{name}}}={_shown(value)}: expected {rule.expected}{advice}.", where)
+            raise ParameterError(f"{{{name}}}={as_typed(value)}: expected {rule.expected}{advice}.")
 
 
 def _advice(field: Field[Any]) -> str:
     """The default as an example, where there is one."""
     default = field.default_factory() if field.default_factory is not MISSING else field.default
-    return f"; give for instance {{{field.name}}}={_shown(default)}" if default not in (MISSING, None, "") else ""
-
-
-def _shown(value: Any) -> str:
-    """As one would type it."""
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(_shown, value))}]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"; give for instance {{{field.name}}}={as_typed(default)}" if default not in (MISSING, None, "") else ""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A hint such as `` (did you mean 'lanes'?)``; empty where nothing is close."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
+
+
+def assign(record: Any, **values: Any) -> None:
+    """Set fields of a frozen ``record``; for its ``__post_init__``, or of a copy that is not to be checked."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
+
+
+def lists_to_tuples(record: Any) -> None:
+    """Turn lists, which YAML and the command line give, into tuples; for a ``__post_init__`` alone."""
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, list):
+            assign(record, **{field.name: tuple(value)})
+
+
+def part_of(record: Any, kind: type[Record]) -> Record:
+    """The fields that ``record`` inherits from ``kind``, as a ``kind``."""
+    return kind(**{field.name: getattr(record, field.name) for field in fields(kind)})  # type: ignore[arg-type]

@@ -88,7 +88,7 @@ class EgoParameters:
 
     Attributes:
         abort_lane_change: whether the opposite command turns back the current lane change.
-        visibility: when others see its lane changes: one of :data:`VISIBILITIES`.
+        visibility: when others see its lane changes: centre, body, signalled.
         soft_crash_ttc_s: a time to collision below this is a soft crash, s, at least 0.
         soft_crash_gap_m: and so is a gap below this, m, at least 0.
     """

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from ganlane.errors import ParameterError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.checks import above, between, check, positive_range, speed_range
-from ganlane.parameters.records import lists_to_tuples
+from ganlane.parameters.checks import above, between, check, lists_to_tuples, positive_range, speed_range
 
 #: What drives a decision: the tensor code, the native kernel, or the latter where it can.
 KERNELS = ("torch", "native", "auto")
@@ -20,7 +19,7 @@ class EpisodeParameters:
     Attributes:
         decision_period_s: a multiple of 0.1 s, the physics step.
         goal_m: distance from the start at which the episode ends with the goal's reward, m.
-        timeout_s: time at which it is cut off, s.
+        timeout_s: time at which it is cut off, s, reported as time-out.
     """
 
     decision_period_s: float = 1.0
@@ -42,15 +41,27 @@ class EpisodeParameters:
 
 @dataclass(frozen=True)
 class SpawnParameters:
-    """Table II, extended by lorries. Distances in m, speeds in m/s, (low, high) ranges.
-
-    ``min_spacing_m`` is centre to centre in a lane, between cars; it is larger by the extra length of lorries
-    (:attr:`spacing_m`). Each vehicle but the ego is a lorry with probability ``truck_share``. The defaults: 12 m and
-    2.5 m, the longest rigid lorry of Directive 96/53/EC and about its 2.55 m; desired speeds of 80 to 90 km/h, from
-    Germany's limit for lorries to the speed limiter of Directive 92/6/EEC.
+    """The first scene: Table II, extended by lorries. Distances in m, speeds in m/s, ranges (low, high).
 
     Sizes are above 0, speeds from 0 on, desired speeds above 0. Whether so many vehicles fit and can brake is
-    :func:`ganlane.sim.spawn.check_start`'s matter.
+    checked by :func:`ganlane.sim.spawn.check_start`.
+
+    Attributes:
+        spread_m: all vehicles start on this stretch.
+        min_spacing_m: centre to centre in a lane, between cars; larger by the extra length of lorries
+            (:attr:`spacing_m`).
+        front_speed_mps: of vehicles ahead of the ego.
+        rear_speed_mps: of vehicles behind it.
+        ego_speed_mps: of the ego.
+        desired_speed_mps: of the others.
+        ego_desired_speed_mps: of the ego.
+        length_m: of a car.
+        width_m: of a car.
+        truck_share: each of the others is a lorry with this probability, 0 to 1; the paper has none.
+        truck_length_m: the longest rigid lorry of Directive 96/53/EC.
+        truck_width_m: about its 2.55 m.
+        truck_desired_speed_mps: 80 to 90 km/h, from Germany's limit for lorries to the speed limiter of Directive
+            92/6/EEC.
     """
 
     spread_m: float = 200.0

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import above, at_least, between, check, one_of
+from ganlane.parameters.checks import above, assign, at_least, between, check, one_of, part_of
+from ganlane.parameters.removed import refuse_removed_observation
 
 #: How far a delay may be from a whole number of decisions, in decisions.
 _TOLERANCE = 1e-6
+#: What the agent can see, see :data:`ganlane.transforms.OBSERVATIONS`.
+FORMS = (
+    "table3",
+    "table3_progress",
+    "lane_view",
+    "lane_view_drift",
+    "lane_view_overlap",
+    "table3_lane_view",
+)
 #: The masks, see :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe")
 
@@ -18,8 +28,8 @@ class ObservationScale:
     """What observations are divided by, above 0.
 
     Attributes:
-        range_m: range of sight, m.
-        speed_mps: range of relative speeds, m/s; not a cap on driving.
+        range_m: range of sight, m: relative positions are divided by it and clipped.
+        speed_mps: the same for relative speeds, m/s; not a cap on driving.
     """
 
     range_m: float = 200.0
@@ -34,12 +44,12 @@ class SensorParameters:
     """Errors in what the ego perceives of the other vehicles; all at least 0, all 0: none.
 
     Attributes:
-        position_noise_m: standard deviation of a Gaussian error of the position along the road, m, drawn anew for
-            every vehicle and decision.
+        position_noise_m: standard deviation of a Gaussian error along the road, m, drawn anew for every vehicle and
+            decision.
         lateral_noise_m: the same across the road, m.
         speed_noise_mps: the same of the speed, m/s.
         dropout: probability that a vehicle is not seen in a decision.
-        delay_s: age of what is perceived, s, a whole number of decisions.
+        delay_s: age of what is perceived, s, a multiple of env.decision_period_s.
     """
 
     position_noise_m: float = 0.0
@@ -65,6 +75,35 @@ class SensorParameters:
                 f"({decision_period_s:g} s), since the ego measures once per decision; change one of them."
             )
         return round(decisions)
+
+
+@dataclass(frozen=True)
+class ObservationConfig(ObservationScale):
+    """``observation=lane_view_overlap`` and the other forms (:class:`ganlane.transforms.ObservationTransform`).
+
+    Attributes:
+        form: one of :data:`FORMS`.
+        sensors: errors in what the ego perceives of the others; None, and all 0: none.
+    """
+
+    form: str = "lane_view_overlap"
+    sensors: SensorParameters | None = field(default_factory=SensorParameters)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        # One way to say that there are no errors, which is also that of older runs.
+        if self.sensors == SensorParameters():
+            assign(self, sensors=None)
+        refuse_removed_observation(self.form)
+        check(self, form=one_of(FORMS))
+
+    def scale(self) -> ObservationScale:
+        """The normalisers alone."""
+        return part_of(self, ObservationScale)
+
+    def read_by(self, agent: ObservationConfig | None) -> ObservationConfig:
+        """What a driver reads here: the form and scale that ``agent`` names, if it does, through these sensors."""
+        return self if agent is None else replace(agent, sensors=self.sensors)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array, Estimate, entries
 from ganlane.generator import HELD_OUT
-from ganlane.parameters.records import assign
+from ganlane.parameters.checks import assign
 from ganlane.realism.distances import RESAMPLES, ceiling, distance, distance_difference, pooled_distance
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
 from ganlane.realism.quantities import UNITS, Measured, measure_recordings

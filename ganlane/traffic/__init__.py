@@ -9,22 +9,14 @@ All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mob
 :mod:`~ganlane.traffic.presets` builds the chains that ship.
 """
 
+from ganlane.parameters.traffic import AbortFaults, BrakingFaults, HesitationFaults, RandomDrivers, ReactionFaults
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import Overlay, TrafficModule, TrafficSequential
-from ganlane.traffic.faults import (
-    AbortedLaneChange,
-    AbortFaults,
-    BrakingFaults,
-    HesitantLaneChange,
-    HesitationFaults,
-    LateReaction,
-    PhantomBraking,
-    ReactionFaults,
-)
+from ganlane.traffic.faults import AbortedLaneChange, HesitantLaneChange, LateReaction, PhantomBraking
 from ganlane.traffic.foreign import HighwayEnvTraffic, SumoTraffic
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
-from ganlane.traffic.idm_random import IdmRandomTraffic, RandomDrivers
+from ganlane.traffic.idm_random import IdmRandomTraffic
 from ganlane.traffic.lane_change import CalibratedChanges, CalibratedLaneChange, LiteralChanges, LiteralLaneChange
 from ganlane.traffic.mixed import BlindTraffic, MixedTraffic
 from ganlane.traffic.replay import RecordedScenes, Recordings, ReplayTraffic

@@ -8,13 +8,12 @@ every model that ships does.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
+from ganlane.parameters.traffic import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
 from ganlane.sim.lanes import lane_change_done
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.state import Road, Vehicles
@@ -75,21 +74,6 @@ def steps_left(
     return torch.where(begins, round(faults.lasts_s / dt), left)
 
 
-@dataclass(frozen=True)
-class BrakingFaults:
-    """Phantom braking.
-
-    Attributes:
-        per_hour: rate, per hour of driving without it.
-        deceleration: m/s2; a driver who brakes harder anyway continues to do so.
-        lasts_s: duration, s.
-    """
-
-    per_hour: float = 6.0
-    deceleration: float = 4.0
-    lasts_s: float = 1.0
-
-
 class PhantomBraking(Overlay):
     """At times a driver brakes without a reason. Memory: the remaining steps of braking."""
 
@@ -114,21 +98,6 @@ class PhantomBraking(Overlay):
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
-@dataclass(frozen=True)
-class ReactionFaults:
-    """Late reactions.
-
-    Attributes:
-        per_hour: rate of lapses of attention, per hour of driving with attention.
-        delay_s: reaction time during a lapse, s, at least one physics step.
-        lasts_s: duration of a lapse, s.
-    """
-
-    per_hour: float = 12.0
-    delay_s: float = 0.8
-    lasts_s: float = 5.0
-
-
 class LateReaction(Overlay):
     """During a lapse a driver accelerates and brakes as it should have done ``delay_s`` before.
 
@@ -138,9 +107,6 @@ class LateReaction(Overlay):
 
     Memory: ``past`` [N, M, D], the accelerations decided in the last ``delay_s``, m/s2, oldest first (at the start
     the present one), and ``left``, the remaining steps of the lapse.
-
-    Raises:
-        UserError: the delay is less than a physics step.
     """
 
     def __init__(
@@ -149,8 +115,6 @@ class LateReaction(Overlay):
         super().__init__(road, stream)
         self.faults = faults or ReactionFaults()
         self.delay_steps = round(self.faults.delay_s / self.dt)
-        if self.delay_steps < 1:
-            raise UserError(f"delay_s={self.faults.delay_s:g}: expected at least one physics step, {self.dt:g} s.")
 
     @property
     def memory_fields(self) -> MemoryFields:  # type: ignore[override]
@@ -174,19 +138,6 @@ class LateReaction(Overlay):
 def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
     """Drivers whose lane change the model below has just begun, bool [N, M]."""
     return (moved.target_lane != vehicles.target_lane) & other_drivers(vehicles)
-
-
-@dataclass(frozen=True)
-class HesitationFaults:
-    """Hesitant lane changes.
-
-    Attributes:
-        share: of the changes, 0 to 1.
-        pace: lateral speed of such a change over the usual one, above 0 to 1.
-    """
-
-    share: float = 0.2
-    pace: float = 0.5
 
 
 class HesitantLaneChange(Overlay):
@@ -214,19 +165,6 @@ class HesitantLaneChange(Overlay):
         slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
         moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
         return moved, {"hesitant": hesitant & ~lane_change_done(moved, self.road)}
-
-
-@dataclass(frozen=True)
-class AbortFaults:
-    """Aborted lane changes.
-
-    Attributes:
-        share: of the changes, 0 to 1.
-        at: progress of the change at which the driver turns back, 0 to 1; 0.5 is the line between the lanes.
-    """
-
-    share: float = 0.1
-    at: float = 0.5
 
 
 class AbortedLaneChange(Overlay):
@@ -258,16 +196,6 @@ class AbortedLaneChange(Overlay):
         turns = (origin != _NO_LANE) & far_enough
         moved = moved.with_(target_lane=torch.where(turns, origin, moved.target_lane))
         return moved, {"origin": torch.where(turns, _NO_LANE, origin)}
-
-
-@dataclass(frozen=True)
-class DriverFaults:
-    """Rates of all faults; a rate or share of 0 switches one off."""
-
-    phantom_braking: BrakingFaults = field(default_factory=BrakingFaults)
-    late_reaction: ReactionFaults = field(default_factory=ReactionFaults)
-    hesitant_change: HesitationFaults = field(default_factory=HesitationFaults)
-    aborted_change: AbortFaults = field(default_factory=AbortFaults)
 
 
 def with_faults(base: TrafficModule, faults: DriverFaults | None = None) -> TrafficSequential:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.parameters.traffic import RandomDrivers, Range
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
 from ganlane.sim.feasibility import needed_deceleration
 from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration
@@ -22,8 +22,6 @@ from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, MemoryFields, Moved
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
-Range = tuple[float, float]
-
 #: Minimum distance of a swaying body from its lane's markings, m.
 _LANE_MARGIN_M = 0.1
 #: A driver's strongest braking is at least this many times what the initial scene requires of it.
@@ -32,38 +30,6 @@ _START_MARGIN = 1.5
 _DRAWS, _DESIRED_SPEED = 12, 11
 #: Key of the drivers' parameters in the memory, which stored training runs hold.
 _PARAMETERS = "traits"
-
-
-@dataclass(frozen=True)
-class RandomDrivers:
-    """Ranges (low, high) that every driver's parameters are drawn from, uniformly and independently.
-
-    Attributes:
-        headway_s: IDM's time headway T. The recorded followers' middle half on US-101 keeps 0.93 to 1.93 s
-            (median 1.27); Kesting and Treiber (2008) fit 1.2 to 1.5 s, Treiber and Kesting (2013, table 11.2) take
-            1.0 s on highways.
-        max_acceleration: m/s2; 1.0 there, Table V has 0.7, calibrations on trajectories give up to about 1.5.
-        comfortable_deceleration: m/s2; 1.5 there, Table V has 1.7.
-        strongest_braking: m/s2; about 9 is what dry asphalt allows, 4 is a hesitant driver or a wet road. A driver
-            of whom the initial scene requires more gets better brakes (:func:`start_braking`).
-        desired_speed: factor on the desired speed of the scene (Table II: 18 to 26 m/s).
-        politeness: factor on MOBIL's weights of the followers (Table IV), 0 is an egoist.
-        reaction_s: delay between an acceleration's decision and its execution, s. Drivers' reaction times of about
-            1 s are partly compensated by anticipation (Treiber, Kesting and Helbing 2006), which IDM lacks, so the
-            range lies below them.
-        sway_m: amplitude of the wandering around the lane's centre, m; less where the lane is narrow.
-        sway_period_s: periods of that wandering, s.
-    """
-
-    headway_s: Range = (0.8, 2.2)
-    max_acceleration: Range = (0.6, 1.6)
-    comfortable_deceleration: Range = (1.2, 2.5)
-    strongest_braking: Range = (4.0, 9.0)
-    desired_speed: Range = (0.9, 1.1)
-    politeness: Range = (0.0, 1.0)
-    reaction_s: Range = (0.0, 0.6)
-    sway_m: Range = (0.0, 0.25)
-    sway_period_s: Range = (8.0, 20.0)
 
 
 class DriverParams(NamedTuple):

@@ -11,6 +11,7 @@ from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
 from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
 from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.parameters.traffic import CalibratedGanParameters, DriverFaults, GanParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV
@@ -18,16 +19,14 @@ from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import TrafficModule, TrafficSequential
-from ganlane.traffic.faults import DriverFaults, with_faults
+from ganlane.traffic.faults import with_faults
 from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.traffic.lane_change import CalibratedChanges, CalibratedLaneChange, LiteralChanges, LiteralLaneChange
 from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
-#: Latent vectors of the calibrated traffic: factor on the fitted size, and correlation time, s. Both were chosen on
-#: the scenes that the generator is fitted to: as fitted (1 and 5 s) too few drivers accelerate.
-NOISE_SCALE, NOISE_PERIOD_S = 1.4, 3.0
-#: Its anchor: the fitted one, with brisker acceleration and lane changes as fast as recorded ones.
+#: Anchor of the calibrated traffic: the fitted one, with brisker acceleration and lane changes as fast as recorded
+#: ones.
 SIMULATED_ANCHOR: AnchorParameters = replace(
     ANCHOR, idm=replace(ANCHOR.idm, max_acceleration=1.0), lane_stiffness=0.6, lane_damping=1.55
 )
@@ -90,9 +89,9 @@ def gan_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    guard: bool = True,
-    noise_scale: float = 1.0,
-    execute_k: int = 1,
+    guard: bool = GanParameters.guard,
+    noise_scale: float = GanParameters.noise_scale,
+    execute_k: int = GanParameters.execute_k,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden accelerations.
@@ -125,9 +124,9 @@ def gan_calibrated_traffic(
     road: Road | None = None,
     stream: int = Stream.TRAIN,
     path: str | Path | None = None,
-    noise_scale: float = NOISE_SCALE,
+    noise_scale: float = CalibratedGanParameters.noise_scale,
     changes_per_km: float | None = None,
-    noise_period_s: float = NOISE_PERIOD_S,
+    noise_period_s: float = CalibratedGanParameters.noise_period_s,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
     """``traffic=gan_calibrated``: anchored residual, per-driver headways, checked lane changes at the recorded rate.

@@ -29,6 +29,7 @@ from ganlane.data import (
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
 from ganlane.parameters.driving import IdmParameters, Visibility
+from ganlane.parameters.traffic import ReplayParameters
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule
@@ -202,7 +203,7 @@ class ReplayTraffic(TrafficModule):
         self,
         stream: int = Stream.TRAIN,
         path: str | Path | None = None,
-        least_s: float = 4.0,
+        least_s: float = ReplayParameters.least_s,
         recordings: Recordings | None = None,
     ) -> None:
         self.source = "recordings" if recordings else str(path or _found())

@@ -12,7 +12,6 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.generator.closed_loop import (
     ANCHOR,
-    EXTRA_INPUTS,
     AnchorParameters,
     DriverMemory,
     History,
@@ -26,6 +25,7 @@ from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
+from ganlane.parameters.generator import EXTRA_INPUTS
 from ganlane.sim.random import Purpose, Stream, normal, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule

@@ -33,12 +33,11 @@ from ganlane.agents.checkpoint import SHIPPED, SUPPORT
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
 from ganlane.build import make_env, make_road, make_traffic, observation_of
-from ganlane.config.collector import MultiCollectorConfig, RayCollectorConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import TrafficConfig
-from ganlane.config.train import TrainConfig
+from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.removed import RemovedOption, without_removed
 from ganlane.runtime import keep_freed_memory, set_threads
 from ganlane.sim.random import Stream

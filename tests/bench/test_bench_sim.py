@@ -24,10 +24,10 @@ from ganlane.bench.systems import (
 from ganlane.bench.traffic import SYSTEM, TrafficSuite
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig, TrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SHORT = {"repetitions": 2, "seconds": 0.001}

@@ -22,10 +22,10 @@ from ganlane.bench.train import (
 )
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())

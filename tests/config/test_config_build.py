@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -10,10 +12,11 @@ from torchrl.envs.utils import check_env_specs
 from ganlane.agents.drivers import DRIVERS, MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import FORMS, ObservationConfig
-from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.config.realism import RealismConfig
+from ganlane.config.traffic import HighwayEnvTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, SumoTrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.parameters.observation import FORMS, ObservationConfig
 from ganlane.sim.random import Stream
 
 ROAD = EnvConfig(lanes=2, idm=IdmParameters(headway_s=1.2), mobil=MobilParameters(politeness_side=0.0))
@@ -56,3 +59,28 @@ def test_every_driver_drives(name):
 def test_an_unknown_driver_is_refused_with_the_known_ones():
     with pytest.raises(UserError, match=r"agent nobody: unknown; choose one of random, .*agent_idm"):
         make_driver("nobody", ROAD)
+
+
+@pytest.mark.parametrize(
+    ("module", "config", "extra"),
+    [("libsumo", SumoTrafficConfig(), "sumo"), ("highway_env", HighwayEnvTrafficConfig(), "bench")],
+)
+def test_where_the_package_is_missing_a_sentence_names_the_extra(monkeypatch, module, config, extra):
+    monkeypatch.setattr("ganlane.traffic.foreign.packages.find_spec", lambda name: None)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'"):
+        make_traffic(config, EnvConfig())
+
+
+@pytest.mark.parametrize("config", [SumoTrafficConfig(), HighwayEnvTrafficConfig()])
+def test_a_realism_card_has_no_ego_to_drive_around(config):
+    with pytest.raises(UserError, match="drives around an ego only"):
+        RealismConfig(traffic=config)
+
+
+def test_the_first_scene_is_that_of_the_environment():
+    pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
+    env = EnvConfig(spread_m=300.0, rear_speed_mps=(12.0, 13.0))
+    scenes = make_traffic(SumoTrafficConfig(truck_share=0.4), env).scenes(9)
+    assert scenes.cars.parameters == env.spawn_parameters()
+    assert scenes.share == 0.4

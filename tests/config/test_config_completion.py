@@ -13,11 +13,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra.core.config_store import ConfigStore
 
 from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
 from ganlane.config.completion import candidates
-from ganlane.config.store import SCHEMAS, register
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = [*COMMANDS, *PLAIN_COMMANDS]
@@ -54,26 +52,6 @@ def test_nothing_of_hydras_and_no_schema_is_offered():
     offered = candidates("ganlane train ", NAMES)
     assert {"traffic=", "seed=", "env."} <= set(offered)
     assert not [word for word in offered if "schema" in word or word.startswith("hydra")]
-
-
-@pytest.mark.parametrize(
-    "line", ["evaluate ", "train env.", "render film.", "realism traffic=gan traffic.", "train_generator generator."]
-)
-def test_the_yaml_alone_gives_the_same_answer_as_the_dataclasses(line):
-    """The latter import torch, which takes some ten times as long."""
-    register()
-    slow = candidates(f"ganlane {line}", NAMES)
-    repo = ConfigStore.instance().repo
-    kept = {name: node for name, node in repo.items() if name in SCHEMAS or name.endswith("_schema.yaml")}
-    for name in kept:
-        del repo[name]
-    try:
-        quick = candidates(f"ganlane {line}", NAMES)
-        assert quick == slow
-        assert len(quick) > 1
-        assert not [name for name in repo if name.endswith("_schema.yaml")]
-    finally:
-        repo.update(kept)
 
 
 @pytest.mark.parametrize("arguments", [["-sc", "install=bash"], ["train", "-sc", "install=bash"]])

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from ganlane.config.app import run_command
-from ganlane.config.disk import ADVICE, is_users_matter
-from ganlane.config.messages import sentence
+from ganlane.config.messages import ADVICE, is_users_matter, sentence
 from ganlane.files import write_bytes
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,7 +1,11 @@
-"""A wrong value gives one sentence that names it, and leaves nothing behind."""
+"""A wrong value or flag gives one sentence that names it, without waiting for torch, and leaves nothing behind."""
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,10 +14,11 @@ from omegaconf.errors import OmegaConfBaseException
 from reference.hydra_memory import composed, own_part
 
 from ganlane.__main__ import COMMANDS, main
-from ganlane.config.compose import typed
+from ganlane.config.command_line import typed
 from ganlane.config.messages import sentence
 from ganlane.errors import UserError
 
+ROOT = Path(__file__).resolve().parents[2]
 COMPOSED = {command: own_part(composed(command)) for command in COMMANDS}
 
 
@@ -126,3 +131,65 @@ def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, tmp_path, monke
     assert err.rstrip().endswith(".")
     assert out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def loaded(program: str, *names: str) -> str:
+    """Which of the modules ``names`` a program has loaded in the end, and what else it prints."""
+    program = f"import sys; {program}; print([name for name in {names} if name in sys.modules])"
+    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, env=environment, check=True
+    )
+    return done.stdout
+
+
+def test_parameters_are_declared_without_torch():
+    names = sorted(path.stem for path in (ROOT / "ganlane" / "parameters").glob("*.py"))[1:]
+    program = f"import importlib; [importlib.import_module('ganlane.parameters.' + name) for name in {names}]"
+    assert loaded(program, "torch", "hydra", "omegaconf", "ganlane.sim") == "[]\n"
+
+
+@pytest.mark.parametrize("line", ["train env.lane=3", "train env.lanes=0", "evaluate traffics=[gann]"])
+def test_a_mistake_is_reported_without_torch(line):
+    """Which takes seconds to load."""
+    assert loaded(f"from ganlane.__main__ import main; main({line.split()})", "torch", "ganlane.sim") == "[]\n"
+
+
+class Trap:
+    """Writes a file when it is unpickled."""
+
+    def __reduce__(self):
+        return (open, ("sprung", "w"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "told"),
+    [
+        (["--resolve"], "--resolve: it goes with --cfg alone"),
+        (["--package", "env"], "--package: it goes with --cfg alone"),
+        (["--info", "config", "--resolve"], "--resolve: it goes with --cfg alone"),
+        (["--config-dir", "."], "--config-dir: ganlane has its own configuration"),
+        (["--config-name", "train"], "--config-name: ganlane has its own configuration"),
+        (["--cfg", "job", "--config-path", "."], "--config-path: ganlane has its own configuration"),
+    ],
+)
+def test_a_flag_without_effect_is_refused_in_one_sentence(flags, told, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["evaluate", *flags]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"ganlane evaluate: {told}")
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pickled_run_is_not_opened(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.pkl").write_bytes(pickle.dumps(Trap()))
+    assert main(["evaluate", "--cfg", "job", "--experimental-rerun", "run.pkl"]) == 2
+    assert "--experimental-rerun: ganlane has its own configuration" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["run.pkl"]
+
+
+def test_resolve_and_package_go_with_cfg(capsys):
+    assert main(["evaluate", "--cfg", "job", "--resolve", "--package", "env"]) == 0
+    assert "lanes: 3" in capsys.readouterr().out

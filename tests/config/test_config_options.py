@@ -1,52 +1,27 @@
-"""Every option composes, says in its YAML what its dataclass says, and knows every key of what it configures."""
+"""Every option composes, is explained, and hands its values on."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from functools import cache
 from pathlib import Path
 
 import pytest
-from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from ganlane.__main__ import COMMANDS
 from ganlane.agents import read_agent
-from ganlane.config.compose import check
-from ganlane.config.data import NgsimDataConfig
-from ganlane.config.generator import (
-    CalibratedGeneratorConfig,
-    CalibratedLoopOptions,
-    LoopOptions,
-    PaperGeneratorConfig,
-    WeightOptions,
-)
-from ganlane.config.observation import FORMS, ObservationConfig
-from ganlane.config.plain import plain_copy
-from ganlane.config.store import SCHEMAS, SUFFIX, register
-from ganlane.config.traffic_faults import (
-    AbortFaultsConfig,
-    BrakingFaultsConfig,
-    HesitationFaultsConfig,
-    IdmFaultsTrafficConfig,
-    ReactionFaultsConfig,
-)
-from ganlane.data import NgsimParameters
+from ganlane.config.command_line import check
+from ganlane.config.help import help_text, key_lines
+from ganlane.config.schemas import SCHEMAS, option_of, options_of
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.generator import (
-    CalibratedConfig,
-    LoopConfig,
-    LossWeights,
-    PaperConfig,
-    load_generator,
-    shipped_generator,
-)
-from ganlane.parameters.observation import MASKS, SensorParameters
+from ganlane.generator import load_generator, shipped_generator
+from ganlane.parameters.generator import CalibratedConfig, PaperConfig
+from ganlane.parameters.observation import FORMS, MASKS, ObservationConfig, SensorParameters
 from ganlane.parameters.reward import RewardParameters
-from ganlane.traffic import AbortFaults, BrakingFaults, HesitationFaults, ReactionFaults
-from ganlane.traffic.presets import DriverFaults
 from ganlane.training.phases import describe, phases_of
 from ganlane.transforms import OBSERVATIONS
 
@@ -74,84 +49,34 @@ def test_every_option_composes(group, option):
     config_of(USED_BY.get(group, "train"), f"{group}={option}", *NEEDS.get((group, option), []))
 
 
-#: Options with a dataclass of their own; the others' YAML says what differs from the option that they start from.
-OWN_SCHEMA = [
-    (group, option)
-    for group, option in OPTIONS
-    if group in ("observation", "mask") or option in SCHEMAS.get(group, {}) or group == "generator"
-]
+@pytest.mark.parametrize(("group", "names"), [("observation", FORMS), ("mask", MASKS)])
+def test_every_form_is_an_option_of_its_name(group, names):
+    assert set(options_of(group)) == set(names)
+    assert all(option_of(group, name)[1] == {"form": name} for name in names)
 
 
-@pytest.mark.parametrize(("group", "option"), OWN_SCHEMA)
-def test_yaml_and_dataclass_hold_the_same_values(group, option):
-    needed = NEEDS.get((group, option), [])
-    composed = config_of(USED_BY.get(group, "train"), f"{group}={option}", *needed)
-    value = getattr(composed, group)
-    if needed:
-        assert value == type(value)(scene=value.scene)
-        return
-    expected = type(value)(form=option) if group in ("observation", "mask") else type(value)()
-    assert value == expected
+@pytest.mark.parametrize("group", [group for group in SCHEMAS if group])
+def test_every_schema_has_an_option(group):
+    assert set(SCHEMAS[group].values()) <= {option_of(group, name)[0] for name in options_of(group)}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_root_yaml_and_dataclass_hold_the_same_values(command):
-    composed = config_of(command)
-    default = type(composed)()
-    for field in dataclasses.fields(composed):
-        value = getattr(composed, field.name)
-        plain = not dataclasses.is_dataclass(value) and not isinstance(value, dict)
-        if plain or field.name in ("evaluation", "pretrain", "film", "curves"):
-            assert value == getattr(default, field.name), field.name
+def test_help_gives_every_key_a_meaning(command):
+    missing = re.findall(r"^ +[\w]+: [^#\n]+$", help_text(command).partition("keys (KEY=VALUE)")[2], re.MULTILINE)
+    assert missing == []
 
 
-def test_no_schema_is_without_its_yaml():
-    register()
-    for group, options in SCHEMAS.items():
-        names = {path.stem for path in (conf_folder() / group).glob("*.yaml")}
-        if group in ("observation", "mask"):
-            assert names == set({"observation": FORMS, "mask": MASKS}[group])
-        else:
-            assert set(options) <= names, group
-        assert {name + SUFFIX for name in options} <= {
-            name.removesuffix(".yaml") for name in ConfigStore.instance().list(group or "")
-        }
+@pytest.mark.parametrize(("group", "option"), [each for each in OPTIONS if each[0] != "experiment"])
+def test_every_key_of_an_option_has_a_meaning(group, option):
+    kind, values = option_of(group, option)
+    for line in key_lines(kind, values, 0):
+        assert "# " in line, line
 
 
-MIRRORS = [
-    (NgsimDataConfig(), NgsimParameters, {"block_bytes"}),
-    (LoopOptions(), LoopConfig, set()),
-    (WeightOptions(), LossWeights, set()),
-    (PaperGeneratorConfig(), PaperConfig, {"sizes", "loop", "weights", "seed"}),
-    (CalibratedGeneratorConfig(), CalibratedConfig, {"sizes", "loop", "seed"}),
-    (BrakingFaultsConfig(), BrakingFaults, set()),
-    (ReactionFaultsConfig(), ReactionFaults, set()),
-    (HesitationFaultsConfig(), HesitationFaults, set()),
-    (AbortFaultsConfig(), AbortFaults, set()),
-]
-
-
-@pytest.mark.parametrize(("config", "kind", "apart"), MIRRORS, ids=lambda value: getattr(value, "__name__", ""))
-def test_config_offers_every_parameter_with_the_same_default(config, kind, apart):
-    copied = plain_copy(config, kind) if not apart else kind()
-    for field in dataclasses.fields(kind):
-        if field.name in apart:
-            continue
-        assert hasattr(config, field.name), f"{kind.__name__}.{field.name} cannot be set from the command line"
-        given = getattr(config, field.name)
-        assert (tuple(given) if isinstance(given, list) else given) == getattr(kind(), field.name), field.name
-        assert getattr(copied, field.name) == getattr(kind(), field.name)
-
-
-def test_calibrated_loop_is_the_presets_own():
-    assert CalibratedLoopOptions().parameters() == CalibratedConfig().loop
-
-
-def test_faults_of_the_command_line_reach_the_traffic():
-    assert IdmFaultsTrafficConfig().arguments() == {"faults": DriverFaults()}
-    mild = IdmFaultsTrafficConfig(late_reaction=ReactionFaultsConfig(per_hour=0.0)).faults()
-    assert mild.late_reaction == ReactionFaults(per_hour=0.0)
-    assert mild.phantom_braking == BrakingFaults()
+def test_help_shows_what_an_option_sets():
+    shown = "\n".join(key_lines(*option_of("agent", "transfer"), 0))
+    assert "learning_rate_end: 2.5e-05" in shown
+    assert "n_step: 3" in shown
 
 
 def test_observation_forms_are_those_of_the_transform():
@@ -239,10 +164,13 @@ def test_yaml_files_explain_themselves():
         assert OmegaConf.load(path) is not None
 
 
-@pytest.mark.parametrize("options", [PaperGeneratorConfig(), CalibratedGeneratorConfig()], ids=lambda o: o.preset)
-def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(options):
-    shipped = load_generator(shipped_generator(options.preset), options.preset)[1]["config"]
-    assert json.loads(json.dumps(dataclasses.asdict(options.fit_config(seed=0)))) == shipped
+@pytest.mark.parametrize("config", [PaperConfig(), CalibratedConfig()], ids=lambda config: config.preset)
+def test_the_weights_that_ship_were_fitted_with_the_commands_defaults(config):
+    preset = config.preset
+    shipped = load_generator(shipped_generator(preset), preset)[1]["config"]
+    chosen = config_of("train_generator", f"generator={preset}").generator
+    assert chosen == config
+    assert json.loads(json.dumps(dataclasses.asdict(chosen))) == shipped
 
 
 @pytest.mark.parametrize("value", ["auto", "always", "never"])
@@ -257,3 +185,13 @@ def test_a_long_training_is_compiled_where_that_is_known_to_work(version, compil
     monkeypatch.setattr("torch.__version__", version)
     monkeypatch.setattr("ganlane.runtime.has_compiler", lambda: True)
     assert config_of("train", "total_decisions=1000000").compiled().env.compile is compiles
+
+
+@pytest.mark.parametrize("shares", [{"idm": 1}, {"idm": 1, "gan_calibrated": 2}], ids=["fewer", "new"])
+def test_shares_on_the_command_line_replace_those_of_an_experiment(shares):
+    given = ", ".join(f"{name}: {share}" for name, share in shares.items())
+    assert config_of("train", "experiment=general", f"traffic.shares={{{given}}}").traffic.shares == shares
+
+
+def test_an_experiment_on_top_of_another_sets_its_own_shares():
+    assert config_of("train", "experiment=general_continued").traffic.shares["gan"] == 4

@@ -16,14 +16,12 @@ from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
-from ganlane.config.traffic import GanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig
-from ganlane.config.traffic_replay import ReplayTrafficConfig
+from ganlane.config.traffic import GanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
-from ganlane.parameters.observation import SensorParameters
+from ganlane.parameters.observation import ObservationConfig, SensorParameters
 from ganlane.traffic import IdmTraffic
 
 SEED = 4

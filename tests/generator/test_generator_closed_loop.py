@@ -7,7 +7,6 @@ import torch
 
 from ganlane.generator.closed_loop import (
     ANCHOR,
-    EXTRA_INPUTS,
     STEEPEST,
     DriverMemory,
     Plan,
@@ -19,8 +18,9 @@ from ganlane.generator.closed_loop import (
     start,
     wander,
 )
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
+from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.state import Road, Vehicles

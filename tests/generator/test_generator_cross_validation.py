@@ -9,10 +9,7 @@ from ganlane.data.statistics import measure_exposure
 from ganlane.fit_report import ablation_table, fold_tables
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.cross_validation import ablate, cross_validate, variants
-from ganlane.generator.fit_calibrated import CalibratedConfig
-from ganlane.generator.fit_paper import PaperConfig
-from ganlane.generator.loop import LoopConfig
-from ganlane.generator.networks import GeneratorSizes
+from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)
@@ -123,7 +120,7 @@ def test_ablations_of_the_calibrated_preset_are_rolled_out_too(tmp_path):
     sizes = replace(SIZES, extra_inputs=4)
     config = CalibratedConfig(sizes, SHORT_LOOP, (4,), (1.0,), held_out_horizon=8, batch=2, held_out_stride=20)
     rows = ablate(frame, config, ("synthetic-1",), tmp_path)
-    assert variants(config)["without washout"].anchor.washout_s == math.inf
+    assert variants(config)["without washout"].washout_s == math.inf
     assert all(math.isfinite(row["rmse_5_s_ratio"]["mean"]) for row in rows.values())
     assert rows["as it is"] != rows["without traits"]
     assert "RMSE 5 s" in ablation_table(rows)

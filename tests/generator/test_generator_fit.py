@@ -12,20 +12,19 @@ from ganlane.errors import UserError
 from ganlane.files import save_weights
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import assign_folds, fit_generator, split_for_fit
-from ganlane.generator.fit_calibrated import CalibratedConfig, CalibratedTask, energy_score, masked_mean
+from ganlane.generator.fit_calibrated import CalibratedTask, energy_score, masked_mean
 from ganlane.generator.fit_paper import (
-    LossWeights,
-    PaperConfig,
     adversarial_loss,
     discriminator_accuracy,
     discriminator_loss,
     distances,
     variety_loss,
 )
-from ganlane.generator.loop import LoopConfig, learning_rate
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.loop import learning_rate
+from ganlane.generator.networks import Generator
 from ganlane.generator.segments import scene_tracks
 from ganlane.generator.windows import count_windows
+from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 HELD_OUT = ("synthetic-1",)
@@ -45,7 +44,7 @@ def calibrated_config(updates: int) -> CalibratedConfig:
     loop = LoopConfig(updates=updates, evaluate_every=3, learning_rate=5e-3, warmup=1)
     sizes = replace(SIZES, extra_inputs=4)
     return CalibratedConfig(
-        sizes, loop, horizons=(4, 6), shares=(1, 1), held_out_horizon=6, batch=3, held_out_stride=20
+        sizes, loop, horizons=(4, 6), shares=(1, 1), held_out_horizon=8, batch=3, held_out_stride=20
     )
 
 

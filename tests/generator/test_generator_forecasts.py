@@ -5,8 +5,6 @@ import pytest
 import torch
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.closed_loop import EXTRA_INPUTS
-from ganlane.generator.fit_calibrated import CalibratedConfig
 from ganlane.generator.forecasts import (
     RidgeForecast,
     baseline_forecasts,
@@ -18,10 +16,11 @@ from ganlane.generator.forecasts import (
     paper_forecasts,
     repeated,
 )
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.networks import Generator
 from ganlane.generator.scores import displacement_errors, errors_of, scene_metrics
 from ganlane.generator.segments import scene_tracks
 from ganlane.generator.windows import Windows, cut_windows, group_windows
+from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, GeneratorSizes
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 STRIDE = 7

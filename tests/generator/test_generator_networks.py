@@ -11,7 +11,6 @@ from ganlane.generator.networks import (
     RANGE_M,
     Discriminator,
     Generator,
-    GeneratorSizes,
     MotionLSTM,
     PairPooling,
     apply,
@@ -20,6 +19,7 @@ from ganlane.generator.networks import (
     motion_features,
     nearest,
 )
+from ganlane.parameters.generator import GeneratorSizes
 
 SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14, noise=4)
 

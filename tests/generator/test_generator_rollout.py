@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.closed_loop import EXTRA_INPUTS
-from ganlane.generator.fit_calibrated import CalibratedConfig, rollout_errors
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.fit_calibrated import rollout_errors
+from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
     balanced_headway,
     recorded_vehicles,
@@ -19,6 +18,7 @@ from ganlane.generator.rollout import (
 )
 from ganlane.generator.scores import distance
 from ganlane.generator.segments import PRESENT, cut_segments, extrapolate, scene_tracks
+from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, GeneratorSizes
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 WIDTH = 3.5

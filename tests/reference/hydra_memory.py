@@ -20,8 +20,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.singleton import Singleton
 from omegaconf import open_dict
 
-from ganlane.config.compose import VERSION_BASE
-from ganlane.config.store import register
+from ganlane.config.command_line import VERSION_BASE
+from ganlane.config.schemas import register
 from ganlane.files import conf_folder
 
 CONFIGS: dict[tuple[str, tuple[str, ...]], Any] = {}

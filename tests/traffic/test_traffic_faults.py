@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.parameters.traffic import DriverFaults
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.traffic import (
     AbortedLaneChange,
@@ -35,13 +36,7 @@ from ganlane.traffic import (
     TrafficSequential,
 )
 from ganlane.traffic.faults import driven_at
-from ganlane.traffic.presets import (
-    DriverFaults,
-    gan_calibrated_traffic,
-    gan_traffic,
-    idm_faults_traffic,
-    with_faults,
-)
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_faults_traffic, with_faults
 
 NONE = DriverFaults(BrakingFaults(0.0), ReactionFaults(0.0), HesitationFaults(0.0), AbortFaults(0.0))
 EGO = {"x": -1000.0, "lane": 0}
@@ -348,7 +343,7 @@ def test_driving_a_path_at_another_speed_stays_on_it_and_never_goes_back(speed, 
 
 
 def test_a_delay_shorter_than_a_step_is_refused():
-    with pytest.raises(UserError, match="at least one physics step"):
+    with pytest.raises(UserError, match=r"delay_s=0\.01: expected at least 0\.1"):
         LateReaction(faults=ReactionFaults(delay_s=0.01))
 
 

@@ -14,11 +14,14 @@ from scipy.stats import binomtest
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.evaluate import all_traffics
 from ganlane.config.scenarios import CutInEnvConfig
-from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
-from ganlane.config.traffic_mixed import MixedTrafficConfig
-from ganlane.config.traffic_replay import ReplayTrafficConfig
+from ganlane.config.traffic import (
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+    MixedTrafficConfig,
+    ReplayTrafficConfig,
+    all_traffics,
+)
 from ganlane.errors import UserError
 from ganlane.sim import Road, Visibility
 from ganlane.traffic import BlindTraffic, IdmMobilTraffic, IdmRandomTraffic, IdmTraffic, MixedTraffic, TrafficModule

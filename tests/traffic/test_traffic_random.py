@@ -9,7 +9,7 @@ import torch
 from reference.worlds import environment, same_bits, step, vehicles
 
 from ganlane import keys
-from ganlane.config.traffic_random import IdmRandomTrafficConfig
+from ganlane.config.traffic import IdmRandomTrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps
@@ -25,7 +25,7 @@ def params_of(td) -> DriverParams:
 
 
 def test_the_defaults_of_the_command_line_are_those_of_the_traffic():
-    assert IdmRandomTrafficConfig().drivers() == RandomDrivers()
+    assert IdmRandomTrafficConfig().arguments() == {"drivers": RandomDrivers()}
 
 
 def test_drivers_differ_and_lie_within_the_ranges():

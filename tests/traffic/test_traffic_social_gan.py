@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 
 from ganlane.errors import UserError
-from ganlane.generator.closed_loop import EXTRA_INPUTS
-from ganlane.generator.networks import Generator, GeneratorSizes
+from ganlane.generator.networks import Generator
+from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import spawn
 from ganlane.sim.state import Road

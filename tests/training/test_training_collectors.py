@@ -19,12 +19,11 @@ from training.toy import ToyRoad
 from ganlane import keys
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
-from ganlane.config.collector import MultiCollectorConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.config.train import TrainConfig
+from ganlane.config.train import MultiCollectorConfig, TrainConfig
 from ganlane.errors import UserError
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.training import TrainingConfig, train
 from ganlane.training.checkpoint import TrainingState
 from ganlane.training.loop import collect

@@ -7,7 +7,7 @@ import types
 
 import pytest
 
-from ganlane.config.logger import LoggerConfig, TensorBoardLoggerConfig, WandbLoggerConfig
+from ganlane.config.train import LoggerConfig
 from ganlane.errors import UserError
 from ganlane.training.logs import CsvLog, Progress, TensorBoardLog, WandbLog, duration, make_logs, read_rows
 
@@ -175,12 +175,12 @@ def test_the_real_wandb_keeps_an_offline_run(tmp_path, monkeypatch):
 def test_the_option_chooses_the_logs(fake, tmp_path):
     pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
     assert make_logs(LoggerConfig(), tmp_path) == []
-    (board,) = make_logs(TensorBoardLoggerConfig(), tmp_path)
+    (board,) = make_logs(LoggerConfig(kind="tensorboard"), tmp_path)
     assert isinstance(board, TensorBoardLog)
     board.write({"decisions": 100, "loss": 0.5})
     board.close()
     assert any(path.name.startswith("events") for path in (tmp_path / "tensorboard").iterdir())
-    (wandb,) = make_logs(WandbLoggerConfig(project="mine"), tmp_path, {"seed": 1})
+    (wandb,) = make_logs(LoggerConfig(kind="wandb", project="mine"), tmp_path, {"seed": 1})
     assert isinstance(wandb, WandbLog)
     assert (fake.options["project"], fake.options["config"]) == ("mine", {"seed": 1})
 

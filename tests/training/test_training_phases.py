@@ -16,9 +16,9 @@ import torch
 import ganlane
 from ganlane.agents import read_agent, save_agent
 from ganlane.build import make_driver
-from ganlane.config.compose import check
+from ganlane.config.command_line import check
 from ganlane.config.env import EnvConfig
-from ganlane.config.init import InitConfig, NoInitConfig
+from ganlane.config.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.observation import MaskParameters
@@ -353,7 +353,7 @@ def test_a_checkpoint_with_a_removed_option_names_the_revision_that_had_it(train
 SCRIPT = """
 import sys
 from pathlib import Path
-from ganlane.config.compose import check
+from ganlane.config.command_line import check
 from ganlane.training.phases import phases_of, run_phase
 
 if __name__ == "__main__":

@@ -20,12 +20,11 @@ from ganlane.agents import read_agent
 from ganlane.agents.drivers import MobilDriver
 from ganlane.build import make_env, make_traffic, observation_of
 from ganlane.config.env import EnvConfig
-from ganlane.config.observation import ObservationConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluate import main as evaluate
-from ganlane.parameters.observation import SensorParameters
+from ganlane.parameters.observation import ObservationConfig, SensorParameters
 from ganlane.sim import Road, Vehicles
 from ganlane.sim.random import Stream, episode_key
 from ganlane.traffic import IdmMobilTraffic

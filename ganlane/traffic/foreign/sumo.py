@@ -14,6 +14,7 @@ from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
+from ganlane.parameters.traffic import SumoParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.ego import ego_scene, move_ego
 from ganlane.sim.idm import TABLE_V, following_acceleration
@@ -141,11 +142,11 @@ class SumoTraffic(TrafficModule):
         idm: IdmParameters = TABLE_V,
         steering: SteeringParameters = STEERING,
         spawn: SpawnParameters = TABLE_II,
-        truck_share: float = 0.15,
-        truck_length_m: float = 12.0,
-        lane_change_s: float = 4.0,
-        keep_right: float = 1.0,
-        speed_wander: float = 0.03,
+        truck_share: float = SumoParameters.truck_share,
+        truck_length_m: float = SumoParameters.truck_length_m,
+        lane_change_s: float = SumoParameters.lane_change_s,
+        keep_right: float = SumoParameters.keep_right,
+        speed_wander: float = SumoParameters.speed_wander,
     ) -> None:
         super().__init__(road, stream)
         require_libsumo()

@@ -1,19 +1,26 @@
-"""What stands on the command line: flags, overrides, and the single runs that a sweep means."""
+"""The command line: its flags and overrides, the runs that a sweep means, and their checked configurations."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from typing import NoReturn
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
 
+from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType, Quote, QuotedString
+from omegaconf import DictConfig, open_dict
 
+from ganlane.config.messages import CONFIG_ERRORS, sentence
+from ganlane.config.schemas import made, options_of, register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 
+VERSION_BASE = "1.3"
 #: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
 ALIASES = {"render": {"agent": "driver"}}
 
@@ -75,7 +82,7 @@ def _refuse_no_option(override: Override) -> None:
     group = override.key_or_group
     chosen = override.is_sweep_override() or isinstance(override.value(), str)
     if not chosen and (conf_folder() / group).is_dir():
-        names = ", ".join(sorted(path.stem for path in (conf_folder() / group).glob("*.yaml")))
+        names = ", ".join(options_of(group))
         raise UserError(f"{override.input_line}: expected the name of one option; choose one of {names}.")
 
 
@@ -99,6 +106,16 @@ def without_repetitions(overrides: Sequence[str]) -> list[str]:
     return list(last.values())
 
 
+def with_shares_replaced(overrides: Sequence[str]) -> list[str]:
+    """The overrides, each ``traffic.shares=...`` after a null: Hydra would merge it into an experiment's shares."""
+    replaced = []
+    for override in parse(overrides):
+        key = override.key_or_group
+        replaced += [f"{key}=null"] if key.endswith("traffic.shares") else []
+        replaced.append(str(override.input_line))
+    return replaced
+
+
 def single_runs(overrides: Sequence[str], multirun: bool) -> list[list[str]]:
     """The overrides of every run: one, or all combinations of a sweep."""
     if not multirun:
@@ -106,3 +123,56 @@ def single_runs(overrides: Sequence[str], multirun: bool) -> list[list[str]]:
     parsed = [override for override in parse(overrides) if not override.key_or_group.startswith("hydra")]
     batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     return [list(run) for batch in batches for run in batch]
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What is known before a command runs: the config of its (first) run, and where its results will go."""
+
+    config: Any
+    composed: DictConfig
+    run_folder: Path
+    sweep_folder: Path
+
+
+def typed(composed: DictConfig) -> Any:
+    """The root dataclass of a composed config, ranges checked.
+
+    Raises:
+        UserError: a value is of the wrong type or out of range.
+    """
+    try:
+        return made(composed)
+    except CONFIG_ERRORS as error:
+        raise UserError(sentence(error)) from error
+
+
+def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Checked:
+    """Compose and check every run that ``overrides`` mean.
+
+    Args:
+        command: name of the root config, for instance ``train``.
+        overrides: as on the command line.
+        multirun: whether commas stand for a sweep.
+
+    Raises:
+        UserError: an unknown key or option, a value of the wrong type or out of range.
+    """
+    register()
+    try:
+        parse(overrides)
+        runs = single_runs(overrides, multirun)
+        with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
+            checked = [_check_one(command, run) for run in runs]
+    except CONFIG_ERRORS as error:
+        raise UserError(sentence(error)) from error
+    return checked[0]
+
+
+def _check_one(command: str, overrides: Sequence[str]) -> Checked:
+    composed = compose(command, overrides=with_shares_replaced(overrides), return_hydra_config=True)
+    with open_dict(composed):
+        composed.hydra.job.num = 0
+        folders = [Path(str(composed.hydra[mode].dir)) for mode in ("run", "sweep")]
+        del composed["hydra"]
+    return Checked(typed(composed), composed, *folders)

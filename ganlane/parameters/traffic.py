@@ -1,0 +1,241 @@
+"""Drivers of the other vehicles: generated, random and faulty ones, and those of SUMO."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters.checks import (
+    Rule,
+    above,
+    at_least,
+    between,
+    check,
+    lists_to_tuples,
+    optional,
+    positive_range,
+    speed_range,
+)
+
+Range = tuple[float, float]
+_REACTION = Rule(
+    lambda value: speed_range().holds(value) and value[1] <= 3, "two numbers [low, high], 0 <= low <= high <= 3"
+)
+
+
+@dataclass(frozen=True)
+class GanParameters:
+    """The paper's generated traffic (:func:`ganlane.traffic.presets.gan_traffic`).
+
+    Attributes:
+        path: weights of the preset 'paper'; null: the ones that ship.
+        guard: false: without it vehicles leave the road within a minute.
+        noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
+        execute_k: predicted steps driven before predicting again, 1 (the paper) to 8.
+    """
+
+    path: str | None = None
+    guard: bool = True
+    noise_scale: float = 1.0
+    execute_k: int = 1
+
+    def __post_init__(self) -> None:
+        check(self, noise_scale=at_least(0), execute_k=between(1, 8))
+
+
+@dataclass(frozen=True)
+class CalibratedGanParameters:
+    """The calibrated generated traffic (:func:`ganlane.traffic.presets.gan_calibrated_traffic`).
+
+    The two numbers of the noise were chosen on the scenes that the generator is fitted to: as fitted (1 and 5 s) too
+    few drivers accelerate.
+
+    Attributes:
+        path: weights of the preset 'calibrated'; null: the ones that ship.
+        noise_scale: of the latent vectors; 1 as fitted, 0 drives everybody by the mean prediction.
+        noise_period_s: time in which a driver's latent vector is forgotten, s; 5 in fitting, 0: at once.
+        changes_per_km: wishes for a lane change per vehicle-km; null: from the recordings.
+    """
+
+    path: str | None = None
+    noise_scale: float = 1.4
+    noise_period_s: float = 3.0
+    changes_per_km: float | None = None
+
+    def __post_init__(self) -> None:
+        check(self, noise_scale=at_least(0), noise_period_s=at_least(0), changes_per_km=optional(at_least(0)))
+
+
+@dataclass(frozen=True)
+class SumoParameters:
+    """What SUMO's drivers have in common (:class:`ganlane.traffic.SumoTraffic`).
+
+    Attributes:
+        truck_share: lorries among the others, 0 to 1, where the first scene has none of its own.
+        truck_length_m: length of a lorry, m.
+        lane_change_s: how long a lane change takes, s; below 1 it would look like a jump.
+        keep_right: LC2013's lcKeepRight; 0: nobody goes right for its own sake.
+        speed_wander: how far a driver's desired speed strays from its mean, as a share of it.
+    """
+
+    truck_share: float = 0.15
+    truck_length_m: float = 12.0
+    lane_change_s: float = 4.0
+    keep_right: float = 1.0
+    speed_wander: float = 0.03
+
+    def __post_init__(self) -> None:
+        check(
+            self,
+            truck_share=between(0, 1),
+            truck_length_m=between(4.5, 25),
+            lane_change_s=at_least(1),
+            keep_right=at_least(0),
+            speed_wander=between(0, 0.2),
+        )
+
+
+@dataclass(frozen=True)
+class ReplayParameters:
+    """Recorded traffic (:class:`ganlane.traffic.ReplayTraffic`).
+
+    Attributes:
+        path: scene CSV, or Parquet from ganlane prepare; null: US-101 in GANLANE_DATA or ../shared/data.
+        least_s: the vehicle that the ego replaces is recorded at least so long from the start on, s.
+    """
+
+    path: str | None = None
+    least_s: float = 4.0
+
+    def __post_init__(self) -> None:
+        check(self, least_s=at_least(PHYSICS_STEP_S))
+
+
+@dataclass(frozen=True)
+class RandomDrivers:
+    """Ranges (low, high) that every driver's parameters are drawn from, uniformly and independently, per episode.
+
+    Attributes:
+        headway_s: IDM's time headway T, s. The recorded followers' middle half on US-101 keeps 0.93 to 1.93 s
+            (median 1.27); Kesting and Treiber (2008) fit 1.2 to 1.5 s, Treiber and Kesting (2013, table 11.2) take
+            1.0 s on highways.
+        max_acceleration: m/s2; 1.0 there, Table V has 0.7, calibrations on trajectories give up to about 1.5.
+        comfortable_deceleration: m/s2; 1.5 there, Table V has 1.7.
+        strongest_braking: m/s2, more only where the first scene asks for it
+            (:func:`ganlane.traffic.idm_random.start_braking`). About 9 is what dry asphalt allows, 4 is a hesitant
+            driver or a wet road.
+        desired_speed: factor on the desired speed that the scene gives (Table II: 18 to 26 m/s).
+        politeness: factor on MOBIL's weights of the followers (Table IV), 0 is an egoist.
+        reaction_s: time that passes before an acceleration decided on is driven, s. Drivers' reaction times of about
+            1 s are partly made up for by anticipation (Treiber, Kesting and Helbing 2006), which IDM has none of, so
+            the range lies below them.
+        sway_m: how far the line that a driver aims at wanders from its lane's centre, m; less in narrow lanes.
+        sway_period_s: periods of that wandering, s.
+    """
+
+    headway_s: Range = (0.8, 2.2)
+    max_acceleration: Range = (0.6, 1.6)
+    comfortable_deceleration: Range = (1.2, 2.5)
+    strongest_braking: Range = (4.0, 9.0)
+    desired_speed: Range = (0.9, 1.1)
+    politeness: Range = (0.0, 1.0)
+    reaction_s: Range = (0.0, 0.6)
+    sway_m: Range = (0.0, 0.25)
+    sway_period_s: Range = (8.0, 20.0)
+
+    def __post_init__(self) -> None:
+        lists_to_tuples(self)
+        positive = ("max_acceleration", "comfortable_deceleration", "strongest_braking", "desired_speed")
+        check(
+            self,
+            **dict.fromkeys((*positive, "sway_period_s"), positive_range()),
+            **dict.fromkeys(("headway_s", "politeness", "sway_m"), speed_range()),
+            reaction_s=_REACTION,
+        )
+
+
+@dataclass(frozen=True)
+class BrakingFaults:
+    """Phantom braking.
+
+    Attributes:
+        per_hour: how often, per driver and hour of driving without it; 0: never.
+        deceleration: how hard, m/s2; a driver who brakes harder anyway goes on doing so.
+        lasts_s: how long, s.
+    """
+
+    per_hour: float = 6.0
+    deceleration: float = 4.0
+    lasts_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        check(self, per_hour=at_least(0), deceleration=above(0), lasts_s=at_least(PHYSICS_STEP_S))
+
+
+@dataclass(frozen=True)
+class ReactionFaults:
+    """Late reactions.
+
+    Attributes:
+        per_hour: lapses of attention per driver and hour of driving with attention; 0: never.
+        delay_s: how late the driver reacts meanwhile, s, at least one physics step.
+        lasts_s: how long a lapse lasts, s.
+    """
+
+    per_hour: float = 12.0
+    delay_s: float = 0.8
+    lasts_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        steps = dict.fromkeys(("delay_s", "lasts_s"), at_least(PHYSICS_STEP_S))
+        check(self, per_hour=at_least(0), **steps)
+
+
+@dataclass(frozen=True)
+class HesitationFaults:
+    """Hesitant lane changes.
+
+    Attributes:
+        share: of the lane changes, 0 to 1.
+        pace: their lateral speed over the usual one, above 0 to 1.
+    """
+
+    share: float = 0.2
+    pace: float = 0.5
+
+    def __post_init__(self) -> None:
+        pace = Rule(lambda value: 0 < value <= 1, "a number above 0, at most 1")
+        check(self, share=between(0, 1), pace=pace)
+
+
+@dataclass(frozen=True)
+class AbortFaults:
+    """Aborted lane changes.
+
+    Attributes:
+        share: of the lane changes, 0 to 1.
+        at: how far the change has come when the driver turns back, 0 to 1; 0.5 is the line between the lanes.
+    """
+
+    share: float = 0.1
+    at: float = 0.5
+
+    def __post_init__(self) -> None:
+        check(self, share=between(0, 1), at=between(0, 1))
+
+
+@dataclass(frozen=True)
+class DriverFaults:
+    """How often drivers make which faults; a rate or share of 0 switches one off.
+
+    Attributes:
+        phantom_braking: a driver brakes for nothing.
+        late_reaction: a driver accelerates and brakes too late for a while.
+        hesitant_change: a lane change takes longer.
+        aborted_change: a driver turns back during a lane change.
+    """
+
+    phantom_braking: BrakingFaults = field(default_factory=BrakingFaults)
+    late_reaction: ReactionFaults = field(default_factory=ReactionFaults)
+    hesitant_change: HesitationFaults = field(default_factory=HesitationFaults)
+    aborted_change: AbortFaults = field(default_factory=AbortFaults)

@@ -186,5 +186,5 @@ def test_the_option_chooses_the_logs(fake, tmp_path):
 
 
 def test_an_unknown_logger_is_refused():
-    with pytest.raises(UserError, match=r"logger.kind=mlflow.*csv, tensorboard, wandb"):
+    with pytest.raises(UserError, match=r"kind=mlflow.*csv, tensorboard, wandb"):
         LoggerConfig(kind="mlflow")

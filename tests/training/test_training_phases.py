@@ -220,7 +220,7 @@ def test_who_starts_afresh_has_nothing_to_take_over(kind, given):
 
 
 def test_another_word_for_the_support_is_refused():
-    with pytest.raises(UserError, match=r"init\.support=mine: expected one of run, trained"):
+    with pytest.raises(UserError, match=r"support=mine: expected one of run, trained"):
         InitConfig(support="mine")
 
 

@@ -55,6 +55,8 @@ EXTRAS: Final = {
         "peers of ganlane bench",
         ("highway-env>=1.10", "stable-baselines3>=2.4", "eclipse-sumo>=1.20", "libsumo>=1.20"),
     ),
+    "sb3": ("ganlane.sb3", ("stable-baselines3>=2.4", "sb3-contrib>=2.4")),
+    "native": ("env.kernel=native without a compiler", ("ziglang>=0.13",)),
     "sumo": ("traffic=sumo", ("eclipse-sumo>=1.20", "libsumo>=1.20")),
     "wandb": ("logger=wandb", ("wandb>=0.18",)),
     "ray": ("distributed collection", ("ray>=2.40",)),

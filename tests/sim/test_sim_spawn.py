@@ -243,9 +243,9 @@ def test_a_lane_holds_fewer_lorries_and_the_refusal_names_their_length():
 
 
 def test_a_lorry_as_wide_as_its_lane_is_refused():
-    with pytest.raises(UserError, match=r"more than env\.truck_width_m=4"):
+    with pytest.raises(UserError, match=r"more than truck_width_m=4"):
         EnvConfig(truck_share=0.1, truck_width_m=4.0)
-    with pytest.raises(UserError, match=r"more than env\.truck_width_m=4"):
+    with pytest.raises(UserError, match=r"more than truck_width_m=4"):
         RandomScenes(parameters=replace(LORRIES, truck_width_m=4.0)).check(Road(), TABLE_V)
     EnvConfig(truck_width_m=4.0)  # without lorries nobody is so wide
 
@@ -257,7 +257,7 @@ def test_a_share_is_from_0_to_1(share):
 
 
 def test_lorries_in_a_scene_set_by_hand_have_rows_of_their_own():
-    with pytest.raises(UserError, match=r"env\.truck_share=0\.2: has no effect on a scene set by hand"):
+    with pytest.raises(UserError, match=r"truck_share=0\.2: has no effect on a scene set by hand"):
         CutInEnvConfig(truck_share=0.2)
 
 

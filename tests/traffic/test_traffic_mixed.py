@@ -278,5 +278,5 @@ def test_generated_drivers_may_be_blind_too():
 def test_a_share_out_of_range_is_refused():
     with pytest.raises(UserError, match="from 0 to 1"):
         BlindTraffic(IdmTraffic(), 1.5)
-    with pytest.raises(UserError, match=r"traffic\.blind_share=-1"):
+    with pytest.raises(UserError, match=r"blind_share=-1"):
         IdmTrafficConfig(blind_share=-1.0)

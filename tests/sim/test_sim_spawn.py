@@ -245,7 +245,7 @@ def test_a_lane_holds_fewer_lorries_and_the_refusal_names_their_length():
 def test_a_lorry_as_wide_as_its_lane_is_refused():
     with pytest.raises(UserError, match=r"more than truck_width_m=4"):
         EnvConfig(truck_share=0.1, truck_width_m=4.0)
-    with pytest.raises(UserError, match=r"more than truck_width_m=4"):
+    with pytest.raises(UserError, match=r"more than env\.truck_width_m=4"):
         RandomScenes(parameters=replace(LORRIES, truck_width_m=4.0)).check(Road(), TABLE_V)
     EnvConfig(truck_width_m=4.0)  # without lorries nobody is so wide
 

@@ -1,0 +1,1 @@
+"""Tries to break the package, part by part, and counts what held: ``python -m benchmarks.torture``."""

@@ -35,13 +35,10 @@ BATCH = 2000
 
 def damage(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> None:
     """Read ``count`` damaged files, or as many as the minutes allow."""
-    good = scratch / "good"
-    for _, result in forked(lambda folder: make_files(folder), [good], 600.0, MEMORY_GIB):
-        if result is not None:
-            raise RuntimeError(f"the good files could not be made: {result}")
+    good = good_files(scratch)
     end, rng = time.monotonic() + 60.0 * minutes, random.Random(seed)
     names = [name for name, reader in READERS.items() for _ in range(reader.share)]
-    trial = _Trial(good, scratch / "damaged")
+    trial = Trial(good, scratch / "damaged")
     for first in range(0, count, BATCH):
         items = [(rng.choice(names), seed * 10**7 + first + i) for i in range(min(BATCH, count - first))]
         for (name, number), result in forked(trial, items, AT_MOST_S, MEMORY_GIB):
@@ -55,7 +52,16 @@ def damage(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -
                 return
 
 
-class _Trial:
+def good_files(scratch: Path) -> Path:
+    """The folder with a good file of each kind, made in a child: polars has threads, which no fork survives."""
+    folder = scratch / "good"
+    for _, result in forked(make_files, [folder], 600.0, MEMORY_GIB):
+        if result is not None:
+            raise RuntimeError(f"the good files could not be made: {result}")
+    return folder
+
+
+class Trial:
     """Damages one file and reads it; the result in words that begin with one in capitals."""
 
     def __init__(self, good: Path, work: Path) -> None:
@@ -63,6 +69,7 @@ class _Trial:
         self.contents: dict[str, Any] = {}
 
     def __call__(self, item: tuple[str, int]) -> str:
+        """What came of the input with this reader and number."""
         name, number = item
         reader, rng = READERS[name], random.Random(number)
         os.chdir(self.good)
@@ -84,9 +91,9 @@ class _Trial:
         except OSError as error:
             if error.errno is not None:
                 return f"REFUSED {error}"[:200]
-            return f"TRACEBACK after {way.__name__}: {_end(error)}"
+            return f"TRACEBACK after {way.__name__}: {traceback_of(error)}"
         except BaseException as error:
-            return f"TRACEBACK after {way.__name__}: {_end(error)}"
+            return f"TRACEBACK after {way.__name__}: {traceback_of(error)}"
         if "EXECUTED" in said.getvalue():
             return "TRACEBACK the code of a bomb ran"
         if not reader.sealed or same(content, self.contents[name]):
@@ -106,7 +113,7 @@ class _Trial:
         return path
 
 
-def _end(error: BaseException) -> str:
+def traceback_of(error: BaseException) -> str:
     """Where an error came from, in a line."""
     place = traceback.extract_tb(error.__traceback__)
     ours = next((frame for frame in reversed(place) if "/ganlane/" in frame.filename), place[-1])

@@ -20,7 +20,22 @@ Damage = Callable[[random.Random, bytes], bytes]
 #: What stands in a file by mistake or malice instead of a number.
 NUMBERS = (
     *("nan", "inf", "-inf", "1e308", "-1e308", "1e999", "-1", "0", "-0.0", "1e-320", "9" * 400, "9" * 6000, "0x10"),
-    *("1,5", "1_000", "１２", "", " ", "null", "true", "[]", "{}", "--1", "1e", "\x00", str(2**63), str(-(2**64))),
+    *(
+        "1,5",
+        "1_000",
+        "\uff11\uff12",
+        "",
+        " ",
+        "null",
+        "true",
+        "[]",
+        "{}",
+        "--1",
+        "1e",
+        "\x00",
+        str(2**63),
+        str(-(2**64)),
+    ),
 )
 #: The same for names and texts.
 NAMES = (
@@ -73,9 +88,23 @@ def foreign(rng: random.Random, whole: bytes) -> bytes:
     objects = io.BytesIO()
     np.savez(objects, labels=np.array([Bomb()], dtype=object))
     choices = (
-        *(b"", b"\x00", bytes(range(256)) * 16, b"\x89PNG\r\n\x1a\n" + rng.randbytes(99), b"PK\x03\x04", b"{}", b"[]"),
+        *(
+            b"",
+            b"\x00",
+            bytes(range(256)) * 16,
+            b"\x89PNG\r\n\x1a\n" + rng.randbytes(99),
+            b"PK\x03\x04",
+            b"{}",
+            b"[]",
+        ),
         *(b"null", b"[" * 100_000, b'{"a":' * 5000, b"\xff\xfe" + "x,y\n1,2\n".encode("utf-16-le"), b"\x1f\x8b\x08"),
-        *(b"\x7fELF" + rng.randbytes(99), b"PAR1" + rng.randbytes(64) + b"PAR1", b"x,y\n", b"\xef\xbb\xbf", b"\n" * 999),
+        *(
+            b"\x7fELF" + rng.randbytes(99),
+            b"PAR1" + rng.randbytes(64) + b"PAR1",
+            b"x,y\n",
+            b"\xef\xbb\xbf",
+            b"\n" * 999,
+        ),
         *((2**62).to_bytes(8, "little") + b"{}", b"\x93NUMPY" + rng.randbytes(64), b"a" * 10**6, b"," * 10**5),
         *(b"- !!python/object/apply:os.system [echo]\n", b"&a [*a]\n", b"<html></html>", pickle.dumps(Bomb())),
         *(archive.getvalue(), made.getvalue(), objects.getvalue()),

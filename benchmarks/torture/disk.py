@@ -60,9 +60,7 @@ def small_disk() -> Iterator[Path | None]:
         os.rmdir(folder)
 
 
-def _full(
-    tally: Tally, rng: random.Random, arguments: list[str], whole: Path, wall_s: float, small: Path
-) -> None:
+def _full(tally: Tally, rng: random.Random, arguments: list[str], whole: Path, wall_s: float, small: Path) -> None:
     """The disk is full from a random instant on; there is room again when the run is resumed."""
     log, filler = whole.with_name("log"), small / "filler"
     after_s = rng.uniform(0.0, wall_s)

@@ -19,7 +19,7 @@ SIGNALS = {"SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
 
 
 def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> None:
-    """Disturb runs until ``count`` of them have ended, or the minutes are over; each is disturbed three or more times."""
+    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more."""
     rng, end = random.Random(seed), time.monotonic() + 60.0 * minutes
     runs.warm_up()
     wholes: dict[tuple[str, int], tuple[Path, float]] = {}

@@ -35,7 +35,9 @@ from ganlane.training.phases import identity, make_collector, make_initial_agent
 from ganlane.view.figures import draw_runs, read_runs
 
 #: The files below the folder of the good ones.
-SCENE = "x_m,lane,speed_mps,desired_speed_mps,length_m,visibility\n0,1,20,25,4.5,body\n40,1,18,22,4.5,\n30,0,15,20,12,\n"
+SCENE = (
+    "x_m,lane,speed_mps,desired_speed_mps,length_m,visibility\n0,1,20,25,4.5,body\n40,1,18,22,4.5,\n30,0,15,20,12,\n"
+)
 FEET = 0.3048
 
 
@@ -190,8 +192,12 @@ READERS = {
     "recording Parquet": Reader("recording.parquet", read_scenes, TABLE),
     "NGSIM CSV": Reader("ngsim.csv", _recording("ngsim", NgsimParameters(locations=("us-101",))), TEXT),
     "highD tracks": Reader("highd/01_tracks.csv", _recording("highd"), TEXT),
-    "highD vehicles": Reader("highd/01_tracksMeta.csv", lambda path: _recording("highd")(_tracks(path)), TEXT, share=2),
-    "highD road": Reader("highd/01_recordingMeta.csv", lambda path: _recording("highd")(_tracks(path)), TEXT, share=2),
+    "highD vehicles": Reader(
+        "highd/01_tracksMeta.csv", lambda path: _recording("highd")(_tracks(path)), TEXT, share=2
+    ),
+    "highD road": Reader(
+        "highd/01_recordingMeta.csv", lambda path: _recording("highd")(_tracks(path)), TEXT, share=2
+    ),
     "overrides.yaml": Reader("run/overrides.yaml", _overrides, TEXT, share=1),
     "config.yaml": Reader("run/config.yaml", _overrides, TEXT, share=1),
     "metrics.csv, resumed": Reader("run/metrics.csv", _log, TEXT),

@@ -22,7 +22,7 @@ import ganlane.compare
 import ganlane.generator.checkpoint
 import ganlane.traffic.presets
 import ganlane.training.phases
-import ganlane.training.workers  # noqa: F401 (in the parent, so that no child has to)
+import ganlane.training.workers
 from ganlane.agents import read_agent
 from ganlane.train import main as train
 

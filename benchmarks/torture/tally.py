@@ -51,7 +51,12 @@ class Tally:
 
     def plain(self) -> dict[str, Any]:
         """All of it as plain data."""
-        counts = {"counts": dict(self.what), "detail": dict(self.detail), "failed": self.failed, "failures": self.failures}
+        counts = {
+            "counts": dict(self.what),
+            "detail": dict(self.detail),
+            "failed": self.failed,
+            "failures": self.failures,
+        }
         return {"part": self.part, **counts, "minutes": round(self.seconds / 60, 2)}
 
 

@@ -51,13 +51,13 @@ def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -
     elif part == "code":
         code(tally)
     elif part == "misuse":
-        misuse(tally, minutes)
+        misuse(tally, options.seed, minutes)
     elif part == "soak":
         soak(tally, options.configurations, options.seed, minutes, options.compiled)
     elif part == "memory":
         memory(tally, minutes, options.seed)
     else:
-        table = versions(tally, scratch)
+        table = versions(tally, scratch, options.pin)
     tally.seconds = time.monotonic() - begun
     return tally, table
 
@@ -75,6 +75,7 @@ def main() -> int:
     parser.add_argument("--compiled", type=int, default=0, help="of them compiled, a minute each before they drive")
     parser.add_argument("--input", help="one damaged file, KIND:NUMBER, as a failure names it")
     parser.add_argument("--configuration", type=int, help="one configuration of soak, as a failure names it")
+    parser.add_argument("--pin", nargs="*", default=[], help="for versions: torch==2.13.0 in all environments")
     parser.add_argument("--json", type=Path, help="all counts and failures as JSON")
     add_report(parser, *MARKERS)
     options = parser.parse_args()

@@ -9,6 +9,7 @@ import contextlib
 import inspect
 import io
 import os
+import random
 import re
 import subprocess
 import sys
@@ -71,13 +72,15 @@ OF_EVALUATE = ("agents", "traffics", "episodes", "seed", "env", "reward", "obser
 OF_EVALUATE += ("device", "lanes", "goal_m")
 
 
-def misuse(tally: Tally, minutes: float) -> None:
-    """All calls, or as many as the minutes allow."""
+def misuse(tally: Tally, seed: int, minutes: float) -> None:
+    """All calls in random order, or as many as the minutes allow."""
     end = time.monotonic() + 60.0 * minutes
     calls = dict(_calls())
+    names = list(calls)
+    random.Random(seed).shuffle(names)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name, result in forked(lambda name: _outcome(calls[name]), calls, AT_MOST_S, memory_gib=16.0):
+        for name, result in forked(lambda name: _outcome(calls[name]), names, AT_MOST_S, memory_gib=16.0):
             tally.what["calls"] += 1
             tally.what[result.split(maxsplit=1)[0].lower()] += 1
             if not result.startswith(("REFUSED", "WORKED")):
@@ -95,6 +98,8 @@ def _outcome(call: Callable[[], Any]) -> str:
     except (UserError, gymnasium.error.Error) as error:
         text = str(error)
         return f"TALKS in lines: {text[:300]!r}" if "\n" in text else f"REFUSED {text[:100]}"
+    except OSError as error:  # the file system's own refusal, which the API passes on
+        return f"REFUSED {error}"[:100] if error.errno is not None else f"TRACEBACK {traceback_of(error)}"
     except BaseException as error:
         return f"TRACEBACK {traceback_of(error)}"
     return "WORKED"

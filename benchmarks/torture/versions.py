@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.torture.tally import Tally
@@ -41,14 +42,19 @@ def lowest(requirement: str) -> str:
     return f"{found[1]}=={found[2]}"
 
 
-def versions(tally: Tally, scratch: Path) -> str:
-    """A table, in Markdown: each dependency's version in each environment, and how many commands passed."""
-    named = dependencies()
+def versions(tally: Tally, scratch: Path, pins: Sequence[str] = ()) -> str:
+    """A table, in Markdown: each dependency's version in each environment.
+
+    ``pins`` stand for requirements of which other versions cannot be had, as ``torch==2.13.0``, in all environments.
+    """
+    pinned = {pin.partition("==")[0]: pin for pin in pins}
+    named = [pinned.get(re.split("[<>=]", each)[0], each) for each in dependencies()]
+    least = {each: lowest(each) for each in named if each not in pins}
     plans = {
         "highest": named,
-        "lowest": [lowest(each) for each in named],
+        "lowest": [least.get(each, each) for each in named],
         # Each alone at its lower bound, where not all of them install together.
-        **{f"lowest {lowest(each).partition('==')[0]}": [lowest(each), *named] for each in named},
+        **{f"lowest {low.partition('==')[0]}": [low, *named] for low in least.values()},
     }
     columns: dict[str, dict[str, str]] = {}
     for name, wanted in plans.items():

@@ -45,7 +45,7 @@ def damage(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -
             tally.what["damaged files"] += 1
             if result.startswith(("LOST", "TRACEBACK", "ACCEPTED")):
                 tally.fail(f"{name}, input {number} (damage --input '{name}:{number}'): {result}")
-            kind = result.split(maxsplit=1)[0].lower()
+            kind = result.split(maxsplit=1)[0].lower().rstrip(":")
             tally.what[kind] += 1
             tally.detail[f"{kind}: {name}"] += 1
             if time.monotonic() > end:
@@ -126,7 +126,7 @@ def same(one: Any, other: Any) -> bool:
     if isinstance(one, dict):
         return isinstance(other, dict) and one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
     if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
+        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
     if isinstance(one, torch.Tensor | np.ndarray):
         a, b = np.asarray(one), np.asarray(other)
         return (a.dtype, a.shape) == (b.dtype, b.shape) and a.tobytes() == b.tobytes()

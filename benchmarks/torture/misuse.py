@@ -82,7 +82,7 @@ def misuse(tally: Tally, seed: int, minutes: float) -> None:
         warnings.simplefilter("ignore")
         for name, result in forked(lambda name: _outcome(calls[name]), names, AT_MOST_S, memory_gib=16.0):
             tally.what["calls"] += 1
-            tally.what[result.split(maxsplit=1)[0].lower()] += 1
+            tally.what[result.split(maxsplit=1)[0].lower().rstrip(":")] += 1
             if not result.startswith(("REFUSED", "WORKED")):
                 tally.fail(f"{name}: {result}")
             if time.monotonic() > end:

@@ -57,7 +57,7 @@ class Reader:
     read: Callable[[Path], Any]
     ways: tuple[Damage, ...]
     sealed: bool = False
-    share: int = 4
+    share: int = 6
 
 
 def make_files(folder: Path) -> None:
@@ -183,7 +183,7 @@ READERS = {
     "calibrated generator": Reader(
         "generator_calibrated.safetensors", _generator, (*BYTES, damages.in_safetensors), True
     ),
-    "last.pt": Reader("run/checkpoints/last.pt", _checkpoint, (*BYTES, damages.in_torch, damages.in_torch), True, 2),
+    "last.pt": Reader("run/checkpoints/last.pt", _checkpoint, (*BYTES, damages.in_torch, damages.in_torch), True, 1),
     "cached windows": Reader("cache/groups_key.npz", _cache, (*BYTES, damages.in_arrays), True),
     "histograms": Reader("reference.json", _reference, (*TEXT, damages.in_json), True),
     "scene CSV": Reader("scene.csv", read_scene, TEXT),

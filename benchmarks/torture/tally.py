@@ -75,18 +75,20 @@ def forked(
             os.close(reading)
             _serve(work, waiting, writing, int(memory_gib * 2**30))
         os.close(writing)
-        done = 0
-        with os.fdopen(reading, "rb") as results:
-            while done < len(waiting) and select.select([results], [], [], at_most_s)[0]:
-                try:
-                    result = pickle.load(results)  # our own child's
-                except EOFError:
-                    break
-                yield waiting[done], result
-                done += 1
-            hangs = done < len(waiting) and not select.select([results], [], [], 0)[0]
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
+        done, hangs, status = 0, False, 0
+        try:
+            with os.fdopen(reading, "rb") as results:
+                while done < len(waiting) and select.select([results], [], [], at_most_s)[0]:
+                    try:
+                        result = pickle.load(results)  # our own child's
+                    except EOFError:
+                        break
+                    yield waiting[done], result
+                    done += 1
+                hangs = done < len(waiting) and not select.select([results], [], [], 0)[0]
+        finally:  # also where the caller has had enough
+            os.kill(child, signal.SIGKILL)
+            _, status = os.waitpid(child, 0)
         if done < len(waiting):
             why = f"more than {at_most_s:g} s" if hangs else f"the process ended (status {status})"
             yield waiting[done], f"LOST: {why}"

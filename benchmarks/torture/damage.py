@@ -65,7 +65,7 @@ class Trial:
     """Damages one file and reads it; the result in words that begin with one in capitals."""
 
     def __init__(self, good: Path, work: Path) -> None:
-        self.good, self.work = good, work
+        self.good, self.top, self.work = good, work, work
         self.contents: dict[str, Any] = {}
 
     def __call__(self, item: tuple[str, int]) -> str:
@@ -76,6 +76,8 @@ class Trial:
         whole = (self.good / reader.file).read_bytes()
         if reader.sealed and name not in self.contents:
             self.contents[name] = reader.read(self._copy(reader.file))
+        # Some notes are made once for each path.
+        self.work = self.top / f"{name.replace(' ', '-')}-{number}"
         path = self._copy(reader.file)
         way = rng.choice(reader.ways)
         broken = way(rng, whole)
@@ -102,13 +104,13 @@ class Trial:
 
     def _copy(self, file: str) -> Path:
         """The file among its neighbours, in a folder of its own."""
-        shutil.rmtree(self.work, ignore_errors=True)
+        shutil.rmtree(self.top, ignore_errors=True)
         path = self.work / file
+        self.work.mkdir(parents=True)
         if "/" in file:
             top = file.partition("/")[0]
             shutil.copytree(self.good / top, self.work / top)
         else:
-            self.work.mkdir(parents=True)
             shutil.copy(self.good / file, path)
         return path
 

@@ -36,10 +36,15 @@ FLAT = 0.02
 
 
 def soak(tally: Tally, count: int, seed: int, minutes: float, compiled: int = 0) -> None:
-    """Drive ``count`` configurations, each its share of the minutes; the first ``compiled`` are compiled."""
+    """Drive ``count`` configurations, each for its share of the minutes; the first ``compiled`` are compiled.
+
+    Where making them takes longer than that, fewer are driven.
+    """
     torch.set_num_threads(1)
     begun = time.monotonic()
     for number in range(count):
+        if time.monotonic() > begun + 60.0 * minutes:
+            return
         until = begun + 60.0 * minutes * (number + 1) / count
         _configuration(tally, seed * 10**6 + number, compiled > number, until)
 

@@ -73,11 +73,10 @@ class Trial:
         name, number = item
         reader, rng = READERS[name], random.Random(number)
         os.chdir(self.good)
+        self.work = self.top / str(number)  # some notes are made once for each path
         whole = (self.good / reader.file).read_bytes()
         if reader.sealed and name not in self.contents:
             self.contents[name] = reader.read(self._copy(reader.file))
-        # Some notes are made once for each path.
-        self.work = self.top / f"{name.replace(' ', '-')}-{number}"
         path = self._copy(reader.file)
         way = rng.choice(reader.ways)
         broken = way(rng, whole)

@@ -124,7 +124,7 @@ def _driven(tally: Tally, env: TransformedEnv, choice: dict[str, Any], number: i
     what = f"configuration {number} (soak --configuration {number}): {choice}"
     try:
         td = env.reset()
-        while time.monotonic() < until:
+        while decisions < 3 or time.monotonic() < until:
             td["action"] = actions(choice["policy"], td, generator)
             before = td
             stepped, td = env.step_and_maybe_reset(td)

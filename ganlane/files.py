@@ -25,6 +25,8 @@ PACKAGE = Path(__file__).resolve().parent
 CHECKPOINTS = PACKAGE / "checkpoints"
 #: Bytes that are written to find out whether there is room; libraries leave smaller rests unused.
 _PROBE_BYTES = 2**20
+#: Ending of the temporary files, whose names begin with a dot.
+_PART = ".part"
 
 
 def conf_folder() -> Path:
@@ -82,11 +84,17 @@ def _new_part(path: Path) -> Path:
     """An empty file beside ``path``, whose folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     os.close(handle)
     return Path(name)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of writes that were killed, in a folder where nothing writes now."""
+    for part in folder.glob(f".*.????????{_PART}"):
+        part.unlink(missing_ok=True)
 
 
 def _refusal(error: Exception, part: Path) -> OSError | None:

@@ -24,7 +24,7 @@ from ganlane.config.command_line import (
     with_shares_replaced,
     without_repetitions,
 )
-from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
+from ganlane.config.folders import cleared_after_mistakes, held, write_down
 from ganlane.config.help import print_help
 from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
 from ganlane.config.resume import with_resumed
@@ -101,14 +101,13 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
             _hydra(command, task, ["-m", *with_shares_replaced(swept)])
         else:
-            folder.mkdir(parents=True, exist_ok=True)
             asked = [each for each in without_repetitions(overrides) if not each.startswith("hydra")]
             _do(task, checked.config, folder, checked.composed, asked)
 
 
 def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) -> None:
     """The task in its folder, in which its configuration is written down first."""
-    with put_back_after_mistakes(folder):
+    with held(folder):
         write_down(composed, asked, folder)
         with numbered_refusals():
             last_line = task(config, folder)

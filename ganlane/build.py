@@ -156,7 +156,7 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
 
     Args:
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent, the path of an agent's file,
-            or the import path of a policy of your own (a class or function; it may have arguments ``road``,
+            or the import path of a policy of your own (a class or annotated function; it may have ``road``,
             ``stream``, ``idm`` and ``mobil``). A suffix ``+safe``, ``+legal`` or ``+none`` sets its mask, in place of
             the one that it was trained with.
         env: the environment it drives in.

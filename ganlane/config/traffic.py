@@ -1,8 +1,8 @@
 """``traffic=...``: who drives the other vehicles.
 
-``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function that makes one. It is called with those of
-``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys, and with
-``parameters``. A model of your own needs no more than its import path::
+``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function annotated to return one. It is called with
+those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys, and
+with ``parameters``. A model of your own needs no more than its import path::
 
     python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
     python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic +traffic.parameters.pace=0.9

@@ -1,7 +1,7 @@
 """``traffic=...``: who drives the other vehicles.
 
 ``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function annotated to return one. It is called with
-those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys, and
+those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys and
 with ``parameters``. A model of your own needs no more than its import path::
 
     python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'

@@ -72,9 +72,6 @@ def dispatch(arguments: Sequence[str] | None = None) -> int:
         known = ", ".join(COMMANDS | PLAIN_COMMANDS)
         print(f"ganlane: {command}: no such command; choose one of {known}.", file=sys.stderr)
         return 2
-    # A console script, unlike python -m, does not look for a user's own modules where it is started.
-    if "" not in sys.path:
-        sys.path.insert(0, "")
     return importlib.import_module(f"ganlane.{command}").main(rest)
 
 

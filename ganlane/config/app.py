@@ -18,6 +18,8 @@ from typing import Any, TextIO
 from ganlane.config.command_line import (
     VERSION_BASE,
     check,
+    of_hydra,
+    parse,
     parse_arguments,
     quoted,
     typed,
@@ -27,7 +29,7 @@ from ganlane.config.command_line import (
 from ganlane.config.folders import cleared_after_mistakes, held, write_down
 from ganlane.config.help import print_help
 from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
-from ganlane.config.resume import with_resumed
+from ganlane.config.resume import refuse_stored_imports, with_resumed
 from ganlane.config.schemas import register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
@@ -87,6 +89,7 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     if flags.help:
         print_help(command)
         return
+    parse(flags.overrides)
     if flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
         as_given = parse_arguments("", arguments).overrides
         hydras = dict(zip(as_given, flags.overrides))
@@ -94,6 +97,8 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
         return
     overrides = with_resumed(command, flags.overrides, flags.multirun)
     checked = check(command, overrides, flags.multirun)
+    if command == "train" and checked.config.resume is not None:
+        refuse_stored_imports(checked.config, flags.overrides)
     folder = (checked.sweep_folder if flags.multirun else checked.run_folder).absolute()
     with cleared_after_mistakes(folder):
         if flags.multirun:
@@ -101,7 +106,8 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
             _hydra(command, task, ["-m", *with_shares_replaced(swept)])
         else:
-            asked = [each for each in without_repetitions(overrides) if not each.startswith("hydra")]
+            given = parse(without_repetitions(overrides))
+            asked = [str(override.input_line) for override in given if not of_hydra(override)]
             _do(task, checked.config, folder, checked.composed, asked)
 
 

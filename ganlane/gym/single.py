@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ganlane.api import make_env
+from ganlane.env.checks import seed_number
 from ganlane.errors import UserError
 from ganlane.gym.rendering import FilmWindow, LiveView, has_display, real_time_fps
 from ganlane.gym.rows import (
@@ -20,7 +21,6 @@ from ganlane.gym.rows import (
     episode_numbers,
     known_options,
     row_of,
-    seed_number,
 )
 from ganlane.options import Option, option
 

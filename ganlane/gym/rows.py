@@ -152,7 +152,9 @@ def actions_of(given: Any, rows: int) -> Tensor:
 
 def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
     """The options of a reset, checked for unknown names."""
-    unknown = sorted(set(options or {}) - set(names))
+    if not isinstance(options, dict | None):
+        raise UserError(f"options={options!r}: expected a dictionary with {', '.join(names)}, or none.")
+    unknown = sorted(map(str, set(options or {}) - set(names)))
     if unknown:
         raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")
     return dict(options or {})

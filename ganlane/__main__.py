@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from ganlane._version import __version__
+from ganlane.runtime import open_closed_streams
 
 #: Command to what it does; each is a module of the package with a ``main``, and has a configuration.
 COMMANDS = {
@@ -34,6 +35,7 @@ def usage() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
+    open_closed_streams()
     try:
         status = dispatch(arguments)
         sys.stdout.flush()

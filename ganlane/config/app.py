@@ -33,7 +33,7 @@ from ganlane.config.resume import refuse_stored_imports, with_resumed
 from ganlane.config.schemas import register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.runtime import keep_freed_memory
+from ganlane.runtime import keep_freed_memory, open_closed_streams
 
 #: What a command does with its config in its run folder; it returns a line to print last, or None.
 Task = Callable[[Any, Path], str | None]
@@ -54,6 +54,7 @@ class Stopped(BaseException):
 def run_command(command: str, task: Task, arguments: Sequence[str] | None = None) -> int:
     """Run ``task`` as ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit status."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    open_closed_streams()
     # TorchRL tells of every replay buffer otherwise.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     keep_freed_memory()
@@ -89,6 +90,8 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     if flags.help:
         print_help(command)
         return
+    if sys.flags.optimize > 1:
+        raise UserError("python -OO removes the docstrings, which TorchRL needs; run it without -OO.")
     parse(flags.overrides)
     if flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
         as_given = parse_arguments("", arguments).overrides

@@ -18,10 +18,9 @@ from torchrl.envs import TransformedEnv
 from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.errors import UserError
-from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
+from ganlane.keys import ACTIONS, EGO_INDEX, PHYSICS_STEP_S
 from ganlane.sim.state import road_in
 from ganlane.transforms import ObservationTransform, largest_number
-from ganlane.transforms.mask import ACTIONS
 
 Floats = npt.NDArray[np.float32]
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
@@ -151,16 +150,11 @@ def actions_of(given: Any, rows: int) -> Tensor:
     return torch.as_tensor(array.astype(np.int64))
 
 
-def seed_number(seed: Any) -> int:
-    """A seed, checked: the counters of the environment hold 63 bits."""
-    if not hasattr(seed, "__index__") or not 0 <= int(seed) < 2**63:
-        raise UserError(f"seed={seed}: expected a whole number from 0 to 2**63 - 1; give for instance seed=0.")
-    return int(seed)
-
-
 def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
     """The options of a reset, checked for unknown names."""
-    unknown = sorted(set(options or {}) - set(names))
+    if not isinstance(options, dict | None):
+        raise UserError(f"options={options!r}: expected a dictionary with {', '.join(names)}, or none.")
+    unknown = sorted(map(str, set(options or {}) - set(names)))
     if unknown:
         raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")
     return dict(options or {})

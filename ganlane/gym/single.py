@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ganlane.api import make_env
+from ganlane.env.checks import seed_number
 from ganlane.errors import UserError
 from ganlane.gym.rendering import FilmWindow, LiveView, has_display, real_time_fps
 from ganlane.gym.rows import (
@@ -20,7 +21,6 @@ from ganlane.gym.rows import (
     episode_numbers,
     known_options,
     row_of,
-    seed_number,
 )
 from ganlane.options import Option, option
 
@@ -81,9 +81,10 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; see the class for which."""
         given = known_options(options, ("episode",))
+        seed = None if seed is None else seed_number(seed)
         super().reset(seed=seed)
         if seed is not None:
-            self._seed, self._episode = seed_number(seed), -1
+            self._seed, self._episode = seed, -1
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
         self._episode = int(episode_numbers(given.get("episode", self._episode + 1)))

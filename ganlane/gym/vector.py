@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ganlane.api import make_env
+from ganlane.env.checks import seed_number
 from ganlane.errors import UserError
 from ganlane.gym.rendering import BatchView, real_time_fps
 from ganlane.gym.rows import (
@@ -23,7 +24,6 @@ from ganlane.gym.rows import (
     episode_numbers,
     known_options,
     row_mask,
-    seed_number,
 )
 from ganlane.options import Option, option
 

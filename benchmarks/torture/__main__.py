@@ -43,7 +43,7 @@ def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -
     """One part; its counts, and a table of its own if it has one."""
     tally, begun, table = Tally(part), time.monotonic(), ""
     if part == "kill":
-        kill(tally, options.runs, options.seed, minutes, scratch)
+        kill(tally, options.runs, options.seed, minutes, scratch, not options.only_kill)
     elif part == "disk":
         disk(tally, options.disks, options.seed, minutes, scratch)
     elif part == "damage":
@@ -69,6 +69,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="of all parts together, about")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=45, help="that kill disturbs")
+    parser.add_argument("--only-kill", action="store_true", help="kill -9 alone: no SIGTERM, no SIGINT")
     parser.add_argument("--disks", type=int, default=24, help="runs on full disks and with lost workers")
     parser.add_argument("--inputs", type=int, default=10_000, help="damaged files")
     parser.add_argument("--configurations", type=int, default=500, help="that soak drives")

@@ -18,12 +18,13 @@ WAYS = {"kill": 4, "first second": 2, "in a write": 4, "final evaluation": 2, "S
 SIGNALS = {"SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
 
 
-def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> None:
-    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more."""
+def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path, signals: bool = True) -> None:
+    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more; ``signals``: not only kill -9."""
     rng, end = random.Random(seed), time.monotonic() + 60.0 * minutes
     runs.warm_up()
     wholes: dict[tuple[str, int], tuple[Path, float]] = {}
     schemes = list(runs.SCHEMES)
+    ways = [way for way, often in WAYS.items() for _ in range(often) if signals or way not in SIGNALS]
     for number in range(count):
         if time.monotonic() > end:
             return
@@ -36,15 +37,17 @@ def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> 
                 continue
             wholes[scheme, own] = whole, wall_s
         whole, wall_s = wholes[scheme, own]
-        _disturbed(tally, rng, runs.command(scheme, own, scratch / f"run-{number}"), whole, wall_s)
+        _disturbed(tally, rng, runs.command(scheme, own, scratch / f"run-{number}"), whole, wall_s, ways)
 
 
-def _disturbed(tally: Tally, rng: random.Random, arguments: list[str], whole: Path, wall_s: float) -> None:
+def _disturbed(
+    tally: Tally, rng: random.Random, arguments: list[str], whole: Path, wall_s: float, ways: list[str]
+) -> None:
     """One run: disturbed three to five times, then left alone."""
     folder = runs.folder_of(arguments)
     log = folder.with_suffix(".log")
     history: list[str] = []
-    for way in [*rng.choices(list(WAYS), list(WAYS.values()), k=rng.randint(3, 5)), None]:
+    for way in [*rng.choices(ways, k=rng.randint(3, 5)), None]:
         told = runs.again(arguments, folder)
         attempt, how = _attempt(rng, told, way, log, wall_s)
         history.append(how)

@@ -19,7 +19,7 @@ SIGNALS = {"SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
 
 
 def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path, signals: bool = True) -> None:
-    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more; ``signals``: not only kill -9."""
+    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more; not only by kill -9."""
     rng, end = random.Random(seed), time.monotonic() + 60.0 * minutes
     runs.warm_up()
     wholes: dict[tuple[str, int], tuple[Path, float]] = {}

@@ -15,14 +15,14 @@ from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.env import native_step
 from ganlane.errors import UserError
-from ganlane.native import why_not
+from ganlane.native.library import why_not
+from ganlane.native.settings import NATIVE_FORMS
 from ganlane.parameters.driving import EgoParameters, IdmParameters
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, SensorParameters
 from ganlane.sim.state import Road
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.transforms import ActionMaskTransform, ObservationTransform
-from ganlane.transforms.observation import NATIVE
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
 
@@ -131,7 +131,7 @@ def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
     assert (copied(env).step(td.clone())["next"] == env.step(td)["next"]).all()
 
 
-@pytest.mark.parametrize("form", sorted(NATIVE))
+@pytest.mark.parametrize("form", sorted(NATIVE_FORMS))
 @pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
 def test_the_lane_view_is_that_of_the_tensor_code(form, sensors):
     """Up to the rounding of the exponential function; with lorries, and with what the sensors deliver."""

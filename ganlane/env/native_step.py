@@ -12,7 +12,8 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.env.physics import Rules
 from ganlane.errors import UserError
-from ganlane.native import EgoState, Kernel, Outcome, why_not
+from ganlane.native.decision import EgoState, Kernel, Outcome
+from ganlane.native.library import why_not
 from ganlane.parameters.episode import KERNELS
 from ganlane.sim.state import Vehicles
 from ganlane.traffic.base import TrafficModule

@@ -42,7 +42,7 @@ def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeR
         return None  # the other way says what is wrong
     ruled = chosen._target_ in _TRAFFICS and not chosen.blind_share and not chosen.parameters
     seen = observation.form in NATIVE_FORMS and observation.sensors is None
-    random_scenes = type(env).scenes is EnvConfig.scenes
+    random_scenes = type(env).scenes is EnvConfig.scenes and env.kernel != "torch"
     whole = isinstance(count, int) and 1 <= count <= 65536
     if not (ruled and seen and random_scenes and whole) or device != "cpu" or len(own.get("transforms", ())):
         return None

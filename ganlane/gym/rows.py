@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import is_dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -76,15 +75,13 @@ class Rows(ABC):
 def make_rows(traffic: Option, count: int, render_mode: str | None, options: Mapping[str, Any]) -> Rows:
     """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
 
-    The native kernel drives them where it can, unless the option ``kernel`` says otherwise. It shows no physics
-    steps, so with a ``render_mode`` the tensor code does.
+    The native kernel drives them where it can, unless the option ``kernel`` is ``torch``. It shows no physics steps,
+    so with a ``render_mode`` the tensor code does.
 
     Raises:
         UserError: a wrong value.
     """
-    env = options.get("env", "highway")
-    asked = options.get("kernel", env.get("kernel") if isinstance(env, Mapping) else getattr(env, "kernel", None))
-    if asked in (None, "auto", "native") and render_mode is None and why_not() is None:
+    if render_mode is None and why_not() is None:
         from ganlane.gym.native_rows import native_rows  # Hydra's config classes take a tenth of a second
 
         made = native_rows(traffic, count, dict(options))
@@ -92,8 +89,7 @@ def make_rows(traffic: Option, count: int, render_mode: str | None, options: Map
             return made
     from ganlane.gym.tensor_rows import TensorRows  # torch takes seconds
 
-    given = {**options, "kernel": "torch"} if asked == "auto" and not is_dataclass(env) else dict(options)
-    return TensorRows(traffic, count, given)
+    return TensorRows(traffic, count, options)
 
 
 def observation_space(size: int, largest: float) -> Box:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from ganlane._version import __version__
+from ganlane.runtime import open_closed_streams
 
 #: Command to what it does; each is a module of the package with a ``main``, and has a configuration.
 COMMANDS = {
@@ -34,6 +35,7 @@ def usage() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
+    open_closed_streams()
     try:
         status = dispatch(arguments)
         sys.stdout.flush()
@@ -72,9 +74,6 @@ def dispatch(arguments: Sequence[str] | None = None) -> int:
         known = ", ".join(COMMANDS | PLAIN_COMMANDS)
         print(f"ganlane: {command}: no such command; choose one of {known}.", file=sys.stderr)
         return 2
-    # A console script, unlike python -m, does not look for a user's own modules where it is started.
-    if "" not in sys.path:
-        sys.path.insert(0, "")
     return importlib.import_module(f"ganlane.{command}").main(rest)
 
 

@@ -36,7 +36,7 @@ from ganlane.compare import compare_configured
 from ganlane.config.app import Stopped
 from ganlane.config.env import check_reward
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.folders import CONFIG, cleared_after_mistakes, put_back_after_mistakes
+from ganlane.config.folders import CONFIG, cleared_after_mistakes, held
 from ganlane.config.run import RunConfig
 from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import TrafficConfig, all_traffics
@@ -323,8 +323,7 @@ def _run_in(
     """
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
     home = Path("outputs") / name / now if folder is None else Path(folder)
-    with cleared_after_mistakes(home), put_back_after_mistakes(home), _torch_threads():
-        home.mkdir(parents=True, exist_ok=True)
+    with cleared_after_mistakes(home), held(home), _torch_threads():
         write_bytes(home / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)).encode())
         return home, function(config, home)
 

@@ -8,12 +8,10 @@
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 
@@ -23,7 +21,7 @@ from ganlane.agents.checkpoint import SHIPPED
 from ganlane.agents.drivers import DRIVERS
 from ganlane.agents.policy import MaskedPolicy
 from ganlane.config.env import EnvConfig
-from ganlane.config.targets import call_with, import_target
+from ganlane.config.targets import call_with, import_target, is_import_path
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
@@ -67,19 +65,13 @@ def make_traffic(traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TR
         UserError: the target cannot be imported or called, or gives no :class:`ganlane.traffic.TrafficModule`.
     """
     key = "traffic._target_"
-    target = import_target(traffic._target_, key)
-    expected = UserError(
-        f"{key}={traffic._target_}: expected a subclass of ganlane.traffic.TrafficModule or a function that returns "
-        "one; derive your model from it."
-    )
-    if not callable(target) or (inspect.isclass(target) and not issubclass(target, TrafficModule)):
-        raise expected
+    target = import_target(traffic._target_, key, TrafficModule)
     arguments, parts = traffic.arguments(), traffic.parts()
     if parts:
         arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
     made = call_with(target, _offered(env, stream), arguments, key)
-    if not isinstance(made, TrafficModule):
-        raise expected
+    if not isinstance(made, TrafficModule):  # an annotation may be wrong
+        raise UserError(f"{key}={traffic._target_}: returned a {type(made).__name__}, expected a TrafficModule.")
     return BlindTraffic(made, traffic.blind_share) if traffic.blind_share else made
 
 
@@ -164,7 +156,7 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
 
     Args:
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent, the path of an agent's file,
-            or the import path of a policy of your own (a class or function; it may have arguments ``road``,
+            or the import path of a policy of your own (a class or annotated function; it may have ``road``,
             ``stream``, ``idm`` and ``mobil``). A suffix ``+safe``, ``+legal`` or ``+none`` sets its mask, in place of
             the one that it was trained with.
         env: the environment it drives in.
@@ -184,7 +176,7 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
         return Driver(name, policy.to(device))
     if name.removesuffix("@0") in SHIPPED or Path(name).is_file() or name.endswith(".safetensors"):
         return _trained(name, env, device)
-    if "." in name and all(part.isidentifier() for part in name.split(".")):
+    if is_import_path(name):
         return _imported(name, env, stream, device)
     known = ", ".join((*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file())))
     raise UserError(
@@ -230,11 +222,8 @@ def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
 
 def _imported(name: str, env: EnvConfig, stream: int, device: str) -> Driver:
     """A user's own policy; it reads the raw state or the observation of the command."""
-    target = import_target(name, "agents")
-    policy = call_with(target, _offered(env, stream), {}, "agents") if callable(target) else target
-    if not isinstance(policy, torch.nn.Module) or keys.ACTION not in getattr(policy, "out_keys", []):
-        raise UserError(
-            f"agents={name}: expected a TensorDictModule that writes 'action' (its out_keys name it), or a class or "
-            "function that makes one; derive your policy from tensordict.nn.TensorDictModuleBase."
-        )
+    target = import_target(name, "agents", TensorDictModuleBase)
+    policy = call_with(target, _offered(env, stream), {}, "agents")
+    if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(policy, "out_keys", []):
+        raise UserError(f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys name it.")
     return Driver(name, policy.to(device))

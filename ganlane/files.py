@@ -13,8 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 
+from ganlane.checksums import PLACE, has_checksum, note_without_checksum, sealed
 from ganlane.errors import UserError
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ PACKAGE = Path(__file__).resolve().parent
 CHECKPOINTS = PACKAGE / "checkpoints"
 #: Bytes that are written to find out whether there is room; libraries leave smaller rests unused.
 _PROBE_BYTES = 2**20
+#: Ending of the temporary files, whose names begin with a dot.
+_PART = ".part"
 
 
 def conf_folder() -> Path:
@@ -82,11 +85,17 @@ def _new_part(path: Path) -> Path:
     """An empty file beside ``path``, whose folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from error
     os.close(handle)
     return Path(name)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of writes that were killed, in a folder where nothing writes now."""
+    for part in folder.glob(f".*.????????{_PART}"):
+        part.unlink(missing_ok=True)
 
 
 def _refusal(error: Exception, part: Path) -> OSError | None:
@@ -138,8 +147,9 @@ def write_between_markers(path: Path, begin: str, end: str, content: str) -> Non
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write ``content`` to ``path`` as indented JSON, atomically."""
-    write_bytes(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+    """Write ``content`` to ``path`` as indented JSON, atomically; with its checksum if an entry is its place."""
+    text = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+    write_bytes(path, sealed(text) if PLACE.encode() in text else text)
 
 
 def save_weights(
@@ -156,40 +166,49 @@ def save_weights(
     from safetensors.torch import save  # imports torch
 
     flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    header = {"ganlane": json.dumps({"kind": kind, **metadata})}
-    write_bytes(path, save(flat, metadata=header))
+    header = {"ganlane": json.dumps({"kind": kind, **metadata}), "checksum": PLACE}
+    write_bytes(path, sealed(save(flat, metadata=header)))
 
 
 def load_weights(path: str | Path, kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Load what :func:`save_weights` wrote: ``(tensors, metadata)``.
 
     Raises:
-        UserError: the file is absent, not safetensors, not written by ganlane, or of another kind.
+        UserError: the file is absent, damaged, not safetensors, not written by ganlane, of another kind, or holds
+            numbers that are not finite.
     """
+    from safetensors.torch import load  # imports torch
+
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such file; a checkpoint of kind {kind} (.safetensors) was expected there.")
+    content = path.read_bytes()
+    whole = has_checksum(content, path)
     try:
-        with safe_open(str(path), framework="pt") as opened:
-            header = (opened.metadata() or {}).get("ganlane")
-            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+        tensors = load(content)
+        header = _plain(content[8 : 8 + int.from_bytes(content[:8], "little")]).get("__metadata__") or {}
+    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a type of numbers that torch lacks
         raise UserError(
             f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} that ganlane wrote."
         ) from error
-    metadata = _plain(header)
+    metadata = _plain(header.get("ganlane", "{}"))
     if metadata.get("kind") != kind:
         found = metadata.get("kind", "a file that ganlane did not write")
         raise UserError(
             f"{path}: expected a ganlane checkpoint of kind {kind}, found {found}; give one that ganlane wrote."
         )
+    for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise UserError(f"{path}: {name} holds numbers that are not finite; train or fit it again.")
+    if not whole:
+        note_without_checksum(path)
     return tensors, metadata
 
 
-def _plain(header: str | None) -> dict[str, Any]:
-    """The metadata in a header; empty where there is none, or something else."""
+def _plain(text: str | bytes) -> dict[str, Any]:
+    """A JSON object; empty where ``text`` is something else."""
     try:
-        metadata = json.loads(header or "{}")
-    except ValueError:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
         return {}
-    return metadata if isinstance(metadata, dict) else {}
+    return found if isinstance(found, dict) else {}

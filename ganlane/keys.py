@@ -72,5 +72,7 @@ REWARD_TERM_NAMES: Final = ("speed", "lane_change", "out_of_road", "hard_crash",
 KEEP: Final = 0
 LEFT: Final = 1
 RIGHT: Final = 2
+#: How many actions there are.
+ACTIONS: Final = 3
 EGO_INDEX: Final = 0
 PHYSICS_STEP_S: Final = 0.1

@@ -16,6 +16,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.checks import did_you_mean
+from ganlane.runtime import check_default_device
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
@@ -39,8 +40,10 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
         default: name of the option where none is given; None: that of :data:`DEFAULTS`.
 
     Raises:
-        UserError: no such option or key, a value of the wrong type or out of range.
+        UserError: no such option or key, a value of the wrong type or out of range, or torch's default device is
+            none to compute on.
     """
+    check_default_device("cuda")  # no other one can be the environment's
     if is_dataclass(chosen) and not isinstance(chosen, type):
         return typed(group, chosen, overrides or {})
     if chosen is None or isinstance(chosen, str) or inspect.isclass(chosen):

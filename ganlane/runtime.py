@@ -10,8 +10,10 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
+from functools import wraps
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ganlane.errors import UserError
 
@@ -59,6 +61,46 @@ def compiled(function: F) -> F:
 
     torch._dynamo.config.cache_size_limit = max(torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION)
     return torch.compile(function, dynamic=False, fullgraph=True)  # type: ignore[return-value]
+
+
+def outside_autocast(function: F) -> F:
+    """``function``, computed in the types of its arguments where the caller has switched autocast on."""
+
+    @wraps(function)
+    def computed(*arguments: Any, **named: Any) -> Any:
+        import torch
+
+        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+        if not kinds:
+            return function(*arguments, **named)
+        with ExitStack() as stack:
+            for kind in kinds:
+                stack.enter_context(torch.autocast(kind, enabled=False))
+            return function(*arguments, **named)
+
+    return computed  # type: ignore[return-value]
+
+
+def check_default_device(device: str) -> None:
+    """Raise :class:`UserError` where torch makes new tensors neither on the CPU nor on a ``device`` of this type."""
+    import torch
+
+    usual = torch.get_default_device().type
+    if usual not in ("cpu", device):
+        raise UserError(
+            f"torch's default device is {usual}, and the highway's tensors would not meet those that are made there; "
+            "call torch.set_default_device('cpu') and choose the highway's own with device=."
+        )
+
+
+def open_closed_streams() -> None:
+    """Send nowhere what is written to streams that the shell has closed (``>&-``), which Python has as None."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            # The lowest free number, so that no file that is opened later stands where others write to.
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(nowhere, nowhere == number)
+            setattr(sys, name, os.fdopen(nowhere, "w" if number else "r", closefd=False))
 
 
 def set_threads(threads: int) -> None:

@@ -19,7 +19,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from ganlane.config.app import Stopped, run_command
+from ganlane.config.folders import earned
 from ganlane.config.train import TrainConfig
+from ganlane.errors import UserError
 
 #: Name of the agent of this run in the table.
 TRAINED = "trained"
@@ -27,6 +29,8 @@ TRAINED = "trained"
 
 def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate what came out."""
+    if config.resume is None and earned(folder):
+        raise UserError(f"{folder}: a run is there already; go on with resume={folder}, or give another folder.")
     from ganlane.build import make_driver, make_traffic
     from ganlane.compare import compare, publish
     from ganlane.runtime import set_threads

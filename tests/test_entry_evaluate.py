@@ -86,7 +86,7 @@ def foreign(tmp_path: Path) -> str:
         (["agents=[gone.safetensors]"], "agent gone.safetensors: no such file"),
         (["agents=[FOREIGN]"], "not a readable safetensors file"),
         (["agents=[no.such.Policy]"], "agents=no.such.Policy: 'no.such' cannot be imported"),
-        (["agents=[os.path]"], "expected a TensorDictModule that writes 'action'"),
+        (["agents=[os.path]"], "expected a subclass of tensordict"),
         (["agents=[mobil]", "traffics=[no.such.Traffic]"], "traffic._target_=no.such.Traffic"),
         (["agents=[mobil]", "traffics=[entry_own_parts.Missing]"], "entry_own_parts has no Missing"),
         (["agents=[mobil]", "traffics=[entry_own_parts.Stubborn]"], "expected a subclass of"),

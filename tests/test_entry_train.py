@@ -71,6 +71,14 @@ def test_a_finished_run_goes_on_with_more_decisions_and_its_own_command_line(cap
     assert decisions(folder) == [160, 320, 480]
 
 
+def test_a_new_run_in_the_folder_of_another_is_refused(finished, capsys, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert main([*TINY, f"hydra.run.dir={folder}", "seed=9"]) == 2
+    assert f"run: a run is there already; go on with resume={folder}, or" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
 def test_a_run_in_two_parts_ends_like_one_in_a_piece(finished, capsys, tmp_path):
     whole, _ = train(capsys, "total_decisions=480")
     parts = shutil.copytree(finished, tmp_path / "parts")

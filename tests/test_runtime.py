@@ -1,3 +1,4 @@
+import subprocess
 import sys
 
 import pytest
@@ -39,3 +40,27 @@ def test_the_peak_stays_when_memory_is_given_back():
     assert runtime.peak_resident_bytes() >= size
     del held
     assert runtime.peak_resident_bytes() >= size
+
+
+@pytest.mark.parametrize("closed", ["1", "2", "0 1 2"])
+def test_a_command_runs_without_the_streams_that_the_shell_has_closed(closed):
+    shut = " ".join(f"{number}>&-" for number in closed.split())
+    done = subprocess.run(
+        ["bash", "-c", f"exec {sys.executable} -m ganlane --help {shut}"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_command_without_docstrings_is_refused_in_one_sentence():
+    command = [sys.executable, "-OO", "-m", "ganlane", "evaluate"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("ganlane evaluate: python -OO")
+    assert done.stderr.count("\n") == 1
+
+
+def test_without_docstrings_help_still_lists_the_keys():
+    command = [sys.executable, "-OO", "-m", "ganlane", "prepare", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "held_out" in done.stdout

@@ -77,14 +77,14 @@ def start_native_physics(scenario: Scenario, batch: int) -> Runner:
     """The kernel alone, on the tensors of :func:`start_physics`."""
     endless = replace(scenario, env=replace(scenario.env, goal_m=1e9, timeout_s=1e8))
     env = endless.build(NATIVE, "cpu", batch)
-    first = env.reset().set(keys.ACTION, torch.full((batch,), keys.KEEP))
+    first, keep = env.reset(), torch.full((batch,), keys.KEEP)
     recycles = torch.ones(batch, dtype=torch.bool) if scenario.env.recycle else None
 
     def run(decisions: int) -> int:
         state = first
         for _ in range(decisions):
-            out, vehicles = native_decision(env.base_env.kernel, state, recycles)
-            state = after_decision(state, out, vehicles).set(keys.ACTION, first.get(keys.ACTION))
+            out, vehicles = native_decision(env.base_env.kernel, state, keep, recycles)
+            state = after_decision(state, out, vehicles)
         return int((state.get(keys.STEP) - first.get(keys.STEP)).sum())
 
     return run

@@ -18,20 +18,22 @@ from typing import Any, TextIO
 from ganlane.config.command_line import (
     VERSION_BASE,
     check,
+    of_hydra,
+    parse,
     parse_arguments,
     quoted,
     typed,
     with_shares_replaced,
     without_repetitions,
 )
-from ganlane.config.folders import cleared_after_mistakes, put_back_after_mistakes, write_down
+from ganlane.config.folders import cleared_after_mistakes, held, write_down
 from ganlane.config.help import print_help
 from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
-from ganlane.config.resume import with_resumed
+from ganlane.config.resume import refuse_stored_imports, with_resumed
 from ganlane.config.schemas import register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.runtime import keep_freed_memory
+from ganlane.runtime import keep_freed_memory, open_closed_streams
 
 #: What a command does with its config in its run folder; it returns a line to print last, or None.
 Task = Callable[[Any, Path], str | None]
@@ -52,6 +54,7 @@ class Stopped(BaseException):
 def run_command(command: str, task: Task, arguments: Sequence[str] | None = None) -> int:
     """Run ``task`` as ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit status."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    open_closed_streams()
     # TorchRL tells of every replay buffer otherwise.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     keep_freed_memory()
@@ -87,6 +90,9 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     if flags.help:
         print_help(command)
         return
+    if sys.flags.optimize > 1:
+        raise UserError("python -OO removes the docstrings, which TorchRL needs; run it without -OO.")
+    parse(flags.overrides)
     if flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
         as_given = parse_arguments("", arguments).overrides
         hydras = dict(zip(as_given, flags.overrides))
@@ -94,6 +100,8 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
         return
     overrides = with_resumed(command, flags.overrides, flags.multirun)
     checked = check(command, overrides, flags.multirun)
+    if command == "train" and checked.config.resume is not None:
+        refuse_stored_imports(checked.config, flags.overrides)
     folder = (checked.sweep_folder if flags.multirun else checked.run_folder).absolute()
     with cleared_after_mistakes(folder):
         if flags.multirun:
@@ -101,14 +109,14 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
             _hydra(command, task, ["-m", *with_shares_replaced(swept)])
         else:
-            folder.mkdir(parents=True, exist_ok=True)
-            asked = [each for each in without_repetitions(overrides) if not each.startswith("hydra")]
+            given = parse(without_repetitions(overrides))
+            asked = [str(override.input_line) for override in given if not of_hydra(override)]
             _do(task, checked.config, folder, checked.composed, asked)
 
 
 def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) -> None:
     """The task in its folder, in which its configuration is written down first."""
-    with put_back_after_mistakes(folder):
+    with held(folder):
         write_down(composed, asked, folder)
         with numbered_refusals():
             last_line = task(config, folder)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -21,6 +22,10 @@ from ganlane.errors import UserError
 from ganlane.files import conf_folder
 
 VERSION_BASE = "1.3"
+#: Of Hydra's own configuration, much of which names what it is to import, a command line may give only these, the
+#: parameters of the launcher and of the sweeper, and their names.
+HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.num")
+HYDRA_PLUGINS = ("launcher", "sweeper")
 #: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
 ALIASES = {"render": {"agent": "driver"}}
 
@@ -64,7 +69,9 @@ def quoted(value: object) -> str:
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    """The overrides as Hydra understands them, with those refused that would add or delete keys or name no option.
+    """The overrides as Hydra understands them.
+
+    Refused are those that would add or delete keys, name no option, or make Hydra import something.
 
     Raises:
         UserError: as the summary says.
@@ -72,15 +79,50 @@ def parse(overrides: Sequence[str]) -> list[Override]:
     """
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     for override in parsed:
+        if of_hydra(override):
+            _refuse_hydras(override)
+            continue
         _refuse_new_keys(override)
         _refuse_no_option(override)
     return parsed
 
 
+def of_hydra(override: Override) -> bool:
+    """Whether it changes Hydra's own configuration."""
+    return re.match(r"hydra\b", override.key_or_group) is not None or (override.package or "").startswith("hydra")
+
+
+def _refuse_hydras(override: Override) -> None:
+    """Hydra imports and calls every ``_target_`` of its callbacks, launchers and log handlers."""
+    key, value = override.key_or_group, override.value()
+    group = any(key == f"hydra/{plugin}" for plugin in HYDRA_PLUGINS) and re.fullmatch(r"\w+", str(value))
+    if override.type == OverrideType.CHANGE and override.package is None and (group or key in HYDRA_KEYS):
+        return
+    parameter = any(key.startswith(f"hydra.{plugin}.") for plugin in HYDRA_PLUGINS) and not override.is_delete()
+    if parameter and "_target_" not in {*key.split("."), *leaves(value)}:
+        return
+    raise UserError(
+        f"{override.input_line}: {key}: no such key here; of Hydra's configuration give {', '.join(HYDRA_KEYS)}, "
+        "hydra/launcher=NAME, hydra.launcher.PARAMETER=... or the same of the sweeper."
+    )
+
+
+def leaves(value: object) -> Iterator[str]:
+    """All texts in a parsed value: itself, or a list's and mapping's, names too."""
+    if isinstance(value, Mapping):
+        value = [*value, *value.values()]
+    if isinstance(value, list):
+        for each in value:
+            yield from leaves(each)
+    else:
+        yield str(value)
+
+
 def _refuse_no_option(override: Override) -> None:
-    """A group takes the name of one option."""
+    """A group takes the name of one option, which is no path to a file elsewhere."""
     group = override.key_or_group
     chosen = override.is_sweep_override() or isinstance(override.value(), str)
+    chosen = chosen and re.search(r"[/\\]|\.\.", str(override.input_line).partition("=")[2]) is None
     if not chosen and (conf_folder() / group).is_dir():
         names = ", ".join(options_of(group))
         raise UserError(f"{override.input_line}: expected the name of one option; choose one of {names}.")
@@ -89,7 +131,7 @@ def _refuse_no_option(override: Override) -> None:
 def _refuse_new_keys(override: Override) -> None:
     """``+key``, ``++key`` and ``~key`` would slip past the schema; only a target's free parameters are open."""
     key = override.key_or_group
-    if key.startswith(("hydra.", "hydra/")) or override.type == OverrideType.CHANGE:
+    if override.type == OverrideType.CHANGE:
         return
     if override.is_delete():
         raise UserError(f"{override.input_line}: keys cannot be deleted; give {key}=null or leave it as it is.")
@@ -120,7 +162,7 @@ def single_runs(overrides: Sequence[str], multirun: bool) -> list[list[str]]:
     """The overrides of every run: one, or all combinations of a sweep."""
     if not multirun:
         return [list(overrides)]
-    parsed = [override for override in parse(overrides) if not override.key_or_group.startswith("hydra")]
+    parsed = [override for override in parse(overrides) if not of_hydra(override)]
     batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     return [list(run) for batch in batches for run in batch]
 

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from ganlane.config.command_line import parse, quoted, without_repetitions
+from ganlane.config.command_line import leaves, of_hydra, parse, quoted, without_repetitions
 from ganlane.config.folders import CONFIG, OVERRIDES
-from ganlane.errors import UserError
+from ganlane.config.targets import is_import_path
+from ganlane.config.train import TrainConfig
+from ganlane.errors import UserError, as_typed
 from ganlane.parameters.removed import without_removed_overrides
 
 _RUNS = Path("outputs")
 #: Where a run keeps its checkpoint, below its folder.
 LAST = Path("checkpoints") / "last.pt"
+#: Last names of the keys that say whose code is executed: import paths, and a Ray cluster's address.
+_IMPORTED_BY = ("_target_", "shares", "agents", "address")
 #: Keys whose defaults are others than in version 0.1.0.
 CHANGED_SINCE_0_1 = ("total_decisions", "collector.num_envs", "evaluation.episodes")
 
@@ -77,7 +82,54 @@ def _stored(path: Path) -> list[str]:
         raise UserError(
             f"{path}: damaged, expected a list of key=value; write the run's command line there, or start a new run."
         )
-    return without_removed_overrides(map(str, found), str(path))
+    kept = without_removed_overrides(map(str, found), str(path))
+    for override in OverridesParser.create().parse_overrides(kept):
+        if of_hydra(override):
+            raise UserError(f"{path}: {override.input_line}: Hydra is not set by a run's files; remove that line.")
+    return kept
+
+
+def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None:
+    """A run's folder is data: the command line must name what its files would execute from outside the package.
+
+    Args:
+        config: of the resumed run.
+        overrides: of this command line alone.
+
+    Raises:
+        UserError: the run's files name a class or function of another package, or a Ray cluster.
+    """
+    asked = [each for each in parse(overrides) if each.key_or_group.rpartition(".")[2] in _IMPORTED_BY]
+    named = {name.partition("+")[0] for override in asked for name in leaves(override.value())}
+    for key, path in _imports(config):
+        if not path.startswith("ganlane.") and path not in named:
+            raise UserError(
+                f"resume={config.resume}: the run's files name {path}, and code from there would be executed; if you "
+                f"trust it, add {key} to the command line."
+            )
+
+
+def _imports(config: TrainConfig) -> Iterator[tuple[str, str]]:
+    """Every import path that a run would follow, and Ray's address, each with the override that names it."""
+    address = getattr(config.collector, "address", None)
+    if address not in (None, "auto"):  # objects of a cluster come as pickles
+        yield f"collector.address={address}", str(address)
+    traffics = {"pretrain.traffic": config.pretrain.traffic, "traffic": config.traffic}
+    for key, traffic in {**traffics, "evaluation.traffic": config.evaluation.traffic}.items():
+        if traffic is not None:
+            yield f"{key}._target_={traffic._target_}", traffic._target_
+            shares = ",".join(f"{name}:{share}" for name, share in getattr(traffic, "shares", {}).items())
+            for name, part in traffic.parts().items():
+                known = name in getattr(traffic, "options", {})
+                yield (
+                    f"{key}.options.{name}._target_={part._target_}" if known else f"'{key}.shares={{{shares}}}'",
+                    part._target_,
+                )
+    agents = config.evaluation.agents
+    for name in agents:
+        path = name.partition("+")[0]
+        if is_import_path(path) and not path.endswith(".safetensors") and not Path(path).is_file():
+            yield f"evaluation.agents={as_typed(agents)}", path
 
 
 def _asked(overrides: Sequence[str]) -> str | None:

@@ -1,28 +1,45 @@
-"""Names of Python objects in a configuration: imported and called, with a sentence for what can go wrong."""
+"""Names of Python objects in a configuration: imported, checked and called, with a sentence for what can go wrong."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, TypeVar, get_type_hints
 
 from ganlane.errors import UserError
 
+Made = TypeVar("Made")
 
-def import_target(path: str, key: str) -> Any:
-    """The object at import path ``path`` (``my.module.MyTraffic``).
+
+def is_import_path(name: str) -> bool:
+    """Whether ``name`` has the form ``my.module.MyTraffic``; so may the name of a file."""
+    return "." in name and all(part.isidentifier() for part in name.split("."))
+
+
+def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
+    """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
+
+    Importing a module executes it: ``path`` is one that the user gave, on the command line or in a call, or of this
+    package (:func:`ganlane.config.resume.refuse_stored_imports`).
 
     Args:
         path: module and name.
         key: where the user wrote it, for the message.
+        base: what is to be made; nothing else is called.
 
     Raises:
-        UserError: it cannot be imported.
+        UserError: it cannot be imported, or makes something else.
     """
     module, _, name = path.rpartition(".")
+    # A console script does not look for a user's own modules where it is started. Last, and not before one is named:
+    # what lies in that folder never stands in for an installed module.
+    if "" not in sys.path:
+        sys.path.append("")
     try:
-        return getattr(importlib.import_module(module), name)
+        target = getattr(importlib.import_module(module), name)
     except AttributeError as error:
         raise UserError(
             f"{key}={path}: {module} has no {name}; give the import path of a class or function."
@@ -32,6 +49,25 @@ def import_target(path: str, key: str) -> Any:
             f"{key}={path}: {module or path!r} cannot be imported ({type(error).__name__}: {error}); give the import "
             "path of a class or function, and start the command in the folder that holds its module."
         ) from error
+    if not _makes(target, base):
+        raise UserError(
+            f"{key}={path}: expected a subclass of {base.__module__.removesuffix('.base')}.{base.__name__} or a "
+            f"function that is annotated to return one (-> {base.__name__}); derive or annotate yours."
+        )
+    return target
+
+
+def _makes(target: Any, base: type) -> bool:
+    """Whether ``target`` is a subclass of ``base``, or a function annotated to return one."""
+    if not inspect.isclass(target):
+        if not inspect.isfunction(target):
+            return False
+        returned = SimpleNamespace(__annotations__={"return": target.__annotations__.get("return")})
+        try:
+            target = get_type_hints(returned, inspect.unwrap(target).__globals__)["return"]
+        except Exception:  # an annotation may be any text
+            return False
+    return inspect.isclass(target) and issubclass(target, base)
 
 
 def call_with(target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str) -> Any:

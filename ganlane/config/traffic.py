@@ -1,8 +1,8 @@
 """``traffic=...``: who drives the other vehicles.
 
-``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function that makes one. It is called with those of
-``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys, and with
-``parameters``. A model of your own needs no more than its import path::
+``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function annotated to return one. It is called with
+those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys and
+with ``parameters``. A model of your own needs no more than its import path::
 
     python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
     python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic +traffic.parameters.pace=0.9
@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
+from ganlane.config.targets import is_import_path
 from ganlane.errors import ParameterError
 from ganlane.parameters.checks import Rule, assign, between, check, did_you_mean, part_of
 from ganlane.parameters.traffic import (
@@ -28,7 +29,7 @@ from ganlane.parameters.traffic import (
 )
 
 _IMPORT_PATH = Rule(
-    lambda path: all(part.isidentifier() for part in path.split(".")) and "." in path,
+    is_import_path,
     "an import path such as my.module.MyTraffic",
 )
 #: A larger sum would be a period of more episodes than anybody drives side by side.

@@ -20,7 +20,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from tqdm import tqdm
 
@@ -33,6 +33,9 @@ DATA_VARIABLE: Final = "GANLANE_DATA"
 SCENES: Final = Path("ngsim") / "us101_scenes.csv"
 _FOLDER = Path("shared") / "data"
 _PIECE_BYTES: Final = 2**18
+_SCHEMES: Final = ("http", "https")
+#: Larger files are refused, bytes: NGSIM's largest has 2 GB.
+MOST_BYTES: Final = 64 * 2**30
 #: Seconds between two progress lines where there is no terminal.
 LINE_EVERY_S: Final = 10.0
 
@@ -118,6 +121,7 @@ def download(
     timeout_s: float = 60.0,
     attempts: int = 5,
     wait_s: float = 1.0,
+    most_bytes: int = MOST_BYTES,
 ) -> Path:
     """Download ``url`` (http or https) to ``path``; a file that exists already is kept.
 
@@ -127,13 +131,15 @@ def download(
         timeout_s: without a byte for this long, the connection counts as broken.
         attempts: connections without any progress before giving up.
         wait_s: before the second attempt; doubled each time.
+        most_bytes: a larger file is refused, as soon as the server tells its size or that many bytes have come.
 
     Raises:
-        UserError: not an http address, the server refuses or cannot be reached, or the checksum differs.
+        UserError: not an http address, the server sends to one, refuses or cannot be reached, the file is too large,
+            or the checksum differs.
         OSError: the disk's error; it names ``path``. Received bytes are kept for the next run.
     """
     path = Path(path)
-    if urllib.parse.urlsplit(url).scheme not in ("http", "https"):
+    if url.partition("://")[0].lower() not in _SCHEMES:
         raise UserError(f"{url}: not an address of a file; expected http:// or https://.")
     if path.is_file():
         _check_sha256(path, sha256, "remove it, or correct data.sha256")
@@ -141,7 +147,7 @@ def download(
     path.parent.mkdir(parents=True, exist_ok=True)
     part = _Part(path)
     with name_in_errors(path, nameless=True):
-        _fetch(url, part, on_progress, timeout_s, attempts, wait_s)
+        _fetch(url, part, on_progress, timeout_s, attempts, wait_s, most_bytes)
     try:
         _check_sha256(part.file, sha256, "it was removed; download again, or correct data.sha256")
     except UserError:
@@ -153,20 +159,28 @@ def download(
 
 
 def _fetch(
-    url: str, part: _Part, on_progress: OnProgress | None, timeout_s: float, attempts: int, wait_s: float
+    url: str,
+    part: _Part,
+    on_progress: OnProgress | None,
+    timeout_s: float,
+    attempts: int,
+    wait_s: float,
+    most_bytes: int,
 ) -> None:
     """Connect until the file is complete; give up after ``attempts`` connections in a row that bring nothing."""
     failures = 0
     while True:
         before = part.size
         try:
-            _connect(url, part, on_progress, timeout_s)
+            _connect(url, part, on_progress, timeout_s, most_bytes)
             return
         except urllib.error.HTTPError as error:
             if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and before:
                 part.remove()  # It is longer than the file, so it is of another version.
             elif error.code < 500:
-                raise UserError(f"{url}: the server says {error.code} {error.reason}; check data.url.") from error
+                raise UserError(
+                    f"{url}: the server says {error.code} {' '.join(str(error.reason).split())}; check data.url."
+                ) from error
             reason = f"{error.code} {error.reason}"
         except _BrokenConnection as error:
             reason = str(error)
@@ -181,23 +195,37 @@ def _fetch(
             wait_s *= 2.0
 
 
-def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: float) -> None:
+class _HttpOnly(urllib.request.HTTPRedirectHandler):
+    """Follows no redirection to another protocol."""
+
+    def redirect_request(self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, newurl: str) -> Any:
+        if urllib.parse.urlsplit(newurl).scheme not in _SCHEMES:
+            raise UserError(
+                f"{req.full_url}: the server sends to {newurl[:200]}; expected http:// or https://, check data.url."
+            )
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
+def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: float, most_bytes: int) -> None:
     """One connection: the rest of the file, or all of it."""
     received, version = part.size, part.version
-    request = urllib.request.Request(url, headers={"User-Agent": "ganlane", "Accept-Encoding": "identity"})
+    with _network_errors():
+        request = urllib.request.Request(url, headers={"User-Agent": "ganlane", "Accept-Encoding": "identity"})
     if received and version:
         request.add_header("Range", f"bytes={received}-")
         request.add_header("If-Range", version)
     with _network_errors():
-        answer = urllib.request.urlopen(request, timeout=timeout_s)
+        answer = urllib.request.build_opener(_HttpOnly).open(request, timeout=timeout_s)
     with answer:
         resumes = answer.status == http.HTTPStatus.PARTIAL_CONTENT
         if resumes and _range_start(answer) != received:
             part.remove()
             raise _BrokenConnection("the server sent another part than the one asked for")
         received = received if resumes else 0
-        length = answer.headers.get("Content-Length")
-        total = None if length is None else received + int(length)
+        length = (answer.headers.get("Content-Length") or "").strip()
+        # A length that is no number tells nothing; 19 digits are more bytes than there are.
+        total = received + int(length[:19]) if length.isdecimal() else None
+        _check_size(url, part, max(received, total or 0), most_bytes)
         if not resumes:
             part.version = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
         with part.file.open("ab" if received else "wb") as file:
@@ -206,12 +234,23 @@ def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: f
                     piece = answer.read1(_PIECE_BYTES)
                 if not piece:
                     break
+                _check_size(url, part, received + len(piece), most_bytes)
                 file.write(piece)
                 received += len(piece)
                 if on_progress is not None:
                     on_progress(received, total)
     if total is not None and received < total:
         raise _BrokenConnection(f"{received} of {total} bytes came")
+
+
+def _check_size(url: str, part: _Part, size: int, most_bytes: int) -> None:
+    """Refuse more bytes than wanted; what came of them is removed."""
+    if size > most_bytes:
+        part.remove()
+        raise UserError(
+            f"{url}: the file has {size / 1e9:.3g} GB or more, more than {most_bytes / 1e9:.3g}; check data.url, or "
+            "fetch it yourself and give data.path."
+        )
 
 
 @contextmanager
@@ -221,7 +260,8 @@ def _network_errors() -> Iterator[None]:
         yield
     except urllib.error.HTTPError:
         raise
-    except (OSError, http.client.HTTPException) as error:
+    # A ValueError comes from an address that is none.
+    except (OSError, http.client.HTTPException, ValueError) as error:
         raise _BrokenConnection(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
 
 

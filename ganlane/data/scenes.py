@@ -6,6 +6,7 @@ command reads it.
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,11 +14,12 @@ from typing import Final
 
 import polars as pl
 
+from ganlane.checksums import PLACE, has_checksum, sealed
 from ganlane.data.lane_widths import lane_width, scene_lane_widths
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
 from ganlane.data.tables import raise_where, read_table, reason
 from ganlane.errors import UserError
-from ganlane.files import atomic_path
+from ganlane.files import write_bytes
 
 #: Columns of a scene CSV; ``y`` is 0 at the centre of lane 1, which is the leftmost, and positive to the left.
 COLUMNS: Final = {
@@ -61,9 +63,10 @@ def scene_csv_scenes(path: str | Path, count: RowCount) -> Iterator[Scene]:
 
 
 def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
-    """Write a frame in the schema as Parquet, atomically."""
-    with atomic_path(path) as part:
-        frame.write_parquet(part, compression="zstd")
+    """Write a frame in the schema as Parquet with a checksum, atomically."""
+    file = io.BytesIO()
+    frame.write_parquet(file, compression="zstd", metadata={"checksum": PLACE})
+    write_bytes(path, sealed(file.getvalue()))
 
 
 def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
@@ -112,8 +115,10 @@ def _read_files(path: Path) -> Iterator[pl.DataFrame]:
 def _read_parquet(path: Path) -> pl.DataFrame:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder.")
+    content = path.read_bytes()
+    has_checksum(content, path)  # tables of other programs have none
     try:
-        frame = pl.read_parquet(path)
+        frame = pl.read_parquet(content)
     except (pl.exceptions.PolarsError, OSError) as error:
         raise UserError(f"{path}: not a readable Parquet file ({reason(error)}); prepare it again.") from error
     return validate(frame, str(path), first_line=None)

@@ -49,7 +49,7 @@ TRACK: Final = ("scene", "vehicle")
 #: Bounds that no recording of road traffic in SI units exceeds.
 MAX_MEDIAN_SPEED_MPS: Final = 60.0
 MAX_MEDIAN_LENGTH_M: Final = 12.0
-MAX_SPEED_RATIO: Final = 2.0
+MAX_SPEED_RATIO: Final = 1.4
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,23 @@ def _check_rows(frame: pl.DataFrame, source: str, first_line: int | None) -> Non
             raise UserError(f"{_place(source, rows[0], first_line)}, column {column}: {value} {what}.")
 
 
+def _check_frame_step(frame: pl.DataFrame, source: str, first_line: int | None) -> None:
+    """Refuse scenes in which most rows are further apart than a frame: nothing could be measured between them."""
+    steps = frame.select("scene", step=pl.col("frame").diff().over(TRACK)).with_row_index("row")
+    usual = pl.col("step").median().over("scene")
+    found = steps.filter((usual > 1) & (pl.col("step") > 1)).head(1)
+    if not found.is_empty():
+        row, scene, step = found.row(0)
+        raise UserError(
+            f"{_place(source, row, first_line)}, column frame: most rows of scene {scene} come {step} frames after "
+            f"their track's last one; expected {1 / FRAME_S:.0f} frames a second, numbered one by one: resample the "
+            "recording."
+        )
+
+
 def _check_units(frame: pl.DataFrame, source: str, first_line: int | None) -> None:
     """Positions, speeds or sizes that cannot be in metres and seconds; the first row that shows it is named."""
+    _check_frame_step(frame, source, first_line)
     rates = pl.col("x").diff().over(TRACK) / (pl.col("frame").diff().over(TRACK) * FRAME_S)
     speed, length, rate = frame.select(pl.col("speed", "length").median(), rate=rates.median()).row(0)
     for column, median, bound, unit in (

@@ -11,11 +11,13 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
+from ganlane.env.checks import ActionCheck, check_counter, check_sizes, usable_device
 from ganlane.env.decision import Recorder, known_false, run_decision
 from ganlane.env.native_step import after_decision, make_kernel, native_decision
 from ganlane.env.physics import Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
+from ganlane.parameters.checks import seed_number
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -88,7 +90,10 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
-        super().__init__(device=device or torch.device("cpu"), batch_size=torch.Size([num_envs]))
+        if not isinstance(traffic, TrafficModule):
+            raise UserError(f"traffic={traffic!r}: expected a TrafficModule; ganlane.make_env takes names.")
+        check_sizes(num_envs, vehicles, first_episode)
+        super().__init__(device=usable_device(device, dtype), batch_size=torch.Size([int(num_envs)]))
         self.traffic = traffic.to(self.device)
         self.road: Road = traffic.road
         self.spawn_parameters = spawn_parameters or SpawnParameters()
@@ -101,20 +106,21 @@ class HighwayEnv(EnvBase):
         self.recorder: Recorder | None = None
         self.rules = Rules(self.road, self.ego, self.episode, idm, steering)
         self.physics = Physics()
-        self._seed = seed
+        self._seed = seed_number(seed)
         #: Seed and episode [N] of the rows in the last call; automatic resets continue from there.
         self.last_episodes: tuple[Tensor, Tensor] | None = None
         self._check_parts(vehicles, stream)
         #: The native kernel; None: the tensor code drives.
         self.kernel = make_kernel(kernel, traffic, self.rules, self.vehicles, self.device, dtype)
         self._kernel_must = kernel == "native"
+        self._check_action = ActionCheck(self.batch_size[0], self.device)
         self._make_specs()
 
     def _check_parts(self, vehicles: int | None, stream: int | None) -> None:
         """Raise :class:`UserError` for parts that do not fit; ``vehicles`` and ``stream`` as the user gave them."""
-        if stream is not None and int(stream) != self.stream:
+        if stream is not None and stream != self.stream:
             raise UserError(
-                f"stream={int(stream)}: the traffic was built for stream {self.stream}; give both the same one, "
+                f"stream={stream}: the traffic was built for stream {self.stream}; give both the same one, "
                 "or an episode would depend on two of them."
             )
         if self.recycle and self.traffic.own_roads:
@@ -147,7 +153,7 @@ class HighwayEnv(EnvBase):
         # episodes would run the first ones.
         counters = {name: self.observation_spec[name].clone() for name in (keys.SEED, keys.EPISODE)}
         self.state_spec = Composite(counters, shape=(n,), device=device)
-        self.action_spec = Categorical(3, shape=(n,), dtype=torch.int64, device=device)
+        self.action_spec = Categorical(keys.ACTIONS, shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = Unbounded(shape=(n, 1), dtype=self.dtype, device=device)
         self.done_spec = done_spec(n).to(device)
 
@@ -168,7 +174,7 @@ class HighwayEnv(EnvBase):
         return self
 
     def _set_seed(self, seed: int | None) -> None:
-        self._seed = 0 if seed is None else int(seed)
+        self._seed = 0 if seed is None else seed_number(seed)
 
     def _episodes(
         self, tensordict: TensorDictBase | None, next_episode: Tensor | None = None
@@ -177,7 +183,7 @@ class HighwayEnv(EnvBase):
         n = self.batch_size[0]
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is not None and keys.EPISODE in tensordict:
-            seed, last = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
+            seed, last = (check_counter(name, tensordict.get(name, None), n) for name in (keys.SEED, keys.EPISODE))
         elif mask is not None and self.last_episodes is not None:
             # In an automatic reset TorchRL passes the mask without the counters.
             seed, last = self.last_episodes
@@ -224,20 +230,24 @@ class HighwayEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One decision."""
-        self.last_episodes = (tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        seed, episode = tensordict.get(keys.SEED, None), tensordict.get(keys.EPISODE, None)
+        if seed is None or episode is None:
+            raise UserError("step(): the state of no episode was given; call reset() first and step what it returns.")
+        self.last_episodes = (seed, episode)
+        action = self._check_action(tensordict.get(keys.ACTION, None))
         if self.kernel is not None and (self.recorder is None or self._kernel_must):
-            return self._native_step(tensordict)
-        key = episode_key(self.stream, *self.last_episodes)
+            return self._native_step(tensordict, action)
+        key = episode_key(self.stream, seed, episode)
         rules = self._rules_of(tensordict, key)
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(tensordict.get(keys.EGO).items())
-        action, step = tensordict.get(keys.ACTION), tensordict.get(keys.STEP)
+        step = tensordict.get(keys.STEP)
         start, command = self.physics.begin(rules, action, vehicles, ego, step)
         end, memory = run_decision(self.traffic, self.physics, rules, tensordict, start, key, self.recorder)
         ego = self.physics.remember(rules, ego, start, end, command)
         events, flags = outcome(rules, end, command)
         rest = {
-            keys.SEED: tensordict.get(keys.SEED),
-            keys.EPISODE: tensordict.get(keys.EPISODE),
+            keys.SEED: seed,
+            keys.EPISODE: episode,
             keys.STEP: end.step,
             keys.REWARD: torch.zeros_like(ego["distance"])[:, None],
             **flags,
@@ -246,7 +256,7 @@ class HighwayEnv(EnvBase):
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
         return pack(self._recycled(rules, end, key), ego, memory, events, rest)
 
-    def _native_step(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _native_step(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """One decision by the kernel."""
         assert self.kernel is not None
         if self.recorder is not None:
@@ -255,7 +265,7 @@ class HighwayEnv(EnvBase):
         if self.recycle:
             seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
             recycles = self._recycling_rows(episode_key(self.stream, seed, episode))
-        return after_decision(tensordict, *native_decision(self.kernel, tensordict, recycles))
+        return after_decision(tensordict, *native_decision(self.kernel, tensordict, action, recycles))
 
     def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
         """The rules of every row: replayed scenes have their own roads and ends."""

@@ -68,11 +68,13 @@ def _why_not(traffic: TrafficModule, rules: Rules, device: torch.device, dtype: 
     return None
 
 
-def native_decision(kernel: Kernel, state: TensorDictBase, recycles: Tensor | None) -> tuple[Outcome, Vehicles]:
-    """The decision ``action`` from ``state``, and the vehicles after it; ``recycles`` [N] bool or None."""
+def native_decision(
+    kernel: Kernel, state: TensorDictBase, action: Tensor, recycles: Tensor | None
+) -> tuple[Outcome, Vehicles]:
+    """The decision ``action`` [N] from ``state``, and the vehicles after it; ``recycles`` [N] bool or None."""
     vehicles, ego = Vehicles.of(state.get(keys.VEHICLES)), state.get(keys.EGO)
     out = kernel.decide(
-        state.get(keys.ACTION),
+        action,
         vehicles,
         state.get(keys.TRAFFIC).get("steering"),
         EgoState(*(ego.get(name) for name in EgoState._fields)),

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from ganlane.files import atomic_path
 from ganlane.generator.checkpoint import FitResult
 from ganlane.generator.fit import Config, Split, Task, assign_folds, fit_key, fit_result, fit_task, split_for_fit
 from ganlane.generator.fit_calibrated import CalibratedTask
@@ -31,7 +30,7 @@ from ganlane.generator.scores import (
     open_loop_scores,
 )
 from ganlane.generator.segments import OBSERVED_POSITIONS, scene_tracks
-from ganlane.generator.windows import Windows, cut_windows, group_windows, join_windows, save_arrays
+from ganlane.generator.windows import Windows, cut_windows, group_windows, join_windows, load_arrays, save_arrays
 from ganlane.parameters.generator import CalibratedConfig
 
 #: Frames between the starts of two scored windows, the same for both presets.
@@ -86,9 +85,9 @@ def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) ->
     """Forecasts of the held-out windows by the generator, IDM and all baselines, saved next to the fit's state."""
     path = path.with_name(f"{path.stem}_{steps}.npz")
     windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
-    if path.exists():
-        with np.load(path, allow_pickle=False) as kept:
-            return HeldOut(windows, dict(kept))
+    kept = load_arrays(path)
+    if kept is not None:
+        return HeldOut(windows, kept)
     if isinstance(task, CalibratedTask):
         samples = 1 if steps == LONG_STEPS else SAMPLES  # the best of 20 is for short forecasts only
         own = calibrated_forecasts(task.generator, split.held_out, steps, stride, task.config, samples)
@@ -98,8 +97,7 @@ def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) ->
     baselines = baseline_forecasts(windows, split.fitted + split.validation, stride)
     every = own | baselines | idm_forecasts(split.held_out, steps, stride)
     forecasts = {name: positions.astype(np.float32) for name, positions in every.items()}
-    with atomic_path(path) as part, part.open("wb") as file:
-        save_arrays(file, forecasts)
+    save_arrays(path, forecasts)
     return HeldOut(windows, forecasts)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import time
 from collections.abc import Callable
@@ -13,8 +14,9 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from ganlane.checksums import has_checksum, note_without_checksum, sealed_archive
 from ganlane.errors import UserError
-from ganlane.files import atomic_path
+from ganlane.files import write_bytes
 from ganlane.parameters.generator import LoopConfig
 
 
@@ -95,8 +97,9 @@ class FitLoop:
             self.best, self.best_update, self.waited = score, self.done, 0
             self.best_weights = {name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()}
         if self.path is not None:
-            with atomic_path(self.path) as part:
-                torch.save(self._state(), part)
+            file = io.BytesIO()
+            torch.save(self._state(), file)
+            write_bytes(self.path, sealed_archive(file.getvalue()))
         return score
 
     def _state(self) -> dict[str, Any]:
@@ -113,8 +116,10 @@ class FitLoop:
 
     def _resume(self, path: Path) -> None:
         """Continue from a stored state; reading it never executes code."""
+        content = path.read_bytes()
+        whole = has_checksum(content, path)
         try:
-            state = torch.load(path, weights_only=True)
+            state = torch.load(io.BytesIO(content), weights_only=True)
             if "counters" not in state:
                 raise ValueError("no counters")
         except Exception as error:
@@ -134,6 +139,8 @@ class FitLoop:
         self.best, self.best_weights = state["best"], state["best_weights"]
         self.seconds = state["seconds"]
         self.task.random.set_state(state["random"])
+        if not whole:
+            note_without_checksum(path)
 
 
 def learning_rate(config: LoopConfig, number: int) -> float:

@@ -7,13 +7,15 @@ of the time before a fit, so it is cached under a hash of everything that it fol
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import sklearn
@@ -21,8 +23,9 @@ import torch
 from sklearn.cluster import KMeans
 from torch import Tensor
 
+from ganlane.checksums import has_checksum, sealed_archive
 from ganlane.errors import UserError
-from ganlane.files import atomic_path
+from ganlane.files import write_bytes
 from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks
 
 #: Environment variable with the cache folder; empty switches the cache off.
@@ -157,22 +160,32 @@ def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) ->
     if folder is None:
         return compute()
     path = folder / f"{name}_{key}.npz"
-    try:
-        with np.load(path, allow_pickle=False) as kept:
-            return dict(kept)
-    except (OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError):
-        arrays = compute()
-    try:
-        with atomic_path(path) as part, part.open("wb") as file:
-            save_arrays(file, arrays)
-    except OSError:
-        pass
+    kept = load_arrays(path)
+    if kept is not None:
+        return kept
+    arrays = compute()
+    with suppress(OSError):
+        save_arrays(path, arrays)
     return arrays
 
 
-def save_arrays(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays as .npz; reading them needs no pickle."""
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as .npz with a checksum, atomically."""
+    file = io.BytesIO()
     np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's stub takes a name for an option
+    write_bytes(path, sealed_archive(file.getvalue()))
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
+    """What :func:`save_arrays` wrote, without pickle; None where it is absent, damaged or has no checksum."""
+    try:
+        content = path.read_bytes()
+        if not has_checksum(content, path):
+            return None
+        with np.load(io.BytesIO(content), allow_pickle=False) as kept:
+            return dict(kept)
+    except (UserError, OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError):
+        return None
 
 
 @dataclass(frozen=True)

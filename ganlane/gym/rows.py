@@ -15,14 +15,13 @@ import numpy.typing as npt
 from gymnasium.spaces import Box
 
 from ganlane.errors import UserError
+from ganlane.keys import ACTIONS as ACTIONS
 from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
 from ganlane.native.library import why_not
 from ganlane.options import Option
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
-#: Keep, left, right.
-ACTIONS: Final = 3
 #: Unseeded environments draw their seed below this.
 SEEDS: Final = 2**31
 
@@ -131,16 +130,11 @@ def actions_of(given: Any, rows: int) -> npt.NDArray[np.int64]:
     return array.astype(np.int64, copy=False)
 
 
-def seed_number(seed: Any) -> int:
-    """A seed, checked: the counters of the environment hold 63 bits."""
-    if not hasattr(seed, "__index__") or not 0 <= int(seed) < 2**63:
-        raise UserError(f"seed={seed}: expected a whole number from 0 to 2**63 - 1; give for instance seed=0.")
-    return int(seed)
-
-
 def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
     """The options of a reset, checked for unknown names."""
-    unknown = sorted(set(options or {}) - set(names))
+    if not isinstance(options, dict | None):
+        raise UserError(f"options={options!r}: expected a dictionary with {', '.join(names)}, or none.")
+    unknown = sorted(map(str, set(options or {}) - set(names)))
     if unknown:
         raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")
     return dict(options or {})

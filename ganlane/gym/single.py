@@ -19,9 +19,9 @@ from ganlane.gym.rows import (
     known_options,
     make_rows,
     row_of,
-    seed_number,
 )
 from ganlane.options import Option, option
+from ganlane.parameters.checks import seed_number
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -79,9 +79,10 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     ) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; see the class for which."""
         given = known_options(options, ("episode",))
+        seed = None if seed is None else seed_number(seed)
         super().reset(seed=seed)
         if seed is not None:
-            self._seed, self._episode = seed_number(seed), -1
+            self._seed, self._episode = seed, -1
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
         self._episode = int(episode_numbers(given.get("episode", self._episode + 1)))

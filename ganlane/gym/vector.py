@@ -23,9 +23,9 @@ from ganlane.gym.rows import (
     known_options,
     make_rows,
     row_mask,
-    seed_number,
 )
 from ganlane.options import Option, option
+from ganlane.parameters.checks import seed_number
 
 
 class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):

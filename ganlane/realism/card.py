@@ -17,7 +17,8 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array, Estimate, entries
-from ganlane.generator import HELD_OUT
+from ganlane.files import load_weights
+from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.parameters.checks import assign
 from ganlane.realism.distances import RESAMPLES, ceiling, distance, distance_difference, pooled_distance
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
@@ -40,7 +41,7 @@ from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
 
 #: Preset of the weights that a traffic drives with.
-PRESETS = {"gan": "paper", "gan_calibrated": "calibrated"}
+PRESETS: Final[Mapping[str, Preset]] = {"gan": "paper", "gan_calibrated": "calibrated"}
 #: Quantities that one lane shows.
 I80_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
 #: Quantities in which generated traffic should come closer to recordings than rules do.
@@ -287,11 +288,31 @@ def _with_weights(name: str, traffic: TrafficConfig, weights: Mapping[str, Path]
 def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
     """The scenes that traffics start from: the held-out ones, all, or all by folds."""
     if not config.fold_weights:
-        held_out = config.data.held_out_scenes(scenes, HELD_OUT)
-        return [Fold(traffic_factories(config), scenes if config.scenes == "all" else held_out, held_out)]
+        everywhere = config.scenes == "all"
+        # Nothing is held out of recordings that nothing is fitted to.
+        held_out = () if everywhere and not _fits(config, scenes) else config.data.held_out_scenes(scenes, HELD_OUT)
+        if not everywhere and not held_out:
+            raise UserError(
+                f"recordings of one scene, {', '.join(scenes)}: none is held out to start from; give scenes=all, or "
+                "cut it into several with ganlane prepare ... scene_s=30."
+            )
+        return [Fold(traffic_factories(config), scenes if everywhere else held_out, held_out)]
     folds = fold_weights([Path(path) for path in config.fold_weights])
     check_folds_cover(list(folds), scenes)
     return [Fold(traffic_factories(config, weights), held_out, held_out) for held_out, weights in folds.items()]
+
+
+def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
+    """Whether anything is, or was, fitted to some of the ``scenes``, or the user says which were held out."""
+    if config.data.held_out is not None or config.desired_above_mps is None:
+        return True
+    used = {**config.rivals(), config.traffic.label(): config.traffic}
+    for name in PRESETS.keys() & used.keys():
+        path = getattr(used[name], "path", None) or shipped_generator(PRESETS[name])
+        data = load_weights(path, "generator")[1].get("data", {})
+        if set(scenes) & {*data.get("fitted", ()), *data.get("validation", ())}:
+            return True
+    return False
 
 
 def drive_from_starts(config: RealismConfig, factories: Mapping[str, Factory], path: Path | None) -> Starts:

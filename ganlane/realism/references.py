@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ganlane.checksums import PLACE, has_checksum, note_without_checksum
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array
 from ganlane.files import CHECKPOINTS, write_json
@@ -76,29 +77,35 @@ class Reference:
         """Write as JSON, atomically."""
         ceilings = {quantity: ceiling(counts) for quantity, counts in self.counts.items()}
         plain = {**vars(self), "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()}}
-        write_json(path, {"kind": _KIND, "bins": _bins(), "ceilings": ceilings, **plain})
+        write_json(path, {"kind": _KIND, "checksum": PLACE, "bins": _bins(), "ceilings": ceilings, **plain})
 
     @classmethod
     def load(cls, path: Path) -> Reference:
         """What :meth:`save` wrote.
 
         Raises:
-            UserError: no such file, another file, or one with other bins.
+            UserError: no such file, a damaged one, another file, or one with other bins.
         """
         try:
-            numbers = json.loads(path.read_text())
+            content = path.read_bytes()
+            whole = has_checksum(content, path)
+            numbers = json.loads(content)
             if numbers.pop("kind") != _KIND:
                 raise ValueError("another kind of file")
             if numbers.pop("bins") != _bins():
                 raise ValueError("its histograms have other bins")
-            numbers.pop("ceilings")
+            for derived in ("ceilings", "checksum"):
+                numbers.pop(derived, None)
             counts = {name: np.asarray(value, dtype=np.float64) for name, value in numbers.pop("counts").items()}
-            return cls(counts=counts, **numbers)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            reference = cls(counts=counts, **numbers)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise UserError(
                 f"{path}: not the histograms of recorded driving that the realism card needs ({error}); give the "
                 "recordings with data.path=FILE."
             ) from error
+        if not whole:
+            note_without_checksum(path)
+        return reference
 
 
 def _bins() -> dict[str, list[float]]:

@@ -19,13 +19,16 @@ from typing import Any
 
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.scenes import FixedScene, SceneVehicle
+from ganlane.sim.scenes import FixedScene, SceneVehicle, check_count
 from ganlane.sim.state import Road
 
 #: Columns of a scene file.
 COLUMNS = tuple(field.name for field in fields(SceneVehicle) if field.name != "origin")
 WHOLE_NUMBERS = ("lane", "target_lane")
 LANE_WIDTH_M = 4.0
+#: Larger files hold no scene, bytes; and so many signs of a value are quoted in a message.
+_MOST_BYTES = 2**24
+_QUOTED = 60
 
 
 def read_scene(path: str | Path, lanes: int | None = None, lane_width_m: float | None = None) -> FixedScene:
@@ -46,6 +49,8 @@ def read_scene(path: str | Path, lanes: int | None = None, lane_width_m: float |
     readers = {".csv": _read_csv, ".json": _read_json}
     if path.suffix.lower() not in readers:
         raise UserError(f"{path}: expected a scene as .csv or .json; rename or convert the file.")
+    if path.stat().st_size > _MOST_BYTES:
+        raise UserError(f"{path}: more than {_MOST_BYTES} bytes, which no scene has; give a smaller file.")
     try:
         rows, road = readers[path.suffix.lower()](path)
     except UnicodeDecodeError as error:
@@ -80,7 +85,8 @@ def _read_csv(path: Path) -> tuple[list[SceneVehicle], dict[str, Any]]:
         lines = [(number, line) for number, line in enumerate(opened, 1) if line.strip() and line.lstrip()[0] != "#"]
     if not lines:
         raise UserError(f"{path}: empty; expected a header with {', '.join(COLUMNS)}, and a line per vehicle.")
-    header, *body = ([cell.strip() for cell in next(csv.reader([line]))] for _, line in lines)
+    check_count(str(path), len(lines) - 1)
+    header, *body = (_cells(line, f"{path}: line {number}") for number, line in lines)
     _check_names(header, f"{path}: line {lines[0][0]}")
     rows = []
     for (number, _), cells in zip(lines[1:], body, strict=True):
@@ -93,14 +99,25 @@ def _read_csv(path: Path) -> tuple[list[SceneVehicle], dict[str, Any]]:
     return rows, {}
 
 
+def _cells(line: str, where: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:
+        raise UserError(f"{where}: not a line of CSV ({error}); mend the line.") from error
+
+
 def _read_json(path: Path) -> tuple[list[SceneVehicle], dict[str, Any]]:
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (json.JSONDecodeError, RecursionError) as error:
+    except UnicodeDecodeError:
+        raise
+    # A ValueError without a place in the file: a whole number of thousands of digits.
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON ({error}); mend the file.") from error
     content = {"vehicles": content} if isinstance(content, list) else content
     if not isinstance(content, dict) or not isinstance(content.get("vehicles"), list):
         raise UserError(f"{path}: expected a list of vehicles, or an object with 'vehicles'; see docs/scenarios.md.")
+    check_count(str(path), len(content["vehicles"]))
     return list(_json_rows(path, content["vehicles"])), _json_road(path, content)
 
 
@@ -116,7 +133,7 @@ def _json_rows(path: Path, vehicles: list[Any]) -> Iterator[SceneVehicle]:
 def _json_road(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
     unknown = set(content) - {"lanes", "lane_width_m", "vehicles"}
     if unknown:
-        raise UserError(f"{path}: unknown key {min(unknown)}; expected lanes, lane_width_m and vehicles.")
+        raise UserError(f"{path}: unknown key {_quoted(min(unknown))}; expected lanes, lane_width_m and vehicles.")
     road: dict[str, Any] = {}
     if content.get("lanes") is not None:
         road["lanes"] = _number("lanes", content["lanes"], f"{path}: lanes", whole=True)
@@ -132,7 +149,8 @@ def _check_names(names: list[str], where: str, need_place: bool = True) -> None:
     """Check that column names are known and unique, and that the required ones are present."""
     for name in names:
         if name not in COLUMNS:
-            raise UserError(f"{where}: unknown column {name or '(empty)'}; expected some of {', '.join(COLUMNS)}.")
+            unknown = _quoted(name) if name else "(empty)"
+            raise UserError(f"{where}: unknown column {unknown}; expected some of {', '.join(COLUMNS)}.")
         if names.count(name) > 1:
             raise UserError(f"{where}: column {name} is given twice; remove one.")
     if need_place and ("x_m" not in names or not {"lane", "y_m"} & set(names)):
@@ -151,9 +169,15 @@ def _value(name: str, value: Any, where: str) -> Any:
     if name != "visibility":
         return _number(name, value, where, whole=name in WHOLE_NUMBERS)
     kinds = {kind.name.lower(): kind for kind in Visibility}
-    if value not in kinds:
-        raise UserError(f"{where}: {value!r}: expected one of {', '.join(kinds)}.")
+    if not isinstance(value, str) or value not in kinds:
+        raise UserError(f"{where}: {_quoted(value)}: expected one of {', '.join(kinds)}.")
     return kinds[value]
+
+
+def _quoted(value: Any) -> str:
+    """The value in a message, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _QUOTED else f"{text[:_QUOTED]}..."
 
 
 def _number(name: str, value: Any, where: str, whole: bool) -> float | int:
@@ -165,5 +189,5 @@ def _number(name: str, value: Any, where: str, whole: bool) -> float | int:
             raise ValueError
     except (TypeError, ValueError, OverflowError):
         kind = "a whole number" if whole else "a number"
-        raise UserError(f"{where}: {value!r}: expected {kind}.") from None
+        raise UserError(f"{where}: {_quoted(value)}: expected {kind}.") from None
     return int(number) if whole else number

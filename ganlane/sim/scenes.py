@@ -27,6 +27,12 @@ from ganlane.sim.state import STRAIGHT, Road, Vehicles
 #: Duration of the test drive of :func:`check_drive`, s, and number of episodes with jitter that it simulates.
 DRIVE_S = 15.0
 DRIVES = 32
+#: The most vehicles and lanes of a scene, the largest number in it (m, m/s), and the smallest of those above 0:
+#: beyond them float32 is too coarse.
+MOST_VEHICLES = 1000
+MOST_LANES = 100
+LARGEST = 1e6
+SMALLEST = 1e-6
 
 
 class Scenes(Protocol):
@@ -189,13 +195,25 @@ class FixedScene:
         return f"{name} ({origin})" if origin else name
 
 
+def check_count(name: str, vehicles: int) -> None:
+    """Raise :class:`UserError` for more vehicles than a scene may have: every pair of them is looked at."""
+    if vehicles > MOST_VEHICLES:
+        raise UserError(f"{name}: {vehicles} vehicles; a scene has at most {MOST_VEHICLES}, remove some.")
+
+
 def check_rows(scene: FixedScene) -> None:
     """Raise :class:`UserError` for a scene of fewer than two vehicles, or a vehicle with an impossible number."""
+    check_count(scene.name, len(scene.rows))
     if len(scene.rows) < 2:
         raise UserError(f"{scene.name}: {len(scene.rows)} vehicles; a scene needs the ego and at least one other.")
     if not isinstance(scene.road.lanes, int) or isinstance(scene.road.lane_width_m, Tensor):
         raise UserError(f"{scene.name}: a scene set by hand needs one road for all episodes, not one per row.")
-    if not all(0 <= jitter < torch.inf for jitter in (scene.jitter_m, scene.jitter_mps)):
+    if not (1 <= scene.road.lanes <= MOST_LANES and SMALLEST <= scene.road.lane_width_m <= LARGEST):
+        raise UserError(
+            f"{scene.name}: a road of {scene.road.lanes:g} lanes of {scene.road.lane_width_m:g} m; expected 1 to "
+            f"{MOST_LANES} of at most {LARGEST:g} m."
+        )
+    if not all(0 <= jitter <= LARGEST for jitter in (scene.jitter_m, scene.jitter_mps)):
         raise UserError(
             f"{scene.name}: jitter_m={scene.jitter_m:g}, jitter_mps={scene.jitter_mps:g}: expected at least 0."
         )
@@ -209,12 +227,12 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     """What is wrong with one vehicle; empty if nothing is."""
     given = {"x_m": row.x_m, "y_m": row.y_m, "speed_mps": row.speed_mps, "desired_speed_mps": row.desired_speed_mps}
     for name, value in (given | {"length_m": row.length_m, "width_m": row.width_m}).items():
-        if value is not None and not -torch.inf < value < torch.inf:
-            return f"{name}={value}: expected a finite number"
+        if value is not None and not -LARGEST <= value <= LARGEST:
+            return f"{name}={value:g}: expected a number from {-LARGEST:g} to {LARGEST:g}"
     if row.speed_mps < 0:
         return f"speed_mps={row.speed_mps:g}: expected at least 0; vehicles drive forwards only"
     for name in ("desired_speed_mps", "length_m", "width_m"):
-        if getattr(row, name) <= 0:
+        if getattr(row, name) < SMALLEST:
             return f"{name}={getattr(row, name):g}: expected a number above 0"
     return _misplaced(row, road)
 
@@ -288,7 +306,9 @@ def check_drive(scene: FixedScene, idm: IdmParameters) -> None:
 @lru_cache(maxsize=64)
 def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, float] | None:
     """The first two vehicles that overlap and the time, s; None without an overlap."""
-    rows = DRIVES if scene.jitter_m or scene.jitter_mps else 1
+    # Fewer of large scenes, for which every pair of vehicles is looked at.
+    most = max(1, MOST_VEHICLES**2 // scene.vehicles**2)
+    rows = min(DRIVES, most) if scene.jitter_m or scene.jitter_mps else 1
     numbers = torch.arange(rows)
     vehicles = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
     steering = torch.zeros_like(vehicles.x)

@@ -14,7 +14,7 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
-from ganlane.runtime import compiled
+from ganlane.runtime import compiled, outside_autocast
 from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.state import Road, Vehicles
@@ -122,6 +122,11 @@ class TrafficModule(TensorDictModuleBase):
 
     # Below: TensorDicts in and out, so that models can be chained and stored.
 
+    @outside_autocast
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """:meth:`forward` in the run's float type: episodes are the same whatever a caller's autocast does."""
+        return super().__call__(*arguments, **named)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``."""
         vehicles, memory = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(memory_of(tensordict).items())
@@ -133,6 +138,7 @@ class TrafficModule(TensorDictModuleBase):
     def _call(self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor) -> Moved:
         return self.move(vehicles, memory, key, tensordict.get(keys.STEP))
 
+    @outside_autocast
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """:meth:`fresh_memory` as a TensorDict [N]."""
         return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])

@@ -321,4 +321,5 @@ def _found() -> Path:
     try:
         return default_scenes()
     except UserError as missing:
-        raise UserError(str(missing).replace("data.path", "traffic.path")) from missing
+        keys = "traffic.path=FILE (in evaluate traffic_options.replay.path=FILE)"
+        raise UserError(str(missing).replace("data.path=FILE", keys)) from missing

@@ -83,9 +83,15 @@ class GeneratedTraffic(TrafficModule):
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
         along = vehicles.speed * PHYSICS_STEP_S
-        history = start(self.generator, torch.stack([along, torch.zeros_like(along)], dim=-1))
+        history = start(self.network(vehicles.x.dtype), torch.stack([along, torch.zeros_like(along)], dim=-1))
         noise = normal(key, -1, vehicles.x.shape[1], self.purposes, vehicles.x.dtype)
         return {**self.kept(history), "noise": noise}
+
+    def network(self, dtype: torch.dtype) -> Generator:
+        """The generator in the run's float type."""
+        if self.generator.encoder.recurrent.dtype != dtype:
+            self.generator.to(dtype)
+        return self.generator
 
     def history(self, memory: Memory) -> History:
         """The history of all drivers from the memory."""
@@ -154,7 +160,9 @@ class SocialGanTraffic(GeneratedTraffic):
         noise = self.next_noise(memory, key, step)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
         history = self.history(memory)
-        moved, history, plan = paper_step(self.generator, vehicles, history, self.noise_scale * noise, plan)
+        moved, history, plan = paper_step(
+            self.network(vehicles.x.dtype), vehicles, history, self.noise_scale * noise, plan
+        )
         kept = {**self.kept(history), "noise": noise}
         return moved, kept if plan is None else {**kept, "plan": plan.ahead, "plan_left": plan.left}
 
@@ -204,6 +212,8 @@ class AnchoredGanTraffic(GeneratedTraffic):
         noise = self.next_noise(memory, key, step)
         driver = DriverMemory(self.history(memory), memory["residual_mean"], memory["headway"])
         scaled = self.noise_scale * noise
-        moved, driver = anchored_step(self.generator, vehicles, self.road, driver, scaled, self.anchor)
+        moved, driver = anchored_step(
+            self.network(vehicles.x.dtype), vehicles, self.road, driver, scaled, self.anchor
+        )
         kept = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
         return moved, {**self.kept(driver.history), **kept}

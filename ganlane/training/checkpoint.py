@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,9 @@ DEFAULTS = "defaults"
 COMPUTED_BY = ("env.compile",)
 #: A checkpoint that took t seconds to write is followed by the next after 50 t at the earliest: 2 % of the time.
 PATIENCE = 50.0
+#: Stands at the very end of a checkpoint, as the comment of its zip archive, before the SHA-256 of all above.
+SEAL = b"ganlane sha256 "
+_DIGITS = 2 * hashlib.sha256().digest_size
 
 
 class TrainingState:
@@ -92,7 +97,23 @@ class TrainingState:
         parts = {"agent", "window", "env_state", "stats", "counters", "identity"}
         if not isinstance(state, dict) or not state.keys() >= parts:
             raise UserError(f"resume={path}: parts of the run are missing in it; give another checkpoint.")
+        if not isinstance(state["identity"], dict):
+            raise UserError(f"resume={path}: it does not say what run it is of; give another checkpoint.")
         self._refuse_another_run(path, state["identity"])
+        try:
+            missing = self._take_over(state, path)
+        except UserError:
+            raise
+        except Exception as error:  # what a part can be instead of what it was has no end
+            raise UserError(
+                f"resume={path}: a part of the run is damaged in it ({type(error).__name__}: {error}); give another "
+                "checkpoint."
+            ) from error
+        note_without_checksum(path)
+        return missing
+
+    def _take_over(self, state: Mapping[str, Any], path: str | Path) -> str | None:
+        """Everything from ``state``; see :meth:`restore`."""
         exact = state["window"] is not None
         try:
             self.collector.load_state_dict(state["env_state"], exact)
@@ -162,33 +183,88 @@ class Checkpointer:
 
 
 def save_checkpoint(path: str | Path, state: Any) -> None:
-    """Write ``state`` (tensors and plain data) atomically."""
+    """Write ``state`` (tensors and plain data) atomically, with a checksum of the whole file."""
     with atomic_path(path) as part:
-        torch.save({"kind": KIND, "version": VERSION, "state": state}, part)
+        torch.save({"kind": KIND, "version": VERSION, "sealed": True, "state": state}, part)
+        with part.open("rb+") as file:
+            file.seek(-2, 2)  # an archive without a comment ends in the comment's length
+            file.write((len(SEAL) + _DIGITS).to_bytes(2, "little") + SEAL)
+        digest = _sha256(part, part.stat().st_size)
+        with part.open("ab") as file:
+            file.write(digest)
 
 
-def load_checkpoint(path: str | Path, device: torch.device | str = "cpu") -> Any:
+def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: str = "resume") -> Any:
     """Read what :func:`save_checkpoint` wrote, under today's names; never executes code.
 
+    A file of a version that wrote no checksum is read, too (:func:`note_without_checksum`).
+
+    Args:
+        path: of the file.
+        device: for its tensors.
+        key: of the command line that gave ``path``.
+
     Raises:
-        UserError: absent, truncated, or not a training checkpoint of this version.
+        UserError: absent, damaged in any byte, with weights that are not finite, or no training checkpoint of this
+            version.
     """
-    path = Path(path)
+    path, given = Path(path), f"{key}={path}"
     if not path.is_file():
-        raise UserError(f"resume={path}: no such file; give a run's folder or its {LAST}.")
+        raise UserError(f"{given}: no such file; give a run's folder or its {LAST}.")
+    damaged = f"{given}: damaged, its content does not have the checksum that was written with it; give another one."
+    digest = _digest_of(path)
+    if digest is not None and digest != _sha256(path, path.stat().st_size - _DIGITS):
+        raise UserError(damaged)
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # foreign bytes can make the unpickler fail in any way
         raise UserError(
-            f"resume={path}: not a readable checkpoint (truncated, or not written by ganlane); give another one or "
-            "start without resume."
+            f"{given}: not a readable checkpoint (truncated, or not written by ganlane); give another one."
         ) from error
     if not isinstance(content, dict) or content.get("kind") != KIND or content.get("version") != VERSION:
-        raise UserError(f"resume={path}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
+        raise UserError(f"{given}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
+    if digest is None and "sealed" in content:
+        raise UserError(damaged)
     state = _renamed(content.get("state"))  # whether a run can go on from it, the run knows
     if isinstance(state, dict) and "counters" in state:
         state["counters"] = _renamed(state["counters"])
+    learned = state.get("agent") if isinstance(state, dict) else None
+    for name in ("network", "target", "optimizer"):
+        if isinstance(learned, dict) and not all(tensor.isfinite().all() for tensor in _tensors(learned.get(name))):
+            raise UserError(f"{given}: numbers of its {name} are not finite; give a checkpoint of another run.")
     return state
+
+
+def note_without_checksum(path: str | Path, key: str = "resume") -> None:
+    """Say on stderr that nobody would see damage to the checkpoint of an older version."""
+    if _digest_of(Path(path)) is None:
+        print(f"{key}={path}: of a version that wrote no checksum, damage would not be seen.", file=sys.stderr)
+
+
+def _digest_of(path: Path) -> bytes | None:
+    """The checksum that stands at the file's end; None where there is none."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - _DIGITS - len(SEAL), 0))
+        return file.read(_DIGITS) if file.read(len(SEAL)) == SEAL else None
+
+
+def _sha256(path: Path, size: int) -> bytes:
+    """SHA-256 of the first ``size`` bytes, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(min(size, 2**20)):
+            digest.update(block)
+            size -= len(block)
+    return digest.hexdigest().encode()
+
+
+def _tensors(state: Any) -> Iterator[torch.Tensor]:
+    """All tensors in nested plain data."""
+    if isinstance(state, torch.Tensor):
+        yield state
+    elif isinstance(state, dict | list | tuple):
+        for value in state.values() if isinstance(state, dict) else state:
+            yield from _tensors(value)
 
 
 def _renamed(names: Any) -> Any:

@@ -58,16 +58,15 @@ class Logs:
     def __init__(
         self, folder: str | Path, actions: int, decisions: int, total: int | None, further: Sequence[Log] = ()
     ) -> None:
-        self.evaluation_file, self.first = Path(folder) / "evaluation.csv", decisions
+        self.evaluation_file = Path(folder) / "evaluation.csv"
         shares = [f"action_{i}_share" for i in range(actions)]
         metrics = CsvLog(Path(folder) / "metrics.csv", [*COLUMNS, *shares], decisions)
         self.progress = None if total is None else Progress(total, decisions)
         self.further = list(further)
         self.of_metrics: list[Log] = [metrics, *([] if self.progress is None else [self.progress]), *further]
-        self.evaluation: CsvLog | None = None
         before = read_rows(self.evaluation_file)
         if before:  # of a resumed run; rows beyond its checkpoint go
-            self.evaluation = CsvLog(self.evaluation_file, list(before[0]), decisions)
+            CsvLog(self.evaluation_file, list(before[0]), decisions).close()
         self._last, self._last_s = decisions, monotonic()
 
     def write(self, row: Mapping[str, float]) -> None:
@@ -79,10 +78,10 @@ class Logs:
             log.write({**row, "decisions_per_s": rate})
 
     def write_evaluation(self, row: Mapping[str, float]) -> None:
-        """A row of evaluation figures; the columns of ``evaluation.csv`` are the first row's."""
-        if self.evaluation is None:
-            self.evaluation = CsvLog(self.evaluation_file, list(row), self.first)
-        self.evaluation.write(row)
+        """A row of evaluation figures, in place of one that a run made here before it was stopped and resumed."""
+        evaluation = CsvLog(self.evaluation_file, list(row), int(row["decisions"]) - 1)
+        evaluation.write(row)
+        evaluation.close()
         for log in self.further:
             log.write({name if name == "decisions" else f"evaluation/{name}": value for name, value in row.items()})
 
@@ -97,7 +96,7 @@ class Logs:
 
     def close(self) -> None:
         """Close all of them."""
-        for log in [*self.of_metrics, *([] if self.evaluation is None else [self.evaluation])]:
+        for log in self.of_metrics:
             log.close()
 
 
@@ -137,14 +136,30 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV file that :class:`CsvLog` wrote; none if it is absent.
 
     A row that a full disk or a kill has torn is left out: its last figure may have lost digits.
+
+    Raises:
+        UserError: something else than numbers stands in it.
     """
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        whole = [line for line in file if line.endswith("\n")]
-    # DictReader gives what a short row lacks as None, and what a long one has too much under None.
-    rows = [row for row in csv.DictReader(whole) if None not in row and None not in row.values()]
-    return [row for row in rows if row.get("decisions")]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            whole = [line for line in file if line.endswith("\n")]
+        # DictReader gives what a short row lacks as None, and what a long one has too much under None.
+        rows = [row for row in csv.DictReader(whole) if None not in row and None not in row.values()]
+        if whole and "decisions" not in next(csv.reader(whole)):
+            raise ValueError("it has no column 'decisions'")
+        rows = [row for row in rows if row["decisions"]]
+        for row in rows:
+            numbers = {name: float(value) for name, value in row.items() if value}
+            if not 0.0 <= numbers["decisions"] < float("inf"):
+                raise ValueError(f"decisions={row['decisions']}")
+    except (ValueError, csv.Error) as error:
+        reason = str(error)[:100]
+        raise UserError(
+            f"{path}: damaged ({reason}); repair it, or move it away to go on without its rows."
+        ) from error
+    return rows
 
 
 class Progress:

@@ -12,8 +12,6 @@ lane change that has begun continues (or, with ``abort_lane_change``, can be tur
 
 from __future__ import annotations
 
-from typing import Final
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -22,7 +20,7 @@ from torchrl.data.tensor_specs import Binary
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.keys import EGO_INDEX
+from ganlane.keys import ACTIONS, EGO_INDEX
 from ganlane.native.mask import SafeActions
 from ganlane.parameters.driving import IdmParameters
 from ganlane.parameters.observation import MASKS
@@ -32,8 +30,6 @@ from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.transforms.sensors import PerceptionTransform
-
-ACTIONS: Final = 3
 
 
 def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:

@@ -36,6 +36,9 @@ X_COLUMN = "decisions"
 #: Prefix of the columns of ``evaluation.csv``.
 EVALUATION = "evaluation_"
 
+#: Matplotlib cannot scale an axis for much larger numbers.
+_LARGEST = 1e100
+
 INK, FAINT, GRID = "#262a30", "#6e747c", "#e2e5e9"
 #: Okabe and Ito's palette, which colour-blind readers tell apart, with grey for its yellow (too pale on white).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f")
@@ -154,7 +157,7 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
     """A run's metrics: the file itself, or ``metrics.csv`` in the run's folder.
 
     Raises:
-        UserError: no such file, it cannot be read, or it has no column ``decisions`` or no rows.
+        UserError: no such file, it cannot be read, it holds text, or it has no column ``decisions`` or no rows.
     """
     path = Path(path)
     file = path / "metrics.csv" if path.is_dir() else path
@@ -167,6 +170,15 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
         raise UserError(f"{file}: not a readable CSV file ({reason}); give a run's metrics.csv.") from error
     if X_COLUMN not in frame.columns or frame.height == 0:
         raise UserError(f"{file}: expected a column '{X_COLUMN}' and at least one row; give a run's metrics.csv.")
+    for column in frame.iter_columns():
+        wrong = column.drop_nulls()
+        if column.dtype.is_numeric():
+            wrong = wrong.filter(wrong.is_finite() & (wrong.abs() > _LARGEST))
+        if wrong.len():
+            found = str(wrong[0])[:40]
+            raise UserError(
+                f"{file}: column {column.name!r} holds {found!r}, expected numbers that one can draw; repair it."
+            )
     return frame
 
 

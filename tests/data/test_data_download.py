@@ -166,3 +166,28 @@ def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatc
     assert data_folder() is None
     (tmp_path / "shared" / "data").mkdir(parents=True)
     assert data_folder() == tmp_path / "shared" / "data"
+
+
+@pytest.mark.parametrize("length", ["abc", "-5", "", "1e3"])
+def test_a_length_that_is_no_number_tells_nothing(length, tmp_path):
+    with Server(length=length) as server:
+        assert download(server.url, tmp_path / "f", SHA256, None, **QUICK).read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("length", [True, False, "9" * 5000])
+def test_a_file_larger_than_wanted_is_refused_and_leaves_nothing(length, tmp_path):
+    with Server(length=length) as server, pytest.raises(UserError, match=r"the file has .* GB or more"):
+        download(server.url, tmp_path / "f", None, None, **QUICK, most_bytes=len(CONTENT) - 1)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("place", ["ftp://here/f", "file:///etc/hostname", "data:,f", "http://[::1"])
+def test_no_redirection_leads_away_from_http(place, tmp_path):
+    with Server(sends_to=place) as server, pytest.raises(UserError, match=r"not allowed|expected http|Invalid"):
+        download(server.url, tmp_path / "f", None, None, **QUICK)
+    assert "f" not in names(tmp_path)
+
+
+def test_a_redirection_on_http_is_followed(tmp_path):
+    with Server() as server, Server(sends_to=server.url) as first:
+        assert download(first.url, tmp_path / "f", SHA256, None, **QUICK).read_bytes() == CONTENT

@@ -172,3 +172,16 @@ def test_the_validator_checks_frames_that_come_from_nowhere():
     holed = made.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
     with pytest.raises(UserError, match="made, line 9, column x: None is not a finite number"):
         validate(holed, "made")
+
+
+@pytest.mark.parametrize(("kept", "renumbered"), [(2, False), (5, False), (2, True), (3, True)])
+def test_recordings_with_frames_missing_throughout_are_refused(kept, renumbered, tmp_path):
+    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=8.0))
+    # One scene is whole; the other one has every second frame alone, or so.
+    sparse = (pl.col("scene") == frame["scene"].max()) | renumbered
+    frame = frame.filter(~sparse | (pl.col("frame") % kept == 0))
+    if renumbered:
+        frame = frame.with_columns(frame=pl.col("frame") // kept)
+    write_scene_csv(frame, tmp_path / "sparse.csv")
+    with pytest.raises(UserError, match=r"sparse.csv, line \d+, .*10 frames a second"):
+        read_scenes(tmp_path / "sparse.csv")

@@ -187,3 +187,24 @@ def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, mon
     assert status == 0
     assert module.Reference.load(there).source == "scenes.csv"
     assert SHIPPED_REFERENCE.read_bytes() == before
+
+
+def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(recordings, capsys):
+    one = pl.read_csv(recordings).filter(pl.col("scene") == "synthetic-1")
+    one.write_csv(recordings)
+    status, _, _, err = run(capsys, "traffic=idm", f"data.path={recordings}")
+    assert status == 2
+    assert "one scene, synthetic-1" in err
+    assert "scenes=all" in err
+    assert "scene_s=30" in err
+    assert run(capsys, "traffic=idm", f"data.path={recordings}", "scenes=all")[0] == 0
+
+
+def test_nothing_is_held_out_of_recordings_that_nothing_was_fitted_to(recordings, capsys):
+    # quick=true takes desired speeds as they are, and the shipped generator was fitted to other scenes.
+    asked = ["traffic=gan_calibrated", f"data.path={recordings}", "scenes=all", "against=[idm]", "vehicle_km=0"]
+    status, results, out, _ = run(capsys, *asked)
+    assert status == 0
+    assert results["quantities_held_out"] is None
+    assert results["held_out"] == [[]]
+    assert "held-out" not in out

@@ -16,9 +16,11 @@ class Server:
     ``breaks`` holds after how many bytes each of the first connections ends.
     """
 
-    def __init__(self, content=CONTENT, breaks=(), ranges=True, etag='"one"', length=True, status=None):
+    def __init__(
+        self, content=CONTENT, breaks=(), ranges=True, etag='"one"', length=True, status=None, sends_to=None
+    ):
         self.content, self.breaks, self.ranges, self.etag = content, list(breaks), ranges, etag
-        self.length, self.status = length, status
+        self.length, self.status, self.sends_to = length, status, sends_to
         self.asked: list[str | None] = []
         server = self
 
@@ -35,6 +37,11 @@ class Server:
 
     def answer(self, request):
         self.asked.append(request.headers.get("Range"))
+        if self.sends_to:
+            request.send_response(302)
+            request.send_header("Location", self.sends_to)
+            request.end_headers()
+            return
         if self.status:
             request.send_error(self.status)
             return
@@ -50,7 +57,8 @@ class Server:
         if self.etag:
             request.send_header("ETag", self.etag)
         if self.length:
-            request.send_header("Content-Length", str(len(self.content) - start))
+            length = self.length if isinstance(self.length, str) else str(len(self.content) - start)
+            request.send_header("Content-Length", length)
         request.end_headers()
         body = self.content[start:]
         request.wfile.write(body[: self.breaks.pop(0)] if self.breaks else body)

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from ganlane.errors import UserError
-from ganlane.training.checkpoint import load_checkpoint, save_checkpoint
+from ganlane.training.checkpoint import SEAL, load_checkpoint, note_without_checksum, save_checkpoint
 from ganlane.training.collectors import pack, unpack
 
 
@@ -61,3 +61,38 @@ def test_a_tensordict_is_packed_with_its_nested_batch_sizes():
     back = unpack(pack(whole))
     assert back["inner"].batch_size == (2, 3)
     assert (back == whole).all()
+
+
+def test_one_changed_byte_anywhere_is_refused(tmp_path):
+    path = tmp_path / "last.pt"
+    save_checkpoint(path, {"weights": torch.arange(40), "count": 4})
+    whole = path.read_bytes()
+    for place in (*range(0, len(whole), 13), *range(len(whole) - 110, len(whole))):
+        changed = bytearray(whole)
+        changed[place] ^= 1 << place % 8
+        path.write_bytes(changed)
+        with pytest.raises(UserError, match=r"^resume=.*last\.pt: .*; give another one\.$|, its content .* one\.$"):
+            load_checkpoint(path)
+    path.write_bytes(whole[: -len(SEAL) - 64])  # the checksum cut off altogether
+    with pytest.raises(UserError, match="damaged"):
+        load_checkpoint(path)
+
+
+def test_a_checkpoint_of_a_version_without_checksums_is_read_with_a_note(tmp_path, capsys):
+    path = tmp_path / "last.pt"
+    torch.save({"kind": "ganlane training checkpoint", "version": 2, "state": {"count": 4}}, path)
+    assert load_checkpoint(path) == {"count": 4}
+    note_without_checksum(path)
+    assert "wrote no checksum, damage would not be seen" in capsys.readouterr().err
+    save_checkpoint(path, {"count": 4})
+    note_without_checksum(path)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("part", ["network", "target", "optimizer"])
+def test_weights_that_are_not_finite_are_refused(part, value, tmp_path):
+    state = {"agent": {part: {"state": {0: {"exp_avg": torch.tensor([1.0, value])}}}}}
+    save_checkpoint(tmp_path / "last.pt", state)
+    with pytest.raises(UserError, match=f"numbers of its {part} are not finite"):
+        load_checkpoint(tmp_path / "last.pt")

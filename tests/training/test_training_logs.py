@@ -9,7 +9,7 @@ import pytest
 
 from ganlane.config.train import LoggerConfig
 from ganlane.errors import UserError
-from ganlane.training.logs import CsvLog, Progress, TensorBoardLog, WandbLog, duration, make_logs, read_rows
+from ganlane.training.logs import CsvLog, Logs, Progress, TensorBoardLog, WandbLog, duration, make_logs, read_rows
 
 # --- CSV
 
@@ -49,6 +49,37 @@ def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
     path = tmp_path / "metrics.csv"
     path.write_text(f"decisions,loss,sigma\n10,0.5,1\n{torn}\n40,0.5,\n")
     assert [row["decisions"] for row in read_rows(path)] == ["10", "40"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"decisions,loss\nmany,0.5\n",
+        b"decisions,loss\n10,half\n",
+        b"decisions,loss\nnan,0.5\n",
+        b"decisions,loss\n-1,0.5\n",
+        b"loss,sigma\n10,0.5\n",
+        b"\xff\xfe\x00\n",
+        b"decisions,loss\n" + b"1" * 200_000 + b",1\n",
+        b"decisions,loss\n10,\x00\n",
+    ],
+    ids=lambda content: str(content[:24]),
+)
+def test_a_log_that_is_none_is_refused_in_one_sentence(content, tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"metrics\.csv: damaged \(.*\); repair it, or move it away"):
+        CsvLog(path, ["decisions", "loss"])
+    assert path.read_bytes() == content
+
+
+def test_an_evaluation_that_a_resumed_run_repeats_stands_once(tmp_path):
+    for _ in range(2):
+        logs = Logs(tmp_path, 3, 160, None)
+        for decisions in (80, 160):
+            logs.write_evaluation({"decisions": decisions, "mean_reward": 1.0})
+        logs.close()
+    assert [row["decisions"] for row in read_rows(tmp_path / "evaluation.csv")] == ["80", "160"]
 
 
 # --- progress

@@ -188,7 +188,7 @@ DAMAGES = ["text", "truncated", "another kind", "no state", "no agent", "unknown
 def test_a_damaged_checkpoint_is_refused_in_one_sentence(damage, trained, tmp_path):
     path = tmp_path / "last.pt"
     damaged(damage, trained / LAST, path)
-    with pytest.raises(UserError, match=r"^init\.path=.*last\.pt: not a training checkpoint .*; give a run's folder"):
+    with pytest.raises(UserError, match=r"^init\.path=.*last\.pt: not a .*checkpoint .*; give "):
         read_start(str(path))
 
 

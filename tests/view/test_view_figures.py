@@ -207,3 +207,11 @@ def test_what_is_no_metrics_file_is_named(tmp_path):
         (tmp_path / "metrics.csv").write_bytes(content)
         with pytest.raises(UserError, match=message):
             read_metrics(tmp_path)
+
+
+@pytest.mark.parametrize("row", ["many,1", "10,text", "10,1e300"])
+def test_what_is_no_number_in_a_runs_figures_is_named(row, tmp_path):
+    run_folder(tmp_path / "run")
+    (tmp_path / "run" / "metrics.csv").write_text(f"decisions,mean_return\n5,2\n{row}\n")
+    with pytest.raises(UserError, match=r"metrics\.csv: column '.*' holds .*; repair it\."):
+        read_runs([tmp_path / "run"])

@@ -1,0 +1,63 @@
+"""A checksum inside each file that is written and read back: damage is seen, in whichever byte it is.
+
+:data:`PLACE` stands once in the content, wherever the format has room for a text: metadata, an entry, an archive's
+comment. Its digits are the SHA-256 of the whole content with zeros in their place. This protects against damage, not
+against forgery: who changes a file on purpose can put a new checksum in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from functools import cache
+from pathlib import Path
+
+from ganlane.errors import UserError
+
+_BEGIN, _END = b"ganlane sha256 ", b" of this file"
+_ZEROS = b"0" * 64
+#: Stands in the content until :func:`sealed` puts the checksum in.
+PLACE = (_BEGIN + _ZEROS + _END).decode()
+
+
+def sealed(content: bytes) -> bytes:
+    """``content``, which holds :data:`PLACE`, with its checksum."""
+    begin = content.index(PLACE.encode()) + len(_BEGIN)
+    return content[:begin] + _digits(content, begin) + content[begin + len(_ZEROS) :]
+
+
+def sealed_archive(content: bytes) -> bytes:
+    """A zip archive without a comment (.npz, .pt) with its checksum as comment."""
+    return sealed(content[:-2] + len(PLACE).to_bytes(2, "little") + PLACE.encode())
+
+
+def has_checksum(content: bytes, path: str | Path) -> bool:
+    """Whether ``content`` has a checksum; files of ganlane 0.2 and before have none.
+
+    Raises:
+        UserError: it has one, which is that of another content; ``path`` is named as the damaged file.
+    """
+    begin, end = content.find(_BEGIN), content.find(_END)
+    if begin < 0 and end < 0:
+        return False
+    begin += len(_BEGIN)
+    if end != begin + len(_ZEROS) or content[begin:end] != _digits(content, begin):
+        raise UserError(
+            f"{path}: damaged, its content does not have the checksum that was written with it; take a copy that is "
+            "whole, or make it again."
+        )
+    return True
+
+
+def _digits(content: bytes, begin: int) -> bytes:
+    """Checksum of ``content`` with zeros in the place of the digits at ``begin``."""
+    view, digest = memoryview(content), hashlib.sha256()
+    for part in (view[:begin], _ZEROS, view[begin + len(_ZEROS) :]):
+        digest.update(part)
+    return digest.hexdigest().encode()
+
+
+@cache
+def note_without_checksum(path: str | Path) -> None:
+    """Say once for each file that it is of a version that wrote no checksum."""
+    print(f"{path}: of a version that wrote no checksum; damage to it would not be seen.", file=sys.stderr)

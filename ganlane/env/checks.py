@@ -1,0 +1,106 @@
+"""What :class:`~ganlane.env.HighwayEnv` is made of and what it is given, checked before anything is allocated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ganlane.errors import UserError
+from ganlane.keys import ACTIONS
+from ganlane.parameters.checks import whole_number
+from ganlane.runtime import check_default_device
+
+#: The most rows and vehicles; the configuration's bounds lie within.
+_MOST_ROWS, _MOST_VEHICLES = 2**20, 1000
+
+
+def check_sizes(num_envs: Any, vehicles: Any, first_episode: Any) -> None:
+    """Raise :class:`UserError` for numbers of rows, vehicles or episodes that there cannot be."""
+    whole_number("num_envs", num_envs, 1, _MOST_ROWS)
+    whole_number("first_episode", first_episode, 0, 2**62)
+    if vehicles is not None:
+        whole_number("vehicles", vehicles, 1, _MOST_VEHICLES)
+
+
+def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
+    """``counter`` [N] int64 of a reset; :class:`UserError` if it is none, or of another shape or type."""
+    if counter is None or counter.shape != (rows,) or counter.dtype != torch.int64:
+        found = "missing" if counter is None else f"{list(counter.shape)} in {counter.dtype}"
+        raise UserError(
+            f"reset(): {name} is {found}; give 'seed' and 'episode' as int64 of shape [{rows}], or neither."
+        )
+    return counter
+
+
+def usable_device(device: Any, dtype: Any) -> torch.device:
+    """The device, which torch's tensors can be on.
+
+    Raises:
+        UserError: there is no such device here, torch puts new tensors elsewhere, or a type other than float32 and
+            float64.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise UserError(f"dtype={dtype}: the simulation runs in torch.float32 or torch.float64; give one of them.")
+    try:
+        chosen = torch.empty(0, device=device or "cpu").device
+    except (RuntimeError, AssertionError, TypeError) as error:
+        raise UserError(f"device={device}: no such device here; use device='cpu'.") from error
+    if chosen.type == "meta":
+        raise UserError("device=meta: it holds no numbers; use device='cpu'.")
+    check_default_device(chosen.type)
+    return chosen
+
+
+class ActionCheck:
+    """Refuses actions other than 0, 1 and 2.
+
+    On a GPU a step does not wait for the answer: it is looked at in later steps, when it has arrived.
+
+    Args:
+        rows: N.
+        device: of the actions.
+    """
+
+    def __init__(self, rows: int, device: torch.device) -> None:
+        self.rows = rows
+        # Where a copy arrives by itself; elsewhere the answer is read at once.
+        self._arrived = torch.zeros((), dtype=torch.bool).pin_memory() if device.type == "cuda" else None
+        self._wrong = torch.zeros((), dtype=torch.bool, device=device)
+
+    def __call__(self, action: Tensor | None) -> Tensor:
+        """``action`` [N] as int64.
+
+        Raises:
+            UserError: there is none, it has another shape, it is not a whole number, or not one from 0 to 2.
+        """
+        if action is None:
+            raise UserError(f"step(): no action; give 'action' [{self.rows}], int64, from 0 to {ACTIONS - 1}.")
+        if action.shape != (self.rows,) or action.is_floating_point() or action.dtype == torch.bool:
+            raise _refused(f"of shape {list(action.shape)} in {action.dtype}", self.rows)
+        if action.dtype != torch.int64:
+            action = action.long()
+        if action.device.type == "cpu":
+            # As unsigned numbers, in which those below 0 are large, and by NumPy: a few microseconds.
+            if action.numpy().view(np.uint64).max() >= ACTIONS:
+                raise _refused(str(int(action[(action < 0) | (action >= ACTIONS)][0])), self.rows)
+        else:
+            self._look_later(action)
+        return action
+
+    def _look_later(self, action: Tensor) -> None:
+        if self._arrived is None:
+            return
+        if self._arrived:
+            raise _refused("in an earlier step", self.rows)
+        self._wrong |= ((action < 0) | (action >= ACTIONS)).any()
+        self._arrived.copy_(self._wrong, non_blocking=True)
+
+
+def _refused(found: str, rows: int) -> UserError:
+    return UserError(
+        f"action {found}: expected {rows} whole numbers (int64, shape [{rows}]), each 0 (keep), 1 (left) or "
+        "2 (right); correct the policy."
+    )

@@ -1,0 +1,173 @@
+"""A run's folder has one run at a time, and what a run has earned can be gone on with, however it ended."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from training.test_training_loop import ToyRoad, agent, settings, train
+
+from ganlane.config.app import run_command
+from ganlane.config.folders import CONFIG, LOCK, OVERRIDES, held
+from ganlane.errors import UserError
+from ganlane.training.checkpoint import LAST, load_checkpoint
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.usefixtures("hydra_from_memory")
+COLUMNS = ("decisions", "updates", "mean_return", "loss", "crash_rate")
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def toy_run(config, folder):
+    """A training run on the toy road in the folder of a ``ganlane train``, with evaluations."""
+    learner = agent()
+    figures = {"mean_reward": 0.0}
+
+    def evaluate(policy):
+        figures["mean_reward"] += 1.0
+        return dict(figures)
+
+    resume = folder / LAST if config.resume else None
+    often = settings(160, log_every=40, evaluate_every=80, checkpoint_every_s=0.0)
+    train(ToyRoad(8), learner, often, folder, evaluate, resume=resume)
+
+
+def command(*arguments, task=toy_run):
+    return run_command("train", task, [*arguments, "seed=3"])
+
+
+def left_by(folder):
+    """Weights and figures of a run, without times."""
+    state = load_checkpoint(folder / LAST)
+    rows = [[row[c] for c in COLUMNS] for row in csv.DictReader((folder / "metrics.csv").open())]
+    evaluated = [row["decisions"] for row in csv.DictReader((folder / "evaluation.csv").open())]
+    return state["agent"]["network"], rows, evaluated
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert command(f"hydra.run.dir={folder}") == 0
+    return left_by(folder)
+
+
+def same(ours, theirs):
+    (weights, *rest), (whole, *others) = ours, theirs
+    return rest == others and all(torch.equal(weights[name], whole[name]) for name in whole)
+
+
+class Disk:
+    """Room for so many writes that are synced; then none until there is ``room`` again."""
+
+    def __init__(self, writes: int) -> None:
+        self.left, self.fsync = writes, os.fsync
+
+    def __call__(self, handle: int) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.fsync(handle)
+
+
+@pytest.mark.parametrize(
+    "writes", [3, 7, 10, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4, 5, 6, 8, 9, 11))]
+)
+def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(writes, here, undisturbed, monkeypatch, capsys):
+    with monkeypatch.context() as patch:
+        patch.setattr("ganlane.files.os.fsync", Disk(writes))
+        patch.setattr("ganlane.training.checkpoint.PATIENCE", 0.0)
+        assert command("hydra.run.dir=run") == 2
+    assert "No space left on device; make room" in capsys.readouterr().err
+    assert not list(here.rglob("*.part"))
+    assert (here / "run" / LAST).is_file() == (here / "run" / OVERRIDES).is_file() == (here / "run").exists()
+    assert command("resume=run" if (here / "run").exists() else "hydra.run.dir=run") == 0
+    assert same(left_by(here / "run"), undisturbed)
+
+
+@pytest.mark.parametrize("error", [UserError("a worker died"), OSError(errno.EIO, "Input/output error")])
+def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(error, here, capsys):
+    def task(config, folder):
+        toy_run(config, folder)
+        raise error
+
+    assert command("hydra.run.dir=run", "env.lanes=4", task=task) == 2
+    assert "env.lanes=4" in (here / "run" / OVERRIDES).read_text()
+    assert (here / "run" / CONFIG).is_file()
+    assert command("resume=run", "log_every=50", task=task) == 2
+    assert "log_every=50" in (here / "run" / OVERRIDES).read_text()
+    assert command("resume=run") == 0
+
+
+def test_a_run_that_is_refused_leaves_the_command_line_of_the_one_before(here, capsys):
+    def refused(config, folder):
+        raise UserError("no such agent")
+
+    assert command("hydra.run.dir=run") == 0
+    assert command("resume=run", "log_every=50", task=refused) == 2
+    assert "log_every=50" not in (here / "run" / OVERRIDES).read_text()
+    assert command("hydra.run.dir=new", task=refused) == 2
+    assert not (here / "new").exists()
+
+
+def test_a_second_run_in_a_folder_is_refused_while_the_first_is_at_work(here, capsys):
+    def second(config, folder):
+        before = sorted(here.rglob("*"))
+        assert command("hydra.run.dir=run") == 2
+        assert f"run: a run is at work there (process {os.getpid()} on " in capsys.readouterr().err
+        assert sorted(here.rglob("*")) == before
+
+    assert command("hydra.run.dir=run", task=second) == 0
+    assert not (here / "run" / LOCK).exists()
+    assert command("hydra.run.dir=run") == 0
+
+
+def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(here):
+    script = (
+        "import time; from pathlib import Path; from ganlane.config.folders import held\n"
+        "from ganlane.files import atomic_path\n"
+        "with held(Path('run')), atomic_path('run/checkpoints/last.pt') as part:\n"
+        "    part.write_bytes(b'half'); print('at work', flush=True); time.sleep(60)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, env=environment) as process:
+        assert process.stdout.readline() == b"at work\n"
+        with pytest.raises(UserError, match=rf"process {process.pid} on .*; wait for its end"), held(Path("run")):
+            pass
+        process.kill()
+    assert (here / "run" / LOCK).is_file()
+    assert len(list(here.rglob("*.part"))) == 1
+    (here / "run" / ".a.film.part").write_text("of another program")
+    with held(Path("run")):
+        assert [path.name for path in here.rglob("*.part")] == [".a.film.part"]
+    assert not (here / "run" / LOCK).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of a process are the system's")
+def test_a_run_with_a_limit_on_the_size_of_its_files_goes_on_without_it(here):
+    """The checkpoint grows with its replay buffer until the system refuses it."""
+    script = (
+        "import resource, sys; from config.test_config_folders import command\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), -1)); sys.exit(command(*sys.argv[2:]))"
+    )
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "OMP_NUM_THREADS": "1"}
+    assert command("hydra.run.dir=whole") == 0
+    size = (here / "whole" / LAST).stat().st_size
+    for limit in (size - 20_000, size - 5_000, size - 100):
+        start = [sys.executable, "-c", script, str(limit), f"hydra.run.dir=run{limit}"]
+        done = subprocess.run(start, env=environment, capture_output=True, text=True)
+        assert done.returncode == 2
+        assert "File too large; make room there" in done.stderr
+        assert command(f"resume=run{limit}") == 0
+        assert same(left_by(here / f"run{limit}"), left_by(here / "whole"))

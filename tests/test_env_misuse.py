@@ -1,0 +1,185 @@
+"""Wrong arguments, actions, seeds and states end in one sentence; autocast and float types change no episode."""
+
+from __future__ import annotations
+
+import gymnasium
+import pytest
+import torch
+from tensordict import TensorDict
+
+import ganlane
+from ganlane import keys
+from ganlane.build import make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.env import HighwayEnv
+from ganlane.env.checks import ActionCheck
+from ganlane.errors import UserError
+from ganlane.options import option
+from ganlane.sim.scenes import LARGEST, MOST_VEHICLES, FixedScene, SceneVehicle
+from ganlane.sim.state import Road
+from ganlane.traffic import IdmTraffic
+
+KERNELS = ["torch", pytest.param("native", marks=pytest.mark.usefixtures("native_kernel"))]
+
+
+def made(**options):
+    return HighwayEnv(IdmTraffic(), **options)
+
+
+@pytest.fixture
+def native_kernel():
+    """Skips where the native kernel cannot be built."""
+    try:
+        made(kernel="native")
+    except UserError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"vehicles": value} for value in (0, -1, 2.5, "nine", 10**9)),
+        *({"num_envs": value} for value in (0, -1, 1.5, None, True, 2**40)),
+        *({"dtype": value} for value in (torch.float16, torch.bfloat16, torch.int64, "float32")),
+        *({"seed": value} for value in (2**63, -1, 0.5, "one")),
+        *({"first_episode": value} for value in (2**63, -1, 0.5)),
+        *({"device": value} for value in ("meta", "nonsense")),
+        {"stream": "train"},
+    ],
+    ids=str,
+)
+def test_an_environment_that_cannot_be_is_refused(options):
+    with pytest.raises(UserError, match=next(iter(options))):
+        made(**options)
+
+
+def test_a_name_is_no_traffic():
+    with pytest.raises(UserError, match="expected a TrafficModule"):
+        HighwayEnv("idm")
+
+
+@pytest.mark.parametrize("seed", [2**63, -1, -(2**63) - 1, 1.5, "one"])
+def test_a_seed_that_is_none_is_refused_where_it_is_set(seed):
+    with pytest.raises(UserError, match="seed="):
+        made().set_seed(seed)
+
+
+def test_the_largest_seed_drives():
+    env = made()
+    env.set_seed(2**63 - 1)
+    assert env.rollout(2)[keys.SEED].eq(2**63 - 1).all()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("action", [[1, 3], [-1, 1], [2**62, 0], [-(2**63), 0]])
+def test_an_action_outside_0_to_2_is_refused(action, kernel):
+    env = made(num_envs=2, kernel=kernel)
+    with pytest.raises(UserError, match=r"^action -?\d+: expected 2 whole numbers"):
+        env.step(env.reset().set(keys.ACTION, torch.tensor(action)))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("action", [torch.ones(2), torch.ones(2, 1).long(), torch.ones(2).bool()], ids=str)
+def test_an_action_of_another_form_is_refused(action, kernel):
+    env = made(num_envs=2, kernel=kernel)
+    with pytest.raises(UserError, match=r"^action of shape"):
+        env.step(env.reset().set(keys.ACTION, action))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_actions_of_a_shorter_integer_type_are_taken(kernel):
+    env = made(num_envs=2, kernel=kernel)
+    start = env.reset()
+    long, short = (
+        env.step(start.clone().set(keys.ACTION, torch.tensor([1, 2]).to(t))) for t in (torch.int64, torch.int8)
+    )
+    assert torch.equal(long["next", keys.VEHICLES, "x"], short["next", keys.VEHICLES, "x"])
+
+
+def test_what_is_found_on_another_device_is_told_in_a_later_step():
+    check = ActionCheck(1, torch.device("cpu"))
+    check._arrived = torch.zeros((), dtype=torch.bool)  # as on a GPU, without one
+    check._look_later(torch.tensor([3]))
+    with pytest.raises(UserError, match="in an earlier step"):
+        check._look_later(torch.tensor([1]))
+
+
+@pytest.mark.parametrize("state", [{}, {keys.ACTION: torch.ones(1, dtype=torch.int64)}], ids=["nothing", "action"])
+def test_a_step_before_a_reset_is_refused(state):
+    for env in (made(), ganlane.make_env("idm")):
+        with pytest.raises(UserError, match="call reset"):
+            env.base_env.step(TensorDict(state, [1])) if hasattr(env, "base_env") else env.step(
+                TensorDict(state, [1])
+            )
+
+
+@pytest.mark.parametrize("counters", [{keys.EPISODE: torch.zeros(2)}, {keys.EPISODE: torch.zeros(2).long()}])
+def test_a_reset_to_episodes_that_are_none_is_refused(counters):
+    with pytest.raises(UserError, match="reset"):
+        made(num_envs=2).reset(TensorDict(counters, [2]))
+
+
+def test_a_default_device_without_numbers_is_refused_everywhere():
+    traffic = IdmTraffic()
+    calls = (
+        lambda: HighwayEnv(traffic),
+        lambda: ganlane.make_env("gan"),
+        lambda: ganlane.make_env(env="cut_in"),
+        lambda: ganlane.load_agent(),
+        lambda: gymnasium.make(ganlane.gym.ENV_ID),
+    )
+    torch.set_default_device("meta")
+    try:
+        for call in calls:
+            with pytest.raises(UserError, match="default device is meta"):
+                call()
+    finally:
+        torch.set_default_device(None)
+
+
+def paths(env, actions):
+    """x of all vehicles after each of the ``actions`` [T, N]."""
+    state, found = env.reset(), []
+    for action in actions:
+        stepped, state = env.step_and_maybe_reset(state.set(keys.ACTION, action))
+        found.append(stepped["next", keys.VEHICLES, "x"])
+    return torch.stack(found)
+
+
+@pytest.mark.parametrize(
+    "traffic", ["idm_mobil", "gan", "gan_calibrated", "mixed", {"name": "gan", "execute_k": 3, "blind_share": 0.5}]
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_autocast_changes_no_traffic(traffic, dtype):
+    model = make_traffic(option("traffic", traffic), EnvConfig())
+    actions = torch.tensor([[1, 0], [0, 2], [0, 0], [2, 1]])
+    plain = paths(HighwayEnv(model, 2, dtype=dtype), actions)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        cast = paths(HighwayEnv(model, 2, dtype=dtype), actions)
+    assert plain.dtype == cast.dtype == dtype
+    assert torch.equal(plain, cast)
+
+
+def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_side_by_side():
+    model, actions = (
+        make_traffic(option("traffic", "gan_calibrated"), EnvConfig()),
+        torch.zeros(3, 2, dtype=torch.int64),
+    )
+    before = paths(HighwayEnv(model, 2), actions)
+    double = paths(HighwayEnv(model, 2, dtype=torch.float64), actions)
+    assert torch.allclose(before.double(), double, atol=1e-3)
+    assert torch.equal(paths(HighwayEnv(model, 2), actions), before)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        tuple(SceneVehicle(30.0 * number, 0) for number in range(MOST_VEHICLES + 1)),
+        (SceneVehicle(0.0, 0), SceneVehicle(10.0 * LARGEST, 0)),
+        (SceneVehicle(0.0, 0), SceneVehicle(40.0, 0, desired_speed_mps=1e-300)),
+    ],
+    ids=["too many", "too far", "too slow"],
+)
+def test_a_scene_beyond_all_bounds_is_refused(rows):
+    with pytest.raises(UserError, match="scene: "):
+        FixedScene(rows, Road(1))

@@ -1,0 +1,302 @@
+"""Files and folders are data: nothing that stands in them is executed; each way here would leave a marker."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ganlane.__main__ import dispatch, main
+from ganlane.agents import load_agent
+from ganlane.build import make_driver
+from ganlane.config.command_line import parse
+from ganlane.config.env import EnvConfig
+from ganlane.config.resume import refuse_stored_imports
+from ganlane.config.targets import import_target
+from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.config.train import FinalEvaluationConfig, TrainConfig
+from ganlane.errors import UserError
+from ganlane.files import CHECKPOINTS, load_weights, save_weights
+from ganlane.generator import load_generator
+from ganlane.generator.windows import cached
+from ganlane.realism.references import Reference
+from ganlane.traffic import TrafficModule
+
+pytestmark = pytest.mark.usefixtures("hydra_from_memory")
+
+MARKER = "executed"
+#: A module that a folder brings along; importing it is enough.
+EVIL = f"""
+from pathlib import Path
+Path({MARKER!r}).touch()
+from os import system
+from ganlane.traffic import IdmTraffic as Traffic
+from ganlane.agents.drivers import KeepLaneDriver as Policy
+def make(road) -> Traffic: return Traffic(road)
+"""
+#: YAML that names it, as an option of a group and as Hydra's own.
+OPTION = "# @package _global_\ntraffic:\n  _target_: evil.Traffic\nhydra:\n  callbacks: {x: {_target_: evil.make}}\n"
+
+
+class Bomb:
+    """Unpickling it leaves the marker."""
+
+    def __reduce__(self):
+        return open, (MARKER, "w")
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """A folder that somebody else has filled, as working directory; a marker there fails the test."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", *sys.path])  # as python -m has it
+    monkeypatch.delitem(sys.modules, "evil", raising=False)
+    (tmp_path / "evil.py").write_text(EVIL)
+    (tmp_path / "evil.yaml").write_text(OPTION)
+    yield tmp_path
+    assert not (tmp_path / MARKER).exists()
+    assert "evil" not in sys.modules
+
+
+def run_of_somebody(overrides: str, config: str = "compile: auto\n", checkpoint: bytes = b"") -> None:
+    """The folder ``run``, as far as resuming reads it."""
+    folder = Path("run")
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints" / "last.pt").write_bytes(checkpoint)
+    (folder / "overrides.yaml").write_text(overrides)
+    (folder / "config.yaml").write_text(config)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one sentence with which a command line is refused."""
+    assert main(arguments) == 2, arguments
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1, err
+    assert err.endswith(".\n")
+    return err
+
+
+#: What a stored command line says, a line of overrides.yaml each.
+STORED = {
+    "a class of a module beside it": ["traffic=idm", "traffic._target_=evil.Traffic"],
+    "a function of it": ["traffic=idm", "traffic._target_=evil.make"],
+    "a shell": ["traffic=idm", "traffic._target_=os.system", "+traffic.parameters.command='touch executed'"],
+    "a process": ["traffic._target_=subprocess.getoutput", "+traffic.parameters.cmd='touch executed'"],
+    "a script": ["traffic._target_=runpy.run_path", "+traffic.parameters.path_name=evil.py"],
+    "an import": ["traffic._target_=importlib.import_module", "+traffic.parameters.name=evil"],
+    "exec": ["traffic._target_=builtins.exec", "+traffic.parameters.source='import evil'"],
+    "a file": ["traffic._target_=builtins.open", "+traffic.parameters.file=executed", "+traffic.parameters.mode=w"],
+    "the first phase's": ["traffic@pretrain.traffic=idm", "pretrain.traffic._target_=evil.Traffic"],
+    "the evaluation's": ["traffic@evaluation.traffic=idm", "evaluation.traffic._target_=evil.Traffic"],
+    "a share": ["traffic=mixed", "traffic.shares={evil.Traffic: 1, idm: 1}"],
+    "a share's option": ["traffic=mixed", "traffic.options.gan._target_=evil.Traffic"],
+    "a policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,evil.Policy]"],
+    "a masked policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,evil.Policy+safe]"],
+    "a shell as policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,os.system]"],
+    "a reference to a name": ["init.path=evil.Traffic", "traffic=idm", "traffic._target_=${init.path}"],
+    "an option elsewhere": ["traffic=../../evil"],
+    "an absolute option": ["experiment=/tmp/evil"],
+    "an option of the phase's elsewhere": ["traffic@pretrain.traffic=../../evil"],
+    "Hydra's callbacks": ["hydra.callbacks.x._target_=evil.make"],
+    "Hydra's callbacks, added": ["+hydra.callbacks.x={_target_: evil.make}"],
+    "Hydra's callbacks, forced": ["++hydra.callbacks={x: {_target_: evil.make}}"],
+    "an option as callback": ["traffic@hydra.callbacks.x=idm"],
+    "all of Hydra": ["+hydra={callbacks: {x: {_target_: evil.make}}}"],
+    "Hydra's launcher": ["hydra.launcher._target_=evil.make"],
+    "Hydra's sweeper": ["hydra.sweeper._target_=evil.make"],
+    "a launcher elsewhere": ["hydra/launcher=../../evil"],
+    "Hydra's places to search": ["hydra.searchpath=['file://.']"],
+    "Hydra's log": ["hydra.job_logging.handlers.x={(): evil.make}"],
+    "a cluster": ["collector=ray", "collector.address=evil.example:6379"],
+}
+
+
+@pytest.mark.parametrize("way", STORED)
+def test_a_stored_command_line_executes_nothing(way, capsys):
+    run_of_somebody("".join(f"- {json.dumps(line)}\n" for line in STORED[way]))
+    refused(capsys, "train", "resume=run")
+
+
+#: Other files of a run's folder, or others in their place.
+FILES = {
+    "a YAML tag": {"overrides": "!!python/object/apply:os.system ['touch executed']"},
+    "a YAML tag in the list": {"overrides": "- traffic=idm\n- !!python/name:evil.make\n"},
+    "a tag in the config": {"config": "mask: !!python/object/apply:os.system ['touch executed']"},
+    "a mask elsewhere in an old config": {"config": "mask: {form: ../../evil}"},
+    "a pickle": {"checkpoint": pickle.dumps(Bomb())},
+}
+
+
+@pytest.mark.parametrize("way", FILES)
+def test_no_other_file_of_a_run_executes_anything(way, capsys):
+    run_of_somebody(**{"overrides": "- traffic=idm\n", **FILES[way]})
+    refused(capsys, "train", "resume=run")
+
+
+def torch_pickle() -> bytes:
+    file = io.BytesIO()
+    torch.save({"kind": "ganlane training checkpoint", "version": 2, "state": Bomb()}, file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("content", [pickle.dumps(Bomb()), torch_pickle()], ids=["pickle", "torch"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["evaluate", "agents=[bomb.safetensors]"],
+        ["train", "traffic=gan", "generator.path=bomb.safetensors"],
+        ["train", "traffic=idm", "init.path=bomb/last.pt"],
+        ["render", "run=bomb"],
+        ["evaluate", "env=scene", "env.scene.path=bomb.json"],
+        ["prepare", "data=scenes", "data.path=bomb.parquet"],
+        ["prepare", "data=scenes", "data.path=bomb.csv"],
+    ],
+    ids=str,
+)
+def test_a_pickle_in_the_place_of_another_file_is_refused(content, arguments, here, capsys):
+    (here / "bomb").mkdir()
+    for name in ("bomb.safetensors", "bomb/last.pt", "bomb/metrics.csv", "bomb.json", "bomb.parquet", "bomb.csv"):
+        (here / name).write_bytes(content)
+    assert "bomb" in refused(capsys, *arguments)
+
+
+def test_pickles_in_the_cache_are_not_read(here, monkeypatch):
+    monkeypatch.setenv("GANLANE_CACHE", str(here))
+    np.savez(here / "groups_key.npz", labels=np.array([Bomb()], dtype=object))
+    assert cached("groups", "key", lambda: {"labels": np.arange(3)})["labels"].tolist() == [0, 1, 2]
+
+
+def test_a_reference_of_recorded_driving_is_plain_numbers(here):
+    (here / "reference.json").write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(UserError, match="not the histograms"):
+        Reference.load(here / "reference.json")
+
+
+@pytest.mark.parametrize("key", ["network", "observation_scale", "mask"])
+def test_an_agents_description_is_not_instantiated(key):
+    weights, metadata = load_weights(CHECKPOINTS / "agent_idm.safetensors", metadata_kind := "agent")
+    del metadata["kind"]
+    called = {"_target_": "evil.make", "_partial_": False}
+    save_weights("agent.safetensors", metadata_kind, weights, {**metadata, key: {**metadata.get(key, {}), **called}})
+    with pytest.raises(UserError):
+        make_driver("agent.safetensors", EnvConfig())
+    save_weights("agent.safetensors", metadata_kind, weights, {**metadata, "_target_": "evil.make"})
+    assert load_agent("agent.safetensors")[1]["_target_"] == "evil.make"
+
+
+def test_a_generators_description_is_not_instantiated():
+    weights, metadata = load_weights(CHECKPOINTS / "generator_paper.safetensors", "generator")
+    del metadata["kind"]
+    for key in ("sizes", "preset"):
+        save_weights("g.safetensors", "generator", weights, {**metadata, key: {"_target_": "evil.make"}})
+        with pytest.raises(UserError):
+            load_generator("g.safetensors")
+
+
+#: Command lines that would have Hydra import something, or read another configuration.
+COMMAND_LINES = [
+    ["+hydra.callbacks.x._target_=evil.make"],
+    ["-m", "hydra.callbacks={x: {_target_: evil.make}}", "seed=0,1"],
+    ["-m", "hydra/launcher=../../evil", "seed=0,1"],
+    ["-m", "hydra.launcher._target_=evil.make", "seed=0,1"],
+    ["-m", "+hydra.launcher.x={y: [{_target_: evil.make}]}", "seed=0,1"],
+    ["-m", "hydra.searchpath=['file://.']", "seed=0,1"],
+    ["--cfg", "job", "+hydra.callbacks.x._target_=evil.make"],
+    ["--info", "config", "hydra.searchpath=['file://.']"],
+    ["~hydra.callbacks"],
+    ["--experimental-rerun", "evil.pickle"],
+    ["--config-dir", "."],
+    ["--config-path", "."],
+    ["--config-name", "evil"],
+    ["experiment=../../evil"],
+    ["-m", "experiment=paper,../../evil"],
+]
+
+
+@pytest.mark.parametrize("arguments", COMMAND_LINES, ids=" ".join)
+def test_hydra_imports_nothing_and_reads_no_other_configuration(arguments, here, capsys):
+    (here / "evil.pickle").write_bytes(pickle.dumps(Bomb()))
+    refused(capsys, "train", *arguments)
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "hydra.run.dir=out",
+        "hydra.sweep.dir=out",
+        "hydra.job.num=3",
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        "hydra.sweeper.max_batch_size=4",
+        "+hydra.launcher.ray.init.num_cpus=2",
+    ],
+)
+def test_what_sweeps_need_of_hydra_can_be_given(override):
+    assert parse([override])[0].input_line == override
+
+
+# --- what the user names
+
+
+class NoTraffic:
+    """Called by mistake, it leaves the marker."""
+
+    def __init__(self, road):
+        Path(MARKER).touch()
+
+
+def traffic_without_annotation(road):
+    Path(MARKER).touch()
+
+
+def traffic_by_annotation(road) -> TrafficModule:
+    return TrafficModule(road)
+
+
+def something_else(road) -> NoTraffic:
+    return NoTraffic(road)
+
+
+def annotated_with_text(road) -> "a traffic":  # noqa: F722
+    Path(MARKER).touch()
+
+
+@pytest.mark.parametrize(
+    "name", ["NoTraffic", "traffic_without_annotation", "something_else", "annotated_with_text", "MARKER", "json"]
+)
+def test_what_is_named_is_called_only_if_it_makes_a_traffic(name, capsys):
+    with pytest.raises(UserError, match=r"expected a subclass of ganlane\.traffic\.TrafficModule or a function"):
+        import_target(f"{__name__}.{name}", "traffic._target_", TrafficModule)
+    assert "_target_" in refused(capsys, "train", "traffic=idm", f"traffic._target_={__name__}.{name}")
+
+
+def test_a_class_or_an_annotated_function_is_taken():
+    for name in ("ganlane.traffic.IdmTraffic", "ganlane.traffic.presets.gan_traffic"):
+        import_target(name, "traffic._target_", TrafficModule)
+    assert import_target(f"{__name__}.traffic_by_annotation", "", TrafficModule) is traffic_by_annotation
+
+
+def test_a_resumed_run_takes_what_this_command_line_repeats():
+    own = IdmTrafficConfig(_target_="evil.Traffic")
+    agents = ["mobil", "random_legal", "evil.Policy+safe"]
+    config = TrainConfig(resume="run", traffic=own, evaluation=FinalEvaluationConfig(agents=agents))
+    told = ["traffic._target_=evil.Traffic", "evaluation.agents=[mobil,random_legal,evil.Policy+safe]"]
+    refuse_stored_imports(config, told)
+    for half, missing in ((told[:1], told[1]), (told[1:], told[0])):
+        with pytest.raises(UserError) as caught:
+            refuse_stored_imports(config, half)
+        assert f"add {missing} to the command line" in str(caught.value)
+    with pytest.raises(UserError, match=r"the run's files name evil\.Traffic"):
+        refuse_stored_imports(config, ["resume=evil.Traffic", "init.path=evil.Policy"])  # names of files name no code
+
+
+def test_a_command_does_not_look_for_modules_where_it_is_started(monkeypatch):
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
+    dispatch(["train", "resume=nowhere"])
+    assert "" not in sys.path

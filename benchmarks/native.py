@@ -27,7 +27,7 @@ from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
-from ganlane.native import EgoState, Kernel, Outcome
+from ganlane.native.decision import EgoState, Kernel, Outcome
 from ganlane.native.library import VARIANTS, best_variant
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.parameters.observation import ObservationConfig

@@ -115,7 +115,7 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
 def test_the_facade_gives_what_the_torchrl_environment_gives():
     envs = make_vec(2, goal_m=400.0)
     observation, _ = envs.reset(seed=1)
-    env = ganlane.make_env("idm", 2, goal_m=400.0, seed=1)
+    env = ganlane.make_env("idm", 2, goal_m=400.0, seed=1, kernel="auto")
     state = env.reset()
     np.testing.assert_array_equal(observation, state["observation"].numpy())
     for _ in range(3):
@@ -283,7 +283,7 @@ class Screen:
 
 
 def test_a_window_shows_every_physics_step(monkeypatch):
-    monkeypatch.setattr("ganlane.gym.single.FilmWindow", Screen)
+    monkeypatch.setattr("ganlane.gym.rendering.FilmWindow", Screen)
     monkeypatch.setattr("ganlane.gym.single.has_display", lambda: True)
     env = make(render_mode="human")
     assert env.unwrapped.metadata["render_modes"] == ["human", "rgb_array"]

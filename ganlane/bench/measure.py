@@ -27,7 +27,7 @@ Runner = Callable[[int], int]
 #: Labels and figures of a case (:func:`make_row`).
 Row = dict[str, Any]
 
-EAGER, COMPILED = "eager", "compiled"
+EAGER, COMPILED, NATIVE = "eager", "compiled", "native"
 #: In a turn, however little one costs.
 _MOST_DECISIONS = 2**20
 #: Decisions after which every buffer that a case needs is allocated.
@@ -332,7 +332,7 @@ def measure(suite: Suite, repetitions: int, seconds: float) -> dict[str, Any]:
 
 
 def _start(group: Group, notes: list[str]) -> tuple[list[Case], list[Runner]]:
-    """The reference, if any, and the cases that run here; one that cannot be compiled is left out, with a note."""
+    """The reference, if any, and the cases that run here; a mode that cannot do a case leaves it out, with a note."""
     if any(case.labels.mode == COMPILED for case in group.cases):
         # Each group compiles for its own sizes; torch would fall back to eager after a few recompilations.
         torch.compiler.reset()
@@ -342,7 +342,7 @@ def _start(group: Group, notes: list[str]) -> tuple[list[Case], list[Runner]]:
             runners.append(case.start())
             cases.append(case)
         except UserError as error:
-            if case.labels.mode != COMPILED:
+            if case.labels.mode == EAGER:
                 raise
             if str(error) not in notes:
                 notes.append(str(error))

@@ -10,9 +10,21 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDictBase
 
-from ganlane.bench.measure import EAGER, Case, Group, Row, Suite, best_rows, growth_per_environment, speed_table
+from ganlane.bench.measure import (
+    EAGER,
+    NATIVE,
+    Case,
+    Group,
+    Row,
+    Suite,
+    best_rows,
+    growth_per_environment,
+    speed_table,
+)
 from ganlane.bench.systems import (
+    GymnasiumRunner,
     Scenario,
+    envpool_case,
     highway_env_case,
     installed_version,
     start_environment,
@@ -23,8 +35,8 @@ from ganlane.config.bench import BenchConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.evaluation.table import NOTHING, Table, significant
 
-PHYSICS, ENVIRONMENT = "ganlane physics", "ganlane environment"
-_START: dict[str, Any] = {PHYSICS: start_physics, ENVIRONMENT: start_environment}
+PHYSICS, ENVIRONMENT, GYMNASIUM = "ganlane physics", "ganlane environment", "ganlane gymnasium"
+_START: dict[str, Any] = {PHYSICS: start_physics, ENVIRONMENT: start_environment, GYMNASIUM: GymnasiumRunner}
 _MISSING = (
     "HighwayEnv is not installed, so there are no ratios to it; "
     '`pip install "ganlane[bench]"` (or `pip install highway-env`) brings it.'
@@ -50,6 +62,7 @@ class SimSuite(Suite):
         self.has_peer = config.peers and installed_version("highway-env") is not None
         if config.peers and not self.has_peer:
             self.notes.append(_MISSING)
+        self.has_envpool = config.peers and installed_version("envpool") is not None
         # A scene set by hand has as many vehicles as it has.
         self.grows = type(config.env) in (EnvConfig, DenseEnvConfig)
         if not self.grows:
@@ -66,13 +79,18 @@ class SimSuite(Suite):
                     self._case("speed", system, mode, device, threads, batch)
                     for system in _START
                     for mode in self.config.modes
-                ],
+                    if system != GYMNASIUM or (mode == NATIVE and device == "cpu")
+                ]
+                + ([envpool_case(self, threads, batch)] if self.has_envpool and device == "cpu" else []),
                 reference,
             )
             for device, threads in self.places()
             for batch in self.config.batches
         ]
-        return [*speed, *(group for system in _START for group in self._growth(system) if len(group.cases) > 1)]
+        return [
+            *speed,
+            *(group for system in (PHYSICS, ENVIRONMENT) for group in self._growth(system) if len(group.cases) > 1),
+        ]
 
     def _growth(self, system: str) -> list[Group]:
         """Sizes side by side, on the first device."""

@@ -15,13 +15,14 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from ganlane import keys
-from ganlane.bench.measure import COMPILED, Case, Runner, Suite
+from ganlane.bench.measure import COMPILED, NATIVE, Case, Runner, Suite
 from ganlane.build import make_env, make_traffic
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.decision import run_decision
+from ganlane.env.native_step import after_decision, native_decision
 from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import episode_key
@@ -48,7 +49,7 @@ class Scenario:
 
     def build(self, mode: str, device: str, batch: int) -> TransformedEnv:
         """The environment."""
-        env = replace(self.env, compile=mode == COMPILED)
+        env = replace(self.env, compile=mode == COMPILED, kernel="native" if mode == NATIVE else "torch")
         traffic = make_traffic(self.traffic, env)
         return make_env(traffic, env, self.observation, self.reward, batch, self.seed, device)
 
@@ -59,6 +60,8 @@ def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Run
     The ego keeps its lane, and goal and time-out are out of reach, so that in rule-driven traffic no episode ends and
     every step moves every environment.
     """
+    if mode == NATIVE:
+        return start_native_physics(scenario, batch)
     env = scenario.build(mode, device, batch)
     state, base = env.reset(), env.base_env
     substeps = base.rules.episode.substeps()
@@ -66,6 +69,23 @@ def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Run
     def run(decisions: int) -> int:
         _, step = bare_steps(base, state, decisions * substeps)
         return int((step - state.get(keys.STEP)).sum())
+
+    return run
+
+
+def start_native_physics(scenario: Scenario, batch: int) -> Runner:
+    """The kernel alone, on the tensors of :func:`start_physics`."""
+    endless = replace(scenario, env=replace(scenario.env, goal_m=1e9, timeout_s=1e8))
+    env = endless.build(NATIVE, "cpu", batch)
+    first, keep = env.reset(), torch.full((batch,), keys.KEEP)
+    recycles = torch.ones(batch, dtype=torch.bool) if scenario.env.recycle else None
+
+    def run(decisions: int) -> int:
+        state = first
+        for _ in range(decisions):
+            out, vehicles = native_decision(env.base_env.kernel, state, keep, recycles)
+            state = after_decision(state, out, vehicles)
+        return int((state.get(keys.STEP) - first.get(keys.STEP)).sum())
 
     return run
 
@@ -118,6 +138,47 @@ def start_environment(scenario: Scenario, mode: str, device: str, batch: int) ->
     return EnvironmentRunner(scenario.build(mode, device, batch), actions)
 
 
+class GymnasiumRunner:
+    """``gymnasium.make_vec`` (with one environment ``gymnasium.make``), random actions, resets where episodes end."""
+
+    def __init__(self, scenario: Scenario, mode: str, device: str, batch: int) -> None:
+        import gymnasium
+
+        options: dict[str, Any] = {"traffic": scenario.traffic, "env": replace(scenario.env, kernel=mode)}
+        options |= {"observation": scenario.observation, "reward": scenario.reward, "seed": scenario.seed}
+        self.batch, self.actions = batch, np.random.default_rng(scenario.seed).integers(3, size=(_DRAWN, batch))
+        self.env: Any = (
+            gymnasium.make("ganlane/Highway-v0", disable_env_checker=True, **options)
+            if batch == 1
+            else gymnasium.make_vec("ganlane/Highway-v0", batch, **options)
+        )
+        self.env.reset()
+        self.decisions = 0
+        self.time_s = np.zeros(batch)
+
+    def __call__(self, decisions: int) -> int:
+        """See :data:`~ganlane.bench.measure.Runner`."""
+        driven_s = 0.0
+        for _ in range(decisions):
+            self.decisions += 1
+            actions = self.actions[self.decisions % _DRAWN]
+            if self.batch > 1:
+                *_, info = self.env.step(actions)
+                after_s = info["time_s"]
+                if "_final_info" in info:
+                    after_s = np.where(info["_final_info"], info["final_info"]["time_s"], after_s)
+                driven_s += float((after_s - self.time_s).sum())
+                self.time_s = info["time_s"]
+            else:
+                *_, terminated, truncated, info = self.env.step(int(actions[0]))
+                driven_s += info["time_s"] - float(self.time_s[0])
+                self.time_s[0] = info["time_s"]
+                if terminated or truncated:
+                    self.env.reset()
+                    self.time_s[0] = 0.0
+        return round(driven_s / keys.PHYSICS_STEP_S)
+
+
 def installed_version(package: str) -> str | None:
     """Of a package; None where it is not installed."""
     try:
@@ -166,6 +227,47 @@ class HighwayEnvRunner:
             if terminated or truncated:
                 self.env.reset()
         return decisions * self.steps_per_decision
+
+
+class EnvPoolRunner:
+    """HighwayEnv in EnvPool's C++: random actions; an episode that has ended begins anew in the next step."""
+
+    def __init__(self, env: EnvConfig, batch: int, threads: int, seed: int) -> None:
+        import envpool
+
+        self.env: Any = envpool.make_gymnasium(
+            "Highway-v0", num_envs=batch, num_threads=min(threads, batch), seed=seed, **envpool_settings(env)
+        )
+        self.env.reset()
+        self.actions = np.random.default_rng(seed).integers(5, size=(_DRAWN, batch)).astype(np.int32)
+        self.steps = batch * env.episode_parameters().substeps()
+        self.decisions = 0
+
+    def __call__(self, decisions: int) -> int:
+        """See :data:`~ganlane.bench.measure.Runner`."""
+        for _ in range(decisions):
+            self.decisions += 1
+            self.env.step(self.actions[self.decisions % _DRAWN])
+        return decisions * self.steps
+
+
+def envpool_settings(env: EnvConfig) -> dict[str, Any]:
+    """:func:`highway_env_settings` as EnvPool takes them; its rates are whole numbers."""
+    return {
+        "lanes_count": env.lanes,
+        "vehicles_count": env.vehicles - 1,
+        "simulation_frequency": round(1 / keys.PHYSICS_STEP_S),
+        "policy_frequency": max(1, round(1 / env.decision_period_s)),
+        "duration": round(env.timeout_s),
+        "max_episode_steps": round(env.timeout_s / env.decision_period_s),
+    }
+
+
+def envpool_case(suite: Suite, threads: int, batch: int) -> Case:
+    """EnvPool on the suite's road."""
+    config = suite.config
+    labels = suite.labels(f"EnvPool {installed_version('envpool')}", "its IDM and MOBIL", NATIVE, threads, batch)
+    return Case(labels, partial(EnvPoolRunner, config.env, batch, threads, config.seed))
 
 
 def highway_env_case(suite: Suite) -> Case:

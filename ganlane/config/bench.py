@@ -14,7 +14,7 @@ from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
 SUITES = ("sim", "traffic", "train")
-MODES = ("eager", "compiled")
+MODES = ("eager", "compiled", "native")
 DEVICES = ("cpu", "cuda")
 _QUICK_BATCH = 64
 _QUICK_STORED = 1000
@@ -37,7 +37,7 @@ class BenchConfig:
             loop, compared with stable-baselines3 on HighwayEnv.
         quick: true: a check that it runs: small batches, two short repetitions, no memory, training in one mode.
         batches: environments side by side.
-        modes: compiled: env.compile=true.
+        modes: eager: env.kernel=torch; compiled: the same with env.compile=true; native: env.kernel=native.
         threads: torch's threads; a GPU is measured with the first number alone.
         devices: [cpu], [cuda] or both; null: the CPU, and a GPU where there is one.
         vehicle_counts: for the growth with the vehicles, at the density of env=dense.
@@ -51,7 +51,7 @@ class BenchConfig:
         train_stored: transitions in the replay buffer when the clock starts.
         repetitions: turns of every case; cases of a group take turns, medians are reported.
         seconds: a turn lasts about so long, or as long as one decision does, s.
-        peers: a peer's simulator or learner in every group, if it is installed (extra 'bench').
+        peers: a peer's simulator or learner in every group, if it is installed (extra 'bench'; EnvPool by itself).
         memory: peak memory of every case, each in a fresh process.
         report: a document whose tables to rewrite, for instance docs/performance.md.
         seed: of all random numbers.

@@ -41,7 +41,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     recycle: bool = False
     recycle_share: float = 1.0
     compile: bool = False
-    kernel: str = "torch"
+    kernel: str = "auto"
     ego: EgoParameters = field(default_factory=EgoParameters)
     idm: IdmParameters = field(default_factory=IdmParameters)
     mobil: MobilParameters = field(default_factory=MobilParameters)

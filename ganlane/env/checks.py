@@ -10,29 +10,11 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import ACTIONS
+from ganlane.parameters.checks import whole_number
 from ganlane.runtime import check_default_device
 
 #: The most rows and vehicles; the configuration's bounds lie within.
 _MOST_ROWS, _MOST_VEHICLES = 2**20, 1000
-
-
-def whole_number(name: str, value: Any, low: int, high: int) -> int:
-    """``value`` as an int; NumPy's integers are allowed.
-
-    Raises:
-        UserError: it is none, or not from ``low`` to ``high``.
-    """
-    if isinstance(value, bool) or not hasattr(value, "__index__") or not low <= int(value) <= high:
-        most = "2**63 - 1" if high == 2**63 - 1 else f"{high}"
-        raise UserError(
-            f"{name}={value}: expected a whole number from {low} to {most}; give for instance {name}={low}."
-        )
-    return int(value)
-
-
-def seed_number(seed: Any) -> int:
-    """A seed, checked: the counters of the environment hold 63 bits."""
-    return whole_number("seed", seed, 0, 2**63 - 1)
 
 
 def check_sizes(num_envs: Any, vehicles: Any, first_episode: Any) -> None:

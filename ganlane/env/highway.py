@@ -11,12 +11,13 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
-from ganlane.env.checks import ActionCheck, check_counter, check_sizes, seed_number, usable_device
+from ganlane.env.checks import ActionCheck, check_counter, check_sizes, usable_device
 from ganlane.env.decision import Recorder, known_false, run_decision
-from ganlane.env.native_step import ego_memory, events_of, make_kernel, native_decision, traffic_memory
+from ganlane.env.native_step import after_decision, make_kernel, native_decision
 from ganlane.env.physics import Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
+from ganlane.parameters.checks import seed_number
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -53,7 +54,8 @@ class HighwayEnv(EnvBase):
         recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their numbers: a mixture
             of roads that empty and roads that do not.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel (:mod:`ganlane.native`),
-            which does the same up to rounding, for rule-driven traffic on a CPU; ``auto``, the kernel where it can.
+            which does the same up to rounding, for rule-driven traffic on a CPU; ``auto``, the kernel where it can,
+            and the tensor code while a recorder is set.
 
     An episode is (stream, seed, episode) and does not depend on the batch. ``reset(td)`` with ``seed`` and
     ``episode`` [N] in ``td`` and no ``_reset`` mask runs exactly those episodes. With a mask the masked rows continue
@@ -110,6 +112,7 @@ class HighwayEnv(EnvBase):
         self._check_parts(vehicles, stream)
         #: The native kernel; None: the tensor code drives.
         self.kernel = make_kernel(kernel, traffic, self.rules, self.vehicles, self.device, dtype)
+        self._kernel_must = kernel == "native"
         self._check_action = ActionCheck(self.batch_size[0], self.device)
         self._make_specs()
 
@@ -232,7 +235,7 @@ class HighwayEnv(EnvBase):
             raise UserError("step(): the state of no episode was given; call reset() first and step what it returns.")
         self.last_episodes = (seed, episode)
         action = self._check_action(tensordict.get(keys.ACTION, None))
-        if self.kernel is not None:
+        if self.kernel is not None and (self.recorder is None or self._kernel_must):
             return self._native_step(tensordict, action)
         key = episode_key(self.stream, seed, episode)
         rules = self._rules_of(tensordict, key)
@@ -258,15 +261,11 @@ class HighwayEnv(EnvBase):
         assert self.kernel is not None
         if self.recorder is not None:
             raise UserError("env.kernel=native shows no physics steps to a recorder; set env.kernel=torch.")
-        seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
         recycles = None
         if self.recycle:
+            seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
             recycles = self._recycling_rows(episode_key(self.stream, seed, episode))
-        out, vehicles = native_decision(self.kernel, tensordict, action, recycles)
-        events, flags = events_of(out)
-        reward = torch.zeros_like(out.distance)[:, None]
-        rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: out.step, keys.REWARD: reward, **flags}
-        return pack(vehicles, ego_memory(out), traffic_memory(out), events, rest)
+        return after_decision(tensordict, *native_decision(self.kernel, tensordict, action, recycles))
 
     def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
         """The rules of every row: replayed scenes have their own roads and ends."""

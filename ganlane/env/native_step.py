@@ -11,8 +11,10 @@ from torch import Tensor
 
 from ganlane import keys
 from ganlane.env.physics import Rules
+from ganlane.env.state import pack
 from ganlane.errors import UserError
-from ganlane.native import EgoState, Kernel, Outcome, why_not
+from ganlane.native.decision import EgoState, Kernel, Outcome
+from ganlane.native.library import why_not
 from ganlane.parameters.episode import KERNELS
 from ganlane.sim.state import Vehicles
 from ganlane.traffic.base import TrafficModule
@@ -36,12 +38,16 @@ def make_kernel(
     """
     if wanted not in KERNELS:
         raise UserError(f"env.kernel={wanted}: expected one of {', '.join(KERNELS)}; choose one of them.")
-    reason = None if wanted == "torch" else _why_not(traffic, rules, device, dtype)
-    if wanted == "native" and reason:
-        raise UserError(f"env.kernel=native {reason}; set env.kernel=torch.")
+    if wanted == "torch":
+        return None
+    reason, missing = _why_not(traffic, rules, device, dtype), why_not()
+    if wanted == "native" and (reason or missing):
+        raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
+    if reason:
+        return None
     if wanted == "auto":
-        _say_once(f"env.kernel=auto: the tensor code, since the native kernel {reason}" if reason else NATIVE_TAKEN)
-    if wanted == "torch" or reason:
+        _say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}" if missing else NATIVE_TAKEN)
+    if missing:
         return None
     assert isinstance(traffic, IdmTraffic)
     mobil = traffic.mobil if isinstance(traffic, IdmMobilTraffic) else None
@@ -59,7 +65,7 @@ def _why_not(traffic: TrafficModule, rules: Rules, device: torch.device, dtype: 
         return "has no ring"
     if (traffic.idm, traffic.steering) != (rules.idm, rules.steering):
         return "has one set of parameters of car following and steering for the ego and the others"
-    return why_not()
+    return None
 
 
 def native_decision(
@@ -76,6 +82,14 @@ def native_decision(
         recycles,
     )
     return out, out.moved(vehicles)
+
+
+def after_decision(state: TensorDictBase, out: Outcome, vehicles: Vehicles) -> TensorDictBase:
+    """The state after the decision from ``state``; reward 0, which a transform writes."""
+    events, flags = events_of(out)
+    rest = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.STEP: out.step}
+    rest |= {keys.REWARD: torch.zeros_like(out.distance)[:, None], **flags}
+    return pack(vehicles, ego_memory(out), traffic_memory(out), events, rest)
 
 
 def ego_memory(out: Outcome) -> dict[str, Tensor]:

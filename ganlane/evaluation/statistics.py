@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from statistics import NormalDist
 from typing import Any
 
@@ -27,6 +28,8 @@ _TAIL = (1.0 - _CONFIDENCE) / 2.0
 TAIL_LEVELS = np.array([_TAIL, (1.0 + _CONFIDENCE) / 2.0])
 #: Resamples held in memory at once.
 _CHUNK = 500
+#: Counts that are kept for the next interval, 2 bytes each.
+_MOST_KEPT = 20_000_000
 _NORMAL = NormalDist()
 
 
@@ -69,10 +72,17 @@ def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
         yield np.bincount(drawn.ravel(), minlength=rows * size).reshape(rows, size).astype(np.float64)
 
 
+@lru_cache(maxsize=2)
+def _kept_counts(size: int, resamples: int, seed: int) -> tuple[npt.NDArray[np.uint16], ...]:
+    """The chunks of :func:`resample_counts`: a table's intervals draw the same ones, 0.25 s for 1000 episodes."""
+    return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed))
+
+
 def bootstrap_means(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> Array:
     """Means [R] or [R, K] of resampled ``values`` [E] or [E, K]; the K columns of an episode stay together."""
     size = len(values)
-    return np.concatenate([counts @ values / size for counts in resample_counts(size, resamples, seed)])
+    drawn = (_kept_counts if size * resamples <= _MOST_KEPT else resample_counts)(size, resamples, seed)
+    return np.concatenate([counts.astype(np.float64) @ values / size for counts in drawn])
 
 
 def _bca_levels(values: Array, means: Array) -> Array:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import sys
 import time
 from typing import Any
 
@@ -16,6 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from ganlane import keys
 from ganlane.errors import UserError
+from ganlane.gym import has_display
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
 from ganlane.view.frames import Picture
@@ -23,11 +21,6 @@ from ganlane.view.record import outcome_of, road_of_row
 
 #: Physics steps of the past that are kept: as many as the trails show.
 _KEPT = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
-
-
-def real_time_fps(env: TransformedEnv) -> int:
-    """Frames per second at which a frame per decision shows real time, at least 1."""
-    return max(1, round(1.0 / env.base_env.episode.decision_period_s))
 
 
 def _label(env: TransformedEnv, state: TensorDictBase, row: int, traffic: str) -> EpisodeLabel:
@@ -125,13 +118,6 @@ class BatchView:
         recorder.add(state.get(keys.VEHICLES), 0.0)
         recorder.time_s[0] = float(state.get(keys.STEP)[row]) * PHYSICS_STEP_S
         return FramePainter(recorder.trajectory(_label(self.env, state, row, self.traffic))).draw(0)
-
-
-def has_display() -> bool:
-    """Whether a window can be opened here: tkinter is there and, but on Windows and macOS, a display is named."""
-    if importlib.util.find_spec("tkinter") is None:
-        return False
-    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY"))
 
 
 class FilmWindow:

@@ -1,127 +1,106 @@
-"""A batch of TorchRL environments as NumPy arrays, and checks of the arguments of reset and step.
+"""What both environments, single and vector, stand on: N highways behind NumPy arrays, and checks of what users give.
 
-Both environments, single and vector, stand on this module.
+:class:`Rows` is the interface. :mod:`~ganlane.gym.native_rows` has it for rule-driven traffic, by the native kernel
+alone and without torch; :mod:`~ganlane.gym.tensor_rows` for everything else, by the TorchRL environment.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from gymnasium.spaces import Box
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.envs import TransformedEnv
 
-from ganlane import keys
-from ganlane.agents.drivers import legal_actions
 from ganlane.errors import UserError
-from ganlane.keys import ACTIONS, EGO_INDEX, PHYSICS_STEP_S
-from ganlane.sim.state import road_in
-from ganlane.transforms import ObservationTransform, largest_number
+from ganlane.keys import ACTIONS as ACTIONS
+from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
+from ganlane.native.library import why_not
+from ganlane.options import Option
 
 Floats = npt.NDArray[np.float32]
-#: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
-SPEED_RATIO_LIMIT: Final = 4.0
+Flags = npt.NDArray[np.bool_]
 #: Unseeded environments draw their seed below this.
 SEEDS: Final = 2**31
 
 
-def observation_space(env: TransformedEnv) -> Box:
-    """Bounds of the observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
-    size = env.observation_spec[keys.OBSERVATION].shape[-1]
-    form = next((each.form for each in env.transform if isinstance(each, ObservationTransform)), "table3")
-    largest = largest_number(form, env.base_env.scenes.longest_m)
+class Rows(ABC):
+    """N highways.
+
+    Attributes:
+        count: N.
+        space: of one observation.
+        decision_period_s: time between two actions, s.
+        env, state: the TorchRL environment and the state of its rows, where there is one.
+    """
+
+    count: int
+    space: Box
+    decision_period_s: float
+    env: Any = None
+    state: Any = None
+
+    @abstractmethod
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
+        """Begin the episodes [N] of the seeds [N]; each may be one number for all rows."""
+
+    @abstractmethod
+    def restart(self, rows: Flags) -> None:
+        """Go on to the next episode, the present one plus N, in some rows [N]."""
+
+    @abstractmethod
+    def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
+        """One decision of every row; no row is reset. The arrays hold until the next call."""
+
+    @abstractmethod
+    def observation(self) -> Floats:
+        """Observations [N, D], within the space; the array holds until the next call."""
+
+    @abstractmethod
+    def mask(self) -> Flags:
+        """Which actions are allowed now, [N, 3]; the array holds until the next call."""
+
+    @abstractmethod
+    def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+        """Seeds and episodes [N] under way; None before the first :meth:`start`."""
+
+    @abstractmethod
+    def info(self) -> dict[str, Any]:
+        """Gymnasium's info: by name (docs/gymnasium.md) arrays [N], which hold until the next call."""
+
+
+def make_rows(traffic: Option, count: int, render_mode: str | None, options: Mapping[str, Any]) -> Rows:
+    """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
+
+    The native kernel drives them where it can, unless the option ``kernel`` is ``torch``. It shows no physics steps,
+    so with a ``render_mode`` the tensor code does.
+
+    Raises:
+        UserError: a wrong value.
+    """
+    if render_mode is None and why_not() is None:
+        from ganlane.gym.native_rows import native_rows  # Hydra's config classes take a tenth of a second
+
+        made = native_rows(traffic, count, dict(options))
+        if made is not None:
+            return made
+    from ganlane.gym.tensor_rows import TensorRows  # torch takes seconds
+
+    return TensorRows(traffic, count, options)
+
+
+def observation_space(size: int, largest: float) -> Box:
+    """Bounds of an observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
     low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
 
-class Rows:
-    """N rows of an environment from :func:`ganlane.api.make_env`, and their state."""
-
-    def __init__(self, env: TransformedEnv) -> None:
-        self.env, self.count = env, env.batch_size[0]
-        self.space = observation_space(env)
-        self.state: TensorDictBase | None = None
-
-    @torch.no_grad()
-    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
-        """Begin the episodes [N] of the seeds [N]; each may be one number for all rows."""
-        numbers = {keys.SEED: seed, keys.EPISODE: episode}
-        counters = {
-            name: torch.as_tensor(np.broadcast_to(value, self.count).astype(np.int64), device=self.env.device)
-            for name, value in numbers.items()
-        }
-        self.state = self.env.reset(TensorDict(counters, [self.count], device=self.env.device))
-
-    @torch.no_grad()
-    def step(self, actions: Tensor) -> TensorDictBase:
-        """One decision; the state after it, which is kept. No row is reset."""
-        stepped = self.env.step(self._with(actions))
-        self.state = self.env.step_mdp(stepped)
-        return stepped.get("next")
-
-    @torch.no_grad()
-    def step_and_reset(self, actions: Tensor) -> TensorDictBase:
-        """One decision; the state after it. The state that is kept has the next episodes of rows that ended."""
-        stepped, self.state = self.env.step_and_maybe_reset(self._with(actions))
-        return stepped.get("next")
-
-    @torch.no_grad()
-    def restart(self, rows: npt.NDArray[np.bool_]) -> None:
-        """Go on to the next episode in some rows [N]."""
-        mask = torch.as_tensor(rows, device=self.env.device)[:, None]
-        self.state = self.env.reset(self.now().set("_reset", mask))
-
-    def now(self) -> TensorDictBase:
-        """The state of all rows."""
-        if self.state is None:
-            raise UserError("no episode is under way; call reset() first.")
-        return self.state
-
-    def _with(self, actions: Tensor) -> TensorDictBase:
-        return self.now().set(keys.ACTION, actions.to(self.env.device))
-
-    def observation(self, state: TensorDictBase | None = None) -> Floats:
-        """Observations [N, D], a copy, within the space."""
-        found = (self.now() if state is None else state).get(keys.OBSERVATION)
-        return np.clip(found.cpu().numpy(), self.space.low, self.space.high)
-
-    def allowed(self) -> npt.NDArray[np.bool_]:
-        """Which actions are allowed now, [N, 3]; a copy."""
-        return _array(self._mask(self.now()))
-
-    def _mask(self, state: TensorDictBase) -> Tensor:
-        """The environment's mask, bool [N, 3]; without one, the actions that stay on the road."""
-        mask = state.get(keys.ACTION_MASK, None)
-        return legal_actions(state, road_in(state, self.env.base_env.road)) if mask is None else mask
-
-    def info(self, state: TensorDictBase | None = None) -> dict[str, Any]:
-        """Gymnasium's info: by name (docs/gymnasium.md lists them) arrays [N], the mask [N, 3]; copies."""
-        state = self.now() if state is None else state
-        vehicles, ego, events = state.get(keys.VEHICLES), state.get(keys.EGO), state.get(keys.EVENTS)
-        road = road_in(state, self.env.base_env.road)
-        found = {
-            "seed": state.get(keys.SEED),
-            "episode_number": state.get(keys.EPISODE),
-            "time_s": state.get(keys.STEP).double() * PHYSICS_STEP_S,
-            "distance_m": ego.get("distance"),
-            "speed_mps": vehicles.get("speed")[:, EGO_INDEX],
-            "lane": road.lane_of(vehicles.get("y"))[:, EGO_INDEX].long(),
-            "decisions": ego.get("decisions"),
-            "lane_changes": ego.get("lane_changes"),
-            "action_mask": self._mask(state).to(torch.int8),
-            **{name: events.get(name)[:, 0] for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)},
-        }
-        terms = {name: _array(term[:, 0]) for name, term in state.get(keys.REWARD_TERMS).items()}
-        return {**{name: _array(value) for name, value in found.items()}, keys.REWARD_TERMS: terms}
-
-
-def _array(tensor: Tensor) -> npt.NDArray[Any]:
-    return tensor.cpu().numpy().copy()
+def copied(info: dict[str, Any]) -> dict[str, Any]:
+    """An info whose arrays the caller may keep."""
+    return {name: copied(value) if isinstance(value, dict) else value.copy() for name, value in info.items()}
 
 
 def row_of(info: dict[str, Any], row: int) -> dict[str, Any]:
@@ -132,22 +111,23 @@ def row_of(info: dict[str, Any], row: int) -> dict[str, Any]:
 def _item(value: Any, row: int) -> Any:
     if isinstance(value, dict):
         return row_of(value, row)
-    return value[row].copy() if value.ndim > 1 else value[row].item()
+    return value[row].copy() if value.ndim > 1 else value.item(row)
 
 
-def actions_of(given: Any, rows: int) -> Tensor:
-    """A user's actions as a tensor [rows] int64.
+def actions_of(given: Any, rows: int) -> npt.NDArray[np.int64]:
+    """A user's actions as an array [rows] int64.
 
     Raises:
         UserError: another shape, or no such action.
     """
     array = np.asarray(given)
-    if array.shape != (rows,) or array.dtype.kind not in "iu" or not np.isin(array, range(ACTIONS)).all():
+    whole = array.shape == (rows,) and array.dtype.kind in "iu"
+    if not whole or not 0 <= array.min() <= array.max() < ACTIONS:
         raise UserError(
             f"action {array.tolist()}: expected {rows} whole number(s), 0 (keep), 1 (left) or 2 (right); give one "
             "for every environment."
         )
-    return torch.as_tensor(array.astype(np.int64))
+    return array.astype(np.int64, copy=False)
 
 
 def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
@@ -168,7 +148,7 @@ def episode_numbers(episode: Any) -> npt.NDArray[np.int64]:
     return numbers.astype(np.int64)
 
 
-def row_mask(mask: Any, rows: int) -> npt.NDArray[np.bool_]:
+def row_mask(mask: Any, rows: int) -> Flags:
     """The option ``reset_mask``, checked: a boolean array [rows]."""
     array = np.asarray(mask)
     if array.shape != (rows,) or array.dtype != np.bool_:

@@ -8,21 +8,20 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from ganlane.api import make_env
-from ganlane.env.checks import seed_number
 from ganlane.errors import UserError
-from ganlane.gym.rendering import FilmWindow, LiveView, has_display, real_time_fps
+from ganlane.gym import has_display
 from ganlane.gym.rows import (
     ACTIONS,
     SEEDS,
     Floats,
-    Rows,
     actions_of,
     episode_numbers,
     known_options,
+    make_rows,
     row_of,
 )
 from ganlane.options import Option, option
+from ganlane.parameters.checks import seed_number
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -56,22 +55,21 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        made = make_env(traffic, 1, **options)
-        self._rows = Rows(made)
+        if render_mode not in (None, *RENDER_MODES):
+            raise UserError(f"render_mode={render_mode}: expected {' or '.join(RENDER_MODES)}; choose one of them.")
+        self._rows = make_rows(traffic, 1, render_mode, options)
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
         # Without a display there is no window.
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
-        self.metadata = {"render_modes": modes, "render_fps": real_time_fps(made)}
+        self.metadata = {"render_modes": modes, "render_fps": max(1, round(1.0 / self._rows.decision_period_s))}
         self.render_mode = render_mode
-        self._view: LiveView | None = None
+        self._view: Any = None
         if render_mode is not None:
-            if render_mode not in RENDER_MODES:
-                raise UserError(
-                    f"render_mode={render_mode}: expected {' or '.join(RENDER_MODES)}; choose one of them."
-                )
+            from ganlane.gym.rendering import FilmWindow, LiveView  # with torch, which takes seconds
+
             window = FilmWindow("ganlane") if render_mode == "human" else None
-            self._view = LiveView(made, option("traffic", traffic).label(), window)
+            self._view = LiveView(self._rows.env, option("traffic", traffic).label(), window)
         self._seed = None if seed is None else seed_number(seed)
         self._episode = -1
         self._running = False
@@ -91,8 +89,8 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         self._rows.start(self._seed, self._episode)
         self._running = True
         if self._view is not None:
-            self._view.start(self._rows.now())
-        return self._rows.observation()[0], row_of(self._rows.info(), 0)
+            self._view.start(self._rows.state)
+        return self._rows.observation()[0].copy(), row_of(self._rows.info(), 0)
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """One decision: observation, reward, terminated, truncated, info."""
@@ -101,17 +99,17 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         actions = actions_of(np.reshape(action, -1), 1)
         if self._view is not None:
             self._view.before_step(int(actions[0]))
-        after = self._rows.step(actions)
-        reward = float(after.get("reward")[0])
-        terminated, truncated = (bool(after.get(name)[0]) for name in ("terminated", "truncated"))
+        stepped = self._rows.step(actions)
+        reward = float(stepped.reward[0])
+        terminated, truncated = bool(stepped.terminated[0]), bool(stepped.truncated[0])
         self._running = not (terminated or truncated)
         if self._view is not None:
-            self._view.after_step(after, reward)
-        return self._rows.observation(after)[0], reward, terminated, truncated, row_of(self._rows.info(after), 0)
+            self._view.after_step(self._rows.state, reward)
+        return stepped.observation[0].copy(), reward, terminated, truncated, row_of(self._rows.info(), 0)
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
         """Which actions are allowed now, bool [3]; named as sb3-contrib's MaskablePPO asks for it."""
-        return self._rows.allowed()[0]
+        return self._rows.mask()[0].copy()
 
     def render(self) -> Any:
         """The picture [height, width, 3] uint8 of the last moment with ``rgb_array``; ``human`` draws by itself."""

@@ -11,23 +11,21 @@ from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ganlane.api import make_env
-from ganlane.env.checks import seed_number
 from ganlane.errors import UserError
-from ganlane.gym.rendering import BatchView, real_time_fps
 from ganlane.gym.rows import (
     ACTIONS,
     SEEDS,
+    Flags,
     Floats,
-    Rows,
     actions_of,
+    copied,
     episode_numbers,
     known_options,
+    make_rows,
     row_mask,
 )
 from ganlane.options import Option, option
-
-Flags = npt.NDArray[np.bool_]
+from ganlane.parameters.checks import seed_number
 
 
 class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):
@@ -38,13 +36,16 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         traffic: as in :func:`ganlane.api.make_env`, as are ``options``.
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random.
         render_mode: None or ``rgb_array``.
+        autoreset_mode: what happens to a row that has ended, see below.
         options: as in :class:`ganlane.gym.single.HighwayGym`.
 
-    A row that ends is reset in the same step (``AutoresetMode.SAME_STEP``): ``observation`` is the first of its next
-    episode, ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended with. Row i of N runs the episodes
-    i, i + N, i + 2N, ... of the seed, in whatever batch. ``reset(options={"episode": k})`` begins with the episodes
-    k + i instead; an array [N] gives each row its own. ``reset(options={"reset_mask": mask})`` sends the rows of a
-    boolean array [N] on to their next episodes.
+    ``AutoresetMode.SAME_STEP``: a row that ends is reset in the same step: ``observation`` is the first of its next
+    episode, ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended with. ``NEXT_STEP``: it is reset in
+    the next step, which ignores its action and gives the reward 0. ``DISABLED``: you reset it, by
+    ``reset(options={"reset_mask": mask})``, which sends the rows of a boolean array [N] on to their next episodes.
+
+    Row i of N runs the episodes i, i + N, i + 2N, ... of the seed, in whatever batch.
+    ``reset(options={"episode": k})`` begins with the episodes k + i instead; an array [N] gives each row its own.
 
     Raises:
         UserError: a wrong value.
@@ -59,21 +60,29 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         *,
         seed: int | None = None,
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         **options: Any,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UserError(
                 f"render_mode={render_mode}: a batch has rgb_array only; use gymnasium.make for a window."
             )
-        made = make_env(traffic, num_envs, **options)
-        self._rows = Rows(made)
+        self._mode = _mode_of(autoreset_mode)
+        self._rows = make_rows(traffic, num_envs, render_mode, options)
         self.num_envs, self.render_mode = self._rows.count, render_mode
-        self.metadata = {**self.metadata, "render_fps": real_time_fps(made)}
+        fps = max(1, round(1.0 / self._rows.decision_period_s))
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.single_observation_space, self.single_action_space = self._rows.space, Discrete(ACTIONS)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seed = None if seed is None else seed_number(seed)
-        self._view = None if render_mode is None else BatchView(made, option("traffic", traffic).label())
+        #: Rows whose episode is over, until they are reset.
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._view: Any = None
+        if render_mode is not None:
+            from ganlane.gym.rendering import BatchView  # with torch, which takes seconds
+
+            self._view = BatchView(self._rows.env, option("traffic", traffic).label())
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -82,13 +91,22 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         given = known_options(options, ("episode", "reset_mask"))
         if "reset_mask" in given:
             fresh = row_mask(given["reset_mask"], self.num_envs)
-            self._rows.restart(fresh)
+            if self._rows.numbers() is None:
+                raise UserError("no episode is under way; call reset() first.")
+            self._restart(fresh)
         else:
             fresh = np.ones(self.num_envs, dtype=np.bool_)
             self._start(seed, given.get("episode"))
+            self._ended[:] = False
+            if self._view is not None:
+                self._view.start(fresh)
+        return self._rows.observation().copy(), copied(self._rows.info())
+
+    def _restart(self, rows: Flags) -> None:
+        self._rows.restart(rows)
+        self._ended = self._ended & ~rows
         if self._view is not None:
-            self._view.start(fresh)
-        return self._rows.observation(), self._rows.info()
+            self._view.start(rows)
 
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         each = np.arange(self.num_envs)
@@ -107,41 +125,62 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
 
     def _next(self, each: npt.NDArray[np.int64]) -> tuple[Any, npt.NDArray[np.int64]]:
         """Seeds and episodes after the present ones; at first the constructor's seed and the first episodes."""
-        if self._rows.state is not None:
-            now = self._rows.info()
-            return now["seed"], now["episode_number"] + self.num_envs
+        now = self._rows.numbers()
+        if now is not None:
+            return now[0].copy(), now[1] + self.num_envs
         return int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed, each
 
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
         """One decision in every row: observations [N, D], rewards, terminated, truncated [N], info."""
-        after = self._rows.step_and_reset(actions_of(actions, self.num_envs))
-        reward, terminated, truncated = (
-            after.get(name)[:, 0].cpu().numpy().copy() for name in ("reward", "terminated", "truncated")
-        )
-        info, ended = self._rows.info(), terminated | truncated
+        if self._rows.numbers() is None:
+            raise UserError("no episode is under way; call reset() first.")
+        waiting = self._ended
+        if self._mode is AutoresetMode.DISABLED and waiting.any():
+            raise UserError(
+                f"step(): the episodes of rows {np.flatnonzero(waiting).tolist()} are over; call "
+                "reset(options={'reset_mask': mask}) first, or choose another autoreset_mode."
+            )
+        stepped = self._rows.step(actions_of(actions, self.num_envs))
+        reward = stepped.reward.astype(np.float64)
+        terminated, truncated = stepped.terminated.copy(), stepped.truncated.copy()
         if self._view is not None:
             self._view.after_step(actions, reward)
-            self._view.start(ended)
-        if ended.any():
-            final = self._rows.observation(after)
-            info |= {"final_obs": _where(ended, final), "_final_obs": ended.copy()}
-            info |= {"final_info": self._rows.info(after), "_final_info": ended.copy()}
-        return self._rows.observation(), reward.astype(np.float64), terminated, truncated, info
+        if waiting.any():  # what these rows did after their ends is forgotten
+            reward[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
+            self._restart(waiting)
+        ended = self._ended = terminated | truncated
+        final: dict[str, Any] = {}
+        if self._mode is AutoresetMode.SAME_STEP and ended.any():
+            final = {"final_obs": _where(ended, self._rows.observation()), "_final_obs": ended}
+            final |= {"final_info": copied(self._rows.info()), "_final_info": ended}
+            self._restart(ended)
+        return self._rows.observation().copy(), reward, terminated, truncated, copied(self._rows.info()) | final
 
     def action_masks(self) -> Flags:
         """Which actions are allowed now, bool [N, 3]."""
-        return self._rows.allowed()
+        return self._rows.mask().copy()
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture [height, width, 3] uint8 of every row, without trails."""
         if self._view is None:
             raise UserError("render(): made without render_mode; give render_mode='rgb_array' to make_vec().")
-        return self._view.pictures(self._rows.now())
+        if self._rows.state is None:
+            raise UserError("no episode is under way; call reset() first.")
+        return self._view.pictures(self._rows.state)
+
+
+def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
+    """gymnasium's mode, by itself or by its name."""
+    for known in AutoresetMode:
+        if mode is known or str(mode).lower() in (known.name.lower(), known.value.lower()):
+            return known
+    names = ", ".join(known.name.lower() for known in AutoresetMode)
+    raise UserError(f"autoreset_mode={mode}: expected one of {names}; choose one of them.")
 
 
 def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
     """Final observations in gymnasium's form: an object array [N], None outside ``rows``."""
     found = np.full(len(rows), None, dtype=object)
     for row in np.flatnonzero(rows):
-        found[row] = observations[row]
+        found[row] = observations[row].copy()
     return found

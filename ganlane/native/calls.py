@@ -1,15 +1,14 @@
-"""Calls of the kernel: tensors as pointers, rows shared between threads."""
+"""Calls of the kernel: arrays as pointers, rows shared between threads. Imports no torch."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-
-import torch
-from torch import Tensor
+from typing import Any
 
 #: Rows per thread from which on a second thread pays.
 ROWS_PER_THREAD = 64
@@ -17,18 +16,29 @@ ROWS_PER_THREAD = 64
 BLOCK = 16
 
 
-def addresses(tensors: Sequence[Tensor], count: int) -> ctypes.Array[ctypes.c_void_p]:
-    """A struct of ``count`` pointers; those beyond the tensors are null."""
-    return (ctypes.c_void_p * count)(*(tensor.data_ptr() for tensor in tensors))
+def addresses(arrays: Sequence[Any], count: int) -> ctypes.Array[ctypes.c_void_p]:
+    """A struct of ``count`` pointers to tensors or NumPy arrays; those beyond the arrays are null."""
+    return (ctypes.c_void_p * count)(
+        *(each.ctypes.data if hasattr(each, "ctypes") else each.data_ptr() for each in arrays)
+    )
+
+
+def threads_allowed() -> int:
+    """As many threads as torch may use; where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores."""
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        return int(torch.get_num_threads())
+    named = os.environ.get("OMP_NUM_THREADS", "")
+    return int(named) if named.isdigit() and int(named) > 0 else os.cpu_count() or 1
 
 
 def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
-    """``call(first, last)`` for all ``rows``, in as many threads as torch may use.
+    """``call(first, last)`` for all ``rows``, in as many threads as pay and are allowed.
 
     Raises:
         MemoryError: a call returned other than 0.
     """
-    threads = min(torch.get_num_threads(), rows // ROWS_PER_THREAD)
+    threads = 1 if rows < 2 * ROWS_PER_THREAD else min(threads_allowed(), rows // ROWS_PER_THREAD)
     if threads <= 1:
         codes = [call(0, rows)]
     else:

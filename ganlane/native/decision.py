@@ -9,81 +9,13 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import UserError
-from ganlane.keys import PHYSICS_STEP_S
 from ganlane.native.calls import addresses, in_threads
 from ganlane.native.library import load
-from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
+from ganlane.native.settings import settings_of
+from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, SteeringParameters
 from ganlane.parameters.episode import EpisodeParameters
-from ganlane.sim.dynamics import STEERING, SteeringParameters
+from ganlane.sim.dynamics import STEERING
 from ganlane.sim.state import Road, Vehicles
-
-
-class Settings(ctypes.Structure):
-    """``Settings`` of model.hpp."""
-
-    _fields_ = [
-        *((name, ctypes.c_float) for name in (
-            "min_gap", "headway", "per_brake_scale", "min_acceleration", "max_acceleration",
-            "threshold", "politeness_rear", "politeness_side", "safe_deceleration", "exclusive",
-            "per_near_s", "per_far_s", "gain_far", "gain_near", "gain_integral", "slow", "max_angle",
-            "soft_crash_ttc", "soft_crash_gap", "goal", "lane_width", "per_lane_width",
-        )),
-        *((name, ctypes.c_int32) for name in (
-            "lanes", "vehicles", "substeps", "timeout_steps", "mobil", "abort_lane_change",
-        )),
-    ]  # fmt: skip
-
-
-def settings_of(
-    road: Road,
-    vehicles: int,
-    episode: EpisodeParameters | None = None,
-    ego: EgoParameters | None = None,
-    idm: IdmParameters | None = None,
-    steering: SteeringParameters = STEERING,
-    mobil: MobilParameters | None = None,
-) -> Settings:
-    """The numbers as the kernel takes them; arguments as :class:`Kernel`'s.
-
-    Raises:
-        UserError: the road is a ring or differs from row to row.
-    """
-    if road.ring_m is not None or isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
-        raise UserError(
-            "env.kernel=native: the road must be straight and the same in all rows; set env.kernel=torch."
-        )
-    episode, ego = episode or EpisodeParameters(), ego or EgoParameters()
-    idm, lane_changes = idm or IdmParameters(), mobil or MobilParameters()
-    return Settings(
-        min_gap=idm.min_gap_m,
-        headway=idm.headway_s,
-        per_brake_scale=1.0 / idm.brake_scale(),
-        min_acceleration=idm.min_acceleration,
-        max_acceleration=idm.max_acceleration,
-        threshold=lane_changes.threshold,
-        politeness_rear=lane_changes.politeness_rear,
-        politeness_side=lane_changes.politeness_side,
-        safe_deceleration=lane_changes.safe_deceleration,
-        exclusive=lane_changes.exclusive_m,
-        per_near_s=1.0 / steering.near_s,
-        per_far_s=1.0 / steering.far_s,
-        gain_far=steering.gain_far,
-        gain_near=steering.gain_near,
-        gain_integral=steering.gain_integral,
-        slow=steering.slow_mps,
-        max_angle=steering.max_angle_rad,
-        soft_crash_ttc=ego.soft_crash_ttc_s,
-        soft_crash_gap=ego.soft_crash_gap_m,
-        goal=episode.goal_m,
-        lane_width=road.lane_width_m,
-        per_lane_width=1.0 / road.lane_width_m,
-        lanes=road.lanes,
-        vehicles=vehicles,
-        substeps=episode.substeps(),
-        timeout_steps=round(episode.timeout_s / PHYSICS_STEP_S),
-        mobil=mobil is not None,
-        abort_lane_change=ego.abort_lane_change,
-    )
 
 
 class EgoState(NamedTuple):
@@ -193,7 +125,11 @@ class Kernel:
     ) -> None:
         self.vehicles, self.variant = vehicles, variant
         self._decide = load(variant).ganlane_decide
-        self._settings = settings_of(road, vehicles, episode, ego, idm, steering, mobil)
+        if road.ring_m is not None or isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
+            raise UserError(
+                "env.kernel=native: the road must be straight and the same in all rows; set env.kernel=torch."
+            )
+        self._settings = settings_of(road.lanes, road.lane_width_m, vehicles, episode, ego, idm, steering, mobil)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the library, which another process loads for itself."""

@@ -14,35 +14,8 @@
 #include <stdint.h>
 #include <stdlib.h>
 
+#include "arrays.hpp"
 #include "model.hpp"
-
-// ---- Arrays, as ganlane/native/decision.py declares them
-
-struct Inputs {  // [rows] or [rows, vehicles]
-    const int64_t* action;
-    const float *x, *y, *heading, *speed, *acceleration, *length, *width, *desired_speed;
-    const int64_t *target_lane, *visibility;
-    const uint8_t* valid;
-    const float* steering;
-    const float* ego_steering;
-    const int64_t *change_direction, *decisions, *lane_changes;
-    const uint8_t *soft_crash, *soft_crash_behind;
-    const int64_t* step;
-    const uint8_t* recycles;  // whether the row recycles its vehicles; null: none does
-};
-
-struct Outputs {
-    float *x, *y, *heading, *speed, *acceleration;
-    int64_t* target_lane;
-    float* steering;
-    float *ego_steering, *mean_acceleration, *change_progress, *distance;
-    int64_t *change_direction, *decisions, *lane_changes;
-    uint8_t *soft_crash, *soft_crash_behind, *started_change;
-    int64_t* step;
-    uint8_t *goal, *hard_crash, *out_of_road, *timeout;
-    int64_t *soft_crashes, *soft_crashes_behind;
-    uint8_t *done, *terminated, *truncated;
-};
 
 const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f;
 const int MOBIL_PERIOD = 10;

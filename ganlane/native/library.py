@@ -21,11 +21,18 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 from ganlane.errors import UserError
 
-FILES = ("kernel.cpp", "observation.cpp", "mask.cpp", "model.hpp", "vectors.hpp")
+FILES = (
+    "kernel.cpp",
+    "observation.cpp",
+    "mask.cpp",
+    "spawn.cpp",
+    "step.cpp",
+    "arrays.hpp",
+    "model.hpp",
+    "vectors.hpp",
+)
 #: The sources to compile, and what they include.
 SOURCES = tuple(Path(__file__).with_name(name) for name in FILES)
 #: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives the same bits.
@@ -43,7 +50,7 @@ class Variant(NamedTuple):
     zig_flags: tuple[str, ...]
 
 
-#: By the names of ``torch.backends.cpu.get_cpu_capability``; ``default`` runs everywhere.
+#: By the names that torch gives them; ``default`` runs everywhere.
 VARIANTS = {
     "AVX512": Variant(16, ("-march=x86-64-v4",), ("-mcpu=x86_64_v4",)),
     "AVX2": Variant(8, ("-march=x86-64-v3",), ("-mcpu=x86_64_v3",)),
@@ -51,10 +58,28 @@ VARIANTS = {
 }
 
 
+#: What Linux knows of the processor.
+CPU_INFO = Path("/proc/cpuinfo")
+#: What a processor must have for a variant (x86-64-v4 and -v3), by the names of Linux.
+_NEEDED = {
+    "AVX512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"},
+    "AVX2": {"avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"},
+}
+
+
 def best_variant() -> str:
     """The fastest of :data:`VARIANTS` that this processor runs."""
-    found = torch.backends.cpu.get_cpu_capability() if platform.machine() in ("x86_64", "AMD64") else "default"
-    return found if found in VARIANTS else "default"
+    if platform.machine() not in ("x86_64", "AMD64"):
+        return "default"
+    try:
+        lines = CPU_INFO.read_text().splitlines()
+        found = set(next(line for line in lines if line.startswith("flags")).split())
+    except (OSError, StopIteration):  # not Linux
+        import torch  # seconds to import
+
+        capability = torch.backends.cpu.get_cpu_capability()
+        return capability if capability in VARIANTS else "default"
+    return next((name for name, needed in _NEEDED.items() if needed <= found), "default")
 
 
 def find_compiler() -> tuple[str, ...] | None:
@@ -143,7 +168,8 @@ def _build(command: tuple[str, ...], library: Path) -> None:
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
     """With the types of its functions; a call through ctypes releases the interpreter's lock."""
     pointer, number = ctypes.c_void_p, ctypes.c_long
-    for function in (library.ganlane_decide, library.ganlane_lane_view, library.ganlane_mask):
-        function.argtypes = [pointer, pointer, pointer, number, number]
+    for name, pointers in (("decide", 3), ("lane_view", 3), ("mask", 3), ("spawn", 3), ("step", 1), ("start", 1)):
+        function = getattr(library, f"ganlane_{name}")
+        function.argtypes = [*[pointer] * pointers, number, number]
         function.restype = ctypes.c_int
     return library

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ganlane.native.calls import addresses, in_threads
-from ganlane.native.decision import settings_of
 from ganlane.native.library import load
-from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
+from ganlane.native.settings import safe_settings
+from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.state import Road, Vehicles
 
 
@@ -38,8 +38,9 @@ class SafeActions:
     ) -> None:
         self.variant = variant
         self._allow = load(variant).ganlane_mask
-        safe = MobilParameters(safe_deceleration=safe_deceleration)
-        self._settings = settings_of(road, vehicles, ego=EgoParameters(abort_lane_change=abort), idm=idm, mobil=safe)
+        assert not isinstance(road.lanes, Tensor)
+        assert not isinstance(road.lane_width_m, Tensor)
+        self._settings = safe_settings(road.lanes, road.lane_width_m, vehicles, idm, safe_deceleration, abort)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the library, which another process loads for itself."""

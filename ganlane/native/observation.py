@@ -10,17 +10,9 @@ from torch import Tensor
 
 from ganlane.native.calls import addresses, in_threads
 from ganlane.native.library import load
+from ganlane.native.settings import view_of
 from ganlane.parameters.observation import ObservationScale
 from ganlane.sim.state import Road, Vehicles
-
-
-class _View(ctypes.Structure):
-    """``View`` of observation.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_float) for name in ("range", "speed_scale", "lane_width", "nearness_m", "overlap_m")),
-        *((name, ctypes.c_int32) for name in ("lanes", "vehicles", "drift", "overlap")),
-    )
 
 
 class LaneView:
@@ -30,8 +22,7 @@ class LaneView:
         road: straight, the same in all rows.
         vehicles: M, the ego included.
         scale: range of sight and of relative speeds.
-        nearness_m, overlap_m: scales of the nearness.
-        drift, overlap: as in :func:`ganlane.transforms.observation.lane_view`.
+        form: one of :data:`ganlane.native.settings.NATIVE_FORMS`.
         variant: one of :data:`ganlane.native.library.VARIANTS`; None: the best for this processor.
     """
 
@@ -40,19 +31,15 @@ class LaneView:
         road: Road,
         vehicles: int,
         scale: ObservationScale,
-        nearness_m: float,
-        overlap_m: float,
-        drift: bool = False,
-        overlap: bool = False,
+        form: str,
         variant: str | None = None,
     ) -> None:
-        self.size = 5 + 6 * (4 if drift else 3)
         self.variant = variant
         self._look = load(variant).ganlane_lane_view
-        self._view = _View(
-            scale.range_m, scale.speed_mps, road.lane_width_m, nearness_m, overlap_m,
-            road.lanes, vehicles, drift, overlap,
-        )  # fmt: skip
+        assert not isinstance(road.lanes, Tensor)
+        assert not isinstance(road.lane_width_m, Tensor)
+        self._view = view_of(road.lanes, road.lane_width_m, vehicles, scale, form)
+        self.size = self._view.numbers()
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the library, which another process loads for itself."""

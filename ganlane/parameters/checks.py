@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, fields
 from typing import Any, Final, NamedTuple, TypeVar
 
-from ganlane.errors import ParameterError, as_typed
+from ganlane.errors import ParameterError, UserError, as_typed
 
 Record = TypeVar("Record")
 #: Metadata of a field that is set from Python alone: OmegaConf leaves such fields out of a schema.
@@ -138,3 +138,22 @@ def lists_to_tuples(record: Any) -> None:
 def part_of(record: Any, kind: type[Record]) -> Record:
     """The fields that ``record`` inherits from ``kind``, as a ``kind``."""
     return kind(**{field.name: getattr(record, field.name) for field in fields(kind)})  # type: ignore[arg-type]
+
+
+def whole_number(name: str, value: Any, low: int, high: int) -> int:
+    """``value`` as an int; NumPy's integers are allowed.
+
+    Raises:
+        UserError: it is none, or not from ``low`` to ``high``.
+    """
+    if isinstance(value, bool) or not hasattr(value, "__index__") or not low <= int(value) <= high:
+        most = "2**63 - 1" if high == 2**63 - 1 else f"{high}"
+        raise UserError(
+            f"{name}={value}: expected a whole number from {low} to {most}; give for instance {name}={low}."
+        )
+    return int(value)
+
+
+def seed_number(seed: Any) -> int:
+    """A seed, checked: the counters of the environment hold 63 bits."""
+    return whole_number("seed", seed, 0, 2**63 - 1)

@@ -101,3 +101,17 @@ class EgoParameters:
     def __post_init__(self) -> None:
         limits = dict.fromkeys(("soft_crash_ttc_s", "soft_crash_gap_m"), at_least(0))
         check(self, visibility=one_of(VISIBILITIES), **limits)
+
+
+@dataclass(frozen=True)
+class SteeringParameters:
+    """Look-ahead times (s), gains (each divided by speed, times the wheelbase) and limits."""
+
+    near_s: float = 1.0
+    far_s: float = 4.0
+    gain_far: float = 1.5
+    gain_near: float = 3.0
+    gain_integral: float = 3.375
+    #: Below this speed the law is one of distance travelled, not of time: a standing car does not turn its wheels.
+    slow_mps: float = 3.0
+    max_angle_rad: float = 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 from ganlane.errors import ParameterError
 from ganlane.keys import PHYSICS_STEP_S
@@ -10,6 +11,14 @@ from ganlane.parameters.checks import above, between, check, lists_to_tuples, po
 
 #: What drives a decision: the tensor code, the native kernel, or the latter where it can.
 KERNELS = ("torch", "native", "auto")
+
+
+class Stream(IntEnum):
+    """Disjoint sets of episodes: for training, for selection (validation), and for reported results (test)."""
+
+    TRAIN = 0
+    SELECT = 1
+    REPORT = 2
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,10 @@ FORMS = (
     "lane_view_overlap",
     "table3_lane_view",
 )
+#: Scale of the nearness in the lane view, m.
+NEARNESS_M = 15.0
+#: Overlap along the road that adds 1 to the nearness, m: drivers beside brake so hard that one metre decides.
+OVERLAP_M = 1.0
 #: The masks, see :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe")
 
@@ -104,6 +108,14 @@ class ObservationConfig(ObservationScale):
     def read_by(self, agent: ObservationConfig | None) -> ObservationConfig:
         """What a driver reads here: the form and scale that ``agent`` names, if it does, through these sensors."""
         return self if agent is None else replace(agent, sensors=self.sensors)
+
+
+def largest_number(form: str, longest_m: float = 4.5) -> float:
+    """Upper bound of all numbers of observation ``form`` but the first (speed over desired speed, unbounded).
+
+    ``longest_m`` is the length of the longest vehicle, m: ``lane_view_overlap`` counts metres of overlap.
+    """
+    return 1.0 + longest_m / OVERLAP_M if form == "lane_view_overlap" else 1.0
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ proportional to speed a lane change takes about 4 s at every speed, without over
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from ganlane.parameters.driving import SteeringParameters
 
 #: Distance between the axles, m.
 WHEELBASE_M = 2.7
@@ -58,20 +59,6 @@ def advance(
         new_speed,
         (new_speed - speed) / dt,
     )
-
-
-@dataclass(frozen=True)
-class SteeringParameters:
-    """Look-ahead times (s), gains (each divided by speed, times the wheelbase) and limits."""
-
-    near_s: float = 1.0
-    far_s: float = 4.0
-    gain_far: float = 1.5
-    gain_near: float = 3.0
-    gain_integral: float = 3.375
-    #: Below this speed the law is one of distance travelled, not of time: a standing car does not turn its wheels.
-    slow_mps: float = 3.0
-    max_angle_rad: float = 0.5
 
 
 STEERING = SteeringParameters()

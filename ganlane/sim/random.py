@@ -13,17 +13,11 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
+from ganlane.parameters.episode import Stream as Stream  # also known as ganlane.sim.Stream
+
 _GOLDEN = -7046029254386353131  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
 _MIX_A = -4658895280553007687  # 0xBF58476D1CE4E5B9
 _MIX_B = -7723592293110705685  # 0x94D049BB133111EB
-
-
-class Stream(IntEnum):
-    """Disjoint sets of episodes: for training, for selection (validation), and for reported results (test)."""
-
-    TRAIN = 0
-    SELECT = 1
-    REPORT = 2
 
 
 class Purpose(IntEnum):

@@ -10,7 +10,7 @@ used in the same way::
 """
 
 from ganlane.transforms.mask import MASKS, ActionMaskTransform
-from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, largest_number, observation_size
+from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, observation_size
 from ganlane.transforms.reward import RewardParameters, RewardTransform
 from ganlane.transforms.sensors import SensorParameters, SensorTransform
 
@@ -23,6 +23,5 @@ __all__ = [
     "RewardTransform",
     "SensorParameters",
     "SensorTransform",
-    "largest_number",
     "observation_size",
 ]

@@ -21,16 +21,13 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native import LaneView
-from ganlane.parameters.observation import ObservationScale
+from ganlane.native.observation import LaneView
+from ganlane.native.settings import NATIVE_FORMS
+from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale
 from ganlane.runtime import compiled
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.transforms.sensors import PerceptionTransform
 
-#: Scale of the nearness feature, m.
-NEARNESS_M = 15.0
-#: Overlap along the road that adds 1 to the nearness, m: drivers beside brake so hard that one metre decides.
-OVERLAP_M = 1.0
 LANE_VIEW_SIZE = 18
 DRIFT_SIZE = 6
 #: Lanes of the fixed order: to the left, own, to the right.
@@ -212,22 +209,10 @@ OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
     "lane_view_overlap": (OWN, OVERLAP_VIEW, CHANGE),
 }
 
-#: The forms that the native kernel computes: drift, overlap.
-NATIVE: Final = {"lane_view": (False, False), "lane_view_drift": (True, False), "lane_view_overlap": (True, True)}
-
 
 def observation_size(name: str, vehicles: int) -> int:
     """Length D of observation ``name`` for ``vehicles`` vehicles, the ego included."""
     return sum(part.size(vehicles - 1) for part in OBSERVATIONS[name])
-
-
-def largest_number(name: str, longest_m: float = 4.5) -> float:
-    """Upper bound of all numbers of observation ``name`` but the first (speed over desired speed, unbounded).
-
-    ``longest_m`` is the length of the longest vehicle, m (:attr:`ganlane.sim.scenes.Scenes.longest_m`): with
-    ``lane_view_overlap`` the nearness counts metres of overlap.
-    """
-    return 1.0 + longest_m / OVERLAP_M if OVERLAP_VIEW in OBSERVATIONS[name] else 1.0
 
 
 class ObservationTransform(PerceptionTransform):
@@ -238,7 +223,8 @@ class ObservationTransform(PerceptionTransform):
         vehicles: M, the ego included.
         form: a key of :data:`OBSERVATIONS`.
         scale: normalisers.
-        native: the native kernel computes the forms in :data:`NATIVE`, for float32 on a CPU.
+        native: the native kernel computes the forms in :data:`ganlane.native.settings.NATIVE_FORMS`, for float32 on a
+            CPU.
 
     Raises:
         UserError: an unknown form, or fewer than two vehicles.
@@ -260,8 +246,8 @@ class ObservationTransform(PerceptionTransform):
         self.road, self.vehicles, self.form = road, vehicles, form
         self.scale = scale or ObservationScale()
         self.native: LaneView | None = None
-        if native and form in NATIVE:
-            self.native = LaneView(road, vehicles, self.scale, NEARNESS_M, OVERLAP_M, *NATIVE[form])
+        if native and form in NATIVE_FORMS:
+            self.native = LaneView(road, vehicles, self.scale, form)
 
     def observe(
         self, vehicles: Vehicles, progress: Tensor, direction: Tensor, road: Road, seen: Vehicles | None = None

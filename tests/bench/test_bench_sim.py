@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from importlib.metadata import version
 
 import pytest
 import torch
@@ -11,8 +12,10 @@ from tensordict import TensorDict
 from ganlane import keys
 from ganlane.bench import sim as sim_module
 from ganlane.bench.measure import measure
-from ganlane.bench.sim import ENVIRONMENT, PHYSICS, SimSuite, bytes_of, exponent, scaling
+from ganlane.bench.sim import ENVIRONMENT, GYMNASIUM, PHYSICS, SimSuite, bytes_of, exponent, scaling
 from ganlane.bench.systems import (
+    EnvPoolRunner,
+    GymnasiumRunner,
     HighwayEnvRunner,
     Scenario,
     bare_steps,
@@ -139,7 +142,7 @@ def test_what_cannot_be_compiled_is_left_out_with_the_reason(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(sim_module, "_START", {PHYSICS: start})
+    monkeypatch.setattr(sim_module, "_START", {PHYSICS: start, ENVIRONMENT: start, GYMNASIUM: start})
     measured = suite(batches=[1, 2], vehicle_counts=[9], modes=["eager", "compiled"], linear_from=4)
     rows = measure(measured, **SHORT)["rows"]
     assert {row["mode"] for row in rows} == {"eager"}
@@ -202,7 +205,8 @@ def test_an_episode_of_the_peer_that_ends_is_followed_by_another(monkeypatch):
 
 
 @pytest.mark.usefixtures("_peer")
-def test_the_peer_takes_turns_in_every_group_and_makes_one_row():
+def test_the_peer_takes_turns_in_every_group_and_makes_one_row(monkeypatch):
+    monkeypatch.setattr(sim_module, "installed_version", lambda name: None if name == "envpool" else version(name))
     measured = suite(batches=[1, 2], vehicle_counts=[9], linear_from=4, peers=True)
     labels = highway_env_case(measured).labels
     assert (labels.vehicles, labels.lanes, labels.batch) == (9, 3, 1)
@@ -213,6 +217,21 @@ def test_the_peer_takes_turns_in_every_group_and_makes_one_row():
     assert [row["system"] for row in ours] == [PHYSICS, ENVIRONMENT] * 2
     assert all(row["ratio"] > 0 for row in ours)
     assert [row["system"] for row in numbers["ratios"]] == [PHYSICS, ENVIRONMENT]
+
+
+@pytest.mark.parametrize("batch", [1, 6])
+def test_gymnasium_simulates_the_steps_that_its_episodes_last(batch):
+    run = GymnasiumRunner(scenario(IdmTrafficConfig(), lanes=1, vehicles=2, goal_m=200.0), "native", "cpu", batch)
+    kept = sum(int((run.actions[i % 64] == keys.KEEP).sum()) for i in range(1, 26))
+    driven = run(25)
+    assert (
+        8 * kept < driven <= 10 * kept
+    )  # the last decision before the goal is shorter; whoever changes lanes is out
+
+
+def test_envpool_drives_the_same_road():
+    pytest.importorskip("envpool")
+    assert EnvPoolRunner(EnvConfig(), 4, 1, seed=0)(3) == 4 * 3 * 10
 
 
 # suite=traffic

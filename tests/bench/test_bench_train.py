@@ -79,7 +79,7 @@ def test_every_traffic_takes_turns_in_every_mode_batch_and_thread_count():
     groups = suite(train_batches=[2, 4]).groups()
     assert [(group.threads, group.cases[0].labels.batch) for group in groups] == [(1, 2), (1, 4), (2, 2), (2, 4)]
     seen = [(case.labels.traffic, case.labels.mode) for case in groups[0].cases]
-    assert seen == [(traffic, mode) for traffic in ("idm_mobil", "idm") for mode in ("eager", "compiled")]
+    assert seen == [(traffic, mode) for traffic in ("idm_mobil", "idm") for mode in ("eager", "compiled", "native")]
     assert groups[0].reference is None
 
 
@@ -128,7 +128,7 @@ def test_what_cannot_be_measured_is_refused(options, part):
 def test_quick_is_small_and_eager():
     quick = BenchConfig(suite="train", quick=True).shortened()
     assert (quick.train_batches, quick.train_stored, quick.modes) == ([64], 1000, ["eager"])
-    assert BenchConfig(quick=True).shortened().modes == ["eager", "compiled"]
+    assert BenchConfig(quick=True).shortened().modes == ["eager", "compiled", "native"]
 
 
 # stable-baselines3

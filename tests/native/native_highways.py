@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.native import EgoState, Kernel, Outcome
+from ganlane.native.decision import EgoState, Kernel, Outcome
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.state import Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic

@@ -22,8 +22,8 @@ from reference.worlds import environment, rules_of, scalar_state
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native import Kernel, Outcome, why_not
-from ganlane.native.library import VARIANTS, best_variant
+from ganlane.native.decision import Kernel, Outcome
+from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.sim.state import Road, Vehicles
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")

@@ -89,10 +89,23 @@ def test_clang_of_the_package_ziglang_is_found_where_there_is_no_other(monkeypat
     assert library.find_compiler() == (sys.executable, "-m", "ziglang", "c++")
 
 
+V3 = "avx2 bmi1 bmi2 f16c fma movbe"
+V4 = f"{V3} avx512f avx512bw avx512cd avx512dq avx512vl"
+
+
 @pytest.mark.parametrize(
-    ("machine", "capability"), [("riscv64", "DEFAULT"), ("x86_64", "DEFAULT"), ("arm64", "AVX2")]
+    ("machine", "flags", "variant"),
+    [
+        ("riscv64", V4, "default"),
+        ("arm64", V4, "default"),
+        ("x86_64", "sse2", "default"),
+        ("x86_64", "avx2", "default"),
+        ("x86_64", V3, "AVX2"),
+        ("x86_64", V4, "AVX512"),
+    ],
 )
-def test_an_unknown_processor_gets_the_variant_that_runs_everywhere(monkeypatch, machine, capability):
+def test_a_processor_gets_the_fastest_variant_that_it_runs(monkeypatch, tmp_path, machine, flags, variant):
+    (tmp_path / "cpuinfo").write_text(f"processor\t: 0\nflags\t\t: fpu {flags} sse\n")
     monkeypatch.setattr(library.platform, "machine", lambda: machine)
-    monkeypatch.setattr(library.torch.backends.cpu, "get_cpu_capability", lambda: capability)
-    assert library.best_variant() == "default"
+    monkeypatch.setattr(library, "CPU_INFO", tmp_path / "cpuinfo")
+    assert library.best_variant() == variant

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -9,11 +10,10 @@ from reference.worlds import vehicles
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from ganlane.api import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.gym.rows import Rows
+from ganlane.parameters.observation import largest_number
 from ganlane.sim import Road, Vehicles
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import (
@@ -21,7 +21,6 @@ from ganlane.transforms import (
     ObservationTransform,
     RewardTransform,
     SensorParameters,
-    largest_number,
     observation_size,
 )
 from ganlane.transforms.sensors import Measurement, measure
@@ -224,5 +223,5 @@ def test_the_largest_number_grows_with_the_longest_vehicle_where_overlap_counts(
 
 @pytest.mark.parametrize(("share", "largest"), [(0.0, 5.5), (0.5, 13.0)])
 def test_the_bounds_of_the_gymnasium_space_know_of_lorries(share, largest):
-    env = make_env("idm", env=EnvConfig(truck_share=share), observation="lane_view_overlap")
-    assert Rows(env).space.high[1:].tolist() == [largest] * (Rows(env).space.shape[0] - 1)
+    space = gymnasium.make("ganlane/Highway-v0", env=EnvConfig(truck_share=share)).observation_space
+    assert space.high[1:].tolist() == [largest] * (space.shape[0] - 1)

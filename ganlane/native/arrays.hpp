@@ -1,0 +1,52 @@
+// The arrays of a batch and the settings of an episode's start, as ganlane/native/settings.py declares them.
+// [rows] or [rows, vehicles], the ego first; flags are bytes.
+
+#pragma once
+
+#include <stdint.h>
+
+struct Inputs {
+    const int64_t* action;
+    const float *x, *y, *heading, *speed, *acceleration, *length, *width, *desired_speed;
+    const int64_t *target_lane, *visibility;
+    const uint8_t* valid;
+    const float* steering;
+    const float* ego_steering;
+    const int64_t *change_direction, *decisions, *lane_changes;
+    const uint8_t *soft_crash, *soft_crash_behind;
+    const int64_t* step;
+    const uint8_t* recycles;  // whether the row recycles its vehicles; null: none does
+};
+
+struct Outputs {  // may be the same memory as the inputs
+    float *x, *y, *heading, *speed, *acceleration;
+    int64_t* target_lane;
+    float* steering;
+    float *ego_steering, *mean_acceleration, *change_progress, *distance;
+    int64_t *change_direction, *decisions, *lane_changes;
+    uint8_t *soft_crash, *soft_crash_behind, *started_change;
+    int64_t* step;
+    uint8_t *goal, *hard_crash, *out_of_road, *timeout;
+    int64_t *soft_crashes, *soft_crashes_behind;
+    uint8_t *done, *terminated, *truncated;
+};
+
+struct Range {
+    float low, span;
+};
+
+struct Spawn {  // Table II
+    double recycle_share;
+    int64_t stream;
+    Range front_speed, rear_speed, ego_speed, desired_speed, truck_desired_speed;
+    float spread, spacing, ego_desired_speed, truck_share, length, width, truck_length, truck_width, lane_width;
+    int32_t vehicles, lanes, capacity, ego_visibility, others_visibility, recycle;
+};
+
+struct Scene {  // what an episode's start sets besides the state
+    const int64_t *seed, *episode;
+    const uint8_t* fresh;  // rows that start
+    float *length, *width, *desired_speed;
+    int64_t* visibility;
+    uint8_t *valid, *recycles;
+};

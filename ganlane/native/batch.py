@@ -1,0 +1,205 @@
+"""A batch of highways on NumPy arrays: a whole step (drive, reward, mask, observation) in one call of the kernel.
+
+What gymnasium's environments stand on (:mod:`ganlane.gym`). Imports no torch, so it is there in a fraction of a
+second, and costs microseconds where a TensorDict costs milliseconds. Its episodes are, number for number, those of
+the TorchRL environment with ``env.kernel=native``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ganlane.native.calls import addresses, in_threads
+from ganlane.native.library import load
+from ganlane.native.settings import reward_of, safe_settings, settings_of, spawn_of, view_of
+from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
+from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
+from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, largest_number
+from ganlane.parameters.reward import RewardParameters
+
+#: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
+SPEED_RATIO_LIMIT = 4.0
+_FLOAT, _INTEGER, _FLAG = np.float32, np.int64, np.bool_
+_VEHICLE = {
+    **dict.fromkeys(("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed"), _FLOAT),
+    **dict.fromkeys(("target_lane", "visibility"), _INTEGER),
+    "valid": _FLAG,
+    "steering": _FLOAT,
+}
+_ROW = {
+    **dict.fromkeys(("seed", "episode", "action", "change_direction", "decisions", "lane_changes", "step"), _INTEGER),
+    **dict.fromkeys(("soft_crashes", "soft_crashes_behind"), _INTEGER),
+    **dict.fromkeys(("ego_steering", "mean_acceleration", "change_progress", "distance", "reward"), _FLOAT),
+    **dict.fromkeys(("soft_crash", "soft_crash_behind", "started_change", "recycles", "fresh"), _FLAG),
+    **dict.fromkeys(("goal", "hard_crash", "out_of_road", "timeout", "done", "terminated", "truncated"), _FLAG),
+}  # fmt: skip
+# The structures of arrays.hpp, observation.cpp and mask.cpp, in their order.
+_EGO = ("ego_steering", "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind")
+_INPUTS = ("action", *_VEHICLE, *_EGO, "step", "recycles")
+_OUTPUTS = (
+    "x", "y", "heading", "speed", "acceleration", "target_lane", "steering",
+    "ego_steering", "mean_acceleration", "change_progress", "distance",
+    "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind", "started_change",
+    "step", "goal", "hard_crash", "out_of_road", "timeout", "soft_crashes", "soft_crashes_behind",
+    "done", "terminated", "truncated",
+)  # fmt: skip
+_SCENE = ("seed", "episode", "fresh", "length", "width", "desired_speed", "visibility", "valid", "recycles")
+_VIEW = ("speed", "desired_speed", "length", "y", "x", "y", "speed", "valid", "change_progress", "change_direction")
+_MASK = (
+    "x", "y", "heading", "speed", "length", "width", "desired_speed", "target_lane", "visibility", "valid",
+    "change_direction",
+)  # fmt: skip
+
+
+class _Batch(ctypes.Structure):
+    """``Batch`` of step.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in (
+            "settings", "inputs", "outputs", "spawn", "scene", "reward_settings", "reward", "terms",
+            "view", "view_inputs", "observation", "mask_settings", "mask_inputs", "mask_outputs", "mask",
+        )),
+        *((name, ctypes.c_float) for name in ("lowest", "highest", "fastest")),
+        *((name, ctypes.c_int32) for name in ("vehicles", "lanes", "size", "mask_form", "abort_lane_change")),
+    )  # fmt: skip
+
+
+class Stepped(NamedTuple):
+    """What a decision led to; arrays of the batch itself, which the next call overwrites.
+
+    ``observation`` [N, D] and ``reward`` [N] float32, ``terminated`` and ``truncated`` [N] bool.
+    """
+
+    observation: npt.NDArray[np.float32]
+    reward: npt.NDArray[np.float32]
+    terminated: npt.NDArray[np.bool_]
+    truncated: npt.NDArray[np.bool_]
+
+
+class NativeBatch:
+    """N highways with rule-driven traffic, from the random first scenes of Table II.
+
+    Args:
+        rows: N.
+        lanes, lane_width_m: of the road.
+        vehicles: M, the ego included.
+        spawn: Table II.
+        ego: the ego's lane changes and visibility.
+        episode: decision period, goal and time-out.
+        idm: car following of all.
+        mobil: lane changes of the others; None: they keep their lanes.
+        recycle_share: share of the episodes in which vehicles left behind return ahead; None: of none.
+        observation: one of :data:`ganlane.native.settings.NATIVE_FORMS`, without sensor errors.
+        reward: section V.C.
+        mask: of the ego's actions; ``none``: those that stay on the road.
+        stream: family of episodes.
+        variant: one of :data:`ganlane.native.library.VARIANTS`; None: the best for this processor.
+
+    Attributes:
+        state: name to array, [N, M] of the vehicles, [N] of the rest.
+
+    Raises:
+        UserError: the kernel cannot be built here.
+    """
+
+    def __init__(
+        self,
+        rows: int = 1,
+        lanes: int = 3,
+        lane_width_m: float = 4.0,
+        vehicles: int = 9,
+        spawn: SpawnParameters | None = None,
+        ego: EgoParameters | None = None,
+        episode: EpisodeParameters | None = None,
+        idm: IdmParameters | None = None,
+        mobil: MobilParameters | None = None,
+        recycle_share: float | None = None,
+        observation: ObservationConfig | None = None,
+        reward: RewardParameters | None = None,
+        mask: MaskParameters | None = None,
+        stream: int = 0,
+        variant: str | None = None,
+    ) -> None:
+        spawn, ego, episode = spawn or SpawnParameters(), ego or EgoParameters(), episode or EpisodeParameters()
+        observation, reward = observation or ObservationConfig(), reward or RewardParameters()
+        idm, mask = idm or IdmParameters(), mask or MaskParameters()
+        road = (lanes, lane_width_m, vehicles)
+        self.rows, self.lanes, self.lane_width_m, self.terms = rows, lanes, lane_width_m, reward.term_names
+        self.decision_period_s = episode.decision_period_s
+        view = view_of(*road, observation.scale(), observation.form)
+        self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
+        self.state: dict[str, npt.NDArray[Any]] = {
+            **{name: np.zeros((rows, vehicles), kind) for name, kind in _VEHICLE.items()},
+            **{name: np.zeros(rows, kind) for name, kind in _ROW.items()},
+        }
+        self.observation = np.zeros((rows, view.numbers()), _FLOAT)
+        self.mask = np.ones((rows, 3), _FLAG)
+        self._term_values = np.zeros((rows, len(self.terms)), _FLOAT)
+        self._no_safe_action = np.zeros(rows, _FLAG)
+        self._library = load(variant)
+        visible = Visibility.named(ego.visibility)
+        pointed = {
+            "settings": settings_of(*road, episode, ego, idm, mobil=mobil),
+            "inputs": self._pointers(_INPUTS),
+            "outputs": self._pointers(_OUTPUTS),
+            "spawn": spawn_of(*road, spawn, stream, visible, Visibility.SIGNALLED, recycle_share),
+            "scene": self._pointers(_SCENE),
+            "reward_settings": reward_of(reward, episode.decision_period_s),
+            "view": view,
+            "view_inputs": self._pointers(_VIEW),
+            "mask_settings": safe_settings(*road, idm, mask.safe_deceleration, ego.abort_lane_change),
+            "mask_inputs": self._pointers(_MASK),
+            "mask_outputs": addresses([self.mask, self._no_safe_action], 2),
+        }
+        self._pointed = pointed  # kept, since the structure holds no more than their addresses
+        arrays = {
+            "reward": self.state["reward"],
+            "terms": self._term_values,
+            "observation": self.observation,
+            "mask": self.mask,
+        }
+        self._batch = _Batch(
+            **{name: ctypes.addressof(each) for name, each in pointed.items()},
+            **{name: each.ctypes.data for name, each in arrays.items()},
+            lowest=self.bounds[0],
+            highest=self.bounds[1],
+            fastest=SPEED_RATIO_LIMIT,
+            vehicles=vehicles,
+            lanes=lanes,
+            size=view.numbers(),
+            mask_form=MASKS.index(mask.form),
+            abort_lane_change=ego.abort_lane_change,
+        )
+        self._address = ctypes.byref(self._batch)
+        self._stepped = Stepped(
+            self.observation, *(self.state[name] for name in ("reward", "terminated", "truncated"))
+        )
+
+    def _pointers(self, names: Sequence[str]) -> ctypes.Array[ctypes.c_void_p]:
+        return addresses([self.state[name] for name in names], len(names))
+
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None) -> None:
+        """Begin the episodes [N] of the seeds [N], each perhaps one number for all, in ``rows`` [N] (None: all)."""
+        state = self.state
+        fresh = state["fresh"]
+        fresh[:] = True if rows is None else rows
+        np.copyto(state["seed"], seed, where=fresh)
+        np.copyto(state["episode"], episode, where=fresh)
+        start, batch = self._library.ganlane_start, self._address
+        in_threads(self.rows, lambda first, last: start(batch, first, last))
+
+    def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
+        """One decision of every row, by the actions [N]; no row is reset."""
+        self.state["action"][:] = actions
+        step, batch = self._library.ganlane_step, self._address
+        in_threads(self.rows, lambda first, last: step(batch, first, last))
+        return self._stepped
+
+    def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:
+        """The terms of the last reward by name, each [N]."""
+        return dict(zip(self.terms, self._term_values.T))

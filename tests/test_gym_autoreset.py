@@ -1,0 +1,78 @@
+"""What happens to a row of a gymnasium batch whose episode has ended, in each of gymnasium's three modes."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import ganlane  # noqa: F401 - registers the environments
+from ganlane.errors import UserError
+
+KEEP, LEFT = 0, 1
+
+
+def make_vec(rows, **options):
+    return gymnasium.make_vec("ganlane/Highway-v0", num_envs=rows, **{"traffic": "idm", "goal_m": 60.0, **options})
+
+
+def returns_by_episode(mode, traffic):
+    """Return of every finished episode by its number, rows in ``mode``; all rows keep their lanes."""
+    envs = make_vec(3, traffic=traffic, autoreset_mode=mode, goal_m=120.0)
+    assert envs.metadata["autoreset_mode"] is mode
+    _, info = envs.reset(seed=4)
+    running, numbers = np.zeros(3), info["episode_number"]
+    found, resets = {}, []
+    for _ in range(40):
+        _, reward, terminated, truncated, info = envs.step(np.zeros(3, int))
+        running += reward
+        ended = terminated | truncated
+        found |= {int(numbers[row]): running[row] for row in np.flatnonzero(ended)}
+        resets.append(ended)
+        if mode is AutoresetMode.DISABLED and ended.any():
+            _, info = envs.reset(options={"reset_mask": ended})
+        fresh = resets[-2] if mode is AutoresetMode.NEXT_STEP and len(resets) > 1 else ended
+        if mode is AutoresetMode.NEXT_STEP:
+            assert not reward[fresh].any()
+            assert not info["time_s"][fresh].any()
+        running[ended], numbers = 0.0, info["episode_number"]
+    return found
+
+
+@pytest.mark.parametrize("traffic", ["idm_mobil", "gan"])
+def test_episodes_are_the_same_in_every_autoreset_mode(traffic):
+    same, following, by_hand = (returns_by_episode(mode, traffic) for mode in (
+        AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED,
+    ))  # fmt: skip
+    assert len(same) >= 9
+    for other in (following, by_hand):
+        shared = same.keys() & other.keys()
+        assert len(shared) >= 9
+        assert {number: other[number] for number in shared} == pytest.approx({n: same[n] for n in shared}, abs=1e-3)
+
+
+def test_a_row_that_is_over_is_not_stepped_where_resets_are_left_to_the_user():
+    envs = make_vec(2, lanes=1, autoreset_mode="disabled")
+    envs.reset(seed=0)
+    envs.step(np.array([LEFT, KEEP]))
+    with pytest.raises(UserError, match=r"rows \[0\] are over; call reset"):
+        envs.step(np.array([KEEP, KEEP]))
+    with pytest.raises(UserError, match="expected one of next_step, same_step, disabled"):
+        make_vec(2, autoreset_mode="never")
+
+
+def test_gymnasiums_own_vector_wrappers_take_the_batch():
+    from gymnasium.wrappers import vector
+
+    envs = vector.NormalizeObservation(
+        vector.RecordEpisodeStatistics(make_vec(4, goal_m=40.0, autoreset_mode=AutoresetMode.NEXT_STEP))
+    )
+    envs.reset(seed=0)
+    lengths = []
+    for _ in range(12):
+        *_, info = envs.step(np.zeros(4, int))
+        if "episode" in info:
+            lengths += info["episode"]["l"][info["_episode"]].tolist()
+    assert len(lengths) >= 4
+    assert all(1 <= length <= 6 for length in lengths)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks
+from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks, read_table
 from ganlane.errors import UserError
 
 
@@ -83,5 +83,5 @@ def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path
 @pytest.mark.parametrize("value", ["1e30", "-1e308", str(2**63)])
 def test_a_whole_number_that_no_integer_holds_is_named(value, tmp_path):
     (tmp_path / "table.csv").write_text(f"frame\n1\n{value}\n")
-    with pytest.raises(UserError, match="line 3, column frame: .* is too large a number"):
+    with pytest.raises(UserError, match=r"line 3, column frame: .* is too large a number"):
         read_table(tmp_path / "table.csv", {"frame": pl.Int64})

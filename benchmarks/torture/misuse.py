@@ -211,7 +211,7 @@ def _on_meta() -> Any:
 
 def code(tally: Tally) -> None:
     """Run the tests in which every way to have code executed is tried once."""
-    line = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", TESTS]
+    line = [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", TESTS]
     done = subprocess.run(line, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
     counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed|error)", done.stdout)}
     tally.what["ways to have code executed"] = sum(counts.values())

@@ -160,7 +160,7 @@ class BrakingFaults:
 
     Attributes:
         per_hour: how often, per driver and hour of driving without it; 0: never.
-        deceleration: how hard, m/s2; a driver who brakes harder anyway goes on doing so.
+        deceleration: how hard, m/s2; a driver who brakes harder anyway is not changed.
         lasts_s: how long, s.
     """
 

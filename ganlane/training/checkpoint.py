@@ -236,7 +236,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
 
 
 def note_without_checksum(path: str | Path, key: str = "resume") -> None:
-    """Say on stderr that nobody would see damage to the checkpoint of an older version."""
+    """Print on stderr that damage to a checkpoint of an older version is not detected."""
     if _digest_of(Path(path)) is None:
         print(f"{key}={path}: of a version that wrote no checksum, damage would not be seen.", file=sys.stderr)
 

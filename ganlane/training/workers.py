@@ -300,7 +300,7 @@ def check_reachable(address: str, patience_s: float = 10.0) -> None:
     """Try to connect to ``HOST:PORT`` or ``ray://HOST:PORT``; Ray itself would try for minutes.
 
     Raises:
-        ConnectionError: nobody listens there.
+        ConnectionError: no process listens there.
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not port.isdigit():

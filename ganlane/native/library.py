@@ -38,7 +38,7 @@ SOURCES = tuple(Path(__file__).with_name(name) for name in FILES)
 #: Libraries that came with the wheel.
 PREBUILT = Path(__file__).with_name("prebuilt")
 #: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives the same bits.
-FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared")
+FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared", "-s")
 #: The kernel needs no C++ library; zig would compile one first, which takes minutes.
 ZIG_FLAGS = ("-nostdinc++", "-nostdlib++")
 ADVICE = "install g++ or clang++ (Debian: apt install g++), or pip install 'ganlane[native]', which brings Clang."

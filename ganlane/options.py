@@ -64,7 +64,7 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
 
 
 def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
-    """Dataclass of an option and the values that its name stands for."""
+    """Dataclass of an option and the values of its name."""
     if group == "traffic" and inspect.isclass(name):
         return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
     if group == "traffic" and isinstance(name, str) and "." in name:

@@ -216,7 +216,7 @@ def train(
     resume: bool = False,
     **keys: Any,
 ) -> TrainingRun:
-    """Train an agent on a traffic, then evaluate it beside others on the same episodes.
+    """Train an agent on a traffic, then compare it with other drivers on the same episodes.
 
     Args:
         traffic: as in :func:`make_env`.
@@ -233,7 +233,7 @@ def train(
 
     Raises:
         UserError: a wrong value, an agent or checkpoint that does not fit.
-        KeyboardInterrupt: stopped by Ctrl-C; the run is saved, ``resume=True`` goes on from there.
+        KeyboardInterrupt: stopped by Ctrl-C; the run is saved, ``resume=True`` continues it.
     """
     if resume and folder is None:
         raise UserError("resume=True: which run? give its folder, for instance folder='outputs/train/RUN'.")

@@ -107,7 +107,7 @@ def open_closed_streams() -> None:
     """Send nowhere what is written to streams that the shell has closed (``>&-``), which Python has as None."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            # The lowest free number, so that no file that is opened later stands where others write to.
+            # The lowest free number, so that no file that is opened later gets the number that others write to.
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(nowhere, nowhere == number)
             setattr(sys, name, os.fdopen(nowhere, "w" if number else "r", closefd=False))

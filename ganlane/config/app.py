@@ -202,7 +202,7 @@ def let_go_of_streams() -> bool:
 
 
 def _has_no_reader(stream: TextIO) -> bool:
-    """Whether the stream is a pipe that nobody reads; there is no telling on Windows."""
+    """Whether the stream is a pipe without a reader; always False on Windows."""
     try:
         looked = select.poll()
         looked.register(stream.fileno(), 0)

@@ -26,8 +26,8 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             2.5 m touch.
         recycle: true: vehicles that the ego leaves 200 m behind return ahead of it, and the reverse.
         recycle_share: share of the episodes in which they do, 0 to 1.
-        compile: true: physics and traffic as compiled graphs (needs a C++ compiler); faster in large batches, after a
-            minute or so of compiling, and the same up to rounding (docs/performance.md).
+        compile: true: physics, traffic and the agent's update as compiled graphs (needs a C++ compiler); faster,
+            after a minute or so of compiling, and the same up to rounding (docs/performance.md).
         kernel: what drives a decision: the tensor code (torch), the native kernel (native), which does the same up to
             rounding for traffic=idm and idm_mobil on a CPU, or the kernel where it can (auto).
         ego: how the ego drives.
@@ -69,7 +69,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         self._check_start()
 
     def _check_start(self) -> None:
-        """Refuse first scenes that do not fit on the road, or from which nobody could drive on."""
+        """Refuse first scenes that do not fit on the road, or in which a crash is unavoidable."""
         # The defaults need no check, which loads torch: so a mistake anywhere else is reported without it.
         asked = (self.spawn_parameters(), self.vehicles, self.lanes, self.idm)
         if asked == (SpawnParameters(), EnvConfig.vehicles, EnvConfig.lanes, IdmParameters()):

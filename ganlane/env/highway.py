@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from ganlane import keys
 from ganlane.env.checks import ActionCheck, check_counter, check_sizes, usable_device
 from ganlane.env.decision import Recorder, known_false, run_decision
-from ganlane.env.native_step import after_decision, make_kernel, native_decision
+from ganlane.env.native_step import NATIVE_TAKEN, after_decision, make_kernel, native_decision, say_once
 from ganlane.env.physics import Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
@@ -261,6 +261,8 @@ class HighwayEnv(EnvBase):
         assert self.kernel is not None
         if self.recorder is not None:
             raise UserError("env.kernel=native shows no physics steps to a recorder; set env.kernel=torch.")
+        if not self._kernel_must:
+            say_once(NATIVE_TAKEN)
         recycles = None
         if self.recycle:
             seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)

@@ -332,7 +332,7 @@ def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path
     """The I-80 files next to the scenes that ``config`` asks for, by name."""
     files = {} if path is None or config.i80 is False else i80_files(path.parent)
     if config.i80 and not files:
-        raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies beside the scenes; use i80=false.")
+        raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use i80=false.")
     return files
 
 

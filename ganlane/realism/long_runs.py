@@ -41,7 +41,7 @@ _MOST_SAMPLES = 12_000_000
 _MOST_ROWS = 64
 #: A body further beyond the edge than this is off the road, m; less is rounding.
 EDGE_M: Final = 0.01
-#: A vehicle slower than this with a leader no nearer than that stands still without reason, m/s and m.
+#: A vehicle slower than this with a leader no nearer than that has stopped without reason, m/s and m.
 STANDING_MPS: Final = 1.0
 FREE_M: Final = 50.0
 #: Standstills are tested once in so many steps.

@@ -22,7 +22,7 @@ from ganlane.realism.recordings import Recording, recorded_frame, units_of
 SETTLING_S: Final = 3.0
 #: Half of the second that speeds are taken over, and all of it, in frames.
 _HALF, _WHOLE = 5, 10
-#: Further ahead nobody is followed, m; slower than this a driver shows no headway, m/s.
+#: Leaders further ahead are ignored, m; slower than this a driver shows no headway, m/s.
 FOLLOWING_M: Final = 100.0
 SLOWEST_FOLLOWER_MPS: Final = 2.0
 #: Closing in slower than this, a driver approaches nobody, m/s.

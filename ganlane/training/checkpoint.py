@@ -25,11 +25,11 @@ VERSION = 2
 RENAMED = {"carrier": "env_state", "meter": "stats", "owed": "pending_decisions"}
 #: Key of an identity for the defaults of its options.
 DEFAULTS = "defaults"
-#: Parts of an identity that may change when a run goes on, bit-exact only if they do not: how it is computed.
+#: Parts of an identity that may change when a run is resumed, bit-exact only if they do not: how it is computed.
 COMPUTED_BY = ("env.compile",)
 #: A checkpoint that took t seconds to write is followed by the next after 50 t at the earliest: 2 % of the time.
 PATIENCE = 50.0
-#: Stands at the very end of a checkpoint, as the comment of its zip archive, before the SHA-256 of all above.
+#: The very end of a checkpoint, as the comment of its zip archive, before the SHA-256 of all above.
 SEAL = b"ganlane sha256 "
 _DIGITS = 2 * hashlib.sha256().digest_size
 
@@ -236,13 +236,13 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
 
 
 def note_without_checksum(path: str | Path, key: str = "resume") -> None:
-    """Say on stderr that nobody would see damage to the checkpoint of an older version."""
+    """Print on stderr that damage to a checkpoint of an older version is not detected."""
     if _digest_of(Path(path)) is None:
         print(f"{key}={path}: of a version that wrote no checksum, damage would not be seen.", file=sys.stderr)
 
 
 def _digest_of(path: Path) -> bytes | None:
-    """The checksum that stands at the file's end; None where there is none."""
+    """The checksum at the file's end; None where there is none."""
     with path.open("rb") as file:
         file.seek(max(path.stat().st_size - _DIGITS - len(SEAL), 0))
         return file.read(_DIGITS) if file.read(len(SEAL)) == SEAL else None

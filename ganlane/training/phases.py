@@ -253,7 +253,8 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
         rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
     size = observation_size(config.observation.form, config.env.vehicles)
     legal = partial(legal_actions, road=make_road(config.env))
-    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal)
+    compile = config.env.compile
+    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal, compile=compile)
 
 
 def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | None) -> tuple[TrainConfig, Rainbow]:
@@ -308,7 +309,7 @@ def check_observation(start: Start, config: TrainConfig) -> None:
 def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
     """Write the agent of the phase: the best one where the run chose among several, else the last.
 
-    Its metadata hold, beside the description, the length of the run and, for the best one, its figures on the
+    Its metadata hold, with the description, the length of the run and, for the best one, its figures on the
     stream kept for selection.
     """
     best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)

@@ -195,7 +195,7 @@ def test_resolve_and_package_go_with_cfg(capsys):
     assert "lanes: 3" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("override", ["seed=" + "9" * 6000, "agents=" + "[" * 3000])
+@pytest.mark.parametrize("override", ["seed=" + "9" * 6000, "agents=" + "[" * 500 + "]" * 500])
 def test_a_number_too_long_or_a_list_too_deep_for_python_is_one_sentence(override):
     with pytest.raises(UserError, match=r"too long a number or too deep a list") as caught:
         parse([override])

@@ -5,8 +5,8 @@ Read in this order:
 - recordings to batches: ``segments`` (of scenes), ``windows`` (9 positions observed, 8 to predict; k-means groups);
 - ``networks``: generator and discriminator;
 - closed loop: ``closed_loop`` (one step of each preset, in fitting and in simulation), ``rollout`` (whole scenes);
-- fitting: ``loop`` (early stopping, resuming), ``fit_paper``, ``fit_calibrated``, ``fit`` (one call), ``checkpoint``;
-- measuring: ``forecasts`` (networks, IDM, baselines), ``scores``, ``cross_validation`` (folds by scene, ablations).
+- fitting: ``loop`` (early stopping, resuming), ``tasks`` (of both presets), ``fit`` (one call), ``checkpoint``;
+- measuring: ``forecasts`` (networks, IDM, baselines; scores), ``cross_validation`` (folds by scene, ablations).
 """
 
 from ganlane.generator.checkpoint import FitResult, Preset, load_generator, shipped_generator

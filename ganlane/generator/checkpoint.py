@@ -13,8 +13,8 @@ from torch import Tensor
 from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, load_weights, save_weights
+from ganlane.generator.forecasts import Metrics
 from ganlane.generator.networks import Generator
-from ganlane.generator.scores import Metrics
 from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
 
 KIND = "generator"

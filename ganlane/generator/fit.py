@@ -12,11 +12,10 @@ import polars as pl
 from ganlane.data import TRACK, driving_statistics
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import FitResult, Preset
-from ganlane.generator.fit_calibrated import CalibratedTask
-from ganlane.generator.fit_paper import PaperTask
+from ganlane.generator.forecasts import Metrics
 from ganlane.generator.loop import FitLoop, OnProgress
-from ganlane.generator.scores import Metrics
 from ganlane.generator.segments import SceneTracks, scene_tracks
+from ganlane.generator.tasks import CalibratedTask, PaperTask
 from ganlane.generator.windows import content_hash, count_windows
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 

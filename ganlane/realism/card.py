@@ -20,9 +20,17 @@ from ganlane.evaluation.statistics import Array, Estimate, entries
 from ganlane.files import load_weights
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.parameters.checks import assign
-from ganlane.realism.distances import RESAMPLES, ceiling, distance, distance_difference, pooled_distance
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
-from ganlane.realism.quantities import UNITS, Measured, measure_recordings
+from ganlane.realism.measures import (
+    RESAMPLES,
+    UNITS,
+    Measured,
+    ceiling,
+    distance,
+    distance_difference,
+    measure_recordings,
+    pooled_distance,
+)
 from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
 from ganlane.realism.replay_starts import Factory, StartOptions
 from ganlane.realism.starts import (

@@ -19,7 +19,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ganlane.data import FRAME_S, SCHEMA
-from ganlane.data.lane_widths import STANDARD_LANE_WIDTH_M
+from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 

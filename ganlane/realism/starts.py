@@ -20,9 +20,15 @@ from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array
 from ganlane.files import load_weights
-from ganlane.realism.distances import pooled_distance
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
-from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate, measure, measure_recordings
+from ganlane.realism.measures import (
+    QUANTITIES,
+    Measured,
+    lane_change_rate,
+    measure,
+    measure_recordings,
+    pooled_distance,
+)
 from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of, units_of
 from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
 from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings

@@ -12,17 +12,19 @@ from ganlane.errors import UserError
 from ganlane.files import save_weights
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import assign_folds, fit_generator, split_for_fit
-from ganlane.generator.fit_calibrated import CalibratedTask, energy_score, masked_mean
-from ganlane.generator.fit_paper import (
+from ganlane.generator.loop import learning_rate
+from ganlane.generator.networks import Generator
+from ganlane.generator.segments import scene_tracks
+from ganlane.generator.tasks import (
+    CalibratedTask,
     adversarial_loss,
     discriminator_accuracy,
     discriminator_loss,
     distances,
+    energy_score,
+    masked_mean,
     variety_loss,
 )
-from ganlane.generator.loop import learning_rate
-from ganlane.generator.networks import Generator
-from ganlane.generator.segments import scene_tracks
 from ganlane.generator.windows import count_windows
 from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 

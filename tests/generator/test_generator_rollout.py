@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.fit_calibrated import rollout_errors
+from ganlane.generator.forecasts import distance
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
     balanced_headway,
@@ -16,8 +16,8 @@ from ganlane.generator.rollout import (
     sampled_driver_params,
     typical_driver_params,
 )
-from ganlane.generator.scores import distance
 from ganlane.generator.segments import PRESENT, cut_segments, extrapolate, scene_tracks
+from ganlane.generator.tasks import rollout_errors
 from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, GeneratorSizes
 
 SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}

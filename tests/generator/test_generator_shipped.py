@@ -8,10 +8,9 @@ from ganlane.data import default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator.checkpoint import load_generator, shipped_generator
 from ganlane.generator.fit import split_for_fit
-from ganlane.generator.fit_calibrated import rollout_errors
-from ganlane.generator.forecasts import paper_forecasts, repeated
-from ganlane.generator.scores import BASELINE, scene_metrics
+from ganlane.generator.forecasts import BASELINE, paper_forecasts, repeated, scene_metrics
 from ganlane.generator.segments import scene_tracks
+from ganlane.generator.tasks import rollout_errors
 from ganlane.generator.windows import cut_windows, group_windows
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 

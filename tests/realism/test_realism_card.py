@@ -2,9 +2,8 @@
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.realism.card import card_checks, quantity_rows
-from ganlane.realism.distances import ceiling
 from ganlane.realism.long_runs import LongRunParameters, long_run
-from ganlane.realism.quantities import QUANTITIES, measure_recordings
+from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
 from ganlane.realism.recordings import recordings_of
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.realism.replay_starts import StartOptions

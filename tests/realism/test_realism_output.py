@@ -6,8 +6,8 @@ from matplotlib.colors import to_hex
 
 from ganlane.realism.card import card_checks
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
+from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.output import checks_text, draw_distances, draw_distributions, draw_speeds_over_time, long_table
-from ganlane.realism.quantities import QUANTITIES
 from ganlane.realism.references import ConstantVelocity
 from ganlane.sim.state import Road
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic

@@ -10,8 +10,7 @@ from tensordict import TensorDict
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.generator.rollout import balanced_headway
-from ganlane.realism.distances import pooled_distance
-from ganlane.realism.quantities import measure_recordings
+from ganlane.realism.measures import measure_recordings, pooled_distance
 from ganlane.realism.recordings import Recording, recorded_frame, recordings_of
 from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
 from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways

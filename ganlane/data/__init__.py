@@ -4,7 +4,7 @@
 - readers: ``scenes`` (scene CSV and Parquet), ``ngsim`` and ``highd``, all based on ``tables``
   (text tables with errors traced to line and column);
 - ``download`` finds or fetches recordings, ``synthetic`` generates some;
-- measuring: ``lane_changes`` treats recordings and simulations alike, ``statistics`` combines all measurements;
+- measuring: ``lanes`` treats recordings and simulations alike, ``statistics`` combines all measurements;
 - ``prepare`` turns any recording into Parquet and pooled statistics.
 """
 

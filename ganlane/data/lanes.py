@@ -76,7 +76,6 @@ def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "sc
     Args:
         y: [R] lateral positions, m, with 0 at the centre of lane 0 and growing with the lane number.
         lane: [R] lane numbers.
-        scene: name for messages.
 
     Raises:
         UserError: the estimate is below 2 m or above 6 m.

@@ -21,18 +21,9 @@ from ganlane.data.tables import raise_where, read_table, reason
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
 
-#: Columns of a scene CSV; ``y`` is 0 at the centre of lane 1, which is the leftmost, and positive to the left.
-COLUMNS: Final = {
-    "scene": pl.String,
-    "vehicle": pl.Int64,
-    "frame": pl.Int64,
-    "x": pl.Float64,
-    "y": pl.Float64,
-    "v": pl.Float64,
-    "lane": pl.Int64,
-    "length": pl.Float64,
-    "width": pl.Float64,
-}
+#: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0 at the centre of
+#: lane 1, which is the leftmost.
+COLUMNS: Final = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
 _ENDING: Final = ".parquet"
 
 

@@ -254,7 +254,7 @@ def srlc(changes: int, vehicles: int, road_m: float) -> float:
 def steps_between_changes(rate_per_km: float, speed_mps: float, step_s: float = FRAME_S) -> float:
     """Equation 10's ``t_m``: mean time between two lane changes of a vehicle, in steps of ``step_s``.
 
-    ``rate_per_km`` counts lane changes per vehicle-kilometre and is above 0; ``speed_mps`` is the mean speed.
+    ``rate_per_km`` counts lane changes per vehicle-km and is above 0.
     """
     return 1000.0 / (rate_per_km * speed_mps * step_s)
 
@@ -274,8 +274,8 @@ class LaneChangeStatistics:
         count: number of lane changes (:mod:`ganlane.data.lanes` defines what counts).
         srlc: equation 9, per vehicle and km of road.
         per_vehicle_km, per_vehicle_km_low, per_vehicle_km_high: per driven km, with its exact 95 % interval.
-        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m`` from either rate and the mean speed, in steps
-            of 0.1 s; None without lane changes.
+        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m`` from either rate and the mean speed, in steps of
+            0.1 s; None without lane changes.
         duration: equation 11, s.
         lateral_speed: mean lateral speed of each complete change, m/s; its ``mean`` and ``sd`` are the Gaussian.
         lateral_speed_with_censored: the same of all changes, over their recorded parts.

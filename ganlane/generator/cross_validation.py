@@ -16,7 +16,18 @@ import numpy as np
 import polars as pl
 
 from ganlane.generator.checkpoint import FitResult
-from ganlane.generator.fit import Config, Split, Task, assign_folds, fit_key, fit_result, fit_task, split_for_fit
+from ganlane.generator.fit import (
+    Config,
+    FitLoop,
+    OnProgress,
+    Split,
+    Task,
+    assign_folds,
+    fit_key,
+    fit_result,
+    fit_task,
+    split_for_fit,
+)
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
@@ -30,7 +41,6 @@ from ganlane.generator.forecasts import (
     open_loop_scores,
     paper_forecasts,
 )
-from ganlane.generator.loop import FitLoop, OnProgress
 from ganlane.generator.segments import OBSERVED_POSITIONS, scene_tracks
 from ganlane.generator.tasks import CalibratedTask
 from ganlane.generator.windows import Windows, cut_windows, group_windows, join_windows, load_arrays, save_arrays

@@ -108,11 +108,8 @@ def parts_of(windows: Windows, least: int) -> dict[str, np.ndarray]:
 def direction_scores(forecasts: Forecasts, recorded: np.ndarray, observed: np.ndarray | None = None) -> Row:
     """Among vehicles that move more than 0.1 m sideways: share predicted to the right side.
 
-    Args:
-        forecasts: positions [W, T, 2] relative to the present.
-        recorded: the recorded ones.
-        observed: lateral moves [W] in m while observed, to be added to both; if None, only the move after the
-            present counts.
+    ``observed`` are lateral moves [W] in m while observed, to be added to both; if None, only the move after the
+    present counts.
     """
     before = 0.0 if observed is None else observed
     lateral = before + recorded[:, -1, 1]
@@ -220,7 +217,7 @@ def driven_windows(
     """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames.
 
     ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K = ``samples``
-    samples. Of every segment the vehicles are kept that were recorded throughout: these are the windows.
+    samples. The vehicles that were recorded throughout a segment are the windows.
     """
     forecasts = []
     for scene in scenes:
@@ -308,8 +305,7 @@ def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
 class RidgeForecast:
     """Ridge regression from the last displacement and all observed differences to the error of constant velocity.
 
-    Args:
-        windows: to fit to, as they are and mirrored.
+    It is fitted to ``windows`` as they are and mirrored.
     """
 
     def __init__(self, windows: Windows):

@@ -1,4 +1,4 @@
-"""What is fitted: the losses, updates and scores of both presets, each a :class:`ganlane.generator.loop.FitTask`.
+"""What is fitted: the losses, updates and scores of both presets, each a :class:`ganlane.generator.fit.FitTask`.
 
 **paper**, open loop: adversarial, variety, single-sample and mean terms on k-means groups of windows. Losses after
 Gupta et al. (2018), with the changes that the fit needs here.
@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ganlane.generator.forecasts import BASELINE, Metrics, distance, paper_forecasts, repeated, scene_metrics
-from ganlane.generator.loop import descend
 from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
 from ganlane.generator.rollout import (
     common_driver_params,
@@ -30,6 +29,14 @@ from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 
 #: Segments in one forward pass of an evaluation; bounds the memory.
 _SEGMENTS = 16
+
+
+def descend(optimiser: torch.optim.Optimizer, loss: Tensor, largest: float) -> None:
+    """One step of ``optimiser`` down ``loss``, with the norm of its parameters' gradient clipped at ``largest``."""
+    optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], largest)
+    optimiser.step()
 
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
@@ -60,7 +67,7 @@ def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
 
 
 class PaperTask:
-    """The Social-GAN on windows; see :class:`ganlane.generator.loop.FitTask`."""
+    """The Social-GAN on windows; see :class:`ganlane.generator.fit.FitTask`."""
 
     def __init__(self, fitted: list[SceneTracks], validation: list[SceneTracks], config: PaperConfig):
         torch.manual_seed(config.seed)
@@ -77,17 +84,24 @@ class PaperTask:
 
     def update(self, number: int) -> dict[str, float]:
         """One step of the discriminator, if the adversarial term is on, and one of the generator."""
-        groups = self._batch()
+        config = self.config
+        groups = self.groups.select(torch.randint(len(self.groups), (config.batch,), generator=self.random))
+        if config.mirror:
+            groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         recorded = groups.displacements[groups.mask]
         generated = self._samples(groups, self.config.history_noise)
         losses = {}
         if self.config.weights.adversarial > 0:
             loss = discriminator_loss(self.discriminator(recorded), self.discriminator(generated[0].detach()))
-            self._descend("discriminator", loss)
+            descend(self.optimisers["discriminator"], loss, self.config.loop.largest_gradient)
             losses["discriminator"] = float(loss.detach())
-        terms = self._generator_terms(recorded, generated)
+        observed = self.config.sizes.observed
+        errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
+        terms = {"variety": variety_loss(errors[:-1]), "single": errors[:-1].mean(), "mean": errors[-1].mean()}
+        if self.config.weights.adversarial > 0:
+            terms["adversarial"] = adversarial_loss(self.discriminator(generated[0]))
         weighted = [getattr(self.config.weights, name) * term for name, term in terms.items()]
-        self._descend("generator", torch.stack(weighted).sum())
+        descend(self.optimisers["generator"], torch.stack(weighted).sum(), self.config.loop.largest_gradient)
         return losses | {name: float(term.detach()) for name, term in terms.items()}
 
     def evaluate(self) -> float:
@@ -112,13 +126,6 @@ class PaperTask:
         windows = cut_windows(scenes, stride, sizes.observed + 1 + sizes.predicted)
         return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
-    def _batch(self) -> Groups:
-        rows = torch.randint(len(self.groups), (self.config.batch,), generator=self.random)
-        groups = self.groups.select(rows)
-        if not self.config.mirror:
-            return groups
-        return groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
-
     def _samples(self, groups: Groups, history_noise: float = 0.0) -> Tensor:
         """Recorded past and generated future [K + 1, n, T, 2] of n vehicles: the samples, the mean prediction last.
 
@@ -139,18 +146,6 @@ class PaperTask:
         outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
         future = displacements_of(outputs, vehicles.displacement)
         return torch.cat([past[mask].expand(len(future), -1, -1, -1), future], dim=-2)
-
-    def _generator_terms(self, recorded: Tensor, generated: Tensor) -> dict[str, Tensor]:
-        """Terms of the generator's loss by the names of their weights."""
-        observed = self.config.sizes.observed
-        errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
-        terms = {"variety": variety_loss(errors[:-1]), "single": errors[:-1].mean(), "mean": errors[-1].mean()}
-        if self.config.weights.adversarial > 0:
-            terms["adversarial"] = adversarial_loss(self.discriminator(generated[0]))
-        return terms
-
-    def _descend(self, name: str, loss: Tensor) -> None:
-        descend(self.optimisers[name], loss, self.config.loop.largest_gradient)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -226,7 +221,7 @@ def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> 
 
 
 class CalibratedTask:
-    """The anchored generator on whole scenes; see :class:`ganlane.generator.loop.FitTask`."""
+    """The anchored generator on whole scenes; see :class:`ganlane.generator.fit.FitTask`."""
 
     def __init__(self, fitted: list[SceneTracks], validation: list[SceneTracks], config: CalibratedConfig):
         torch.manual_seed(config.seed)

@@ -76,17 +76,14 @@ def pooled_distance(simulated: Array, recorded: Array) -> float:
 def distance(
     simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES, seed: int = 0
 ) -> Estimate:
-    """Distance with its 95 % bootstrap interval over units.
+    """Distance with its 95 % bootstrap interval over units; both are [units, bins]. One unit gives no interval.
 
     A resample holds some units twice and others not at all, so its distance is biased upwards; near 0 all of them lie
     above the estimate. Hence the basic (reverse percentile) interval, taken of the squared distance, in which that
     bias adds up, cut off at 0 and widened to hold the estimate. Percentile and BCa intervals consist of resamples,
     none of which is 0, so they miss a perfect model's distance (``benchmarks/realism_coverage.py``).
 
-    Args:
-        simulated, recorded: [units, bins].
-        paired: the units are the same and are resampled together; else ``simulated`` alone is.
-        resamples, seed: of the bootstrap. One unit gives no interval.
+    ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """
     value = pooled_distance(simulated, recorded)
     (drawn,) = _resampled((simulated,), recorded, paired, resamples, seed)
@@ -205,11 +202,9 @@ def measure_recordings(recordings: Sequence[Recording]) -> Measured:
 
 
 def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
-    """Measure trajectories.
+    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them, sorted by track.
 
-    Args:
-        frame: as :func:`ganlane.realism.recordings.frame_of` gives it, sorted by track.
-        units: what the bootstrap resamples, in the order of the rows of ``counts``.
+    ``units`` are what the bootstrap resamples, in the order of the rows of ``counts``.
     """
     motion = _motion(frame)
     own = motion.filter(pl.col("counts"))

@@ -193,9 +193,7 @@ def draw_distributions(
 ) -> Figure:
     """One panel per quantity: the recorded density, and each traffic's; none where nothing was counted.
 
-    Args:
-        recorded: by quantity, counts [bins].
-        simulated: by traffic, then quantity.
+    Both are counts [bins], by quantity; ``simulated`` by traffic first.
     """
     figure, grid = panel_grid(len(recorded))
     colours = {**palette(list(simulated)), "recorded": RECORDED}

@@ -72,12 +72,9 @@ class Recording:
 def recordings_of(
     frame: pl.DataFrame, lane_widths: Mapping[str, float], scenes: Sequence[str] | None = None
 ) -> list[Recording]:
-    """The scenes of a frame in the schema, in the order of their names.
+    """The scenes of a frame in the schema, whose tracks have no gaps, in the order of their names.
 
-    Args:
-        frame: in the schema; a track must have no gap.
-        lane_widths: m, by scene.
-        scenes: names; None takes all.
+    ``lane_widths`` are in m, by scene; ``scenes`` are names, all by default.
     """
     names = sorted(frame["scene"].unique().to_list() if scenes is None else scenes)
     made = []
@@ -160,11 +157,7 @@ def i80_files(folder: Path) -> dict[str, Path]:
 
 
 def read_i80(name: str, path: Path) -> list[Recording]:
-    """Segments of 15 s from one of the files.
-
-    Args:
-        name: which of :data:`I80_FILES` it is.
-        path: the file.
+    """Segments of 15 s from the file ``path``, which is the one of :data:`I80_FILES` called ``name``.
 
     Raises:
         UserError: it is damaged, or no track in it lasts 15 s.

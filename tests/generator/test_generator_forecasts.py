@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
+from reference.small_networks import silenced, small_generator
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.forecasts import (
@@ -24,10 +24,9 @@ from ganlane.generator.forecasts import (
     scene_metrics,
     side_classifier_share,
 )
-from ganlane.generator.networks import Generator
 from ganlane.generator.segments import scene_tracks
 from ganlane.generator.windows import Windows, cut_windows, group_windows
-from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, GeneratorSizes
+from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 
 
 def windows_in_lanes(lanes, lengths, future) -> Windows:
@@ -119,7 +118,6 @@ def test_nobody_moving_sideways_has_no_side():
     assert direction_scores({"own": windows.future}, windows.future)["share_right"] == {"own": None}
 
 
-SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 STRIDE = 7
 
 
@@ -130,11 +128,6 @@ def scenes():
     every[0].present[25:, 1] = False
     every[0].present[:12, 3] = False
     return every
-
-
-def small_generator(extra_inputs: int) -> Generator:
-    torch.manual_seed(1)
-    return Generator(GeneratorSizes(**SMALL, extra_inputs=extra_inputs))
 
 
 @pytest.mark.parametrize("horizon", [8, 20])
@@ -169,10 +162,7 @@ def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scen
 
 
 def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
-    generator = small_generator(EXTRA_INPUTS)
-    with torch.no_grad():
-        generator.head.weight.zero_()
-        generator.head.bias.zero_()
+    generator = silenced(small_generator(EXTRA_INPUTS))
     forecasts = calibrated_forecasts(generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3)
     np.testing.assert_allclose(forecasts["single"], forecasts["mean"], atol=1e-5)
     # without a residual the anchor alone drives: along the road that is IDM with the driver's own headway

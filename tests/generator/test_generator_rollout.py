@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from reference.small_networks import small_generator
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.forecasts import distance
-from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
     balanced_headway,
     recorded_vehicles,
@@ -18,9 +18,8 @@ from ganlane.generator.rollout import (
 )
 from ganlane.generator.segments import PRESENT, cut_segments, extrapolate, scene_tracks
 from ganlane.generator.tasks import rollout_errors
-from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, GeneratorSizes
+from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 
-SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 WIDTH = 3.5
 
 
@@ -32,8 +31,7 @@ def recorded_scenes():
 
 @pytest.fixture
 def generator():
-    torch.manual_seed(0)
-    return Generator(GeneratorSizes(**SMALL, extra_inputs=EXTRA_INPUTS))
+    return small_generator(EXTRA_INPUTS)
 
 
 def typical_rollout(generator, segments):

@@ -264,14 +264,15 @@ def traffic_factories(config: RealismConfig, weights: Mapping[str, Path] | None 
     there are none of a preset.
     """
     every = {config.traffic.label(): config.traffic, **config.rivals()}
-    for name in () if weights is None else [name for name in every if name in PRESETS]:
-        path = weights.get(PRESETS[name])
-        if path is None:
-            raise UserError(
-                f"fold_weights: traffic {name} needs the preset {PRESETS[name]}, and a fold has no such file; give "
-                "one for every fold."
-            )
-        every[name] = replace(every[name], path=str(path))  # type: ignore[call-arg]
+    if weights is not None:
+        for name in [name for name in every if name in PRESETS]:
+            path = weights.get(PRESETS[name])
+            if path is None:
+                raise UserError(
+                    f"fold_weights: traffic {name} needs the preset {PRESETS[name]}, and a fold has no such file; "
+                    "give one for every fold."
+                )
+            every[name] = replace(every[name], path=str(path))  # type: ignore[call-arg]
     return {name: _factory(traffic, config.env) for name, traffic in every.items()}
 
 

@@ -191,8 +191,7 @@ class Observation(NamedTuple):
         projections: [B, G, observed - 1, 4H] or a sequence of [B, G, 4H], input projections of the observed motions
             (:meth:`Generator.project`), oldest first. A motion is a displacement and its difference to the one
             before, so 8 displacements are 7 motions.
-        displacement: [B, G, 2], the last displacement, m per 0.1 s.
-        difference: [B, G, 2], its difference to the one before, m.
+        displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference to the one before.
         position: [B, G, 2], m, relative to any common point.
         valid: [B, G] bool.
         extra: [B, G, extra_inputs].
@@ -209,8 +208,7 @@ class Observation(NamedTuple):
 class Generator(nn.Module):
     """Encoder, pooling over pairs, context with noise, decoder.
 
-    The decoder's output is the change of the displacement, a residual on the last one: with an output of 0 it
-    predicts constant velocity.
+    The decoder's output changes the last displacement: with an output of 0 it predicts constant velocity.
     """
 
     def __init__(self, sizes: GeneratorSizes):

@@ -134,8 +134,7 @@ class Segments:
 
     Attributes:
         positions: [B, 9 + H, V, 2] float32, m, x relative to the segment's mean at the present.
-        present: [B, 9 + H, V] bool.
-        target_lane: [B, 9 + H, V] int64.
+        present, target_lane: [B, 9 + H, V], bool and int64.
         length, width: [B, V] m.
         lanes, lane_width: [B, 1].
     """

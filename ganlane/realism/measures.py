@@ -96,19 +96,14 @@ def distance(
 
 
 def distance_difference(
-    first: Array,
-    second: Array,
-    recorded: Array,
-    paired: bool = True,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
+    first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES, seed: int = 0
 ) -> Estimate:
     """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval; see :func:`distance`.
 
-    ``first`` and ``second`` are of the same units and resampled together. The interval is Student's, from the
-    bootstrap's standard error of the difference in squared distance, in which the bias of both mostly cancels,
-    divided by the sum of the distances: (a^2 - b^2) / (a + b) = a - b. With four units the basic and the percentile
-    interval find one of two equally good models closer too often.
+    Both are of the same units and resampled together. The interval is Student's, from the bootstrap's standard error
+    of the difference in squared distance, in which the bias of both mostly cancels, divided by the sum of the
+    distances: (a^2 - b^2) / (a + b) = a - b. With four units the basic and the percentile interval find one of two
+    equally good models closer too often.
     """
     one, other = pooled_distance(first, recorded), pooled_distance(second, recorded)
     ours, theirs = _resampled((first, second), recorded, paired, resamples, seed)

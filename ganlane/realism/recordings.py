@@ -106,8 +106,8 @@ def _recording(name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lan
 def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: str) -> pl.DataFrame:
     """Trajectories [T, V] of the vehicles of ``recording`` as a frame in the schema, sorted by track.
 
-    The lane is the one whose centre is nearest, and the speed is 0: everything is measured from positions. The
-    further columns ``unit``, ``driven`` and ``lane_width`` are the recording's.
+    The lane is the one whose centre is nearest, and the speed is 0: everything is measured from positions. Further
+    columns are the recording's ``unit``, ``driven`` and ``lane_width``.
     """
     vehicle, time = np.nonzero(present.T)
     width = recording.lane_width_m

@@ -108,7 +108,7 @@ class Starts:
         scenes: started from.
         held_out: by fold, the scenes that desired speeds were not fitted on.
         options: by traffic, how it was driven; over several folds the mean of what was fitted.
-        driven: by name, the traffic of the card first, then its rivals, then :data:`FLOORS` (recorded starts only).
+        driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded starts only).
         recorded: by quantity, [units, bins] of the same scenes (spawned starts: of all).
         recorded_summary: lane changes and quantiles of those scenes.
         reference: all recordings.

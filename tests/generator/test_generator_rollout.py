@@ -10,13 +10,11 @@ from reference.small_networks import small_generator
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.forecasts import distance
 from ganlane.generator.rollout import (
-    balanced_headway,
-    recorded_vehicles,
     rollout,
     sampled_driver_params,
     typical_driver_params,
 )
-from ganlane.generator.segments import PRESENT, cut_segments, extrapolate, scene_tracks
+from ganlane.generator.segments import cut_segments, extrapolate, scene_tracks
 from ganlane.generator.tasks import rollout_errors
 from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 
@@ -120,14 +118,6 @@ def test_nothing_of_the_future_enters_an_evaluation(recorded_scenes, generator):
     altered.target_lane[:, 9:] = 0
     one, other = (typical_rollout(generator, each.without_intentions()) for each in (segments, altered))
     torch.testing.assert_close(one, other)
-
-
-def test_a_balanced_driver_neither_brakes_nor_speeds_up(recorded_scenes):
-    scenes = cut_segments([(recorded_scenes[0], 0)], horizon=1)
-    desired = torch.full((1, 7), 30.0)
-    shown = balanced_headway(recorded_vehicles(scenes, PRESENT, desired), scenes.road, torch.full((1, 7), -1.0))
-    assert ((shown >= 0.5) | (shown == -1.0)).all()
-    assert (shown != -1.0).any()
 
 
 def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(recorded_scenes):

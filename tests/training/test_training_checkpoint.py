@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from ganlane.errors import UserError
-from ganlane.training.checkpoint import SEAL, load_checkpoint, note_without_checksum, save_checkpoint
+from ganlane.training.checkpoint import load_checkpoint, save_checkpoint
 from ganlane.training.collectors import pack, unpack
 
 

@@ -127,6 +127,7 @@ def convert(
     raise_where(~numbers.is_finite(), text, path, "is not a finite number", lines)
     if kind == pl.Int64:
         raise_where(numbers != numbers.round(), text, path, "is not a whole number", lines)
+        raise_where(numbers.abs() >= 2.0**63, text, path, "is too large a number", lines)
     return numbers.cast(kind)
 
 

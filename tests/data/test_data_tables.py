@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks
+from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks, read_table
 from ganlane.errors import UserError
 
 
@@ -78,3 +78,10 @@ def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path
     path = tmp_path / "t.csv"
     path.write_bytes(b'\xef\xbb\xbf"A", B,c\n1,2,3\n')
     assert csv_table(path, {"a": pl.Int64, "c": pl.Int64}).names == ("a", "b", "c")
+
+
+@pytest.mark.parametrize("value", ["1e30", "-1e308", str(2**63)])
+def test_a_whole_number_that_no_integer_holds_is_named(value, tmp_path):
+    (tmp_path / "table.csv").write_text(f"frame\n1\n{value}\n")
+    with pytest.raises(UserError, match=r"line 3, column frame: .* is too large a number"):
+        read_table(tmp_path / "table.csv", {"frame": pl.Int64})

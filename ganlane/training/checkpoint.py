@@ -105,24 +105,24 @@ class TrainingState:
         except UserError:
             raise
         except Exception as error:  # what a part can be instead of what it was has no end
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(
-                f"resume={path}: a part of the run is damaged in it ({type(error).__name__}: {error}); give another "
-                "checkpoint."
+                f"resume={path}: a part of the run is damaged in it ({reason}); give another checkpoint."
             ) from error
         return missing
 
     def _take_over(self, state: Mapping[str, Any], path: str | Path) -> str | None:
         """Everything from ``state``; see :meth:`restore`."""
         exact = state["window"] is not None
-        try:
-            self.collector.load_state_dict(state["env_state"], exact)
-        except ValueError as error:
+        fresh, shape = self.collector.state_dict(exact), state["env_state"]["batch_size"]
+        if isinstance(shape, list) and shape != fresh["batch_size"]:
             raise UserError(
-                f"resume={path}: saved with environments of shape {error}, this run has [{self.environments}]; use "
+                f"resume={path}: saved with environments of shape {shape}, this run has [{self.environments}]; use "
                 "the same number."
-            ) from error
+            )
         self.agent.load_state_dict(state["agent"])
-        check_parts(state, self.agent, self.collector, self.stats)
+        check_parts(state, self.agent, fresh, self.stats)
+        self.collector.load_state_dict(state["env_state"], exact)
         if exact:
             self.window.load_state_dict(state["window"])
             self.stats.load_state_dict(state["stats"])
@@ -220,13 +220,13 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
     if not whole and "sealed" in content:
         raise UserError(f"{given}: damaged, the checksum that was written with it is missing; give another one.")
     state = _renamed(content.get("state"))  # whether a run can go on from it, the run knows
-    if isinstance(state, dict):
-        state["counters"] = _renamed(state.get("counters"))
-        agent = state.get("agent")
-        parts = {**state, **(agent if isinstance(agent, dict) else {})}
-        for name in FINITE:
-            if not all(tensor.isfinite().all() for tensor in _tensors(parts.get(name))):
-                raise UserError(f"{given}: numbers of its {name} are not finite; give a checkpoint of another run.")
+    if isinstance(state, dict) and "counters" in state:
+        state["counters"] = _renamed(state["counters"])
+    agent = state.get("agent") if isinstance(state, dict) else None
+    parts = {**state, **agent} if isinstance(agent, dict) else {}
+    for name in FINITE:
+        if not all(tensor.isfinite().all() for tensor in _tensors(parts.get(name))):
+            raise UserError(f"{given}: numbers of its {name} are not finite; give a checkpoint of another run.")
     if not whole:
         note_without_checksum(given)
     return state

@@ -16,21 +16,24 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.agents import NetworkConfig, Rainbow
 from ganlane.agents.n_step import Step
-from ganlane.agents.replay import ROW
-from ganlane.training.collectors import Collector
+from ganlane.agents.replay import MASK_KEY, ROW
 from ganlane.training.stats import EpisodeStats
 
 #: Decisions, updates and rows of a run are fewer.
 MOST = 2**53
+#: Name of the masks among the rows of the replay buffer, where there are masks.
+MASK = ".".join(MASK_KEY)
 
 
-def check_parts(state: Mapping[str, Any], agent: Rainbow, collector: Collector, stats: EpisodeStats) -> None:
+def check_parts(
+    state: Mapping[str, Any], agent: Rainbow, environments: Mapping[str, Any], stats: EpisodeStats
+) -> None:
     """Compare ``state`` (:meth:`~ganlane.training.checkpoint.TrainingState.state_dict`) with a run that begins.
 
     Args:
         state: of the checkpoint.
         agent: has its moments from it already.
-        collector: fresh, for the state of the environments.
+        environments: state of those of a run that begins.
         stats: fresh.
 
     Raises:
@@ -50,10 +53,11 @@ def check_parts(state: Mapping[str, Any], agent: Rainbow, collector: Collector, 
     if replay is not None:
         _check_replay(replay, agent)
     if state["window"] is not None:  # so the resumed run will be exact
-        environments = collector.state_dict(exact=True)
         check_like(state["env_state"], environments, "env_state")
         mask = environments["items"].get(keys.ACTION_MASK)
-        _check_window(state["window"]["steps"], agent, collector.environments, mask)
+        if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
+            raise ValueError("replay: its masks are those of another run")
+        _check_window(state["window"]["steps"], agent, len(stats.returns), mask)
         _check_stats(state["stats"], stats)
 
 
@@ -62,7 +66,8 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
     count = len(rows["action"]) if rows else 0
     check_like(replay, {"cursor": 0, "writes": 0}, "replay")
     if rows:
-        check_like(rows, transitions(count, agent.network.config), "replay")
+        like = transitions(count, agent.network.config)
+        check_like(rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay")
         _check_actions(rows["action"], agent.network.config)
     if not (cursor == count < capacity or cursor < count == capacity):
         raise ValueError(f"replay: {count} rows of {capacity}, the next one is {cursor}")
@@ -102,6 +107,7 @@ def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
     number = torch.empty(rows, 1, device="meta")
     seen = number.expand(rows, network.observation_size)
     after = {"next.observation": seen, "next.reward": number, "next.terminated": number.bool()}
+    after[MASK] = number.expand(rows, network.actions).bool()
     return {"observation": seen, "action": number[:, 0].long(), "steps_to_next_obs": number, **after}
 
 

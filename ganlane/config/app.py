@@ -68,7 +68,7 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
             print(f"ganlane {command}: stopped by Ctrl-C.", file=sys.stderr)
         if number is not None:
             return 128 + number
-        if isinstance(error, UserError | CONFIG_ERRORS):
+        if isinstance(error, (UserError, *CONFIG_ERRORS)):
             return _refused(command, error)
         if not isinstance(error, OSError):
             raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 import zipfile
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 import ganlane
 from ganlane.files import PACKAGE, conf_folder
+from ganlane.native import library
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -59,4 +61,7 @@ def test_the_wheel_holds_configuration_and_weights(tmp_path):
     page = {f"ganlane/view/player_page/{path.name}" for path in (PACKAGE / "view" / "player_page").iterdir()}
     assert "ganlane/view/player_page/page.html" in page <= names
     assert "ganlane/py.typed" in names
+    if library.find_compiler() and platform.machine() == "x86_64":
+        kernels = {name.split("-")[1] for name in names if name.startswith("ganlane/native/prebuilt/kernel-")}
+        assert kernels == {"avx512", "avx2", "default"}
     assert not [name for name in names if name.startswith(("tests/", "outputs/"))]

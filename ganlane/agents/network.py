@@ -165,15 +165,20 @@ def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
 
     In place of TorchRL's ``reset_noise``, which draws from the global generator; one draw serves all layers.
     """
+    for layer, (inputs, outputs) in zip(_noisy_layers(network), noise_of(network, generator)):
+        torch.outer(outputs, inputs, out=layer.weight_epsilon)
+        layer.bias_epsilon.copy_(outputs)
+
+
+def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
+    """New noise of the inputs and of the outputs of every noisy layer; empty without such layers."""
     layers = _noisy_layers(network)
     if not layers:
-        return
+        return []
     sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
     normal = torch.randn(sum(sizes), generator=generator, device=generator.device)
     noise = (normal.sign() * normal.abs().sqrt()).split(sizes)
-    for layer, inputs, outputs in zip(layers, noise[::2], noise[1::2]):
-        torch.outer(outputs, inputs, out=layer.weight_epsilon)
-        layer.bias_epsilon.copy_(outputs)
+    return list(zip(noise[::2], noise[1::2]))
 
 
 def mean_sigma(network: nn.Module) -> Tensor:

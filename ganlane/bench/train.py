@@ -118,20 +118,21 @@ def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[
     most of a long run has a full buffer, with all of its memory in use.
     """
     env = training.scenario.build(mode, device, batch)
-    run = TrainingState(env, make_agent(training, device))
+    run = TrainingState(env, make_agent(training, device, mode))
     while not run.agent.ready:
         run.agent.store(run.window.push(collect(run)))
     repeat(run.agent, run.agent.replay[:].select(*TRANSITION_KEYS), training.stored)
     return run, env
 
 
-def make_agent(training: Training, device: str = "cpu") -> Rainbow:
+def make_agent(training: Training, device: str = "cpu", mode: str = EAGER) -> Rainbow:
     """An agent with random weights, ready to learn as soon as ``stored`` transitions are there."""
     env, config = training.scenario.env, training.agent
     config = replace(config, warmup=min(config.warmup, training.stored))
     size = observation_size(training.scenario.observation.form, env.vehicles)
     legal = partial(legal_actions, road=make_road(env))
-    return Rainbow(config, size, seed=training.scenario.seed, device=device, legal=legal)
+    seed = training.scenario.seed
+    return Rainbow(config, size, seed=seed, device=device, legal=legal, compile=mode != EAGER)
 
 
 def repeat(agent: Rainbow, transitions: TensorDict, stored: int) -> None:

@@ -38,6 +38,7 @@ class BenchConfig:
         quick: true: a check that it runs: small batches, two short repetitions, no memory, training in one mode.
         batches: environments side by side.
         modes: eager: env.kernel=torch; compiled: the same with env.compile=true; native: env.kernel=native.
+            Training is compiled in the last two.
         threads: torch's threads; a GPU is measured with the first number alone.
         devices: [cpu], [cuda] or both; null: the CPU, and a GPU where there is one.
         vehicle_counts: for the growth with the vehicles, at the density of env=dense.

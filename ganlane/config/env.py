@@ -26,8 +26,8 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
             2.5 m touch.
         recycle: true: vehicles that the ego leaves 200 m behind return ahead of it, and the reverse.
         recycle_share: share of the episodes in which they do, 0 to 1.
-        compile: true: physics and traffic as compiled graphs (needs a C++ compiler); faster in large batches, after a
-            minute or so of compiling, and the same up to rounding (docs/performance.md).
+        compile: true: physics, traffic and the agent's update as compiled graphs (needs a C++ compiler); faster,
+            after a minute or so of compiling, and the same up to rounding (docs/performance.md).
         kernel: what drives a decision: the tensor code (torch), the native kernel (native), which does the same up to
             rounding for traffic=idm and idm_mobil on a CPU, or the kernel where it can (auto).
         ego: how the ego drives.

@@ -1,6 +1,6 @@
-"""Builds the C++ sources at their first use and loads them.
+"""Loads the library of the C++ sources: the one that came with the wheel, else one built at first use.
 
-The library goes into the user's cache folder, under a name that follows from the source, the flags and the compiler,
+That one goes into the user's cache folder, under a name that follows from the source, the flags and the compiler,
 so that another version of any of them builds anew. Processes that build at once do so each for itself; the last one
 to finish puts its library in the place of the others', which is the same.
 """
@@ -35,8 +35,10 @@ FILES = (
 )
 #: The sources to compile, and what they include.
 SOURCES = tuple(Path(__file__).with_name(name) for name in FILES)
+#: Libraries that came with the wheel.
+PREBUILT = Path(__file__).with_name("prebuilt")
 #: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives the same bits.
-FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared")
+FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared", "-s")
 #: The kernel needs no C++ library; zig would compile one first, which takes minutes.
 ZIG_FLAGS = ("-nostdinc++", "-nostdlib++")
 ADVICE = "install g++ or clang++ (Debian: apt install g++), or pip install 'ganlane[native]', which brings Clang."
@@ -114,11 +116,13 @@ def why_not() -> str | None:
     """Why the kernel cannot be built or run here, as the end of a sentence; None if it can."""
     if sys.platform == "win32":
         return "is not built for Windows"
-    return None if find_compiler() else f"needs a C++ compiler, and there is none; {ADVICE}"
+    if find_compiler() or _prebuilt(best_variant()).is_file():
+        return None
+    return f"needs a C++ compiler, and there is none; {ADVICE}"
 
 
 def load(variant: str | None = None) -> ctypes.CDLL:
-    """The library for this processor, or for ``variant``, built if it is not there yet.
+    """The library for this processor, or for ``variant``: that of the wheel, else built if it is not there yet.
 
     Raises:
         UserError: there is no compiler, it fails, or the cache folder cannot be written.
@@ -128,19 +132,58 @@ def load(variant: str | None = None) -> ctypes.CDLL:
 
 @lru_cache(maxsize=8)
 def _load(variant: str, compiler: tuple[str, ...] | None, folder: Path) -> ctypes.CDLL:
+    prebuilt = _prebuilt(variant)
+    if prebuilt.is_file():
+        return _declared(ctypes.CDLL(str(prebuilt)))
     reason = why_not()
     if compiler is None or reason:
         raise UserError(f"env.kernel=native {reason} Or set env.kernel=torch.")
-    lanes, flags, zig_flags = VARIANTS[variant]
-    arguments = (*FLAGS, f"-DLANES={lanes}", *((*ZIG_FLAGS, *zig_flags) if "ziglang" in compiler else flags))
-    version = _run((*compiler, "--version")).stdout
-    parts = (*(source.read_text() for source in SOURCES), *compiler, version, *arguments)
-    name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
+    command = _command(variant, compiler)
+    name = _digest(*_sources(), *command, _run((*compiler, "--version")).stdout)
     library = folder / f"kernel-{variant.lower()}-{name}.so"
     if not library.is_file():
-        sources = (str(source) for source in SOURCES if source.suffix == ".cpp")
-        _build((*compiler, *arguments, *sources), library)
+        _build(command, library)
     return _declared(ctypes.CDLL(str(library)))
+
+
+def build_all(folder: Path) -> list[Path]:
+    """Build the variants that this kind of machine may run, for a wheel; the files.
+
+    Raises:
+        UserError: there is no compiler, or it fails.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise UserError(f"there is no C++ compiler; {ADVICE}")
+    made = []
+    for variant in VARIANTS if platform.machine() in ("x86_64", "AMD64") else ("default",):
+        made.append(folder / _prebuilt(variant).name)
+        _build(_command(variant, compiler), made[-1])
+    return made
+
+
+def _prebuilt(variant: str) -> Path:
+    """Where a wheel has the library of these sources."""
+    name = _digest(*_sources(), *_flags(variant), platform.machine())
+    return PREBUILT / f"kernel-{variant.lower()}-{name}.so"
+
+
+def _flags(variant: str) -> tuple[str, ...]:
+    return (*FLAGS, f"-DLANES={VARIANTS[variant].lanes}")
+
+
+def _command(variant: str, compiler: tuple[str, ...]) -> tuple[str, ...]:
+    _, flags, zig_flags = VARIANTS[variant]
+    own = (*ZIG_FLAGS, *zig_flags) if "ziglang" in compiler else flags
+    return (*compiler, *_flags(variant), *own, *(str(source) for source in SOURCES if source.suffix == ".cpp"))
+
+
+def _sources() -> tuple[str, ...]:
+    return tuple(source.read_text() for source in SOURCES)
+
+
+def _digest(*parts: str) -> str:
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
 
 def _run(command: tuple[str, ...]) -> subprocess.CompletedProcess[str]:

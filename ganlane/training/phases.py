@@ -252,7 +252,8 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
         rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
     size = observation_size(config.observation.form, config.env.vehicles)
     legal = partial(legal_actions, road=make_road(config.env))
-    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal)
+    compile = config.env.compile
+    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal, compile=compile)
 
 
 def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | None) -> tuple[TrainConfig, Rainbow]:

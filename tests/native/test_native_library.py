@@ -109,3 +109,20 @@ def test_a_processor_gets_the_fastest_variant_that_it_runs(monkeypatch, tmp_path
     monkeypatch.setattr(library.platform, "machine", lambda: machine)
     monkeypatch.setattr(library, "CPU_INFO", tmp_path / "cpuinfo")
     assert library.best_variant() == variant
+
+
+@needs_compiler
+def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(monkeypatch, tmp_path):
+    (made, *_) = (path for path in library.build_all(tmp_path / "wheel") if "-default-" in path.name)
+    monkeypatch.setattr(library, "PREBUILT", made.parent)
+    monkeypatch.setattr(library, "find_compiler", lambda: None)
+    monkeypatch.setattr(library, "best_variant", lambda: "default")
+    assert library.why_not() is None
+    assert library.load()._name == str(made)
+    assert not built()
+
+
+def test_the_library_of_another_versions_sources_is_not_taken(monkeypatch, tmp_path):
+    ours = library._prebuilt("default")
+    monkeypatch.setattr(library, "_sources", lambda: ("other",))
+    assert library._prebuilt("default").name != ours.name

@@ -69,6 +69,9 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
         like = transitions(count, agent.network.config)
         check_like(rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay")
         _check_actions(rows["action"], agent.network.config)
+        steps = rows["steps_to_next_obs"]
+        if ((steps < 1) | (steps > agent.config.n_step)).any():
+            raise ValueError("replay: transitions of more steps than the run's")
     if not (cursor == count < capacity or cursor < count == capacity):
         raise ValueError(f"replay: {count} rows of {capacity}, the next one is {cursor}")
     if agent.config.prioritised:

@@ -117,6 +117,7 @@ DAMAGE = {
     "agent.replay.rows": {},
     "agent.replay.rows.action": torch.full((144,), 3),
     "agent.replay.rows.observation": torch.zeros(144, 1),
+    "agent.replay.rows.steps_to_next_obs": torch.full((144, 1), -1e30),
     "agent.replay.sampler.priorities": torch.zeros(3, 64),
     "agent.replay.sampler.beta": "x",
     "window.steps.0": {"action": 3},

@@ -27,6 +27,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from ganlane._version import __version__
+from ganlane.errors import UserError
+from ganlane.runtime import check_process
 
 NEEDED_IS_MISSING = 1
 USER_ERROR = 2
@@ -299,7 +301,6 @@ def _loader(name: str, path: Path) -> Callable[[], Finding]:
 def recordings() -> Finding:
     """The recordings that ``data.path=null`` means; needed for fitting and realism, not for training or driving."""
     from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
-    from ganlane.errors import UserError
 
     try:
         path = default_scenes()
@@ -349,6 +350,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if arguments:
         print(f"ganlane doctor: {arguments[0]}: it takes no keys; run ganlane doctor alone.", file=sys.stderr)
+        return USER_ERROR
+    try:
+        check_process()
+    except UserError as error:
+        print(f"ganlane doctor: {error}", file=sys.stderr)
         return USER_ERROR
     found = examine()
     print(f"ganlane {__version__}\n\n{report(found)}")

@@ -113,7 +113,7 @@ def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` as OmegaConf takes it: paths as text, NumPy's and torch's numbers as Python's."""
+    """``value`` as OmegaConf takes it: paths as text, NumPy's and torch's numbers and arrays as Python's."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -122,7 +122,7 @@ def _plain(value: Any) -> Any:
         return node_of(value)
     if isinstance(value, Path):
         return str(value)
-    return value.item() if hasattr(value, "item") else value
+    return _plain(value.tolist()) if hasattr(value, "tolist") else value
 
 
 def default_options(command: str) -> dict[str, str]:

@@ -93,6 +93,16 @@ def check_default_device(device: str) -> None:
         )
 
 
+def check_process() -> None:
+    """Raise :class:`UserError` where torch cannot be imported or files cannot be named."""
+    if sys.flags.optimize > 1:
+        raise UserError("python -OO removes the docstrings, which TorchRL needs; run it without -OO.")
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise UserError("the working directory is gone; change to one that is there (cd).") from error
+
+
 def open_closed_streams() -> None:
     """Send nowhere what is written to streams that the shell has closed (``>&-``), which Python has as None."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):

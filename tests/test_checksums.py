@@ -107,7 +107,7 @@ def test_no_bit_of_a_content_can_change(seal):
                 has_checksum(flipped(content, place, bit), "file")
 
 
-def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch):
+def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path))
     calls = []
 
@@ -123,6 +123,7 @@ def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch):
     for place in range(len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))
         assert load_arrays(path) is None
+    assert capsys.readouterr().err.count("computed again") == len(whole)
     assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
     assert (len(calls), path.read_bytes()) == (2, whole)
     np.savez_compressed(path, labels=np.arange(4))  # as older versions wrote it

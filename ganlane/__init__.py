@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from ganlane._version import __version__
 from ganlane.gym import register_envs
+from ganlane.runtime import check_process
 
 if TYPE_CHECKING:  # for type checkers and editors, which do not run __getattr__
     from ganlane import api as api
@@ -69,6 +70,8 @@ def __getattr__(name: str) -> Any:
 
     ``import ganlane`` must register the gymnasium environments without waiting seconds for torch.
     """
+    if name in ("api", *_MODULES):
+        check_process()
     if name == "api":
         return importlib.import_module("ganlane.api")
     if name in _MODULES:

@@ -11,16 +11,16 @@ from ganlane.runtime import open_closed_streams
 
 #: Command to what it does; each is a module of the package with a ``main``, and has a configuration.
 COMMANDS = {
-    "train": "train an agent on a traffic, then evaluate it beside others",
+    "train": "train an agent on a traffic, then compare it with other drivers",
     "evaluate": "agents x traffics on the same episodes, as one table",
     "render": "episodes as a film, page or table; learning curves of runs",
     "prepare": "recordings into one schema, with a report of what they show",
     "train_generator": "fit a generator to recorded traffic",
     "realism": "how close a traffic comes to recorded driving",
-    "bench": "speed and memory, beside a peer measured in the same run",
+    "bench": "speed and memory, compared with a peer in the same run",
 }
 #: Commands without a configuration: they take no keys.
-PLAIN_COMMANDS = {"doctor": "what is installed and found, and the command that mends what is missing"}
+PLAIN_COMMANDS = {"doctor": "check the installation; show the command for what is missing"}
 COMPLETION_FLAGS = ("-sc", "--shell-completion")
 
 

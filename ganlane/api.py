@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -37,6 +37,7 @@ from ganlane.config.app import Stopped
 from ganlane.config.env import check_reward
 from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.folders import CONFIG, cleared_after_mistakes, held
+from ganlane.config.resume import LAST
 from ganlane.config.run import RunConfig
 from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import TrafficConfig, all_traffics
@@ -45,14 +46,14 @@ from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, wri
 from ganlane.evaluation.results import plain
 from ganlane.files import write_bytes
 from ganlane.options import Option, command_config, option
-from ganlane.parameters.checks import did_you_mean
+from ganlane.parameters.checks import checked_arguments, did_you_mean, whole_number
 from ganlane.runtime import set_threads
 from ganlane.sim.random import Stream
 
 __all__ = ["Driver", "Run", "TrainingRun", "evaluate", "load_agent", "make_env", "render", "run", "train"]
 
 #: A driver's name, a loaded driver, or a policy of your own (named by its class).
-Agent: TypeAlias = str | Driver | TensorDictModuleBase
+Agent: TypeAlias = str | Path | Driver | TensorDictModuleBase
 #: Families of episodes: to train on, to choose on, to report on.
 STREAMS = {stream.name.lower(): stream for stream in Stream}
 
@@ -73,6 +74,7 @@ class TrainingRun(Run):
     table: pl.DataFrame
 
 
+@checked_arguments
 def make_env(
     traffic: Option = "idm_mobil",
     num_envs: int = 1,
@@ -111,16 +113,13 @@ def make_env(
     """
     config, rewards = option("env", env, overrides), option("reward", reward)
     check_reward(config, rewards)
-    checked = RunConfig(seed=_whole("seed", seed), device=device)
-    rows = _whole("num_envs", num_envs)
-    if not 1 <= rows <= 65536:
-        raise UserError(f"num_envs={rows}: expected a number from 1 to 65536; give for instance num_envs=64.")
+    checked = RunConfig(seed=int(seed), device=device)
     made = build.make_env(
         build.make_traffic(option("traffic", traffic), config, _stream(stream)),
         config,
         option("observation", observation),
         rewards,
-        rows,
+        whole_number("num_envs", num_envs, 1, 65536),
         checked.seed,
         checked.device,
         mask=option("mask", mask),
@@ -130,8 +129,9 @@ def make_env(
     return made
 
 
+@checked_arguments
 def load_agent(
-    name: str = "agent_general",
+    name: str | Path = "agent_general",
     *,
     env: Option = "highway",
     stream: str = "report",
@@ -154,6 +154,7 @@ def load_agent(
     return build.make_driver(str(name), config, _stream(stream), RunConfig(device=device).device)
 
 
+@checked_arguments
 def evaluate(
     agents: Sequence[Agent] = ("mobil", "keep_lane", "random_legal", "agent_idm"),
     traffics: Sequence[Option] | Mapping[str, Option] = ("idm", "idm_mobil", "gan", "gan_calibrated"),
@@ -182,23 +183,26 @@ def evaluate(
 
     Raises:
         UserError: an unknown name, a wrong value, or a policy that does not fit.
+        OSError: a folder that cannot be written to.
     """
     chosen = _named_traffics(traffics)
     keys |= {"agents": [_agent_name(agent) for agent in agents], "traffics": list(chosen)}
     keys |= {"episodes": episodes, "seed": seed, "traffic_options": {**all_traffics(), **chosen}}
     config: EvaluateConfig = command_config("evaluate", keys)
-    with _torch_threads(config.threads):
+    with _torch_threads(config.threads), cleared_after_mistakes(Path(folder)) if folder else nullcontext():
+        if folder is not None:  # before hours of driving
+            Path(folder).mkdir(parents=True, exist_ok=True)
         drivers = [_driver(agent, name, config) for agent, name in zip(agents, config.agents)]
         table = compare_configured(drivers, config)
     rows = plain(evaluation_rows(table))
     if folder is not None:
         seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-        Path(folder).mkdir(parents=True, exist_ok=True)
         write_episodes(Path(folder), table)
         write_results(Path(folder), {"rows": rows, "paired": paired_rows(table)}, asdict(config), seeds)
     return table if per_episode else pl.DataFrame(rows, infer_schema_length=None)
 
 
+@checked_arguments
 def train(
     traffic: Option = "gan",
     init: Option = "idm_ckpt",
@@ -212,7 +216,7 @@ def train(
     resume: bool = False,
     **keys: Any,
 ) -> TrainingRun:
-    """Train an agent on a traffic, then evaluate it beside others on the same episodes.
+    """Train an agent on a traffic, then compare it with other drivers on the same episodes.
 
     Args:
         traffic: as in :func:`make_env`.
@@ -229,7 +233,7 @@ def train(
 
     Raises:
         UserError: a wrong value, an agent or checkpoint that does not fit.
-        KeyboardInterrupt: stopped by Ctrl-C; the run is saved, ``resume=True`` goes on from there.
+        KeyboardInterrupt: stopped by Ctrl-C; the run is saved, ``resume=True`` continues it.
     """
     if resume and folder is None:
         raise UserError("resume=True: which run? give its folder, for instance folder='outputs/train/RUN'.")
@@ -244,8 +248,9 @@ def train(
     return TrainingRun(done.folder, done.results, Path(done.results["agent"]), table)
 
 
+@checked_arguments
 def render(
-    agent: str | Sequence[str] = "mobil",
+    agent: str | Path | Sequence[str | Path] = "mobil",
     traffic: Option = "idm_mobil",
     episode: int | Sequence[int] = 0,
     *,
@@ -270,8 +275,8 @@ def render(
         UserError: a wrong value.
         OSError: a file that cannot be written.
     """
-    keys |= {"driver": agent} if isinstance(agent, str) else {"agents": list(agent)}
-    keys |= {"episode": episode} if isinstance(episode, int) else {"episodes": list(episode)}
+    keys |= {"driver": agent} if isinstance(agent, str | Path) else {"agents": list(agent)}
+    keys |= {"episode": episode} if not isinstance(episode, Iterable) else {"episodes": list(episode)}
     if run is not None:
         keys["run"] = [str(each) for each in ([run] if isinstance(run, str | Path) else run)]
     config = command_config("render", {**keys, "traffic": traffic, "film": film or {}, "out": out})
@@ -284,6 +289,7 @@ def render(
     return Path(line.partition(": ")[2])
 
 
+@checked_arguments
 def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
     """Any command that writes ``results.json``: ``prepare``, ``train_generator``, ``realism``, ``bench`` ...
 
@@ -305,6 +311,13 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
         raise UserError(f"run({command!r}): no such command{hint}; choose one of {', '.join(known)}.")
     if command == "bench" and keys.get("report") is not None:
         raise UserError("report: tables go into a document with the command only; run ganlane bench report=FILE.")
+    resumed = keys.get("resume")
+    of_folder = folder is not None and str(resumed) == str(folder) and any(Path(folder).rglob(LAST.name))
+    if resumed is not None and not of_folder:
+        raise UserError(
+            f"resume={resumed}: no run that can go on ({LAST} is missing); give api.train() the folder of one, and "
+            "resume=True."
+        )
     home, _ = _run_in(folder, command, _function(command), command_config(command, keys))
     return Run(home, json.loads((home / "results.json").read_text()))
 
@@ -345,12 +358,7 @@ def _agent_name(agent: Agent) -> str:
         return str(agent)
     if isinstance(agent, Driver):
         return agent.name
-    if isinstance(agent, TensorDictModuleBase):
-        return type(agent).__name__
-    raise UserError(
-        f"agents: {agent!r} is no driver; give a name, what load_agent returned, or a TensorDictModule that writes "
-        "'action'."
-    )
+    return type(agent).__name__
 
 
 def _driver(agent: Agent, name: str, config: EvaluateConfig) -> Driver:
@@ -386,10 +394,3 @@ def _stream(name: str) -> Stream:
     if name not in STREAMS:
         raise UserError(f"stream={name}: expected one of {', '.join(STREAMS)}; choose one of them.")
     return STREAMS[name]
-
-
-def _whole(name: str, value: Any) -> int:
-    """``value`` as an int; NumPy's integers are allowed."""
-    if isinstance(value, bool) or not hasattr(value, "__index__"):
-        raise UserError(f"{name}={value!r}: expected a whole number; give for instance {name}=1.")
-    return int(value)

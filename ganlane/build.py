@@ -8,8 +8,8 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -174,14 +174,14 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     if name in DRIVERS:
         policy = call_with(DRIVERS[name], _offered(env, stream), {}, "agents")
         return Driver(name, policy.to(device))
-    if name.removesuffix("@0") in SHIPPED or Path(name).is_file() or name.endswith(".safetensors"):
+    if name.removesuffix("@0") in SHIPPED or os.path.isfile(name) or name.endswith(".safetensors"):
         return _trained(name, env, device)
     if is_import_path(name):
         return _imported(name, env, stream, device)
     known = ", ".join((*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file())))
     raise UserError(
-        f"agent {name}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the import "
-        "path of a policy."
+        f"agent {name:.100}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the "
+        "import path of a policy."
     )
 
 

@@ -1,6 +1,6 @@
 """A checksum inside each file that is written and read back: damage is seen, in whichever byte it is.
 
-:data:`PLACE` stands once in the content, wherever the format has room for a text: metadata, an entry, an archive's
+:data:`PLACE` occurs once in the content, wherever the format has room for a text: metadata, an entry, an archive's
 comment. Its digits are the SHA-256 of the whole content with zeros in their place. This protects against damage, not
 against forgery: who changes a file on purpose can put a new checksum in.
 """
@@ -17,7 +17,7 @@ from ganlane.errors import UserError
 
 _BEGIN, _END = b"ganlane sha256 ", b" of this file"
 _ZEROS = b"0" * 64
-#: Stands in the content until :func:`sealed` puts the checksum in.
+#: Placeholder in the content until :func:`sealed` puts the checksum in.
 PLACE = (_BEGIN + _ZEROS + _END).decode()
 #: The end of a zip archive: its comment's length, its comment.
 _COMMENT = len(PLACE).to_bytes(2, "little") + PLACE.encode()

@@ -1,4 +1,4 @@
-"""``ganlane doctor``: what is installed and found, what is missing, and the command that mends it.
+"""``ganlane doctor``: what is installed and found, what is missing, and the command that fixes it.
 
     ganlane doctor
 
@@ -27,6 +27,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from ganlane._version import __version__
+from ganlane.errors import UserError
+from ganlane.runtime import check_process
 
 NEEDED_IS_MISSING = 1
 USER_ERROR = 2
@@ -63,14 +65,14 @@ EXTRAS: Final = {
     "sweeps": ("sweeps in several processes", ("hydra-joblib-launcher>=1.2",)),
     "slurm": ("sweeps as Slurm jobs", ("hydra-submitit-launcher>=1.2",)),
     "ray-sweeps": ("sweeps on a Ray cluster", ("hydra-ray-launcher>=1.2.1",)),
-    "docs": ("building these pages", ("mkdocs-material>=9.5", "mkdocstrings[python]>=0.27")),
+    "docs": ("building these pages", ("mkdocs-material>=9.5", "mkdocstrings[python]>=0.27", "ruff>=0.8")),
 }
 #: Distributions whose module has another name.
 MODULES: Final = {"hydra-core": "hydra", "pillow": "PIL", "scikit-learn": "sklearn"}
 #: Weights without which the commands' defaults do not run.
 NEEDED_WEIGHTS: Final = ("agent_idm", "generator_paper", "generator_calibrated")
 _REINSTALL: Final = "python -m pip install --force-reinstall --no-deps PATH_OF_THE_CHECKOUT_OR_WHEEL"
-_MEND_FIRST: Final = "mend what is MISSING above, then run ganlane doctor again"
+_FIX_FIRST: Final = "fix what is MISSING above, then run ganlane doctor again"
 _CUDA_PAGE: Final = "install torch for CUDA as https://pytorch.org/get-started/locally/ says"
 _INSTALL_COMPILER: Final = {"darwin": "xcode-select --install", "win32": "install the Visual Studio build tools"}
 
@@ -85,26 +87,26 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """``subject`` was looked at, ``found`` is what there is, ``mend`` is what to type where something lacks."""
+    """``subject`` was looked at, ``found`` is what there is, ``fix`` is the command where something is missing."""
 
     subject: str
     state: State
     found: str
-    mend: str = ""
+    fix: str = ""
 
     def lines(self) -> list[str]:
         """As the report shows it."""
         first = f"  {self.state.value:<8}{self.subject:<22}{self.found}"
-        return [first, f"          mend: {self.mend}"] if self.mend else [first]
+        return [first, f"          fix: {self.fix}"] if self.fix else [first]
 
 
-def guarded(subject: str, look: Callable[[], Finding], mend: str = _MEND_FIRST) -> Finding:
+def guarded(subject: str, look: Callable[[], Finding], fix: str = _FIX_FIRST) -> Finding:
     """What ``look`` finds; whatever it raises is a finding too, since a broken installation can fail in any way."""
     try:
         return look()
     except Exception as error:
         message = " ".join(str(error).split()) or type(error).__name__
-        return Finding(subject, State.MISSING, message, mend)
+        return Finding(subject, State.MISSING, message, fix)
 
 
 def examine() -> dict[str, list[Finding]]:
@@ -136,7 +138,7 @@ def report(sections: Mapping[str, Sequence[Finding]]) -> str:
     ]
     lacking = missing(sections)
     conclusion = (
-        f"Missing: {', '.join(lacking)}; run what stands beside 'mend'."
+        f"Missing: {', '.join(lacking)}; run the commands after 'fix:'."
         if lacking
         else "All that is needed is there; what is absent serves further purposes only."
     )
@@ -261,8 +263,8 @@ def _compiler() -> Finding:
     path = next(filter(None, map(shutil.which, looked_for)), None)
     if path is None:
         found = f"none (looked for {', '.join(looked_for)}); env.compile=true needs one"
-        mend = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
-        return Finding("C++ compiler", State.ABSENT, found, mend)
+        fix = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
+        return Finding("C++ compiler", State.ABSENT, found, fix)
     return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")
 
 
@@ -299,13 +301,12 @@ def _loader(name: str, path: Path) -> Callable[[], Finding]:
 def recordings() -> Finding:
     """The recordings that ``data.path=null`` means; needed for fitting and realism, not for training or driving."""
     from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
-    from ganlane.errors import UserError
 
     try:
         path = default_scenes()
     except UserError as error:
-        mend = f"export {DATA_VARIABLE}=FOLDER   (one that holds {SCENES}), or give data.path=FILE (docs/own_data.md)"
-        return Finding("recordings", State.ABSENT, str(error).partition("; ")[0], mend)
+        fix = f"export {DATA_VARIABLE}=FOLDER   (one that holds {SCENES}), or give data.path=FILE (docs/own_data.md)"
+        return Finding("recordings", State.ABSENT, str(error).partition("; ")[0], fix)
     return Finding("recordings", State.OK, f"{path} ({_megabytes(path)})")
 
 
@@ -349,6 +350,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if arguments:
         print(f"ganlane doctor: {arguments[0]}: it takes no keys; run ganlane doctor alone.", file=sys.stderr)
+        return USER_ERROR
+    try:
+        check_process()
+    except UserError as error:
+        print(f"ganlane doctor: {error}", file=sys.stderr)
         return USER_ERROR
     found = examine()
     print(f"ganlane {__version__}\n\n{report(found)}")

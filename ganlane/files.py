@@ -31,23 +31,23 @@ _PART = ".part"
 
 
 def conf_folder() -> Path:
-    """Folder of the YAML files: beside the package in a checkout, inside it in a wheel.
+    """Folder of the YAML files: next to the package in a checkout, inside it in a wheel.
 
-    The one beside comes first, since an editable install can leave a stale copy behind.
+    The one next to it comes first, since an editable install can leave a stale copy behind.
 
     Raises:
         UserError: neither is there.
     """
     for folder in (PACKAGE.parent / "conf", PACKAGE / "conf"):
-        # A folder 'conf' of another project may lie beside an installed package.
+        # A folder 'conf' of another project may be next to an installed package.
         if (folder / "train.yaml").is_file() and (folder / "traffic" / "gan.yaml").is_file():
             return folder
-    raise UserError(f"{PACKAGE}: the folder conf/ is missing beside and inside it; install ganlane again.")
+    raise UserError(f"{PACKAGE}: the folder conf/ is missing next to and inside it; install ganlane again.")
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; on success sync it and rename it into place.
+    """Yield a temporary path in the folder of ``path``; on success sync it and rename it into place.
 
     A process killed at any instant leaves either the old file or the new one, never a part of one.
 
@@ -82,7 +82,7 @@ def _refuse_all_but_files(path: Path) -> None:
 
 
 def _new_part(path: Path) -> Path:
-    """An empty file beside ``path``, whose folder is made."""
+    """An empty file in the folder of ``path``, which is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)

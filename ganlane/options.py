@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -16,7 +17,6 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.checks import did_you_mean
-from ganlane.runtime import check_default_device
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
@@ -43,7 +43,10 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
         UserError: no such option or key, a value of the wrong type or out of range, or torch's default device is
             none to compute on.
     """
-    check_default_device("cuda")  # no other one can be the environment's
+    if "torch" in sys.modules:  # which takes seconds to import, and nobody has changed its default device
+        from ganlane.runtime import check_default_device
+
+        check_default_device("cuda")  # no other one can be the environment's
     if is_dataclass(chosen) and not isinstance(chosen, type):
         return typed(group, chosen, overrides or {})
     if chosen is None or isinstance(chosen, str) or inspect.isclass(chosen):
@@ -61,7 +64,7 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
 
 
 def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
-    """Dataclass of an option and the values that its name stands for."""
+    """Dataclass of an option and the values of its name."""
     if group == "traffic" and inspect.isclass(name):
         return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
     if group == "traffic" and isinstance(name, str) and "." in name:
@@ -110,7 +113,7 @@ def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` as OmegaConf takes it: paths as text, NumPy's and torch's numbers as Python's."""
+    """``value`` as OmegaConf takes it: paths as text, NumPy's and torch's numbers and arrays as Python's."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -119,7 +122,7 @@ def _plain(value: Any) -> Any:
         return node_of(value)
     if isinstance(value, Path):
         return str(value)
-    return value.item() if hasattr(value, "item") else value
+    return _plain(value.tolist()) if hasattr(value, "tolist") else value
 
 
 def default_options(command: str) -> dict[str, str]:

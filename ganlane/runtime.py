@@ -93,11 +93,21 @@ def check_default_device(device: str) -> None:
         )
 
 
+def check_process() -> None:
+    """Raise :class:`UserError` where torch cannot be imported or files cannot be named."""
+    if sys.flags.optimize > 1:
+        raise UserError("python -OO removes the docstrings, which TorchRL needs; run it without -OO.")
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise UserError("the working directory is gone; change to one that is there (cd).") from error
+
+
 def open_closed_streams() -> None:
     """Send nowhere what is written to streams that the shell has closed (``>&-``), which Python has as None."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            # The lowest free number, so that no file that is opened later stands where others write to.
+            # The lowest free number, so that no file that is opened later gets the number that others write to.
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(nowhere, nowhere == number)
             setattr(sys, name, os.fdopen(nowhere, "w" if number else "r", closefd=False))

@@ -28,6 +28,7 @@ from ganlane import keys
 from ganlane.build import Driver
 from ganlane.errors import UserError
 from ganlane.gym.vector import HighwayVectorGym
+from ganlane.parameters.checks import seed_number
 
 try:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -38,6 +39,8 @@ except ModuleNotFoundError as error:
 
 Floats = npt.NDArray[np.float32]
 Indices = int | Iterable[int] | None
+#: Methods that give one result for each row.
+_OF_ROWS = ("action_masks", "render")
 
 
 class HighwayVecEnv(VecEnv):
@@ -96,7 +99,7 @@ class HighwayVecEnv(VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed of the next reset; one for all rows, which drive different episodes of it."""
-        self._seeds = [seed] * self.num_envs
+        self._seeds = [None if seed is None else seed_number(seed)] * self.num_envs
         return self._seeds
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
@@ -116,7 +119,13 @@ class HighwayVecEnv(VecEnv):
         raise UserError(f"set_attr({attr_name!r}): the highways are one batch; give options to make_vec_env().")
 
     def env_method(self, method_name: str, *args: Any, indices: Indices = None, **kwargs: Any) -> list[Any]:
-        """The result of a method that gives one result per row (``action_masks``, ``render``), rows ``indices``."""
+        """The result of a method that gives one result per row (``action_masks``, ``render``), rows ``indices``.
+
+        Raises:
+            UserError: no such method.
+        """
+        if method_name not in _OF_ROWS:
+            raise UserError(f"env_method({method_name!r}): the rows have {' and '.join(_OF_ROWS)}; call one of them.")
         found = getattr(self.highways, method_name)(*args, **kwargs)
         return [found[row] for row in self._get_indices(indices)]
 

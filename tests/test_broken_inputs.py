@@ -603,6 +603,7 @@ def test_a_whole_command_ends_with_status_2(line, here):
         run_folder(damaged("torch pickle", AGENT))
     before = everything_below(here)
     environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(here)}
+    environment["GANLANE_CACHE"] = str(here.parent / "cache")
     start = [sys.executable, "-m", "ganlane", *line.split()]
     done = subprocess.run(start, cwd=here, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2, done.stderr

@@ -19,7 +19,7 @@ from ganlane.data.scenes import write_prepared
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, load_weights, save_weights
 from ganlane.generator import load_generator
-from ganlane.generator.loop import FitLoop
+from ganlane.generator.fit import FitLoop
 from ganlane.generator.windows import cached, load_arrays, save_arrays
 from ganlane.parameters.generator import LoopConfig
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
@@ -107,7 +107,7 @@ def test_no_bit_of_a_content_can_change(seal):
                 has_checksum(flipped(content, place, bit), "file")
 
 
-def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch):
+def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path))
     calls = []
 
@@ -123,6 +123,7 @@ def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch):
     for place in range(len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))
         assert load_arrays(path) is None
+    assert capsys.readouterr().err.count("computed again") == len(whole)
     assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
     assert (len(calls), path.read_bytes()) == (2, whole)
     np.savez_compressed(path, labels=np.arange(4))  # as older versions wrote it

@@ -57,7 +57,7 @@ def test_what_is_needed_and_missing_makes_the_status_1(tmp_path, monkeypatch, ca
     assert main(["doctor"]) == 1
     shown = capsys.readouterr().out
     assert "MISSING agent_idm" in shown
-    assert "mend: python -m pip install" in shown
+    assert "fix: python -m pip install" in shown
     assert shown.splitlines()[-1].startswith("Missing: agent_idm, generator_calibrated, generator_paper;")
 
 
@@ -99,14 +99,14 @@ def test_a_package_that_cannot_be_imported_is_missing(monkeypatch):
     monkeypatch.setattr("ganlane.doctor.importlib.import_module", broken)
     found = required("numpy>=1.26")
     assert (found.state, found.found) == (State.MISSING, "lib.so: undefined symbol")
-    assert "--force-reinstall" in found.mend
+    assert "--force-reinstall" in found.fix
 
 
 def test_an_extra_names_only_what_it_lacks(monkeypatch):
     monkeypatch.setitem(EXTRAS, "mixed", ("counting", ("numpy>=1.26", "no-such-package>=1")))
     found = extra("mixed")
     assert (found.state, found.found) == (State.ABSENT, "counting: no-such-package not installed")
-    assert found.mend == 'python -m pip install "no-such-package>=1"'
+    assert found.fix == 'python -m pip install "no-such-package>=1"'
 
 
 def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
@@ -121,7 +121,7 @@ def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
 def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
     assert recordings().state is State.ABSENT
-    assert "export GANLANE_DATA=FOLDER" in recordings().mend
+    assert "export GANLANE_DATA=FOLDER" in recordings().fix
     (tmp_path / "us101_scenes.csv").write_bytes(b"x" * 2**20)
     assert recordings().found == f"{tmp_path / 'us101_scenes.csv'} (1.0 MB)"
 
@@ -143,7 +143,7 @@ def test_a_machine_without_compiler_is_told_what_to_install(monkeypatch):
     found = machine()[-1]
     assert found.state is State.ABSENT
     assert "no-such-compiler" in found.found
-    assert found.mend
+    assert found.fix
 
 
 def test_the_report_shows_every_finding_and_its_command():
@@ -153,9 +153,9 @@ def test_the_report_shows_every_finding_and_its_command():
         "software",
         "  ok      torch                 2.13",
         "  MISSING numpy                 gone",
-        "          mend: do this",
+        "          fix: do this",
         "",
-        "Missing: numpy; run what stands beside 'mend'.",
+        "Missing: numpy; run the commands after 'fix:'.",
     ]
 
 

@@ -14,25 +14,17 @@ from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.checks import ActionCheck
 from ganlane.errors import UserError
+from ganlane.native.library import why_not
 from ganlane.options import option
 from ganlane.sim.scenes import LARGEST, MOST_VEHICLES, FixedScene, SceneVehicle
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
-KERNELS = ["torch", pytest.param("native", marks=pytest.mark.usefixtures("native_kernel"))]
+KERNELS = ["torch", pytest.param("native", marks=pytest.mark.skipif(bool(why_not()), reason="no C++ compiler"))]
 
 
 def made(**options):
     return HighwayEnv(IdmTraffic(), **options)
-
-
-@pytest.fixture
-def native_kernel():
-    """Skips where the native kernel cannot be built."""
-    try:
-        made(kernel="native")
-    except UserError as error:
-        pytest.skip(str(error))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
 import subprocess
 import sys
@@ -420,3 +422,46 @@ def test_a_batch_has_a_mask_for_every_row():
     drawn = {int(envs.single_action_space.sample(info["action_mask"][0])) for _ in range(40)}
     assert drawn == set(np.flatnonzero(mask[0]))
     assert len(drawn) == 2
+
+
+@pytest.mark.parametrize(
+    "twin", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copied", "pickled"]
+)
+@pytest.mark.parametrize("traffic", ["idm_mobil", "gan"])
+def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffic):
+    env = make(traffic=traffic, mask="safe", goal_m=300.0)
+    env.reset(seed=3)
+    env.step(LEFT)
+    other = twin(env)
+    theirs = [other.step(action) for action in (KEEP, RIGHT)]
+    for (observation, *rest), (expected, *known) in zip([env.step(action) for action in (KEEP, RIGHT)], theirs):
+        assert np.array_equal(observation, expected)
+        assert str(rest) == str(known)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: make(render_mode="rgb_array").unwrapped.render(), "call reset"),
+        (lambda: make().reset(options={"episode": [1, 2]}), "episode=.1, 2.: expected a whole number"),
+        (lambda: make().reset(seed=np.array([1, 2])), "seed=array"),
+        (lambda: make(seed=np.array([1, 2])), "seed=array"),
+        (lambda: make(stream={}), "stream=.*expected a text"),
+        (lambda: make(device=np.array([1, 2])), "device="),
+        (lambda: make_vec(2, render_mode=5), "render_mode=5: expected a text"),
+        (lambda: make_vec(True), "num_envs=True: expected a whole number"),
+        (lambda: make_vec(2).reset(options={"episode": [[1, 2], [3]]}), "expected whole numbers from 0"),
+        (lambda: make_vec(2).reset(options={"reset_mask": [[True, True], [True]]}), "expected a boolean array"),
+    ],
+)
+def test_values_of_other_types_are_refused_in_one_sentence(call, told):
+    with pytest.raises(UserError, match=told):
+        call()
+
+
+@pytest.mark.parametrize("action", [[[0, 1], [2]], ["x", None], None])
+def test_what_is_no_array_of_actions_is_refused(action):
+    for env in (make(), make_vec(2)):
+        env.reset(seed=0)
+        with pytest.raises(UserError, match=r"expected \d whole number"):
+            env.unwrapped.step(action)

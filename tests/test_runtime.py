@@ -1,9 +1,12 @@
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from ganlane import runtime
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator is on Linux alone")
@@ -64,3 +67,26 @@ def test_without_docstrings_help_still_lists_the_keys():
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "held_out" in done.stdout
+
+
+def doctor(here, *options):
+    """What the doctor says, with Python's ``options``, in the folder ``here``, which is removed first."""
+    line = [
+        sys.executable,
+        *options,
+        "-c",
+        f"import os; os.rmdir({str(here)!r}); from ganlane.doctor import main; main([])",
+    ]
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
+    return subprocess.run(line, cwd=here, env=environment, capture_output=True, text=True, timeout=120).stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "told"), [((), "working directory is gone"), (("-OO",), "removes the docstrings")]
+)
+def test_a_process_in_which_nothing_can_run_is_told_in_one_sentence(options, told, tmp_path):
+    here = tmp_path / "here"
+    here.mkdir()
+    said = doctor(here, *options)
+    assert told in said
+    assert said.count("\n") == 1

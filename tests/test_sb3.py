@@ -120,6 +120,10 @@ def test_attributes_are_those_of_the_batch_and_cannot_be_set():
     assert env.env_is_wrapped(VecNormalize) == [False] * ROWS
     with pytest.raises(UserError, match="make_vec_env"):
         env.set_attr("lanes", 4)
+    with pytest.raises(UserError, match="call one of them"):
+        env.env_method("no_such_method")
+    with pytest.raises(UserError, match="seed=-1"):
+        env.seed(-1)
     env.close()
 
 

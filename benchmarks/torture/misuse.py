@@ -14,6 +14,7 @@ import re
 import subprocess
 import sys
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,6 +31,7 @@ from benchmarks.torture.damage import traceback_of
 from benchmarks.torture.tally import Tally, forked
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
+from ganlane.files import PACKAGE
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
@@ -101,8 +103,18 @@ def _outcome(call: Callable[[], Any]) -> str:
     except OSError as error:  # the file system's own refusal, which the API passes on
         return f"REFUSED {error}"[:100] if error.errno is not None else f"TRACEBACK {traceback_of(error)}"
     except BaseException as error:
-        return f"TRACEBACK {traceback_of(error)}"
+        # gymnasium and TensorDict look at some arguments before any of our code is asked.
+        return f"{'TRACEBACK' if _through_ours(error) else 'REFUSED'} {traceback_of(error)}"
     return "WORKED"
+
+
+def _through_ours(error: BaseException | None) -> bool:
+    """Whether code of the package was at work when the error, or one that it came from, was raised."""
+    while error is not None:
+        if any(f"{PACKAGE}{os.sep}" in frame.filename for frame in traceback.extract_tb(error.__traceback__)):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _calls() -> Iterator[tuple[str, Callable[[], Any]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -33,9 +34,11 @@ def agent_file(name: str | Path) -> Path:
     text = str(name)
     shipped = text.removesuffix("@0")
     path = CHECKPOINTS / f"{shipped}.safetensors" if shipped in SHIPPED else Path(text)
-    if not path.is_file():
+    if not os.path.isfile(path):  # which takes names that are too long for a file
         known = ", ".join(sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors")))
-        raise UserError(f"agent {text}: no such file ({path}); the agents that ship are {known}; or give a path.")
+        raise UserError(
+            f"agent {text:.100}: no such file ({path!s:.200}); the agents that ship are {known}; or give a path."
+        )
     return path
 
 

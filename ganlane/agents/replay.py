@@ -26,7 +26,7 @@ TRANSITION_KEYS = (
     ("next", "reward"),
     ("next", "terminated"),
 )
-#: What it has besides where the environment has a mask.
+#: Further keys where the environment has a mask.
 MASK_KEY: tuple[str, ...] = ("next", "action_mask")
 #: Priorities per row: a sum tree of two levels, the lower one 64 wide.
 ROW = 64

@@ -73,7 +73,7 @@ def make_suite(config: BenchConfig) -> Suite:
 
 
 def report_text(tables: Sequence[Table], notes: Sequence[str], command: str, threads: Sequence[int]) -> str:
-    """What stands in a document: command, machine, tables, and what could not be measured."""
+    """Content of a document: command, machine, tables, and what could not be measured."""
     from ganlane.evaluation import machine_sentence
 
     parts = [
@@ -98,6 +98,6 @@ def command_line(folder: Path) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit status."""
-    # A thread of OpenMP that spins while it waits takes time from the cases that run beside it.
+    # A thread of OpenMP that spins while it waits takes time from cases that run at the same time.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     return run_command("bench", bench, arguments)

@@ -1,4 +1,4 @@
-"""``suite=sim``: how fast the simulator is, how its cost grows, what it holds in memory, beside HighwayEnv."""
+"""``suite=sim``: how fast the simulator is, how its cost grows, its memory, compared with HighwayEnv."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``suite=train``: decisions per second with learning, beside stable-baselines3's DQN on HighwayEnv."""
+"""``suite=train``: decisions per second with learning, compared with stable-baselines3's DQN on HighwayEnv."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ganlane.transforms import observation_size
 
 SYSTEM = "ganlane training"
 _MISSING = (
-    "stable-baselines3 or HighwayEnv is not installed, so there is no DQN beside ours; "
+    "stable-baselines3 or HighwayEnv is not installed, so there is no DQN to compare with; "
     '`pip install "ganlane[bench]"` brings both.'
 )
 _HEADINGS = (

@@ -33,7 +33,7 @@ from ganlane.config.resume import refuse_stored_imports, with_resumed
 from ganlane.config.schemas import register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.runtime import keep_freed_memory, open_closed_streams
+from ganlane.runtime import check_process, keep_freed_memory, open_closed_streams
 
 #: What a command does with its config in its run folder; it returns a line to print last, or None.
 Task = Callable[[Any, Path], str | None]
@@ -103,8 +103,7 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     if flags.help:
         print_help(command)
         return
-    if sys.flags.optimize > 1:
-        raise UserError("python -OO removes the docstrings, which TorchRL needs; run it without -OO.")
+    check_process()
     parse(flags.overrides)
     if flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
         as_given = parse_arguments("", arguments).overrides
@@ -216,7 +215,7 @@ def let_go_of_streams() -> bool:
 
 
 def _has_no_reader(stream: TextIO) -> bool:
-    """Whether the stream is a pipe that nobody reads; there is no telling on Windows."""
+    """Whether the stream is a pipe without a reader; always False on Windows."""
     try:
         looked = select.poll()
         looked.register(stream.fileno(), 0)

@@ -77,7 +77,11 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         UserError: as the summary says.
         hydra.errors.OverrideParseException: one is not of the form key=value.
     """
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+    except (ValueError, RecursionError) as error:  # Python's own bounds
+        longest = max(overrides, key=len)
+        raise UserError(f"{longest:.60}...: too long a number or too deep a list; give a shorter value.") from error
     for override in parsed:
         if of_hydra(override):
             _refuse_hydras(override)

@@ -69,7 +69,7 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         self._check_start()
 
     def _check_start(self) -> None:
-        """Refuse first scenes that do not fit on the road, or from which nobody could drive on."""
+        """Refuse first scenes that do not fit on the road, or in which a crash is unavoidable."""
         # The defaults need no check, which loads torch: so a mistake anywhere else is reported without it.
         asked = (self.spawn_parameters(), self.vehicles, self.lanes, self.idm)
         if asked == (SpawnParameters(), EnvConfig.vehicles, EnvConfig.lanes, IdmParameters()):

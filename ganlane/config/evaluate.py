@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import NAMES, GeneratorFile, RunConfig
+from ganlane.config.run import EPISODES, NAMES, GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig, all_traffics, chosen_traffics
-from ganlane.parameters.checks import at_least, between, check, one_of
+from ganlane.parameters.checks import between, check, one_of
 from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 
@@ -44,7 +44,7 @@ class EvaluateConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, agents=NAMES, traffics=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+        check(self, agents=NAMES, traffics=NAMES, episodes=EPISODES, num_envs=between(1, 65536))
         check(self, stream=one_of(STREAMS))
         check_reward(self.env, self.reward)
         self.chosen_traffics()

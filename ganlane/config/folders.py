@@ -1,4 +1,4 @@
-"""Run folders: what stands in each, who is at work there, and that a mistake leaves none behind."""
+"""Run folders: their content, the process that uses them, and that a mistake leaves none behind."""
 
 from __future__ import annotations
 

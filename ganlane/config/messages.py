@@ -1,6 +1,6 @@
 """Errors of Hydra, OmegaConf and the file system as one sentence: the value, what was expected, what to do.
 
-A connection that is refused or a process that is gone is an OSError, too, but none that a user can mend: it keeps its
+A connection that is refused or a process that is gone is an OSError, too, but none that a user can fix: it keeps its
 traceback.
 """
 
@@ -144,7 +144,7 @@ def numbered_refusals() -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        told = re.search(r"\(os error (\d+)\)", str(error))
-        if told is None or getattr(error, "errno", None) is not None or isinstance(error, UserError):
+        code = re.search(r"\(os error (\d+)\)", str(error))
+        if code is None or getattr(error, "errno", None) is not None or isinstance(error, UserError):
             raise
-        raise OSError(int(told[1]), os.strerror(int(told[1]))) from error
+        raise OSError(int(code[1]), os.strerror(int(code[1]))) from error

@@ -144,7 +144,7 @@ def run_folder(path: Path) -> Path:
         UserError: there is no run.
     """
     if path.is_file() and path.name != "last.pt":
-        raise UserError(f"resume={path}: a run goes on from its last.pt alone; give the run's folder.")
+        raise UserError(f"resume={path}: a run continues from its last.pt only; give the run's folder.")
     candidates = [path, *path.parents[:3]] if path.exists() else []
     for folder in candidates:
         if (folder / OVERRIDES).is_file() and any(folder.rglob("last.pt")):

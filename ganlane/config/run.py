@@ -9,6 +9,8 @@ from ganlane.parameters.checks import Rule, at_least, between, check, one_of
 
 #: A list of names without repetitions.
 NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
+#: A number of episodes; their results stay in memory.
+EPISODES = between(1, 10_000_000)
 
 
 @dataclass

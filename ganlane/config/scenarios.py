@@ -29,7 +29,7 @@ class SceneOptions:
 
     Attributes:
         jitter_m: positions vary by up to so much to either side from episode to episode, m.
-        jitter_mps: and speeds, m/s; who stands goes on standing.
+        jitter_mps: and speeds, m/s; standing vehicles remain standing.
     """
 
     jitter_m: float = 0.0
@@ -225,7 +225,7 @@ class BlockedLaneEnvConfig(SceneEnvConfig):
     Attributes:
         vehicles: 0: as many as the scene has (11: 2 + standing + 6 in each other lane).
         lanes: 2 or more.
-        timeout_s: s; who has found no gap in two minutes stands at the closure.
+        timeout_s: s; an ego without a gap for two minutes has stopped at the closure.
     """
 
     scenario = "blocked_lane"

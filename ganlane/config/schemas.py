@@ -120,7 +120,7 @@ def _unlock(node: Any) -> None:
 
 
 def made(node: Any, where: str = "") -> Any:
-    """The dataclass that ``node`` stands for, ranges checked.
+    """The dataclass of ``node``, ranges checked.
 
     Args:
         node: a node with a dataclass as its type.

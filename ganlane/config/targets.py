@@ -35,7 +35,7 @@ def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
     """
     module, _, name = path.rpartition(".")
     # A console script does not look for a user's own modules where it is started. Last, and not before one is named:
-    # what lies in that folder never stands in for an installed module.
+    # what lies in that folder never replaces an installed module.
     if "" not in sys.path:
         sys.path.append("")
     try:

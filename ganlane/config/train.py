@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import NAMES, GeneratorFile, RunConfig
+from ganlane.config.run import EPISODES, NAMES, GeneratorFile, RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError
 from ganlane.parameters.agent import RainbowConfig
@@ -171,7 +171,7 @@ class FinalEvaluationConfig:
     num_envs: int = 512
 
     def __post_init__(self) -> None:
-        check(self, agents=NAMES, episodes=at_least(1), num_envs=between(1, 65536))
+        check(self, agents=NAMES, episodes=EPISODES, num_envs=between(1, 65536))
 
 
 @dataclass
@@ -223,7 +223,7 @@ class TrainConfig(RunConfig):
             compile=one_of(COMPILE),
             log_every=at_least(1),
             evaluate_every=at_least(0),
-            selection_episodes=at_least(1),
+            selection_episodes=EPISODES,
             checkpoint_every_s=at_least(0),
         )
         check_reward(self.env, self.reward)

@@ -188,7 +188,7 @@ def _fetch(
         if failures >= attempts:
             raise UserError(
                 f"{url}: cannot be fetched, {part.size} bytes came ({reason}); check the network and run the "
-                "command again, it goes on from there."
+                "command again, it continues from there."
             )
         if failures:
             time.sleep(wait_s)

@@ -57,6 +57,7 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
 class ActionCheck:
     """Refuses actions other than 0, 1 and 2.
 
+    The native kernel looks at their values itself, which costs nothing: there :meth:`form` is enough.
     On a GPU a step does not wait for the answer: it is looked at in later steps, when it has arrived.
 
     Args:
@@ -65,30 +66,33 @@ class ActionCheck:
     """
 
     def __init__(self, rows: int, device: torch.device) -> None:
-        self.rows = rows
+        self.rows, self._shape = rows, torch.Size([rows])
         # Where a copy arrives by itself; elsewhere the answer is read at once.
         self._arrived = torch.zeros((), dtype=torch.bool).pin_memory() if device.type == "cuda" else None
         self._wrong = torch.zeros((), dtype=torch.bool, device=device)
 
-    def __call__(self, action: Tensor | None) -> Tensor:
+    def form(self, action: Tensor | None) -> Tensor:
         """``action`` [N] as int64.
 
         Raises:
-            UserError: there is none, it has another shape, it is not a whole number, or not one from 0 to 2.
+            UserError: there is none, it has another shape, or it is not a whole number.
         """
+        if action is not None and action.dtype is torch.int64 and action.shape == self._shape:
+            return action
         if action is None:
             raise UserError(f"step(): no action; give 'action' [{self.rows}], int64, from 0 to {ACTIONS - 1}.")
-        if action.shape != (self.rows,) or action.is_floating_point() or action.dtype == torch.bool:
+        if action.shape != self._shape or action.is_floating_point() or action.dtype == torch.bool:
             raise _refused(f"of shape {list(action.shape)} in {action.dtype}", self.rows)
-        if action.dtype != torch.int64:
-            action = action.long()
+        return action.long()
+
+    def values(self, action: Tensor) -> None:
+        """Raise :class:`UserError` where ``action`` [N] int64 is not from 0 to 2."""
         if action.device.type == "cpu":
             # As unsigned numbers, in which those below 0 are large, and by NumPy: a few microseconds.
             if action.numpy().view(np.uint64).max() >= ACTIONS:
                 raise _refused(str(int(action[(action < 0) | (action >= ACTIONS)][0])), self.rows)
         else:
             self._look_later(action)
-        return action
 
     def _look_later(self, action: Tensor) -> None:
         if self._arrived is None:

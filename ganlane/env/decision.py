@@ -21,7 +21,7 @@ Recorder = Callable[[Vehicles, Tensor], None]
 class EndedRows:
     """The traffic's memory of the rows that end within a decision, kept as it was when they ended.
 
-    Meanwhile the traffic goes on computing these rows, in vain. Restoring their memory in every physics step would
+    Meanwhile the traffic still computes these rows, in vain. Restoring their memory in every physics step would
     copy that of all rows each time, and generated traffic's is large.
     """
 
@@ -90,8 +90,8 @@ def run_decision(
         before = now
         if known_false(before.running.any()):
             break
-        # The traffic's clock goes on in ended rows: stopped at a moment of decision it would have these rows' drivers
-        # decide in all remaining steps, in vain.
+        # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
+        # these rows' drivers decide in all remaining steps, in vain.
         vehicles = TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size)
         fields = {keys.VEHICLES: vehicles, keys.TRAFFIC: memory, **counters, keys.STEP: start.step + count}
         after = traffic(TensorDict._new_unsafe(fields, batch_size=size))

@@ -13,11 +13,11 @@ from torchrl.envs import EnvBase
 from ganlane import keys
 from ganlane.env.checks import ActionCheck, check_counter, check_sizes, usable_device
 from ganlane.env.decision import Recorder, known_false, run_decision
-from ganlane.env.native_step import after_decision, make_kernel, native_decision
+from ganlane.env.native_step import NATIVE_TAKEN, after_decision, make_kernel, native_decision, say_once
 from ganlane.env.physics import Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
-from ganlane.parameters.checks import seed_number
+from ganlane.parameters.checks import checked_arguments, seed_number
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -70,6 +70,7 @@ class HighwayEnv(EnvBase):
 
     batch_locked = True
 
+    @checked_arguments
     def __init__(
         self,
         traffic: TrafficModule,
@@ -90,8 +91,6 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
-        if not isinstance(traffic, TrafficModule):
-            raise UserError(f"traffic={traffic!r}: expected a TrafficModule; ganlane.make_env takes names.")
         check_sizes(num_envs, vehicles, first_episode)
         super().__init__(device=usable_device(device, dtype), batch_size=torch.Size([int(num_envs)]))
         self.traffic = traffic.to(self.device)
@@ -234,9 +233,10 @@ class HighwayEnv(EnvBase):
         if seed is None or episode is None:
             raise UserError("step(): the state of no episode was given; call reset() first and step what it returns.")
         self.last_episodes = (seed, episode)
-        action = self._check_action(tensordict.get(keys.ACTION, None))
+        action = self._check_action.form(tensordict.get(keys.ACTION, None))
         if self.kernel is not None and (self.recorder is None or self._kernel_must):
             return self._native_step(tensordict, action)
+        self._check_action.values(action)
         key = episode_key(self.stream, seed, episode)
         rules = self._rules_of(tensordict, key)
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(tensordict.get(keys.EGO).items())
@@ -261,11 +261,18 @@ class HighwayEnv(EnvBase):
         assert self.kernel is not None
         if self.recorder is not None:
             raise UserError("env.kernel=native shows no physics steps to a recorder; set env.kernel=torch.")
+        if not self._kernel_must:
+            say_once(NATIVE_TAKEN)
         recycles = None
         if self.recycle:
             seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
             recycles = self._recycling_rows(episode_key(self.stream, seed, episode))
-        return after_decision(tensordict, *native_decision(self.kernel, tensordict, action, recycles))
+        try:
+            decided = native_decision(self.kernel, tensordict, action, recycles)
+        except ValueError:
+            self._check_action.values(action)  # says which
+            raise
+        return after_decision(tensordict, *decided)
 
     def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
         """The rules of every row: replayed scenes have their own roads and ends."""

@@ -24,7 +24,8 @@ NATIVE_TAKEN = "env.kernel=auto: the native kernel"
 
 
 @lru_cache(maxsize=8)
-def _say_once(line: str) -> None:
+def say_once(line: str) -> None:
+    """Print a line to the standard error stream, the first time that it is given."""
     print(line, file=sys.stderr)
 
 
@@ -45,9 +46,8 @@ def make_kernel(
         raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
     if reason:
         return None
-    if wanted == "auto":
-        _say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}" if missing else NATIVE_TAKEN)
     if missing:
+        say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}")
         return None
     assert isinstance(traffic, IdmTraffic)
     mobil = traffic.mobil if isinstance(traffic, IdmMobilTraffic) else None

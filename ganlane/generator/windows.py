@@ -10,7 +10,10 @@ import hashlib
 import io
 import json
 import os
+import sys
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -153,8 +156,7 @@ def content_hash(settings: Any, *arrays: np.ndarray) -> str:
 def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """The arrays that ``compute`` returns, from the cache if it ran for this ``key`` before.
 
-    A damaged file is computed again, and a folder that cannot be written to is ignored: the cache never causes a
-    wrong result or a failure.
+    A damaged file is computed again, and a folder that cannot be written to is ignored.
     """
     folder = cache_folder()
     if folder is None:
@@ -177,15 +179,17 @@ def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """What :func:`save_arrays` wrote, without pickle; None where it is absent, damaged or has no checksum."""
-    try:
-        content = path.read_bytes()
-        if not has_checksum(content, path):
-            return None
-        with np.load(io.BytesIO(content), allow_pickle=False) as kept:
-            return dict(kept)
-    except (UserError, OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError):
+    """What :func:`save_arrays` wrote, without pickle; None where it is absent, with a note where damaged."""
+    if not path.is_file():
         return None
+    of_numpy = (KeyError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)
+    with suppress(UserError, OSError, ValueError, *of_numpy):
+        content = path.read_bytes()
+        if has_checksum(content, path):
+            with np.load(io.BytesIO(content), allow_pickle=False) as kept:
+                return dict(kept)
+    print(f"{path}: damaged or without a checksum; computed again.", file=sys.stderr)
+    return None
 
 
 @dataclass(frozen=True)

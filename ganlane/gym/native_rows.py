@@ -74,8 +74,6 @@ class NativeRows(Rows):
         self.decision_period_s = batch.decision_period_s
         self._started = False
         self._never = np.zeros(batch.rows, np.bool_)
-        state = batch.state
-        self._ego_y, self._ego_speed = state["y"][:, 0], state["speed"][:, 0]
 
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         """See :class:`ganlane.gym.rows.Rows`."""
@@ -107,13 +105,13 @@ class NativeRows(Rows):
     def info(self) -> dict[str, Any]:
         """See :class:`ganlane.gym.rows.Rows`."""
         batch, state = self.batch, self.batch.state
-        lane = np.rint(self._ego_y / np.float32(batch.lane_width_m)).astype(np.int64)
+        lane = np.rint(state["y"][:, 0] / np.float32(batch.lane_width_m)).astype(np.int64)
         return {
             "seed": state["seed"],
             "episode_number": state["episode"],
             "time_s": state["step"] * PHYSICS_STEP_S,
             "distance_m": state["distance"],
-            "speed_mps": self._ego_speed,
+            "speed_mps": state["speed"][:, 0],
             "lane": np.minimum(np.maximum(lane, 0), batch.lanes - 1),
             "decisions": state["decisions"],
             "lane_changes": state["lane_changes"],

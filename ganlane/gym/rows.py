@@ -66,6 +66,11 @@ class Rows(ABC):
     def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
         """Seeds and episodes [N] under way; None before the first :meth:`start`."""
 
+    def check_started(self) -> None:
+        """Raise :class:`UserError` before the first :meth:`start`."""
+        if self.numbers() is None:
+            raise UserError("no episode is under way; call reset() first.")
+
     @abstractmethod
     def info(self) -> dict[str, Any]:
         """Gymnasium's info: by name (docs/gymnasium.md) arrays [N], which hold until the next call."""
@@ -114,17 +119,25 @@ def _item(value: Any, row: int) -> Any:
     return value[row].copy() if value.ndim > 1 else value.item(row)
 
 
+def array_of(given: Any) -> npt.NDArray[Any]:
+    """What a user gave as an array; None in one where it is none, as lists of different lengths are."""
+    try:
+        return np.asarray(given)
+    except (TypeError, ValueError, RuntimeError):
+        return np.asarray(None)
+
+
 def actions_of(given: Any, rows: int) -> npt.NDArray[np.int64]:
     """A user's actions as an array [rows] int64.
 
     Raises:
         UserError: another shape, or no such action.
     """
-    array = np.asarray(given)
+    array = array_of(given)
     whole = array.shape == (rows,) and array.dtype.kind in "iu"
     if not whole or not 0 <= array.min() <= array.max() < ACTIONS:
         raise UserError(
-            f"action {array.tolist()}: expected {rows} whole number(s), 0 (keep), 1 (left) or 2 (right); give one "
+            f"action {given!r:.80}: expected {rows} whole number(s), 0 (keep), 1 (left) or 2 (right); give one "
             "for every environment."
         )
     return array.astype(np.int64, copy=False)
@@ -142,15 +155,16 @@ def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dic
 
 def episode_numbers(episode: Any) -> npt.NDArray[np.int64]:
     """The option ``episode``, checked: whole numbers from 0, one or several."""
-    numbers = np.asarray(episode)
-    if numbers.dtype.kind not in "iu" or (numbers < 0).any():
-        raise UserError(f"options: episode={episode!r}: expected whole numbers from 0; give for instance 3.")
-    return numbers.astype(np.int64)
+    array = array_of(episode)
+    numbers = array.astype(np.int64) if array.dtype.kind in "iu" else np.asarray(-1)
+    if (numbers < 0).any():
+        raise UserError(f"options: episode={episode!r:.80}: expected whole numbers from 0; give for instance 3.")
+    return numbers
 
 
 def row_mask(mask: Any, rows: int) -> Flags:
     """The option ``reset_mask``, checked: a boolean array [rows]."""
-    array = np.asarray(mask)
+    array = array_of(mask)
     if array.shape != (rows,) or array.dtype != np.bool_:
         raise UserError(
             f"options: reset_mask: expected a boolean array of shape ({rows},); give one flag for every row."

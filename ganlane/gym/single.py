@@ -15,13 +15,13 @@ from ganlane.gym.rows import (
     SEEDS,
     Floats,
     actions_of,
-    episode_numbers,
+    array_of,
     known_options,
     make_rows,
     row_of,
 )
 from ganlane.options import Option, option
-from ganlane.parameters.checks import seed_number
+from ganlane.parameters.checks import checked_arguments, seed_number, whole_number
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -47,6 +47,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 1}  # noqa: RUF012 - gymnasium's own form
 
+    @checked_arguments
     def __init__(
         self,
         traffic: Option = "idm_mobil",
@@ -85,7 +86,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
             self._seed, self._episode = seed, -1
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
-        self._episode = int(episode_numbers(given.get("episode", self._episode + 1)))
+        self._episode = whole_number("options: episode", given.get("episode", self._episode + 1), 0, 2**62)
         self._rows.start(self._seed, self._episode)
         self._running = True
         if self._view is not None:
@@ -96,7 +97,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         """One decision: observation, reward, terminated, truncated, info."""
         if not self._running:
             raise UserError("step(): no episode is under way; call reset() first.")
-        actions = actions_of(np.reshape(action, -1), 1)
+        actions = actions_of(array_of(action).reshape(-1), 1)
         if self._view is not None:
             self._view.before_step(int(actions[0]))
         stepped = self._rows.step(actions)
@@ -115,6 +116,7 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         """The picture [height, width, 3] uint8 of the last moment with ``rgb_array``; ``human`` draws by itself."""
         if self._view is None:
             raise UserError(f"render(): made without render_mode; give one of {', '.join(RENDER_MODES)} to make().")
+        self._rows.check_started()
         return self._view.picture() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

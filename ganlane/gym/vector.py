@@ -18,6 +18,7 @@ from ganlane.gym.rows import (
     Flags,
     Floats,
     actions_of,
+    array_of,
     copied,
     episode_numbers,
     known_options,
@@ -25,7 +26,7 @@ from ganlane.gym.rows import (
     row_mask,
 )
 from ganlane.options import Option, option
-from ganlane.parameters.checks import seed_number
+from ganlane.parameters.checks import checked_arguments, seed_number
 
 
 class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):
@@ -53,6 +54,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012
 
+    @checked_arguments
     def __init__(
         self,
         num_envs: int = 1,
@@ -91,8 +93,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         given = known_options(options, ("episode", "reset_mask"))
         if "reset_mask" in given:
             fresh = row_mask(given["reset_mask"], self.num_envs)
-            if self._rows.numbers() is None:
-                raise UserError("no episode is under way; call reset() first.")
+            self._rows.check_started()
             self._restart(fresh)
         else:
             fresh = np.ones(self.num_envs, dtype=np.bool_)
@@ -111,8 +112,8 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         each = np.arange(self.num_envs)
         if seed is not None:
-            super().reset(seed=seed if isinstance(seed, int) else None)
-            seeds: Any = [seed_number(one) for one in np.atleast_1d(seed).tolist()]
+            seeds: Any = [seed_number(one) for one in array_of(seed).ravel().tolist()]
+            super().reset(seed=seeds[0] if len(seeds) == 1 else None)
             first = each
         else:
             seeds, first = self._next(each)
@@ -132,8 +133,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
 
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
         """One decision in every row: observations [N, D], rewards, terminated, truncated [N], info."""
-        if self._rows.numbers() is None:
-            raise UserError("no episode is under way; call reset() first.")
+        self._rows.check_started()
         waiting = self._ended
         if self._mode is AutoresetMode.DISABLED and waiting.any():
             raise UserError(
@@ -164,8 +164,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         """A picture [height, width, 3] uint8 of every row, without trails."""
         if self._view is None:
             raise UserError("render(): made without render_mode; give render_mode='rgb_array' to make_vec().")
-        if self._rows.state is None:
-            raise UserError("no episode is under way; call reset() first.")
+        self._rows.check_started()
         return self._view.pictures(self._rows.state)
 
 

@@ -125,6 +125,7 @@ class NativeBatch:
         stream: int = 0,
         variant: str | None = None,
     ) -> None:
+        self._arguments = {name: value for name, value in locals().items() if name != "self"}
         spawn, ego, episode = spawn or SpawnParameters(), ego or EgoParameters(), episode or EpisodeParameters()
         observation, reward = observation or ObservationConfig(), reward or RewardParameters()
         idm, mask = idm or IdmParameters(), mask or MaskParameters()
@@ -179,6 +180,18 @@ class NativeBatch:
         self._stepped = Stepped(
             self.observation, *(self.state[name] for name in ("reward", "terminated", "truncated"))
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it was made of, and its numbers: pointers and the library hold in this process alone."""
+        return {"arguments": self._arguments, "arrays": self._arrays()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state["arguments"])  # type: ignore[misc]  # anew, in place
+        for array, kept in zip(self._arrays(), state["arrays"]):
+            array[:] = kept
+
+    def _arrays(self) -> list[npt.NDArray[Any]]:
+        return [*self.state.values(), self.observation, self.mask, self._term_values, self._no_safe_action]
 
     def _pointers(self, names: Sequence[str]) -> ctypes.Array[ctypes.c_void_p]:
         return addresses([self.state[name] for name in names], len(names))

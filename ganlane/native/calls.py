@@ -36,7 +36,8 @@ def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
     """``call(first, last)`` for all ``rows``, in as many threads as pay and are allowed.
 
     Raises:
-        MemoryError: a call returned other than 0.
+        ValueError: a call returned 2: an action is not 0, 1 or 2.
+        MemoryError: a call returned 1.
     """
     threads = 1 if rows < 2 * ROWS_PER_THREAD else min(threads_allowed(), rows // ROWS_PER_THREAD)
     if threads <= 1:
@@ -45,6 +46,8 @@ def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
         share = -(-rows // (threads * BLOCK)) * BLOCK
         starts = range(0, rows, share)
         codes = list(_pool(threads).map(call, starts, (min(start + share, rows) for start in starts)))
+    if 2 in codes:
+        raise ValueError("an action is not 0, 1 or 2")
     if any(codes):
         raise MemoryError("the kernel's scratch memory")
 

@@ -159,6 +159,9 @@ class Kernel:
             step: physics steps since the start of the episode, [N] int64.
             recycles: rows that put vehicles left behind ahead of the ego again, [N] bool; None: no row does.
             out: written to; None: new tensors. It must not share memory with what goes in.
+
+        Raises:
+            ValueError: an action is not 0, 1 or 2.
         """
         rows = action.shape[0]
         out = Outcome.empty(rows, self.vehicles) if out is None else out

@@ -583,9 +583,12 @@ static void store(const Settings& s, const Inputs& in, Rows& r, const Outputs& o
     }
 }
 
-// Drives the rows [first, last) through one decision. Returns 0, or 1 without memory.
+// Drives the rows [first, last) through one decision. Returns 0, or 1 without memory, or 2 and drives none of them
+// where an action is not 0, 1 or 2.
 extern "C" int ganlane_decide(const Settings* settings, const Inputs* in, const Outputs* out, long first, long last) {
     const Settings& s = *settings;
+    for (long row = first; row < last; row++)
+        if ((uint64_t)in->action[row] > 2) return 2;
     size_t bytes = scratch_floats(s) * sizeof(Float) + sizeof(Float);
     void* memory = malloc(bytes);
     if (!memory) return 1;

@@ -16,7 +16,7 @@ from ganlane.sim.state import Road, Vehicles
 
 
 class SafeActions:
-    """Which lane changes have an effect and make nobody brake harder than is safe.
+    """Which lane changes have an effect and make no vehicle brake harder than is safe.
 
     Args:
         road: straight, the same in all rows.

@@ -84,10 +84,10 @@ static int look(const Batch& b, long first, long last) {
     return failed || (b.mask_form == MASK_SAFE && ganlane_mask(b.mask_settings, b.mask_inputs, b.mask_outputs, first, last));
 }
 
-// Drives the rows [first, last) through one decision. Returns 0, or 1 without memory.
+// Drives the rows [first, last) through one decision. Returns as ganlane_decide does.
 extern "C" int ganlane_step(const Batch* batch, long first, long last) {
     const Batch& b = *batch;
-    if (ganlane_decide(b.settings, b.in, b.out, first, last)) return 1;
+    if (int failed = ganlane_decide(b.settings, b.in, b.out, first, last)) return failed;
     for (long row = first; row < last; row++) rate(b, row);
     return look(b, first, last);
 }

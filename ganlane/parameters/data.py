@@ -70,7 +70,7 @@ class DataConfig:
         check(self, format=one_of((type(self).format,)), held_out=optional(every(text())))
 
     def parameters(self) -> NgsimParameters | None:
-        """What the reader takes besides the path; None where it takes nothing."""
+        """Further inputs of the reader; None where it takes nothing."""
         return None
 
     def held_out_scenes(self, scenes: Sequence[str], preferred: Sequence[str]) -> tuple[str, ...]:
@@ -87,7 +87,7 @@ class NgsimDataConfig(NgsimParameters, DataConfig):
     Attributes:
         path: the file; with download=true, where to put it.
         held_out: names of scenes not to fit to.
-        download: true: fetch the file first, unless it is there; a broken transfer goes on.
+        download: true: fetch the file first, unless it is there; an interrupted transfer continues.
         url: from where.
         sha256: checksum of the file, 64 hexadecimal digits; another file is refused.
     """

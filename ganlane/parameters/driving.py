@@ -67,7 +67,7 @@ class MobilParameters:
         threshold: least incentive for a change, m/s2.
         politeness_rear: ``q``, weights the old ('rear') follower.
         politeness_side: ``p``, weights the new ('side') one.
-        safe_deceleration: nobody is made to brake harder, m/s2, above 0.
+        safe_deceleration: a change may not make any vehicle brake harder, m/s2, above 0.
         exclusive_m: of several vehicles that want to enter one lane within this distance, only the foremost does, m.
     """
 

@@ -21,7 +21,7 @@ FORMS = (
 )
 #: Scale of the nearness in the lane view, m.
 NEARNESS_M = 15.0
-#: Overlap along the road that adds 1 to the nearness, m: drivers beside brake so hard that one metre decides.
+#: Overlap along the road that adds 1 to the nearness, m: drivers at the side brake so hard that one metre decides.
 OVERLAP_M = 1.0
 #: The masks, see :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe")

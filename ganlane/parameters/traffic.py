@@ -74,7 +74,7 @@ class SumoParameters:
         truck_share: lorries among the others, 0 to 1, where the first scene has none of its own.
         truck_length_m: length of a lorry, m.
         lane_change_s: how long a lane change takes, s; below 1 it would look like a jump.
-        keep_right: LC2013's lcKeepRight; 0: nobody goes right for its own sake.
+        keep_right: LC2013's lcKeepRight; 0: no change to the right for its own sake.
         speed_wander: how far a driver's desired speed strays from its mean, as a share of it.
     """
 
@@ -160,7 +160,7 @@ class BrakingFaults:
 
     Attributes:
         per_hour: how often, per driver and hour of driving without it; 0: never.
-        deceleration: how hard, m/s2; a driver who brakes harder anyway goes on doing so.
+        deceleration: how hard, m/s2; a driver who brakes harder anyway is not changed.
         lasts_s: how long, s.
     """
 

@@ -91,9 +91,7 @@ def _read_csv(path: Path) -> tuple[list[SceneVehicle], dict[str, Any]]:
     rows = []
     for (number, _), cells in zip(lines[1:], body, strict=True):
         if len(cells) != len(header):
-            raise UserError(
-                f"{path}: line {number}: {len(cells)} cells, the header has {len(header)}; mend the line."
-            )
+            raise UserError(f"{path}: line {number}: {len(cells)} cells, the header has {len(header)}; fix the line.")
         given = {name: cell for name, cell in zip(header, cells, strict=True) if cell}
         rows.append(_row(given, f"{path}: line {number}", f"line {number}"))
     return rows, {}
@@ -103,7 +101,7 @@ def _cells(line: str, where: str) -> list[str]:
     try:
         return [cell.strip() for cell in next(csv.reader([line]))]
     except csv.Error as error:
-        raise UserError(f"{where}: not a line of CSV ({error}); mend the line.") from error
+        raise UserError(f"{where}: not a line of CSV ({error}); fix the line.") from error
 
 
 def _read_json(path: Path) -> tuple[list[SceneVehicle], dict[str, Any]]:
@@ -113,7 +111,7 @@ def _read_json(path: Path) -> tuple[list[SceneVehicle], dict[str, Any]]:
         raise
     # A ValueError without a place in the file: a whole number of thousands of digits.
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not JSON ({error}); mend the file.") from error
+        raise UserError(f"{path}: not JSON ({error}); fix the file.") from error
     content = {"vehicles": content} if isinstance(content, list) else content
     if not isinstance(content, dict) or not isinstance(content.get("vehicles"), list):
         raise UserError(f"{path}: expected a list of vehicles, or an object with 'vehicles'; see docs/scenarios.md.")

@@ -250,7 +250,7 @@ def _misplaced(row: SceneVehicle, road: Road) -> str:
     if row.lane is not None and row.lane != row.lane_on(road):
         return f"lane={row.lane} and y_m={y:g} contradict each other (that is lane {row.lane_on(road)}); give one"
     if row.target_lane is not None and abs(row.target_lane - row.lane_on(road)) > 1:
-        return f"target_lane={row.target_lane}: expected a lane beside its own, {row.lane_on(road)}"
+        return f"target_lane={row.target_lane}: expected a lane next to its own, {row.lane_on(road)}"
     return ""
 
 

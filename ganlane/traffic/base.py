@@ -23,7 +23,7 @@ from ganlane.sim.state import Road, Vehicles
 Memory: TypeAlias = dict[str, Tensor]
 #: The vehicles after a step, and the memory to keep.
 Moved: TypeAlias = tuple[Vehicles, Memory]
-#: Name to (trailing shape after [N, M], dtype); the dtype None stands for the run's float type.
+#: Name to (trailing shape after [N, M], dtype); the dtype None is the run's float type.
 MemoryFields: TypeAlias = Mapping[str, tuple[tuple[int, ...], torch.dtype | None]]
 
 

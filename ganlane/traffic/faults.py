@@ -21,7 +21,7 @@ from ganlane.traffic.base import Memory, MemoryFields, Moved, Overlay, TrafficMo
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its heading.
 _SHORTEST_M = 1e-3
-#: Stands for 'no lane to turn back to'.
+#: No lane to turn back to.
 _NO_LANE = -1
 
 

@@ -168,7 +168,7 @@ class IdmRandomTraffic(IdmMobilTraffic):
         return self.drive(scene, vehicles.target_lane + change, memory)
 
     def _idm(self, own: DriverParams, braking: Tensor) -> DriverIdm:
-        """IDM with each driver's parameters; nobody brakes harder than ``braking`` [N, M]."""
+        """IDM with each driver's parameters; no driver brakes harder than ``braking`` [N, M]."""
         return DriverIdm(
             self.idm.min_gap_m, own.headway, own.comfortable_deceleration, -braking, own.max_acceleration
         )

@@ -123,7 +123,7 @@ class CalibratedChanges:
         per_km: hazard of *wishing* for a change, set so that the rate *measured in the simulation* is that of the
             data; waiting for a gap makes the two differ.
         patience_s: a wish that finds no gap for this long is given up, s.
-        safe_deceleration: nobody has to brake harder, by IDM, m/s2.
+        safe_deceleration: no vehicle has to brake harder, by IDM, m/s2.
         exclusive_m: a change does not start while another vehicle is moving into the same lane within this distance;
             of several that would start at once only the foremost does, m.
     """

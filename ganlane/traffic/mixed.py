@@ -296,7 +296,7 @@ def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
 class BlindTraffic(TrafficModule):
     """Any traffic model, blind to the ego in a share of the episodes, as replayed recordings are.
 
-    In these episodes the model gets a state in which the ego is invalid: nobody brakes or waits for it. The
+    In these episodes the model gets a state in which the ego is invalid: no vehicle brakes or waits for it. The
     environment is as ever: the ego hits others, is hit, and observes. Whether an episode is blind follows from
     (stream, seed, episode) alone. Memory: the model's as ``model``, and ``unseen`` [N, M] bool, true for the ego of a
     blind episode.

@@ -175,7 +175,7 @@ def _by_frame(frame: Integers) -> tuple[Integers, Integers]:
 
 
 class ReplayTraffic(TrafficModule):
-    """Plays recorded tracks as they were driven: **nobody reacts to the ego**.
+    """Plays recorded tracks as they were driven: **no vehicle reacts to the ego**.
 
     The ego replaces the recorded vehicle nearest the middle of the episode's first frame, with its position, speed
     and size; the M - 1 nearest to it (or fewer) are its neighbours for the whole episode. A neighbour whose track

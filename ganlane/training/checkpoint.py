@@ -26,7 +26,7 @@ VERSION = 2
 RENAMED = {"carrier": "env_state", "meter": "stats", "owed": "pending_decisions"}
 #: Key of an identity for the defaults of its options.
 DEFAULTS = "defaults"
-#: Parts of an identity that may change when a run goes on, bit-exact only if they do not: how it is computed.
+#: Parts of an identity that may change when a run is resumed, bit-exact only if they do not: how it is computed.
 COMPUTED_BY = ("env.compile",)
 #: A checkpoint that took t seconds to write is followed by the next after 50 t at the earliest: 2 % of the time.
 PATIENCE = 50.0

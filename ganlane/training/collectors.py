@@ -35,7 +35,7 @@ class Collector(ABC):
     def step(self, agent: Rainbow) -> TensorDictBase:
         """One decision of every environment, batch [N], on the agent's device.
 
-        Row i of a step goes on where row i of the last one ended; ``next`` is what followed before any reset.
+        Row i of a step continues row i of the last one; ``next`` is what followed before any reset.
         """
 
     @abstractmethod

@@ -23,7 +23,7 @@ COLUMNS = (
     *("goal_rate", "crash_rate", "out_of_road_rate", "timeout_rate", "lane_changes_per_km"),
     *("loss", "mean_q", "clamped_fraction", "priority", "gradient_norm", "sigma", "epsilon"),
 )
-#: Figures shown beside the rate, and how.
+#: Figures shown with the rate, and their format.
 SHOWN = {
     "mean_return": "return {:.1f}",
     "crash_rate": "crashes {:.1%}",
@@ -104,7 +104,7 @@ class CsvLog:
     """A CSV file with fixed columns, one line per row, complete after every row.
 
     Args:
-        path: the file; if it exists, its whole rows up to ``decisions`` are kept: a resumed run goes on where the
+        path: the file; if it exists, its whole rows up to ``decisions`` are kept: a resumed run continues where the
             checkpoint was made, not where the interrupted run had got to.
         columns: in this order; a row's other entries are dropped, missing ones left empty.
         decisions: where the run starts.
@@ -138,7 +138,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     A row that a full disk or a kill has torn is left out: its last figure may have lost digits.
 
     Raises:
-        UserError: something else than numbers stands in it.
+        UserError: it holds something else than numbers.
     """
     if not path.is_file():
         return []
@@ -199,7 +199,7 @@ class Progress:
         print(", ".join([head, *shown]), file=self.stream, flush=True)
 
     def close(self) -> None:
-        """Leave the bar as it stands."""
+        """Leave the bar as it is."""
         if self._bar is not None:
             self._bar.close()
 
@@ -253,7 +253,7 @@ class WandbLog:
 
     Offline, unless the environment variable ``WANDB_MODE`` asks for something else (``online``, ``disabled``);
     ``wandb sync FOLDER/wandb/offline-run-*`` uploads it later. A resumed training run is a further run there, which
-    starts at the decisions of the checkpoint. ``about`` are JSON-serialisable settings, shown beside the figures.
+    starts at the decisions of the checkpoint. ``about`` are JSON-serialisable settings, shown with the figures.
 
     Raises:
         UserError: wandb is not installed, or does not start (``WANDB_MODE=online`` without an account, for instance).

@@ -84,7 +84,7 @@ def train(
         config: length and schedule.
         run_folder: gets ``metrics.csv``, ``evaluation.csv`` and ``checkpoints/{last.pt, last, best.safetensors}``.
         evaluate: called with the greedy policy every ``config.evaluate_every`` decisions.
-        logs: further logs besides the CSV files and the progress.
+        logs: logs in addition to the CSV files and the progress.
         metadata: JSON-serialisable, written into the agent's files, e.g. the name of the observation.
         resume: checkpoint to go on from.
         identity: plain data that makes the run what it is (environment, traffic, reward, seed); a run with another

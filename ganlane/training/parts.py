@@ -76,8 +76,8 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
         raise ValueError(f"replay: {count} rows of {capacity}, the next one is {cursor}")
     if agent.config.prioritised:
         own = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
-        like = {"priorities": own.float(), "largest": torch.zeros(()), "beta": 0.0}
-        check_like(replay["sampler"], like, "replay.sampler")
+        expected: dict[str, Any] = {"priorities": own.float(), "largest": torch.zeros(()), "beta": 0.0}
+        check_like(replay["sampler"], expected, "replay.sampler")
         if not torch.equal(replay["sampler"]["priorities"] > 0, own):
             raise ValueError("replay: priorities of rows that it does not have")
 

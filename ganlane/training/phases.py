@@ -308,7 +308,7 @@ def check_observation(start: Start, config: TrainConfig) -> None:
 def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
     """Write the agent of the phase: the best one where the run chose among several, else the last.
 
-    Its metadata hold, beside the description, the length of the run and, for the best one, its figures on the
+    Its metadata hold, with the description, the length of the run and, for the best one, its figures on the
     stream kept for selection.
     """
     best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)

@@ -263,7 +263,7 @@ class ClusterCollector(WorkerCollector):
             connection["address"] = self.address
         # A dictionary each: TorchRL writes the policy of a worker into its own.
         own = [{"postproc": read_by_loop, "auto_register_policy_transforms": False} for _ in environments]
-        # TorchRL is told of no weights to send, and warns of it twice: they are sent by _send_weights.
+        # TorchRL gets no weights to send, and warns of it twice: they are sent by _send_weights.
         warnings.filterwarnings("ignore", message="RayCollector iteration started before weight synchronization")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -298,7 +298,7 @@ def check_reachable(address: str, patience_s: float = 10.0) -> None:
     """Try to connect to ``HOST:PORT`` or ``ray://HOST:PORT``; Ray itself would try for minutes.
 
     Raises:
-        ConnectionError: nobody listens there.
+        ConnectionError: no process listens there.
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not port.isdigit():

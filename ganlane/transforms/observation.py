@@ -134,8 +134,8 @@ def lane_view(
 ) -> Tensor:
     """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) if empty.
 
-    The nearest vehicle is the one with the nearest centre; one exactly beside the ego counts as behind. The gap, over
-    the range of sight, is from bumper to bumper.
+    The nearest vehicle is the one with the nearest centre; one exactly level with the ego counts as behind. The gap,
+    over the range of sight, is from bumper to bumper.
 
     Args:
         others: from :func:`other_vehicles`.

@@ -1,6 +1,6 @@
 """Sensor errors as a TorchRL transform: what the ego perceives of the others is noisy, has gaps and comes late.
 
-The transform writes ``perceived`` beside ``vehicles``; observation and mask use ``perceived`` where it is present.
+The transform writes ``perceived`` next to ``vehicles``; observation and mask use ``perceived`` where it is present.
 Physics, reward, events and the rule-based drivers read the true ``vehicles``. Measurements that are not yet delivered
 travel in the TensorDict as ``sensors``, so a state can be saved, branched and resumed.
 

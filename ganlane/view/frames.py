@@ -42,7 +42,7 @@ _OUTCOMES = {
 
 @dataclass(frozen=True)
 class DrawingParameters:
-    """What is drawn besides the road and the vehicles."""
+    """What is drawn in addition to the road and the vehicles."""
 
     #: Length of the trails, s; 0 for none.
     trail_s: float = 3.0

@@ -1,6 +1,6 @@
 """One self-contained HTML page that plays episodes: road, action values, reward, the ego's comfort.
 
-The page is ``player_page/page.html`` with the style and scripts beside it and the episodes as JSON. It loads nothing
+The page is ``player_page/page.html`` with its style and scripts and the episodes as JSON. It loads nothing
 and runs nothing but these scripts.
 
 Numbers are whole multiples of small units. A *series* [T] is a list of T whole numbers: the first sample, then each

@@ -16,7 +16,7 @@ from reference.hydra_memory import composed, own_part
 
 from ganlane.__main__ import COMMANDS, main
 from ganlane.config.app import Stopped
-from ganlane.config.command_line import typed
+from ganlane.config.command_line import parse, typed
 from ganlane.config.messages import sentence
 from ganlane.errors import UserError
 
@@ -208,3 +208,10 @@ def test_a_pickled_run_is_not_opened(tmp_path, monkeypatch, capsys):
 def test_resolve_and_package_go_with_cfg(capsys):
     assert main(["evaluate", "--cfg", "job", "--resolve", "--package", "env"]) == 0
     assert "lanes: 3" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("override", ["seed=" + "9" * 6000, "agents=" + "[" * 3000])
+def test_a_number_too_long_or_a_list_too_deep_for_python_is_one_sentence(override):
+    with pytest.raises(UserError, match=r"too long a number or too deep a list") as caught:
+        parse([override])
+    assert len(str(caught.value)) < 200

@@ -38,7 +38,7 @@ def test_a_broken_transfer_goes_on_where_it_ended(tmp_path):
 
 def test_a_later_run_goes_on_with_what_an_earlier_one_left(tmp_path):
     with Server(breaks=[400_000, 0, 0, 0]) as server:
-        with pytest.raises(UserError, match=r"cannot be fetched, 400000 bytes came .*goes on from there"):
+        with pytest.raises(UserError, match=r"cannot be fetched, 400000 bytes came .*continues from there"):
             download(server.url, tmp_path / "f", SHA256, None, **QUICK)
         assert "f" not in names(tmp_path)
         server.breaks = []

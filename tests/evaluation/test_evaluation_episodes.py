@@ -26,7 +26,7 @@ from ganlane.traffic import IdmTraffic
 
 SEED = 4
 #: Short and of different lengths: who drives at random also leaves the road and crashes.
-SHORT = EnvConfig(goal_m=90.0)
+SHORT = EnvConfig(goal_m=90.0, kernel="torch")
 
 
 def test_each_row_tells_what_the_episode_was():

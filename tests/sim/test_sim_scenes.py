@@ -300,7 +300,7 @@ def test_a_fault_in_a_csv_file_is_named_by_line_and_column(tmp_path, content, wh
         ("3", "expected a list of vehicles"),
         ('{"cars": []}', "expected a list of vehicles"),
         ('{"lanes": 0, "vehicles": []}', "lanes=0: expected a finite number above 0"),
-        ('{"roads": 1, "vehicles": []}', "unknown key roads"),
+        ('{"roads": 1, "vehicles": []}', "unknown key 'roads'"),
         ("[[1, 2]]", "vehicles entry 1: expected an object"),
         ('[{"x_m": 0, "lane": 0}, {"lane": 0}]', "vehicles entry 2: column x_m: no value"),
         ('[{"x_m": 0, "lane": true}]', "vehicles entry 1: column lane: True: expected a whole number"),

@@ -31,7 +31,7 @@ class HighwayEnvTraffic(TrafficModule):
 
     The parameters are HighwayEnv's own (1.5 s, 3 and -5 m/s2, distances from centre to centre, an egoistic MOBIL
     once a second); desired speeds are Table II's, and the exponent differs from driver to driver as HighwayEnv draws
-    it. Its vehicles do not react to crashes here. One whose speed would fall below 0 stands still.
+    it. Its vehicles do not react to crashes here. One whose speed would fall below 0 stops.
 
     HighwayEnv's state of a vehicle is in ``vehicles`` and in this module's memory (the time since the driver's last
     lane change decision, s), and is written into HighwayEnv's objects in every step. So this traffic is a function of

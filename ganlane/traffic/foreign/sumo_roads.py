@@ -80,7 +80,7 @@ class SumoRoads:
             self.libsumo.start(_command(folder, change_s))
         SumoRoads._current = self
         self._serial = 0
-        #: Names of the others [row][index]; empty where there is nobody (any more).
+        #: Names of the others [row][index]; empty where there is no vehicle (any more).
         self.names: list[list[str]] = [[] for _ in range(rows)]
         self._drivers: list[list[SumoDriver | None]] = [[] for _ in range(rows)]
         self._stand_ins: list[dict[int, str]] = [{} for _ in range(rows)]
@@ -105,7 +105,7 @@ class SumoRoads:
         self.names[row], self._stand_ins[row], self._flat = [], {}, None
 
     def fill(self, row: int, drivers: Sequence[SumoDriver | None], places: Sequence[Place]) -> None:
-        """Put the others of a new episode onto an empty highway; None: nobody has this index."""
+        """Put the others of a new episode onto an empty highway; None: no vehicle has this index."""
         self._drivers[row] = list(drivers)
         self.names[row] = [self._add(row, driver, place) if driver else "" for driver, place in zip(drivers, places)]
         self._flat = None
@@ -236,7 +236,7 @@ def _routes(rows: int, keep_right: float) -> str:
 
 
 def _command(folder: Path, change_s: float) -> list[str]:
-    """SUMO's command line. Nobody is removed for standing still or for a crash."""
+    """SUMO's command line. No vehicle is removed for standing still or for a crash."""
     return [
         *("sumo", "--net-file", str(folder / "net.xml"), "--route-files", str(folder / "routes.xml")),
         *("--step-length", str(PHYSICS_STEP_S), "--step-method.ballistic", "true"),

@@ -18,7 +18,7 @@ from scipy.special import ndtr
 
 from benchmarks.script import make_parser
 from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, resample_counts
-from ganlane.realism.distances import distance, distance_difference, jensen_shannon
+from ganlane.realism.measures import distance, distance_difference, jensen_shannon
 
 #: Spread of the scenes' means, and of the logarithm of their sizes; independent samples of a scene of median size.
 _BETWEEN, _SIZES, _MEDIAN = 0.7, 0.8, 20.0

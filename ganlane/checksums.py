@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from functools import cache
+from mmap import mmap
 from pathlib import Path
 
 from ganlane.errors import UserError
@@ -18,6 +19,8 @@ _BEGIN, _END = b"ganlane sha256 ", b" of this file"
 _ZEROS = b"0" * 64
 #: Placeholder in the content until :func:`sealed` puts the checksum in.
 PLACE = (_BEGIN + _ZEROS + _END).decode()
+#: The end of a zip archive: its comment's length, its comment.
+_COMMENT = len(PLACE).to_bytes(2, "little") + PLACE.encode()
 
 
 def sealed(content: bytes) -> bytes:
@@ -28,10 +31,21 @@ def sealed(content: bytes) -> bytes:
 
 def sealed_archive(content: bytes) -> bytes:
     """A zip archive without a comment (.npz, .pt) with its checksum as comment."""
-    return sealed(content[:-2] + len(PLACE).to_bytes(2, "little") + PLACE.encode())
+    return sealed(content[:-2] + _COMMENT)
 
 
-def has_checksum(content: bytes, path: str | Path) -> bool:
+def seal_archive(path: Path) -> None:
+    """:func:`sealed_archive` in place, for files too large to be held in memory."""
+    with path.open("rb+") as file:
+        file.seek(-2, 2)
+        file.write(_COMMENT)
+        file.flush()
+        with mmap(file.fileno(), 0) as content:
+            begin = len(content) - len(PLACE) + len(_BEGIN)
+            content[begin : begin + len(_ZEROS)] = _digits(content, begin)
+
+
+def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
     """Whether ``content`` has a checksum; files of ganlane 0.2 and before have none.
 
     Raises:
@@ -49,7 +63,7 @@ def has_checksum(content: bytes, path: str | Path) -> bool:
     return True
 
 
-def _digits(content: bytes, begin: int) -> bytes:
+def _digits(content: bytes | mmap, begin: int) -> bytes:
     """Checksum of ``content`` with zeros in the place of the digits at ``begin``."""
     view, digest = memoryview(content), hashlib.sha256()
     for part in (view[:begin], _ZEROS, view[begin + len(_ZEROS) :]):

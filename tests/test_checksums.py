@@ -19,7 +19,7 @@ from ganlane.data.scenes import write_prepared
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, load_weights, save_weights
 from ganlane.generator import load_generator
-from ganlane.generator.loop import FitLoop
+from ganlane.generator.fit import FitLoop
 from ganlane.generator.windows import cached, load_arrays, save_arrays
 from ganlane.parameters.generator import LoopConfig
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference

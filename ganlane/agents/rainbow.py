@@ -187,7 +187,8 @@ class Rainbow:
                 )
         load_parameters(self.network, state["network"])
         load_parameters(self.loss.target_network, state["target"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        # The moments alone: the groups are those of the configuration.
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state["optimizer"]["state"]})
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 
+from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
 
 #: What a transition consists of; everything else is dropped before storing.
@@ -123,6 +124,11 @@ class RowSampler(PrioritizedSampler):
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay buffer")
         cumulated = self.row_sums.cumsum(0)
+        if cumulated.device.type == "cpu" and not cumulated[-1].isfinite():  # reading it would make a GPU wait
+            raise UserError(
+                "training has diverged: its errors are not finite; lower agent.learning_rate and start again, or go "
+                "on from an earlier checkpoint."
+            )
         uniform = torch.rand(batch_size, generator=self._rng, dtype=torch.float64, device=self.device)
         mass = _below(uniform * cumulated[-1], cumulated[-1])
         row = torch.searchsorted(cumulated, mass, right=True)

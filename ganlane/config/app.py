@@ -62,21 +62,34 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
         with _sigterm_as_exception():
             _run(command, task, arguments)
             sys.stdout.flush()
-    except (UserError, *CONFIG_ERRORS) as error:
-        return _refused(command, error)
-    except OSError as error:
+    except BaseException as error:
+        number = _signal_behind(error)
+        if number == signal.SIGINT:
+            print(f"ganlane {command}: stopped by Ctrl-C.", file=sys.stderr)
+        if number is not None:
+            return 128 + number
+        if isinstance(error, (UserError, *CONFIG_ERRORS)):
+            return _refused(command, error)
+        if not isinstance(error, OSError):
+            raise
         reader_left = let_go_of_streams()
         if reader_left and isinstance(error, BrokenPipeError):
             return READER_LEFT
         if not is_users_matter(error):
             raise
         return _refused(command, error)
-    except KeyboardInterrupt:
-        print(f"ganlane {command}: stopped by Ctrl-C.", file=sys.stderr)
-        return 128 + signal.SIGINT
-    except Stopped as stop:
-        return 128 + stop.number
     return 0
+
+
+def _signal_behind(error: BaseException | None) -> int | None:
+    """The signal that ended the command: omegaconf, interrupted in a copy, adds an error of its own."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return signal.SIGINT
+        if isinstance(error, Stopped):
+            return error.number
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def _refused(command: str, error: Exception) -> int:

@@ -1,17 +1,23 @@
 """Recorded traffic: readers of trajectory recordings into one schema, and statistics of driving.
 
 - ``schema`` defines the common form and validates it;
-- readers: ``scenes`` (scene CSV and Parquet, with ``lane_widths``), ``ngsim`` and ``highd``, all based on ``tables``
+- readers: ``scenes`` (scene CSV and Parquet), ``ngsim`` and ``highd``, all based on ``tables``
   (text tables with errors traced to line and column);
 - ``download`` finds or fetches recordings, ``synthetic`` generates some;
-- measuring: ``lane_changes`` treats recordings and simulations alike, ``statistics`` combines all measurements;
+- measuring: ``lanes`` treats recordings and simulations alike, ``statistics`` combines all measurements;
 - ``prepare`` turns any recording into Parquet and pooled statistics.
 """
 
 from ganlane.data.download import ByteProgress, data_folder, default_scenes, download
 from ganlane.data.highd import highd_scenes
-from ganlane.data.lane_changes import Tracks, find_lane_changes, lane_changes_of_arrays, tracks_of_frame
-from ganlane.data.lane_widths import scene_lane_counts, scene_lane_widths
+from ganlane.data.lanes import (
+    Tracks,
+    find_lane_changes,
+    lane_changes_of_arrays,
+    scene_lane_counts,
+    scene_lane_widths,
+    tracks_of_frame,
+)
 from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.prepare import PooledStatistics, Preparation, SceneSummary, prepare_recordings, read_recordings
 from ganlane.data.scenes import read_scenes, write_prepared

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import polars as pl
 
-from ganlane.data.lane_changes import Flags, Floats, Integers
+from ganlane.data.lanes import Flags, Floats, Integers
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, number_tracks, sort, validate
 from ganlane.data.tables import FIRST_LINE, LINE, convert, csv_table, raise_where, read_blocks, read_table
 from ganlane.errors import UserError
@@ -42,13 +42,7 @@ LOWER: Final = 2
 
 @dataclass(frozen=True)
 class _Direction:
-    """One direction of travel, ``number`` :data:`UPPER` or :data:`LOWER`.
-
-    Attributes:
-        lane_ids: highD's numbers of its lanes, from the rightmost.
-        right_edge: ``y`` of the road's right edge in the image, m.
-        lane_width: m.
-    """
+    """One direction of travel; ``lane_ids`` from the rightmost, ``right_edge`` is the image's ``y`` in m."""
 
     number: int
     lane_ids: tuple[int, ...]
@@ -60,8 +54,8 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
     """Two scenes, ``highd-XX-upper`` and ``highd-XX-lower``, for each recording.
 
     Args:
-        path: an ``XX_tracks.csv`` in the same folder as ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``, or a
-            folder of recordings.
+        path: an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``, or a folder of
+            them.
         count: rows read and dropped are added to it.
 
     Raises:
@@ -79,8 +73,7 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
     for tracks in recordings:
         stem = tracks.name.removesuffix(_TRACKS)
         rate_hz, directions = _read_recording_meta(tracks.with_name(f"{stem}_recordingMeta.csv"))
-        direction_of = _read_tracks_meta(tracks.with_name(f"{stem}_tracksMeta.csv"))
-        rows = _read_rows(tracks, direction_of, count)
+        rows = _read_rows(tracks, tracks.with_name(f"{stem}_tracksMeta.csv"), count)
         for direction in directions:
             name = f"highd-{stem}-{'upper' if direction.number == UPPER else 'lower'}"
             scene = _scene(rows, direction, rate_hz, name, tracks, count)
@@ -118,17 +111,13 @@ def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
     return found
 
 
-def _read_tracks_meta(path: Path) -> dict[int, int]:
-    """Vehicle to :data:`UPPER` or :data:`LOWER`."""
-    table = read_table(path, {"id": pl.Int64, "drivingDirection": pl.Int64})
+def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
+    """Rows of a recording, sorted by vehicle and frame; ``direction`` is its vehicle's in the ``meta`` file."""
+    table = read_table(meta, {"id": pl.Int64, "drivingDirection": pl.Int64})
     direction = table["drivingDirection"]
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
-    raise_where(~direction.is_in([UPPER, LOWER]), direction, path, what)
-    return dict(table.iter_rows())
-
-
-def _read_rows(path: Path, direction_of: dict[int, int], count: RowCount) -> pl.DataFrame:
-    """Rows of the tracks file, sorted by vehicle and frame, with each vehicle's ``direction``."""
+    raise_where(~direction.is_in([UPPER, LOWER]), direction, meta, what)
+    direction_of = dict(table.iter_rows())
     blocks = []
     for text in read_blocks(csv_table(path, COLUMNS), list(COLUMNS)):
         columns = [convert(text[name], kind, path, text[LINE]) for name, kind in COLUMNS.items()]
@@ -151,14 +140,21 @@ def _read_rows(path: Path, direction_of: dict[int, int], count: RowCount) -> pl.
 def _scene(
     rows: pl.DataFrame, direction: _Direction, rate_hz: float, name: str, path: Path, count: RowCount
 ) -> Scene | None:
-    """One direction in the schema; None where it has no vehicles."""
+    """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles."""
     rows = rows.filter(pl.col("direction") == direction.number)
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
     count.drop("off the lanes of its direction", int((~on_road).sum()))
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
-    frame = _to_ten_hertz(number_tracks(_in_driving_direction(rows, direction, name), str(path)), rate_hz)
+    tracks = number_tracks(_in_driving_direction(rows, direction, name), str(path))
+    begins = (tracks["vehicle"].diff() != 0).fill_null(True).to_numpy()
+    new = resample(begins, tracks["frame"].to_numpy(), rate_hz)
+    columns = {name: tracks[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
+    columns["frame"] = new.frame
+    columns |= {name: new.linear(tracks[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
+    columns["lane"] = new.nearest(tracks["lane"].to_numpy())
+    frame = pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
     if frame.is_empty():
         return None
     return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
@@ -184,23 +180,12 @@ def _in_driving_direction(rows: pl.DataFrame, direction: _Direction, name: str) 
     )
 
 
-def _to_ten_hertz(rows: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
-    """The tracks with a frame every 0.1 s."""
-    begins = (rows["vehicle"].diff() != 0).fill_null(True).to_numpy()
-    new = resample(begins, rows["frame"].to_numpy(), rate_hz)
-    columns = {name: rows[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
-    columns["frame"] = new.frame
-    columns |= {name: new.linear(rows[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
-    columns["lane"] = new.nearest(rows["lane"].to_numpy())
-    return pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
-
-
 class Resampling(NamedTuple):
-    """Positions of R new samples among the old ones.
+    """R new samples among the old ones.
 
     Attributes:
         frame: [R] new frame numbers, 0.1 s each; frame 0 is the old frame 0.
-        before, after: [R] indices of the old samples before and after it (equal at the end of a track).
+        before, after: [R] indices of the old samples around each; equal at the end of a track.
         share: [R] position between the two, 0 to below 1.
     """
 

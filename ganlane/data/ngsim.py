@@ -22,7 +22,7 @@ from typing import Final
 
 import polars as pl
 
-from ganlane.data.lane_widths import lane_grid
+from ganlane.data.lanes import lane_grid
 from ganlane.data.schema import SCHEMA, RowCount, Scene, number_tracks, sort
 from ganlane.data.tables import (
     LINE,
@@ -104,7 +104,7 @@ def ngsim_scenes(
     """The periods of an NGSIM file, one scene each, in bounded memory (a block, then a period).
 
     Args:
-        path: a raw text file (18 columns, no header) or a CSV with NGSIM's column names, in any case and order; with
+        path: a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any case and order; with
             a column ``location`` it may hold several locations.
         count: rows read and dropped are added to it.
         scratch: folder for temporary files, which are removed at the end; by default the system's.

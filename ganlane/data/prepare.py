@@ -15,7 +15,7 @@ import polars as pl
 
 from ganlane.data.download import name_in_errors
 from ganlane.data.highd import highd_scenes
-from ganlane.data.lane_changes import LaneChanges, find_lane_changes, tracks_of_frame
+from ganlane.data.lanes import LaneChanges, find_lane_changes, tracks_of_frame
 from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.scenes import cut_into_scenes, parquet_name, read_scenes, scene_csv_scenes, write_prepared
 from ganlane.data.schema import FRAME_S, TRACK, RowCount, Scene, sort
@@ -103,6 +103,7 @@ class PooledStatistics:
         frames = frame["frame"].to_numpy()
         speed = float(frame["speed"].mean())  # type: ignore[arg-type]
         rates = lane_change_statistics(changes, exposure, speed)
+        shared = ("srlc", "per_vehicle_km", "per_vehicle_km_low", "per_vehicle_km_high")
         summary = SceneSummary(
             name=scene.name,
             rows=frame.height,
@@ -114,10 +115,7 @@ class PooledStatistics:
             vehicle_km=exposure.vehicle_km,
             mean_speed_mps=speed,
             lane_changes=rates.count,
-            srlc=rates.srlc,
-            per_vehicle_km=rates.per_vehicle_km,
-            per_vehicle_km_low=rates.per_vehicle_km_low,
-            per_vehicle_km_high=rates.per_vehicle_km_high,
+            **{name: getattr(rates, name) for name in shared},
         )
         self.scenes.append(summary)
         return summary
@@ -204,12 +202,8 @@ def open_scenes(
 ) -> Iterator[Scene]:
     """The scenes of recordings of a ``kind``: ``scenes``, ``ngsim`` or ``highd``.
 
-    Args:
-        path: file, or folder where the reader takes one.
-        count: rows read and dropped are added to it.
-        parameters: which rows of an NGSIM file to read.
-        scratch: folder for temporary files (NGSIM).
-        on_progress: called with the bytes read (NGSIM).
+    ``path`` is a file, or a folder where the reader takes one; rows read and dropped are added to ``count``. The
+    other arguments are :func:`ngsim_scenes`'s, and for NGSIM only.
 
     Raises:
         UserError: a damaged or missing file, or an unknown kind.

@@ -15,40 +15,30 @@ from typing import Final
 import polars as pl
 
 from ganlane.checksums import PLACE, has_checksum, sealed
-from ganlane.data.lane_widths import lane_width, scene_lane_widths
+from ganlane.data.lanes import lane_width, scene_lane_widths
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
 from ganlane.data.tables import raise_where, read_table, reason
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
 
-#: Columns of a scene CSV; ``y`` is 0 at the centre of lane 1, which is the leftmost, and positive to the left.
-COLUMNS: Final = {
-    "scene": pl.String,
-    "vehicle": pl.Int64,
-    "frame": pl.Int64,
-    "x": pl.Float64,
-    "y": pl.Float64,
-    "v": pl.Float64,
-    "lane": pl.Int64,
-    "length": pl.Float64,
-    "width": pl.Float64,
-}
+#: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0 at the centre of
+#: lane 1, which is the leftmost.
+COLUMNS: Final = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
 _ENDING: Final = ".parquet"
 
 
 def read_scenes(path: str | Path) -> pl.DataFrame:
     """Read a scene CSV, or what ``ganlane prepare`` wrote, into the schema, sorted by scene, vehicle and frame.
 
-    Lanes of a CSV are renumbered from the right (the highest number of a scene, its rightmost lane, becomes 0), and
-    ``y`` is shifted so that it is 0 at the centre of that lane. Positions are not smoothed.
+    Lanes of a CSV are renumbered from the right (a scene's highest number becomes 0), and ``y`` is shifted so that it
+    is 0 at the centre of that lane. Positions are not smoothed.
 
     Args:
-        path: CSV with :data:`COLUMNS` (others are ignored); metres, m/s, 0.1 s a frame. Or Parquet in the schema: a
-            file ``*.parquet``, or a folder of them.
+        path: CSV with :data:`COLUMNS` (others are ignored), in metres, m/s and 0.1 s a frame; or Parquet in the
+            schema, a file ``*.parquet`` or a folder of them.
 
     Raises:
-        UserError: a missing or damaged file, or a scene that is in two files; the message names file, line and
-            column.
+        UserError: a missing or damaged file, or a scene in two files; the message names file, line and column.
     """
     return sort(pl.concat(_read_files(Path(path))))
 

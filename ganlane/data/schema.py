@@ -68,10 +68,7 @@ class Scene:
 
 @dataclass
 class RowCount:
-    """Number of rows read from files so far, and how many of them were dropped for which reason.
-
-    Rows of the files are counted, not those that interpolation makes (highD).
-    """
+    """Number of rows read from files, before any interpolation, and how many were dropped for which reason."""
 
     read: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
@@ -119,9 +116,8 @@ def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LI
         first_line: line of the file that holds the first row; None where rows are not lines (they count from 0).
 
     Raises:
-        UserError: a missing column, no rows, NaN or null, a frame number that does not grow within its track,
-            a size of 0 or less, or units that cannot be metres and metres per second; the message names
-            ``source``, line and column.
+        UserError: a missing column, no rows, NaN or null, a frame number that does not grow within its track, a size
+            of 0 or less, or units that cannot be metres and metres per second.
     """
     missing = [name for name in SCHEMA if name not in frame.columns]
     if missing:

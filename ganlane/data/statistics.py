@@ -13,7 +13,7 @@ import polars as pl
 from numpy.typing import ArrayLike
 from scipy.special import gammaincinv  # scipy.stats takes seconds to import
 
-from ganlane.data.lane_changes import LaneChanges, find_lane_changes, tracks_of_frame
+from ganlane.data.lanes import LaneChanges, find_lane_changes, tracks_of_frame
 from ganlane.data.schema import FRAME_S, TRACK, TRACK_STRIDE
 from ganlane.errors import UserError
 
@@ -254,7 +254,7 @@ def srlc(changes: int, vehicles: int, road_m: float) -> float:
 def steps_between_changes(rate_per_km: float, speed_mps: float, step_s: float = FRAME_S) -> float:
     """Equation 10's ``t_m``: mean time between two lane changes of a vehicle, in steps of ``step_s``.
 
-    ``rate_per_km`` counts lane changes per vehicle-kilometre and is above 0; ``speed_mps`` is the mean speed.
+    ``rate_per_km`` counts lane changes per vehicle-km and is above 0.
     """
     return 1000.0 / (rate_per_km * speed_mps * step_s)
 
@@ -271,11 +271,11 @@ class LaneChangeStatistics:
     """Rates, durations and lateral speeds of lane changes (equations 9, 10 and 11).
 
     Attributes:
-        count: number of lane changes (:mod:`ganlane.data.lane_changes` defines what counts).
+        count: number of lane changes (:mod:`ganlane.data.lanes` defines what counts).
         srlc: equation 9, per vehicle and km of road.
         per_vehicle_km, per_vehicle_km_low, per_vehicle_km_high: per driven km, with its exact 95 % interval.
-        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m`` from either rate and the mean speed, in steps
-            of 0.1 s; None without lane changes.
+        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m`` from either rate and the mean speed, in steps of
+            0.1 s; None without lane changes.
         duration: equation 11, s.
         lateral_speed: mean lateral speed of each complete change, m/s; its ``mean`` and ``sd`` are the Gaussian.
         lateral_speed_with_censored: the same of all changes, over their recorded parts.
@@ -317,11 +317,9 @@ class DrivingStatistics:
     """Statistics of a recording in SI units; :meth:`to_dict` and :meth:`from_dict` are exact inverses.
 
     Attributes:
-        exposure: amount of driving.
-        lane_changes: rates, durations, lateral speeds.
         speed: of all samples, m/s.
-        speed_sd_in_frame, speed_sd_in_lane: standard deviation of the speeds within a frame, and within a frame
-            and lane, m/s; the mean over those with two vehicles or more, None without any.
+        speed_sd_in_frame, speed_sd_in_lane: standard deviation of the speeds within a frame, and within a frame and
+            lane, m/s; the mean over those with two vehicles or more, None without any.
         acceleration_raw, acceleration_smoothed: :func:`raw_accelerations`, :func:`smoothed_accelerations`, m/s2.
         headway: median ``(gap - 2) / speed`` per follower, s (:func:`median_headways`).
     """

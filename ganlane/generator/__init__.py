@@ -5,15 +5,14 @@ Read in this order:
 - recordings to batches: ``segments`` (of scenes), ``windows`` (9 positions observed, 8 to predict; k-means groups);
 - ``networks``: generator and discriminator;
 - closed loop: ``closed_loop`` (one step of each preset, in fitting and in simulation), ``rollout`` (whole scenes);
-- fitting: ``loop`` (early stopping, resuming), ``fit_paper``, ``fit_calibrated``, ``fit`` (one call), ``checkpoint``;
-- measuring: ``forecasts`` (networks, IDM, baselines), ``scores``, ``cross_validation`` (folds by scene, ablations).
+- fitting: ``tasks`` (of both presets), ``fit`` (splits, early stopping, resuming, one call), ``checkpoint``;
+- measuring: ``forecasts`` (networks, IDM, baselines; scores), ``cross_validation`` (folds by scene, ablations).
 """
 
 from ganlane.generator.checkpoint import FitResult, Preset, load_generator, shipped_generator
 from ganlane.generator.closed_loop import ANCHOR, AnchorParameters
 from ganlane.generator.cross_validation import ablate, cross_validate
-from ganlane.generator.fit import HELD_OUT, assign_folds, fit_generator, fit_key, split_for_fit
-from ganlane.generator.loop import Progress
+from ganlane.generator.fit import HELD_OUT, Progress, assign_folds, fit_generator, fit_key, split_for_fit
 from ganlane.generator.networks import Discriminator, Generator
 from ganlane.generator.rollout import headway_quantiles
 from ganlane.generator.segments import scene_tracks

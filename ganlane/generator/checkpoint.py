@@ -13,8 +13,8 @@ from torch import Tensor
 from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, load_weights, save_weights
+from ganlane.generator.forecasts import Metrics
 from ganlane.generator.networks import Generator
-from ganlane.generator.scores import Metrics
 from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
 
 KIND = "generator"
@@ -29,14 +29,12 @@ class FitResult:
     """A fitted generator and what it was fitted with.
 
     Attributes:
-        preset: ``"paper"`` or ``"calibrated"``.
         module: the generator with the weights that were best on the validation scenes.
-        metrics: of these weights on the held-out scenes, for ``"all"`` and each scene; the paper's preset also
-            has ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored together.
+        metrics: of these weights on the held-out scenes, for ``"all"`` and each scene; the paper's preset also has
+            ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored together.
         config: settings of the fit, as plain data.
         data: file, rows and tracks, and the names of the fitted, validation and held-out scenes.
-        statistics: ``ganlane.data.DrivingStatistics.to_dict()`` of all recordings, held out or not; for a fold's fit
-            of its other scenes.
+        statistics: ``DrivingStatistics.to_dict()`` of all recordings; for a fold's fit of its other scenes.
         updates: updates after which the weights were taken (early stopping).
         seconds: duration of the fit, with its evaluations on the validation scenes.
     """
@@ -55,9 +53,8 @@ class FitResult:
     ) -> None:
         """Write weights and metadata, atomically.
 
-        Args:
-            folds: result of :func:`ganlane.generator.cross_validate`, if it was called.
-            code: the code's version in more detail than the package's number.
+        ``folds`` is the result of :func:`ganlane.generator.cross_validate`, if it was called; ``code`` the code's
+        version in more detail than the package's number.
         """
         metadata = {
             "preset": self.preset,
@@ -81,8 +78,7 @@ def shipped_generator(preset: Preset) -> Path:
 def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Generator, dict[str, Any]]:
     """The generator in evaluation mode, without gradients, and its metadata, as :meth:`FitResult.save` wrote them.
 
-    Args:
-        preset: the required one; None accepts any.
+    ``preset`` is the required one; None accepts any.
 
     Raises:
         UserError: no such file, another kind of file, another preset, or weights that do not fit the stored sizes.

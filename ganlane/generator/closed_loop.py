@@ -47,7 +47,7 @@ class History(NamedTuple):
     Attributes:
         motions: observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest first. Separate
             tensors, because a single one would be copied whole at every step.
-        displacement: [N, M, 2], the displacement of the newest of them, m per 0.1 s.
+        displacement: [N, M, 2], the newest motion's displacement, m per 0.1 s.
     """
 
     motions: tuple[Tensor, ...]
@@ -68,10 +68,7 @@ def recorded(generator: Generator, displacements: Tensor) -> History:
 
 
 def push(generator: Generator, history: History, displacement: Tensor) -> tuple[History, Tensor]:
-    """The history with the new motion and without the oldest, and the new motion's difference [N, M, 2], m.
-
-    Only the new motion is embedded and projected.
-    """
+    """The history with the new motion, the only one projected, and its difference [N, M, 2] to the last one, m."""
     difference = displacement - history.displacement
     new = generator.encoder.project(displacement, difference)
     return History((*history.motions[1:], new), displacement), difference
@@ -193,12 +190,8 @@ def inside_lane(residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor
     """Lateral ``residual`` [N, M] in m/s2 without what would move the body out of its lane.
 
     Outward residuals fade to 0 over :data:`_FADE_M` before the point at which the vehicle, left alone, would come to
-    rest ``room`` off the lane's centre.
-
-    Args:
-        offset: distance to the target lane's centre, m.
-        velocity: lateral, m/s; damping alone carries the vehicle another ``velocity / damping``.
-        room: free space on each side of a vehicle in the middle of its lane, m.
+    rest ``room`` off the lane's centre: damping alone carries it another ``velocity / damping``. ``offset`` is the
+    distance to the target lane's centre, m.
     """
     rest = velocity / damping - offset
     outwards = torch.where(residual > 0, rest, -rest)
@@ -216,7 +209,6 @@ def anchored_step(
     """One step of the calibrated preset: vehicles 0.1 s later and their new memory.
 
     Args:
-        generator: with ``extra_inputs`` = 4.
         vehicles: [N, M]; ``target_lane`` is the lane to keep or to change to, ``desired_speed`` is the driver's own.
         road: one per row in recorded scenes.
         noise: latent vectors [N, M, Z]; zeros give the mean driver.

@@ -16,20 +16,33 @@ import numpy as np
 import polars as pl
 
 from ganlane.generator.checkpoint import FitResult
-from ganlane.generator.fit import Config, Split, Task, assign_folds, fit_key, fit_result, fit_task, split_for_fit
-from ganlane.generator.fit_calibrated import CalibratedTask
-from ganlane.generator.forecasts import baseline_forecasts, calibrated_forecasts, idm_forecasts, paper_forecasts
-from ganlane.generator.loop import FitLoop, OnProgress
-from ganlane.generator.scores import (
+from ganlane.generator.fit import (
+    Config,
+    FitLoop,
+    OnProgress,
+    Split,
+    Task,
+    assign_folds,
+    fit_key,
+    fit_result,
+    fit_task,
+    split_for_fit,
+)
+from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
     Forecasts,
+    baseline_forecasts,
+    calibrated_forecasts,
     displacement_errors,
     errors_of,
+    idm_forecasts,
     long_rollout_scores,
     open_loop_scores,
+    paper_forecasts,
 )
 from ganlane.generator.segments import OBSERVED_POSITIONS, scene_tracks
+from ganlane.generator.tasks import CalibratedTask
 from ganlane.generator.windows import Windows, cut_windows, group_windows, join_windows, load_arrays, save_arrays
 from ganlane.parameters.generator import CalibratedConfig
 
@@ -124,9 +137,9 @@ def cross_validate(
     recordings in its metadata.
 
     Returns:
-        ``open_loop`` (:func:`ganlane.generator.scores.open_loop_scores`), ``splits`` (names of the scenes of each
+        ``open_loop`` (:func:`ganlane.generator.forecasts.open_loop_scores`), ``splits`` (names of the scenes of each
         fold's parts), and for the calibrated preset ``rollout``
-        (:func:`ganlane.generator.scores.long_rollout_scores`).
+        (:func:`ganlane.generator.forecasts.long_rollout_scores`).
 
     Raises:
         UserError: too many folds for the recordings.

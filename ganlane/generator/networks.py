@@ -84,12 +84,8 @@ def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
 class MotionLSTM(nn.Module):
     """Embedding with ReLU, then an LSTM cell in two parts: the projection of the input, and the recurrence.
 
-    The gates are ordered input, forget, output, new: the three with a sigmoid are adjacent.
-
-    Args:
-        embedding: width of the embedding.
-        hidden: width H of the LSTM's state.
-        differences: whether the displacements' differences are inputs; if not, they are 0 (an ablation).
+    The gates are ordered input, forget, output, new: the three with a sigmoid are adjacent. ``hidden`` is the width H
+    of the state; without ``differences`` the displacements' differences are 0 as inputs (an ablation).
     """
 
     def __init__(self, embedding: int, hidden: int, differences: bool = True):
@@ -162,11 +158,8 @@ def gather_vehicles(values: Tensor, index: Tensor | None) -> Tensor:
 class PairPooling(nn.Module):
     """Max pooling of two layers over each vehicle's nearest neighbours; zeros where there is none.
 
-    Args:
-        hidden: width H of the vehicles' states.
-        inner: width of the first layer.
-        pooled: width P of the result.
-        neighbours: how many of the nearest count; 0 is no pooling.
+    ``hidden`` is the width H of the vehicles' states, ``pooled`` the width P of the result; 0 ``neighbours`` is no
+    pooling.
     """
 
     def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
@@ -198,8 +191,7 @@ class Observation(NamedTuple):
         projections: [B, G, observed - 1, 4H] or a sequence of [B, G, 4H], input projections of the observed motions
             (:meth:`Generator.project`), oldest first. A motion is a displacement and its difference to the one
             before, so 8 displacements are 7 motions.
-        displacement: [B, G, 2], the last displacement, m per 0.1 s.
-        difference: [B, G, 2], its difference to the one before, m.
+        displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference to the one before.
         position: [B, G, 2], m, relative to any common point.
         valid: [B, G] bool.
         extra: [B, G, extra_inputs].
@@ -216,8 +208,7 @@ class Observation(NamedTuple):
 class Generator(nn.Module):
     """Encoder, pooling over pairs, context with noise, decoder.
 
-    The decoder's output is the change of the displacement, a residual on the last one: with an output of 0 it
-    predicts constant velocity.
+    The decoder's output changes the last displacement: with an output of 0 it predicts constant velocity.
     """
 
     def __init__(self, sizes: GeneratorSizes):

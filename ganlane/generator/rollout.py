@@ -98,8 +98,8 @@ def rollout(
     Args:
         segments: their number of frames gives H.
         headway, desired_speed: of each driver, [B, V], s and m/s.
-        noise: [1 + H, K, B, V, Z], latent vectors at the start, then the numbers that change them (:func:`wander`).
-        noise_period_s: time constant of this change.
+        noise: [1 + H, K, B, V, Z], latent vectors at the start, then the numbers that change them (:func:`wander`)
+            with the time constant ``noise_period_s``.
     """
     samples = noise.shape[1]
     segments = segments.repeated(samples)

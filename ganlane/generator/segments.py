@@ -29,8 +29,6 @@ class SceneTracks:
     """One recorded scene of T frames (0.1 s apart) and V vehicles; entries of absent vehicles are 0.
 
     Attributes:
-        name: the scene's name.
-        lane_width_m: m.
         first_frame: frame number of row 0.
         vehicles: [V] vehicle numbers.
         positions: [T, V, 2] float64, centre of the body, m; x along the road, y to the left.
@@ -136,8 +134,7 @@ class Segments:
 
     Attributes:
         positions: [B, 9 + H, V, 2] float32, m, x relative to the segment's mean at the present.
-        present: [B, 9 + H, V] bool.
-        target_lane: [B, 9 + H, V] int64.
+        present, target_lane: [B, 9 + H, V], bool and int64.
         length, width: [B, V] m.
         lanes, lane_width: [B, 1].
     """

@@ -156,8 +156,7 @@ def content_hash(settings: Any, *arrays: np.ndarray) -> str:
 def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """The arrays that ``compute`` returns, from the cache if it ran for this ``key`` before.
 
-    A damaged file is computed again, and a folder that cannot be written to is ignored: the cache never causes a
-    wrong result or a failure.
+    A damaged file is computed again, and a folder that cannot be written to is ignored.
     """
     folder = cache_folder()
     if folder is None:

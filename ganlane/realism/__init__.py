@@ -17,8 +17,7 @@ driving. Long runs without an ego show what a traffic does over minutes.
 The modules, from the bottom up:
 
 - :mod:`~ganlane.realism.recordings`: recorded scenes as arrays.
-- :mod:`~ganlane.realism.quantities`: what is measured of trajectories, recorded or simulated.
-- :mod:`~ganlane.realism.distances`: the distance of two distributions, with intervals.
+- :mod:`~ganlane.realism.measures`: what is measured of trajectories, and the distance of two distributions.
 - :mod:`~ganlane.realism.references`: the histograms that ship, and reference drivers.
 - :mod:`~ganlane.realism.replay_starts`: a traffic drives recorded scenes.
 - :mod:`~ganlane.realism.long_runs`: long runs, and the events in them.

@@ -20,9 +20,17 @@ from ganlane.evaluation.statistics import Array, Estimate, entries
 from ganlane.files import load_weights
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.parameters.checks import assign
-from ganlane.realism.distances import RESAMPLES, ceiling, distance, distance_difference, pooled_distance
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
-from ganlane.realism.quantities import UNITS, Measured, measure_recordings
+from ganlane.realism.measures import (
+    RESAMPLES,
+    UNITS,
+    Measured,
+    ceiling,
+    distance,
+    distance_difference,
+    measure_recordings,
+    pooled_distance,
+)
 from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
 from ganlane.realism.replay_starts import Factory, StartOptions
 from ganlane.realism.starts import (
@@ -125,13 +133,20 @@ def quantity_rows(
         recorded: by quantity, [units, bins]; its quantities are the rows. Their halves give the ceilings.
         floors: by driver and quantity, where ``driven`` does not hold the driver.
         paired: whether the recorded units are those that were driven.
-        resamples: of the bootstrap.
     """
     rivals = [name for name in driven if name != traffic and name not in FLOORS]
     ends = {**floors, **floors_of(driven, recorded)}
     rows = {}
     for name, counts in recorded.items():
-        own = driven[traffic].counts[name]
+        own, against = driven[traffic].counts[name], {}
+        for rival in rivals:
+            other = driven[rival].counts[name]
+            difference = distance_difference(own, other, counts, paired, resamples)
+            against[rival] = {
+                **entries("distance", distance(other, counts, paired, resamples)),
+                **entries("difference", difference),
+                "verdict": verdict(difference),
+            }
         rows[name] = {
             "unit": UNITS[name],
             **entries("distance", distance(own, counts, paired, resamples)),
@@ -140,9 +155,7 @@ def quantity_rows(
             "constant_velocity": ends.get("constant_velocity", {}).get(name),
             "samples": int(own.sum()),
             "recorded_samples": int(counts.sum()),
-            "against": {
-                rival: _against(own, driven[rival].counts[name], counts, paired, resamples) for rival in rivals
-            },
+            "against": against,
         }
     return rows
 
@@ -154,13 +167,6 @@ def floors_of(driven: Mapping[str, Measured], recorded: Mapping[str, Array]) -> 
         values = {name: pooled_distance(driven[floor].counts[name], counts) for name, counts in recorded.items()}
         found[floor] = {name: value for name, value in values.items() if math.isfinite(value)}
     return found
-
-
-def _against(own: Array, other: Array, recorded: Array, paired: bool, resamples: int) -> dict[str, Any]:
-    """Another traffic's distance, and the difference to it."""
-    theirs = distance(other, recorded, paired, resamples)
-    difference = distance_difference(own, other, recorded, paired, resamples)
-    return {**entries("distance", theirs), **entries("difference", difference), "verdict": verdict(difference)}
 
 
 def verdict(difference: Estimate) -> str:
@@ -259,7 +265,14 @@ def traffic_factories(config: RealismConfig, weights: Mapping[str, Path] | None 
     """
     every = {config.traffic.label(): config.traffic, **config.rivals()}
     if weights is not None:
-        every = {name: _with_weights(name, traffic, weights) for name, traffic in every.items()}
+        for name in [name for name in every if name in PRESETS]:
+            path = weights.get(PRESETS[name])
+            if path is None:
+                raise UserError(
+                    f"fold_weights: traffic {name} needs the preset {PRESETS[name]}, and a fold has no such file; "
+                    "give one for every fold."
+                )
+            every[name] = replace(every[name], path=str(path))  # type: ignore[call-arg]
     return {name: _factory(traffic, config.env) for name, traffic in every.items()}
 
 
@@ -271,18 +284,6 @@ def _factory(traffic: TrafficConfig, env: EnvConfig) -> Factory:
         return make_traffic(traffic, own, Stream.REPORT)
 
     return make
-
-
-def _with_weights(name: str, traffic: TrafficConfig, weights: Mapping[str, Path]) -> TrafficConfig:
-    """A generated traffic with the weights of a fold; others as they are."""
-    if name not in PRESETS:
-        return traffic
-    if PRESETS[name] not in weights:
-        raise UserError(
-            f"fold_weights: traffic {name} needs the preset {PRESETS[name]}, and a fold has no such file; give one "
-            "for every fold."
-        )
-    return replace(traffic, path=str(weights[PRESETS[name]]))  # type: ignore[call-arg]
 
 
 def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:

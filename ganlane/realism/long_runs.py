@@ -60,7 +60,6 @@ class LongRunParameters:
         vehicle_km: at least so many are driven.
         most_s: no episode lasts longer, s; it ends when its vehicles have covered 5000 m on average and 5 minutes
             have passed.
-        seed: of the random numbers.
         spawn: Table II; the spread grows with the vehicles at the paper's density.
     """
 
@@ -69,11 +68,6 @@ class LongRunParameters:
     most_s: float = 600.0
     seed: int = 0
     spawn: SpawnParameters = TABLE_II
-
-    def start(self) -> SpawnParameters:
-        """Table II for ``vehicles`` and an empty place for the ego."""
-        spread = self.spawn.spread_m * (self.vehicles + 1) / 9.0
-        return replace(self.spawn, spread_m=max(self.spawn.spread_m, spread))
 
 
 class Trajectories(NamedTuple):
@@ -118,12 +112,9 @@ class EventCounter:
         outside = (others.y + half > left) | (others.y - half < right)
         self.off_road += self._onsets("off_road", outside & others.valid)
         if step % _SECOND == _SECOND - 1:
-            self.standstills += self._onsets("standstill", self._standing(vehicles)[:, 1:])
-
-    def _standing(self, vehicles: Vehicles) -> Tensor:
-        slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
-        ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
-        return slow & (ahead.gap > FREE_M)
+            slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
+            ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
+            self.standstills += self._onsets("standstill", (slow & (ahead.gap > FREE_M))[:, 1:])
 
     def _onsets(self, name: str, now: Tensor) -> int:
         """Number of entries that are true now and were not at the last count."""
@@ -133,10 +124,7 @@ class EventCounter:
 
 
 class GuardMeter:
-    """Counts the vehicle-steps in which a guard alters acceleration or lateral position.
-
-    A counter of one step's sums stays on the device; :attr:`share` fetches it.
-    """
+    """Counts, on the device, the vehicle-steps in which a guard alters acceleration or lateral position."""
 
     def __init__(self) -> None:
         self._altered = torch.zeros((), dtype=torch.int64)
@@ -210,7 +198,9 @@ def spawned_vehicles(traffic: TrafficModule, parameters: LongRunParameters, key:
     lanes, width, seen = traffic.road.lanes, traffic.road.lane_width_m, int(traffic.visibility)
     assert not isinstance(lanes, Tensor)
     assert not isinstance(width, Tensor)
-    start = parameters.start()
+    # Table II's density, for the vehicles and an empty place for the ego.
+    spread = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
+    start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread))
     vehicles = spawn(key, parameters.vehicles + 1, lanes, float(width), start, others_visibility=seen)
     index = torch.arange(parameters.vehicles + 1)
     return vehicles.with_(valid=vehicles.valid & (index > 0))

@@ -22,7 +22,7 @@ from ganlane.evaluation.table import aligned, number, with_interval
 from ganlane.files import split_at_markers, write_between_markers, write_bytes
 from ganlane.realism import references
 from ganlane.realism.card import Card, floors_of
-from ganlane.realism.quantities import QUANTITIES, UNITS
+from ganlane.realism.measures import QUANTITIES, UNITS
 from ganlane.realism.starts import FLOORS, Starts, print_progress
 from ganlane.view.figures import (
     FAINT,
@@ -193,9 +193,7 @@ def draw_distributions(
 ) -> Figure:
     """One panel per quantity: the recorded density, and each traffic's; none where nothing was counted.
 
-    Args:
-        recorded: by quantity, counts [bins].
-        simulated: by traffic, then quantity.
+    Both are counts [bins], by quantity; ``simulated`` by traffic first.
     """
     figure, grid = panel_grid(len(recorded))
     colours = {**palette(list(simulated)), "recorded": RECORDED}

@@ -19,7 +19,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ganlane.data import FRAME_S, SCHEMA
-from ganlane.data.lane_widths import STANDARD_LANE_WIDTH_M
+from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 
@@ -72,12 +72,9 @@ class Recording:
 def recordings_of(
     frame: pl.DataFrame, lane_widths: Mapping[str, float], scenes: Sequence[str] | None = None
 ) -> list[Recording]:
-    """The scenes of a frame in the schema, in the order of their names.
+    """The scenes of a frame in the schema, whose tracks have no gaps, in the order of their names.
 
-    Args:
-        frame: in the schema; a track must have no gap.
-        lane_widths: m, by scene.
-        scenes: names; None takes all.
+    ``lane_widths`` are in m, by scene; ``scenes`` are names, all by default.
     """
     names = sorted(frame["scene"].unique().to_list() if scenes is None else scenes)
     made = []
@@ -109,8 +106,8 @@ def _recording(name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lan
 def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: str) -> pl.DataFrame:
     """Trajectories [T, V] of the vehicles of ``recording`` as a frame in the schema, sorted by track.
 
-    The lane is the one whose centre is nearest, and the speed is 0: everything is measured from positions. The
-    further columns ``unit``, ``driven`` and ``lane_width`` are the recording's.
+    The lane is the one whose centre is nearest, and the speed is 0: everything is measured from positions. Further
+    columns are the recording's ``unit``, ``driven`` and ``lane_width``.
     """
     vehicle, time = np.nonzero(present.T)
     width = recording.lane_width_m
@@ -160,11 +157,7 @@ def i80_files(folder: Path) -> dict[str, Path]:
 
 
 def read_i80(name: str, path: Path) -> list[Recording]:
-    """Segments of 15 s from one of the files.
-
-    Args:
-        name: which of :data:`I80_FILES` it is.
-        path: the file.
+    """Segments of 15 s from the file ``path``, which is the one of :data:`I80_FILES` called ``name``.
 
     Raises:
         UserError: it is damaged, or no track in it lasts 15 s.

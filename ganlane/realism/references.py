@@ -21,8 +21,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array
 from ganlane.files import CHECKPOINTS, write_json
 from ganlane.generator.rollout import headway_from_uniform
-from ganlane.realism.distances import ceiling
-from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate
+from ganlane.realism.measures import QUANTITIES, Measured, ceiling, lane_change_rate
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, uniform

@@ -58,7 +58,6 @@ class StartOptions:
     Attributes:
         desired_above_mps: desired speeds are the speed at entry and a uniform number from 0 on with this mean.
         repeats: times that every scene is driven, with different random numbers.
-        seed: of the random numbers.
     """
 
     desired_above_mps: float = 6.0
@@ -159,12 +158,10 @@ def _updated_memory(
 
 @dataclass(frozen=True)
 class RecordingBatch:
-    """Recordings of a batch side by side, padded with absent vehicles.
+    """Recordings side by side, padded with absent vehicles; index 0 is the ego's and absent.
 
-    Attributes:
-        x, y, speed, present: [T, N, M]; index 0 is the ego's and absent.
-        length, driven: [N, M].
-        end_m: [N, 1] where each road ends, m.
+    ``x``, ``y``, ``speed`` and ``present`` are [T, N, M], ``length`` and ``driven`` [N, M]; ``end_m`` [N, 1] is where
+    each road ends, m.
     """
 
     x: Tensor

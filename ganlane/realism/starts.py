@@ -20,9 +20,15 @@ from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array
 from ganlane.files import load_weights
-from ganlane.realism.distances import pooled_distance
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
-from ganlane.realism.quantities import QUANTITIES, Measured, lane_change_rate, measure, measure_recordings
+from ganlane.realism.measures import (
+    QUANTITIES,
+    Measured,
+    lane_change_rate,
+    measure,
+    measure_recordings,
+    pooled_distance,
+)
 from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of, units_of
 from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
 from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
@@ -102,7 +108,7 @@ class Starts:
         scenes: started from.
         held_out: by fold, the scenes that desired speeds were not fitted on.
         options: by traffic, how it was driven; over several folds the mean of what was fitted.
-        driven: by name, the traffic of the card first, then its rivals, then :data:`FLOORS` (recorded starts only).
+        driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded starts only).
         recorded: by quantity, [units, bins] of the same scenes (spawned starts: of all).
         recorded_summary: lane changes and quantiles of those scenes.
         reference: all recordings.
@@ -152,12 +158,9 @@ class Starts:
 
 @dataclass(frozen=True)
 class Fold:
-    """Traffics, and the scenes that they start from.
+    """Traffics by name, the card's own first and the same in every fold, and the scenes that they start from.
 
-    Attributes:
-        factories: traffics by name, the card's own first; the same names in every fold.
-        starts: scenes to start from.
-        held_out: scenes that desired speeds are not fitted on.
+    Desired speeds are not fitted on the ``held_out`` scenes.
     """
 
     factories: Mapping[str, Factory]
@@ -199,12 +202,10 @@ def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> 
 def recorded_starts(
     folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str
 ) -> Starts:
-    """Drive every traffic from recorded scenes.
+    """Drive every traffic from recorded scenes; those that are too short are skipped.
 
     Args:
-        folds: traffics and the scenes that they start from; scenes that are too short are skipped.
         frame: the recordings, in the schema.
-        options: of the simulations.
         fit: whether to fit every traffic's desired speeds on a fold's other scenes, or take those of ``options``.
         source: of the recordings.
 
@@ -231,32 +232,24 @@ def recorded_starts(
     if not chosen:
         raise UserError(f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all.")
     recorded = measure_recordings(chosen)
-    return Starts(
-        kind="recorded",
-        scenes=[each.name for each in chosen],
-        held_out=[list(fold.held_out) for fold in folds],
-        options=_mean_options(fitted, options),
-        driven={name: Measured.joined([part[name] for part in driven]) for name in driven[0]},
-        recorded=recorded.counts,
-        recorded_summary=recorded.summary(),
-        reference=Reference.of(measure_recordings(every), names, _whole_recording(frame, widths), source),
-    )
-
-
-def _mean_options(parts: Sequence[Mapping[str, StartOptions]], options: StartOptions) -> dict[str, StartOptions]:
-    """By traffic, the mean over folds of the fitted desired speeds, for sites that belong to no fold."""
-    means = {name: float(np.mean([part[name].desired_above_mps for part in parts])) for name in parts[0]}
-    return {name: replace(options, desired_above_mps=excess) for name, excess in means.items()}
-
-
-def _whole_recording(frame: pl.DataFrame, widths: dict[str, float]) -> dict[str, float]:
-    """Lane changes, vehicle-km and the spread of speeds within a frame, of all frames."""
     statistics = driving_statistics(frame, widths)
-    return {
+    whole = {
         "lane_changes": statistics.lane_changes.count,
         "vehicle_km": statistics.exposure.vehicle_km,
         "speed_spread_mps": statistics.speed_sd_in_frame or 0.0,
     }
+    # Sites that belong to no fold get the mean over folds of the fitted desired speeds.
+    means = {name: float(np.mean([part[name].desired_above_mps for part in fitted])) for name in fitted[0]}
+    return Starts(
+        kind="recorded",
+        scenes=[each.name for each in chosen],
+        held_out=[list(fold.held_out) for fold in folds],
+        options={name: replace(options, desired_above_mps=excess) for name, excess in means.items()},
+        driven={name: Measured.joined([part[name] for part in driven]) for name in driven[0]},
+        recorded=recorded.counts,
+        recorded_summary=recorded.summary(),
+        reference=Reference.of(measure_recordings(every), names, whole, source),
+    )
 
 
 def spawned_starts(
@@ -267,21 +260,17 @@ def spawned_starts(
     seed: int,
     path: Path = SHIPPED_REFERENCE,
 ) -> Starts:
-    """Drive every traffic from the same spawned scenes.
+    """Drive every traffic from the same spawned scenes: ``repeats`` times 8 episodes of 30 vehicles and 30 s each.
 
-    Args:
-        factories: traffics by name, the card's own first.
-        road, spawn: where and how vehicles start (Table II at the paper's density).
-        repeats: 8 episodes of 30 vehicles and 30 s each.
-        seed: of the random numbers.
-        path: the histograms.
+    ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density); ``path`` is the file of
+    the histograms that they are compared with.
     """
     reference, rows = Reference.load(path), _SPAWNED_ROWS * repeats
     print_progress(
         f"no recordings here: spawned starts against {path.name}; give data.path=FILE for the fair comparison"
     )
     parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
-    scenes, driven = [_spawned_name(row) for row in range(rows)], {}
+    scenes, driven = [f"spawned-{row}" for row in range(rows)], {}
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
         driven[name] = measure(spawned_frame(make, road, parameters, rows), scenes)
@@ -296,14 +285,10 @@ def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
     frames = []
     for row in range(rows):
-        name, x, y, speed = _spawned_name(row), paths.x[:, row], paths.y[:, row], paths.speed[:, row]
+        name, x, y, speed = f"spawned-{row}", paths.x[:, row], paths.y[:, row], paths.speed[:, row]
         made = Recording(
             name, name, int(road.lanes), float(road.lane_width_m), x, y, speed, everywhere,
             paths.length[row], paths.width[row], everywhere[0],
         )  # fmt: skip
         frames.append(frame_of(made, x, y, everywhere, name))
     return pl.concat(frames)
-
-
-def _spawned_name(row: int) -> str:
-    return f"spawned-{row}"

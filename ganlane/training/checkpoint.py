@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import sys
+import mmap
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,10 +12,12 @@ import torch
 from torchrl.envs import EnvBase
 
 from ganlane.agents import Rainbow, save_agent
+from ganlane.checksums import has_checksum, note_without_checksum, seal_archive
 from ganlane.config.resume import LAST
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
 from ganlane.training.collectors import Collector, SingleCollector
+from ganlane.training.parts import check_parts
 from ganlane.training.stats import EpisodeStats
 
 KIND = "ganlane training checkpoint"
@@ -29,9 +30,8 @@ DEFAULTS = "defaults"
 COMPUTED_BY = ("env.compile",)
 #: A checkpoint that took t seconds to write is followed by the next after 50 t at the earliest: 2 % of the time.
 PATIENCE = 50.0
-#: The very end of a checkpoint, as the comment of its zip archive, before the SHA-256 of all above.
-SEAL = b"ganlane sha256 "
-_DIGITS = 2 * hashlib.sha256().digest_size
+#: Parts of a checkpoint whose numbers are always finite.
+FINITE = ("network", "target", "optimizer", "replay", "window", "stats")
 
 
 class TrainingState:
@@ -105,24 +105,24 @@ class TrainingState:
         except UserError:
             raise
         except Exception as error:  # what a part can be instead of what it was has no end
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(
-                f"resume={path}: a part of the run is damaged in it ({type(error).__name__}: {error}); give another "
-                "checkpoint."
+                f"resume={path}: a part of the run is damaged in it ({reason}); give another checkpoint."
             ) from error
-        note_without_checksum(path)
         return missing
 
     def _take_over(self, state: Mapping[str, Any], path: str | Path) -> str | None:
         """Everything from ``state``; see :meth:`restore`."""
         exact = state["window"] is not None
-        try:
-            self.collector.load_state_dict(state["env_state"], exact)
-        except ValueError as error:
+        fresh, shape = self.collector.state_dict(exact), state["env_state"]["batch_size"]
+        if isinstance(shape, list) and shape != fresh["batch_size"]:
             raise UserError(
-                f"resume={path}: saved with environments of shape {error}, this run has [{self.environments}]; use "
+                f"resume={path}: saved with environments of shape {shape}, this run has [{self.environments}]; use "
                 "the same number."
-            ) from error
+            )
         self.agent.load_state_dict(state["agent"])
+        check_parts(state, self.agent, fresh, self.stats)
+        self.collector.load_state_dict(state["env_state"], exact)
         if exact:
             self.window.load_state_dict(state["window"])
             self.stats.load_state_dict(state["stats"])
@@ -186,12 +186,7 @@ def save_checkpoint(path: str | Path, state: Any) -> None:
     """Write ``state`` (tensors and plain data) atomically, with a checksum of the whole file."""
     with atomic_path(path) as part:
         torch.save({"kind": KIND, "version": VERSION, "sealed": True, "state": state}, part)
-        with part.open("rb+") as file:
-            file.seek(-2, 2)  # an archive without a comment ends in the comment's length
-            file.write((len(SEAL) + _DIGITS).to_bytes(2, "little") + SEAL)
-        digest = _sha256(part, part.stat().st_size)
-        with part.open("ab") as file:
-            file.write(digest)
+        seal_archive(part)
 
 
 def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: str = "resume") -> Any:
@@ -211,10 +206,9 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
     path, given = Path(path), f"{key}={path}"
     if not path.is_file():
         raise UserError(f"{given}: no such file; give a run's folder or its {LAST}.")
-    damaged = f"{given}: damaged, its content does not have the checksum that was written with it; give another one."
-    digest = _digest_of(path)
-    if digest is not None and digest != _sha256(path, path.stat().st_size - _DIGITS):
-        raise UserError(damaged)
+    with path.open("rb") as file:
+        empty = file.seek(0, 2) == 0
+        whole = not empty and has_checksum(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), given)
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # foreign bytes can make the unpickler fail in any way
@@ -223,39 +217,19 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
         ) from error
     if not isinstance(content, dict) or content.get("kind") != KIND or content.get("version") != VERSION:
         raise UserError(f"{given}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
-    if digest is None and "sealed" in content:
-        raise UserError(damaged)
+    if not whole and "sealed" in content:
+        raise UserError(f"{given}: damaged, the checksum that was written with it is missing; give another one.")
     state = _renamed(content.get("state"))  # whether a run can go on from it, the run knows
     if isinstance(state, dict) and "counters" in state:
         state["counters"] = _renamed(state["counters"])
-    learned = state.get("agent") if isinstance(state, dict) else None
-    for name in ("network", "target", "optimizer"):
-        if isinstance(learned, dict) and not all(tensor.isfinite().all() for tensor in _tensors(learned.get(name))):
+    agent = state.get("agent") if isinstance(state, dict) else None
+    parts = {**state, **agent} if isinstance(agent, dict) else {}
+    for name in FINITE:
+        if not all(tensor.isfinite().all() for tensor in _tensors(parts.get(name))):
             raise UserError(f"{given}: numbers of its {name} are not finite; give a checkpoint of another run.")
+    if not whole:
+        note_without_checksum(given)
     return state
-
-
-def note_without_checksum(path: str | Path, key: str = "resume") -> None:
-    """Print on stderr that damage to a checkpoint of an older version is not detected."""
-    if _digest_of(Path(path)) is None:
-        print(f"{key}={path}: of a version that wrote no checksum, damage would not be seen.", file=sys.stderr)
-
-
-def _digest_of(path: Path) -> bytes | None:
-    """The checksum at the file's end; None where there is none."""
-    with path.open("rb") as file:
-        file.seek(max(path.stat().st_size - _DIGITS - len(SEAL), 0))
-        return file.read(_DIGITS) if file.read(len(SEAL)) == SEAL else None
-
-
-def _sha256(path: Path, size: int) -> bytes:
-    """SHA-256 of the first ``size`` bytes, in hexadecimal digits."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(min(size, 2**20)):
-            digest.update(block)
-            size -= len(block)
-    return digest.hexdigest().encode()
 
 
 def _tensors(state: Any) -> Iterator[torch.Tensor]:

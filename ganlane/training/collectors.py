@@ -44,11 +44,7 @@ class Collector(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Go on from :meth:`state_dict`.
-
-        Raises:
-            ValueError: it was made with environments of another shape, which is the message.
-        """
+        """Go on from :meth:`state_dict`, made with environments of the same shape."""
 
     def close(self) -> None:  # noqa: B027
         """End what was started for collecting; again does no harm."""
@@ -79,8 +75,6 @@ class SingleCollector(Collector):
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
         """Take over the state, or begin the episodes after those of ``state``, the first ones if it has none."""
         saved = unpack(state)
-        if saved.batch_size != self.env_state.batch_size:
-            raise ValueError(str(list(saved.batch_size)))
         if exact:
             self.env_state = saved
         elif keys.EPISODE in saved:

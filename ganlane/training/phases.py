@@ -41,7 +41,7 @@ from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.removed import RemovedOption, without_removed
 from ganlane.runtime import keep_freed_memory, set_threads
 from ganlane.sim.random import Stream
-from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint, note_without_checksum
+from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint
 from ganlane.training.collectors import Collector, SingleCollector
 from ganlane.training.logs import make_logs
 from ganlane.training.loop import Evaluate, TrainingConfig, TrainingResult, train
@@ -229,7 +229,6 @@ def read_start(name: str, key: str = "init.path") -> Start:
     if not path.is_file():
         raise UserError(f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's file.")
     state = load_checkpoint(path, key=key)
-    note_without_checksum(path, key)
     try:
         agent, seen = state["agent"], state["identity"]["observation"]
         observation = ObservationConfig(**{name: seen[name] for name in ("form", "range_m", "speed_mps")})

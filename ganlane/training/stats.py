@@ -122,9 +122,10 @@ def _per_episode(sums: dict[str, float]) -> dict[str, float]:
     if episodes == 0.0:
         return row
     row |= {"mean_return": sums["returns"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
-    row["mean_return_to_go"] = sums["to_go"] / sums["lengths"]
+    decisions = max(sums["lengths"], 1.0)
+    row["mean_return_to_go"] = sums["to_go"] / decisions
     if "values" in sums:
-        row["mean_value"] = sums["values"] / sums["lengths"]
+        row["mean_value"] = sums["values"] / decisions
     row |= {column: sums[name] / episodes for name, column in RATES.items() if name in sums}
     if sums.get("distance", 0.0) > 0.0:
         row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]

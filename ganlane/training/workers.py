@@ -175,8 +175,6 @@ class WorkerCollector(Collector):
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
         """Each worker begins after the last episode that it had begun; before the first :meth:`step` only."""
         last = unpack(state)
-        if last.batch_size != (self.environments,):
-            raise ValueError(str(list(last.batch_size)))
         self._last = last
         if keys.EPISODE in last:
             begun = last.get(keys.EPISODE).reshape(self.pool.workers, -1).amax(1)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import pickle
+import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, Node, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from reference.hydra_memory import composed, own_part
 
 from ganlane.__main__ import COMMANDS, main
+from ganlane.config.app import Stopped
 from ganlane.config.command_line import parse, typed
 from ganlane.config.messages import sentence
 from ganlane.errors import UserError
@@ -130,6 +132,19 @@ def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, tmp_path, monke
     assert err.count("\n") == 1
     assert err.rstrip().endswith(".")
     assert out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), Stopped(signal.SIGTERM)], ids=["SIGINT", "SIGTERM"])
+def test_a_signal_while_the_configuration_is_composed_is_no_error(stop, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def interrupted(self):
+        raise stop
+
+    monkeypatch.setattr(Node, "_key", interrupted)  # omegaconf cleans up after it, with an error of its own
+    assert main(["train", "traffic=idm"]) == 128 + getattr(stop, "number", signal.SIGINT)
+    assert capsys.readouterr().err in ("", "ganlane train: stopped by Ctrl-C.\n")
     assert list(tmp_path.iterdir()) == []
 
 

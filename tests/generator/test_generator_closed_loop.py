@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from reference.small_networks import silenced, small_generator
+from reference.worlds import vehicles as placed
 
 from ganlane.generator.closed_loop import (
     ANCHOR,
@@ -20,33 +22,24 @@ from ganlane.generator.closed_loop import (
 )
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
-from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes
+from ganlane.parameters.generator import EXTRA_INPUTS
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.lanes import Visibility
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road
 
-SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 ROAD = Road(3, 4.0)
 
 
 def vehicles(x, y=None, speed=20.0, desired=25.0, target=None):
-    x = torch.as_tensor(x, dtype=torch.float64)[None]
-    y = torch.zeros_like(x) if y is None else torch.as_tensor(y, dtype=torch.float64)[None]
-    lane = (y / 4.0).round().long() if target is None else torch.as_tensor(target)[None]
-    same = torch.ones_like(x)
-    return Vehicles(
-        x=x, y=y, heading=0 * same, speed=speed * same, acceleration=0 * same, length=4.5 * same, width=2.0 * same,
-        desired_speed=desired * same, target_lane=lane, visibility=torch.full_like(lane, Visibility.BODY),
-        valid=torch.ones_like(lane, dtype=torch.bool),
-    )  # fmt: skip
+    y = [0.0] * len(x) if y is None else y
+    target = [round(at / 4.0) for at in y] if target is None else target
+    same = {"speed": speed, "desired_speed": desired, "width": 2.0, "visibility": int(Visibility.BODY)}
+    return placed(*({"x": a, "y": b, "target_lane": lane, **same} for a, b, lane in zip(x, y, target)))
 
 
 def silent_generator() -> Generator:
     """A network whose residual is 0."""
-    generator = Generator(GeneratorSizes(**SMALL, extra_inputs=EXTRA_INPUTS)).double()
-    torch.nn.init.zeros_(generator.head.weight)
-    torch.nn.init.zeros_(generator.head.bias)
-    return generator.requires_grad_(False)
+    return silenced(small_generator(EXTRA_INPUTS)).double().requires_grad_(False)
 
 
 def drive(generator, state, seconds, headway=1.27, noise=0.0):
@@ -147,31 +140,16 @@ def test_headways_have_the_quantiles_asked_for():
     )
 
 
-def paper_generator() -> Generator:
-    torch.manual_seed(0)
-    return Generator(GeneratorSizes(**SMALL)).double().requires_grad_(False)
-
-
-def test_the_paper_drives_the_first_predicted_displacement():
-    generator, state = paper_generator(), vehicles([0.0, 25.0], y=[0.0, 4.0])
-    history = start(generator, displacement_of(state))
-    noise = torch.randn(1, 2, 4).double()
-    after, _, _ = paper_step(generator, state, history, noise)
-    past = displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
-    seen = generator.observe(past, torch.stack([state.x, state.y], -1), state.valid)
-    expected = generator(seen, noise)[..., 0, :]
-    torch.testing.assert_close(torch.stack([after.x - state.x, after.y - state.y], -1), expected)
-
-
-def test_with_execute_k_the_first_k_predictions_are_driven_before_planning_anew():
-    generator, state = paper_generator(), vehicles([0.0, 25.0], y=[0.0, 4.0])
+@pytest.mark.parametrize("execute_k", [1, 3])
+def test_the_paper_drives_the_first_k_predictions_before_planning_anew(execute_k):
+    generator, state = small_generator().double().requires_grad_(False), vehicles([0.0, 25.0], y=[0.0, 4.0])
     history, noise = start(generator, displacement_of(state)), torch.randn(1, 2, 4).double()
     past = displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
     predicted = generator(generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise)
-    plan = Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long))
-    for step in range(3):
+    plan = Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long)) if execute_k > 1 else None
+    for step in range(execute_k):
         before = state
         state, history, plan = paper_step(generator, state, history, noise, plan)
         moved = torch.stack([state.x - before.x, state.y - before.y], -1)
         torch.testing.assert_close(moved, predicted[..., step, :])
-    assert (plan.left == 0).all()
+    assert plan is None or (plan.left == 0).all()

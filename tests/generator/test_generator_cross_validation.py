@@ -68,18 +68,13 @@ def test_the_folds_generators_are_told_and_forecast_what_was_scored(preset, conf
         generator, metadata = load_generator(path, preset)
         assert metadata["data"]["held_out"] == split["held_out"]
         assert metadata["data"]["file"] == "made.csv"
+        # Its driving statistics are those of its other scenes.
+        others = measure_exposure(frame.filter(~pl.col("scene").is_in(split["held_out"]))).vehicle_km
+        assert 0.0 < metadata["driving_statistics"]["exposure"]["vehicle_km"] == others
+        assert others < measure_exposure(frame).vehicle_km
         assert {name: weights.tolist() for name, weights in generator.state_dict().items()} == {
             name: weights.tolist() for name, weights in again[number].module.state_dict().items()
         }
-
-
-def test_a_folds_driving_statistics_are_those_of_its_other_scenes(frame, tmp_path):
-    told = {}
-    cross_validate(frame, PAPER, 3, tmp_path, on_fold=told.__setitem__)
-    for fold in told.values():
-        others = frame.filter(~pl.col("scene").is_in(fold.data["held_out"]))
-        assert 0.0 < fold.statistics["exposure"]["vehicle_km"] == measure_exposure(others).vehicle_km
-        assert fold.statistics["exposure"]["vehicle_km"] < measure_exposure(frame).vehicle_km
 
 
 SHORT_LOOP = LoopConfig(updates=8, evaluate_every=8, warmup=4)
@@ -104,7 +99,7 @@ def test_every_variant_has_a_quarter_of_the_updates_and_differs_in_its_part_alon
 
 def test_ablations_of_the_papers_preset_stand_side_by_side(tmp_path):
     frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=5.0))
-    config = PaperConfig(SIZES, loop=SHORT_LOOP, stride=6, samples=2, batch=4)
+    config = replace(PAPER, loop=SHORT_LOOP)
     names, updates = [], []
     rows = ablate(frame, config, ("synthetic-1",), tmp_path, names.append, updates.append)
     assert list(rows) == names == list(variants(config))
@@ -117,8 +112,7 @@ def test_ablations_of_the_papers_preset_stand_side_by_side(tmp_path):
 
 def test_ablations_of_the_calibrated_preset_are_rolled_out_too(tmp_path):
     frame = synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=4, seconds=6.5))
-    sizes = replace(SIZES, extra_inputs=4)
-    config = CalibratedConfig(sizes, SHORT_LOOP, (4,), (1.0,), held_out_horizon=8, batch=2, held_out_stride=20)
+    config = replace(CALIBRATED, loop=SHORT_LOOP)
     rows = ablate(frame, config, ("synthetic-1",), tmp_path)
     assert variants(config)["without washout"].washout_s == math.inf
     assert all(math.isfinite(row["rmse_5_s_ratio"]["mean"]) for row in rows.values())

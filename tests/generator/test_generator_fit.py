@@ -11,18 +11,19 @@ from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
 from ganlane.files import save_weights
 from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.fit import assign_folds, fit_generator, split_for_fit
-from ganlane.generator.fit_calibrated import CalibratedTask, energy_score, masked_mean
-from ganlane.generator.fit_paper import (
+from ganlane.generator.fit import assign_folds, fit_generator, learning_rate, split_for_fit
+from ganlane.generator.networks import Generator
+from ganlane.generator.segments import scene_tracks
+from ganlane.generator.tasks import (
+    CalibratedTask,
     adversarial_loss,
     discriminator_accuracy,
     discriminator_loss,
     distances,
+    energy_score,
+    masked_mean,
     variety_loss,
 )
-from ganlane.generator.loop import learning_rate
-from ganlane.generator.networks import Generator
-from ganlane.generator.segments import scene_tracks
 from ganlane.generator.windows import count_windows
 from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 
@@ -130,22 +131,18 @@ def test_wrong_checkpoints_are_refused_in_one_sentence(tmp_path):
     path.write_bytes(b"\x10\x00\x00")
     with pytest.raises(UserError, match="not a readable safetensors"):
         load_generator(path)
-    with pytest.raises(UserError, match="expected a ganlane checkpoint of kind generator"):
-        load_generator(generator_file(path, kind="agent"))
-    with pytest.raises(UserError, match="expected 'calibrated'"):
-        load_generator(generator_file(path), "calibrated")
-    with pytest.raises(UserError, match="preset 'own'"):
-        load_generator(generator_file(path, preset="own"))
-    with pytest.raises(UserError, match="not those of a generator"):
-        load_generator(generator_file(path, sizes={"hidden": 3}))
-    with pytest.raises(UserError, match="not those of a generator"):
-        load_generator(generator_file(path, sizes={**asdict(SIZES), "hidden": 10**9}))
-    with pytest.raises(UserError, match="shapes"):
-        load_generator(generator_file(path, sizes={**asdict(SIZES), "hidden": 20}))
-    with pytest.raises(UserError, match="shapes"):
-        load_generator(generator_file(path, tensors={"x": torch.zeros(2)}))
-    with pytest.raises(UserError, match="further inputs"):
-        load_generator(generator_file(path, preset="calibrated"), "calibrated")
+    for wrong, preset, message in (
+        ({"kind": "agent"}, None, "expected a ganlane checkpoint of kind generator"),
+        ({}, "calibrated", "expected 'calibrated'"),
+        ({"preset": "own"}, None, "preset 'own'"),
+        ({"sizes": {"hidden": 3}}, None, "not those of a generator"),
+        ({"sizes": {**asdict(SIZES), "hidden": 10**9}}, None, "not those of a generator"),
+        ({"sizes": {**asdict(SIZES), "hidden": 20}}, None, "shapes"),
+        ({"tensors": {"x": torch.zeros(2)}}, None, "shapes"),
+        ({"preset": "calibrated"}, "calibrated", "further inputs"),
+    ):
+        with pytest.raises(UserError, match=message):
+            load_generator(generator_file(path, **wrong), preset)
 
 
 def test_a_preset_and_its_config_must_agree(frame):

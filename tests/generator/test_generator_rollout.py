@@ -5,22 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from reference.small_networks import small_generator
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.generator.fit_calibrated import rollout_errors
-from ganlane.generator.networks import Generator
+from ganlane.generator.forecasts import distance
 from ganlane.generator.rollout import (
-    balanced_headway,
-    recorded_vehicles,
     rollout,
     sampled_driver_params,
     typical_driver_params,
 )
-from ganlane.generator.scores import distance
-from ganlane.generator.segments import PRESENT, cut_segments, extrapolate, scene_tracks
-from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, GeneratorSizes
+from ganlane.generator.segments import cut_segments, extrapolate, scene_tracks
+from ganlane.generator.tasks import rollout_errors
+from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 
-SMALL = {"embedding": 16, "hidden": 12, "pooling": 10, "pooled": 6, "context": 14, "noise": 4}
 WIDTH = 3.5
 
 
@@ -32,8 +29,7 @@ def recorded_scenes():
 
 @pytest.fixture
 def generator():
-    torch.manual_seed(0)
-    return Generator(GeneratorSizes(**SMALL, extra_inputs=EXTRA_INPUTS))
+    return small_generator(EXTRA_INPUTS)
 
 
 def typical_rollout(generator, segments):
@@ -122,14 +118,6 @@ def test_nothing_of_the_future_enters_an_evaluation(recorded_scenes, generator):
     altered.target_lane[:, 9:] = 0
     one, other = (typical_rollout(generator, each.without_intentions()) for each in (segments, altered))
     torch.testing.assert_close(one, other)
-
-
-def test_a_balanced_driver_neither_brakes_nor_speeds_up(recorded_scenes):
-    scenes = cut_segments([(recorded_scenes[0], 0)], horizon=1)
-    desired = torch.full((1, 7), 30.0)
-    shown = balanced_headway(recorded_vehicles(scenes, PRESENT, desired), scenes.road, torch.full((1, 7), -1.0))
-    assert ((shown >= 0.5) | (shown == -1.0)).all()
-    assert (shown != -1.0).any()
 
 
 def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(recorded_scenes):

@@ -2,9 +2,8 @@
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.realism.card import card_checks, quantity_rows
-from ganlane.realism.distances import ceiling
 from ganlane.realism.long_runs import LongRunParameters, long_run
-from ganlane.realism.quantities import QUANTITIES, measure_recordings
+from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
 from ganlane.realism.recordings import recordings_of
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.realism.replay_starts import StartOptions
@@ -15,9 +14,13 @@ from ganlane.traffic import IdmTraffic
 WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"]
 
 
+def recorded_cars(**size):
+    frame = synthetic_scenes(SyntheticTraffic(**size))
+    return recordings_of(frame, scene_lane_widths(frame))
+
+
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors():
-    frame = synthetic_scenes(SyntheticTraffic(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2))
-    recordings = recordings_of(frame, scene_lane_widths(frame))
+    recordings = recorded_cars(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2)
     recorded = measure_recordings(recordings).counts
     makers = {"cruise": ConstantVelocity, "random": RandomDriving, "constant_velocity": ConstantVelocity}
     driven = {name: simulate(make, recordings, StartOptions()) for name, make in makers.items()}
@@ -30,8 +33,7 @@ def test_a_card_puts_the_model_between_its_ceiling_and_its_floors():
 
 
 def test_floors_that_were_not_driven_are_those_that_were_measured_before():
-    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=6, seconds=6.0))
-    recordings = recordings_of(frame, scene_lane_widths(frame))
+    recordings = recorded_cars(scenes=2, vehicles=6, seconds=6.0)
     own = simulate(ConstantVelocity, recordings, StartOptions())
     recorded = {"speed": measure_recordings(recordings).counts["speed"]}
     rows = quantity_rows("cruise", {"cruise": own}, recorded, {"random": {"speed": 0.5}}, resamples=100)

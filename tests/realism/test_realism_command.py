@@ -14,7 +14,7 @@ from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.files import load_weights, save_weights
 from ganlane.generator import shipped_generator
 from ganlane.realism import main
-from ganlane.realism.quantities import QUANTITIES
+from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.references import SHIPPED_REFERENCE
 
 QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]

@@ -16,7 +16,6 @@ from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Road
 from ganlane.traffic import Guard, IdmTraffic, TrafficModule
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 
 SHORT = LongRunParameters(vehicles=6, vehicle_km=1.0, most_s=20.0)
 
@@ -63,13 +62,6 @@ def test_the_same_numbers_come_out_again_and_others_of_another_seed():
     runs = [long_run(RandomDriving, Road(), LongRunParameters(6, 1.0, 20.0, seed=seed)) for seed in (0, 0, 1)]
     assert runs[0] == runs[1]
     assert runs[0] != runs[2]
-
-
-def test_the_share_is_told_for_traffic_with_a_guard_alone():
-    short = LongRunParameters(4, 0.1, 10.0)
-    assert 0.0 < long_run(gan_traffic, Road(), short)["guard_share"] < 1.0
-    assert long_run(lambda road: gan_traffic(road, guard=False), Road(), short)["guard_share"] is None
-    assert long_run(gan_calibrated_traffic, Road(), short)["overlaps"] == 0
 
 
 def test_totals_add_counts_up_and_know_nothing_of_nothing():

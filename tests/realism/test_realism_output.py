@@ -6,8 +6,8 @@ from matplotlib.colors import to_hex
 
 from ganlane.realism.card import card_checks
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
+from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.output import checks_text, draw_distances, draw_distributions, draw_speeds_over_time, long_table
-from ganlane.realism.quantities import QUANTITIES
 from ganlane.realism.references import ConstantVelocity
 from ganlane.sim.state import Road
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
@@ -54,6 +54,9 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
 def test_a_traffic_without_a_guard_has_none_in_its_card():
     short = LongRunParameters(vehicles=4, vehicle_km=0.1, most_s=10.0)
     without, with_guard = (long_run(make, Road(), short) for make in (gan_calibrated_traffic, gan_traffic))
+    assert (without["guard_share"], without["overlaps"]) == (None, 0)
+    assert 0.0 < with_guard["guard_share"] < 1.0
+    assert long_run(lambda road: gan_traffic(road, guard=False), Road(), short)["guard_share"] is None
     assert cells(long_table([without], "a"), "the guard's share") == ["none"]
     assert cells(long_table([with_guard], "a"), "the guard's share")[1] == "%"
     assert "guard under 5 percent: no guard" in checks_text(checked(without))

@@ -4,7 +4,7 @@ import polars as pl
 import pytest
 
 from ganlane.errors import UserError
-from ganlane.realism.quantities import measure_recordings
+from ganlane.realism.measures import measure_recordings
 from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
 
 

@@ -8,8 +8,7 @@ import pytest
 
 from ganlane.data import SyntheticTraffic, default_scenes, read_scenes, scene_lane_widths, synthetic_scenes
 from ganlane.errors import UserError
-from ganlane.realism.distances import ceiling
-from ganlane.realism.quantities import QUANTITIES, measure_recordings
+from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
 from ganlane.realism.recordings import recordings_of
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 

@@ -6,12 +6,12 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
 from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.generator.rollout import balanced_headway
-from ganlane.realism.distances import pooled_distance
-from ganlane.realism.quantities import measure_recordings
+from ganlane.realism.measures import measure_recordings, pooled_distance
 from ganlane.realism.recordings import Recording, recorded_frame, recordings_of
 from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
 from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways
@@ -140,14 +140,8 @@ DRAWN = 9.0
 
 def queue(x, speed=10.0, desired=20.0):
     """One row of vehicles of 4 m in the first lane; index 0 is nobody."""
-    position = torch.tensor([[-500.0, *x]])
-    same = torch.full_like(position, speed)
-    lane = torch.zeros(position.shape, dtype=torch.int64)
-    return Vehicles(
-        x=position, y=0.0 * same, heading=0.0 * same, speed=same, acceleration=0.0 * same, length=0.0 * same + 4.0,
-        width=0.0 * same + 2.0, desired_speed=torch.full_like(position, desired), target_lane=lane,
-        visibility=lane, valid=torch.tensor([[False, *[True] * len(x)]]),
-    )  # fmt: skip
+    cars = [{"x": at, "speed": speed, "desired_speed": desired, "length": 4.0} for at in x]
+    return vehicles_of({"x": -500.0, "valid": False}, *cars, dtype=torch.float32)
 
 
 def headways(vehicles):

@@ -6,8 +6,8 @@ import pytest
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
 from ganlane.realism.card import card_rows
-from ganlane.realism.distances import ceiling
 from ganlane.realism.long_runs import LongRunParameters
+from ganlane.realism.measures import ceiling
 from ganlane.realism.recordings import Recording
 from ganlane.realism.references import ConstantVelocity
 from ganlane.realism.replay_starts import StartOptions

@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import json
 import os
 import signal
 import socket
@@ -351,6 +352,33 @@ def test_a_signal_to_the_whole_group_saves_and_leaves_no_process(number, tmp_pat
     assert "go on with: ganlane train resume=" in message
     assert "Traceback" not in message
     assert gone(process.pid)
+
+
+@pytest.mark.slow
+def test_a_run_that_lost_a_worker_is_resumed_to_its_end(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    options = {"cwd": tmp_path, "stderr": subprocess.PIPE, "text": True, "env": environment}
+    start = [sys.executable, "-m", "ganlane.train"]
+    process = subprocess.Popen([*start, *COMMAND, "total_decisions=4000", "hydra.run.dir=run"], **options)
+    figures = tmp_path / "run" / "metrics.csv"
+    while not figures.is_file() or len(figures.read_text().splitlines()) < 3:
+        assert process.poll() is None
+        time.sleep(0.02)
+    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
+    message = process.communicate(timeout=120)[1]
+    assert process.returncode == 2
+    assert "died" in message
+    assert "Traceback" not in message
+    again = subprocess.run([*start, "resume=run"], **options)
+    assert again.returncode == 0, again.stderr
+    assert [int(line.split(",")[0]) for line in figures.read_text().splitlines()[1:]][-1] == 3968
+    assert json.loads((tmp_path / "run" / "results.json").read_text())["decisions"] == 4000
+
+
+def workers_of(parent: int) -> list[int]:
+    """Process ids of a run's workers: children that run a function of multiprocessing, not its resource tracker."""
+    found = subprocess.check_output(["ps", "-o", "pid=,args=", "--ppid", str(parent)], text=True)
+    return [int(line.split()[0]) for line in found.splitlines() if "spawn_main" in line]
 
 
 def gone(group: int, within_s: float = 20.0) -> bool:

@@ -1,0 +1,220 @@
+"""What is measured of trajectories worked out by hand; distances between histograms, their scale and intervals."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.distance import jensenshannon
+from scipy.stats import binom
+
+from ganlane.evaluation.statistics import Estimate
+from ganlane.realism.card import verdict
+from ganlane.realism.measures import QUANTITIES, ceiling, distance, distance_difference, jensen_shannon, measure
+from ganlane.realism.recordings import Recording, recorded_frame, segments
+
+
+def recording(x, y=None, name="scene", lanes=3, present=None):
+    """Cars of 4 m on lanes of 3.5 m; ``x`` [T, V]."""
+    x = np.asarray(x, dtype=np.float64)
+    y = np.zeros_like(x) if y is None else np.asarray(y, dtype=np.float64)
+    present = np.ones(x.shape, bool) if present is None else present
+    size = np.ones(x.shape[1])
+    return Recording(name, name, lanes, 3.5, x, y, np.zeros_like(x), present, 4.0 * size, 2.0 * size, size > 0)
+
+
+def measured(*recordings):
+    return measure(recorded_frame(recordings), sorted(each.name for each in recordings))
+
+
+def values(result, quantity):
+    return result.samples[quantity]["value"].to_numpy()
+
+
+TIME = np.arange(100)[:, None] * 0.1
+
+
+def test_constant_acceleration_shows_as_it_is_and_has_no_jerk():
+    result = measured(recording(10.0 * TIME + 0.5 * 0.8 * TIME**2))
+    assert values(result, "acceleration") == pytest.approx(0.8)
+    assert values(result, "jerk") == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_cubic_path_has_its_jerk_and_speed_of_the_second():
+    result = measured(recording(10.0 * TIME + 0.3 * TIME**3 / 6.0))
+    assert values(result, "jerk") == pytest.approx(0.3)
+    # Mean over the second about t: 10 + 0.3 t^2 / 2 + 0.3 / 24.
+    t = TIME[30:95, 0]
+    assert values(result, "speed") == pytest.approx(10.0 + 0.15 * t**2 + 0.3 / 24.0)
+
+
+def test_the_first_three_seconds_of_a_vehicle_do_not_count():
+    present = np.ones((100, 2), bool)
+    present[:50, 1] = False
+    result = measured(recording(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present))
+    # The first: samples 30 to 94. The second appears at 50: samples 80 to 94.
+    assert len(values(result, "speed")) == 65 + 15
+    assert result.vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
+
+
+def test_gap_headway_and_time_to_collision_of_two_cars():
+    result = measured(recording(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])))
+    t = TIME[30:95, 0]
+    gap = 60.0 - 2.0 * t
+    assert values(result, "gap") == pytest.approx(gap)
+    assert values(result, "time_headway") == pytest.approx(gap / 12.0)
+    assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
+
+
+def test_cars_in_different_lanes_do_not_follow_each_other():
+    beside = np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)])
+    result = measured(recording(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]), beside))
+    assert len(values(result, "gap")) == 0
+    assert result.quantile("gap", 0.5) is None
+
+
+def test_spread_of_speeds_is_that_within_a_frame():
+    x = np.hstack([(10.0 + 2.0 * k) * TIME + 40.0 * k for k in range(3)])
+    assert values(measured(recording(x)), "speed_spread") == pytest.approx(2.0)
+    assert len(values(measured(recording(x[:, :2])), "speed_spread")) == 0
+
+
+def test_a_lane_change_counts_once_with_its_duration_unless_it_comes_too_early():
+    for start, expected in ((4.0, 1), (0.2, 0)):
+        part = np.clip((TIME - start) / 4.0, 0.0, 1.0)
+        y = 3.5 * 0.5 * (1.0 - np.cos(np.pi * part))
+        result = measured(recording(20.0 * TIME, y))
+        assert result.lane_changes == expected
+        if expected:
+            assert 2.0 < values(result, "lane_change_duration")[0] < 4.0
+
+
+def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
+    slow, fast = recording(10.5 * TIME, name="slow"), recording(55.0 * TIME, name="fast")
+    counts = measured(slow, fast).counts["speed"]
+    assert counts.shape == (2, QUANTITIES["speed"].number)
+    assert counts[0, -1] == counts[0].sum() == 65
+    assert counts[1, 10] == counts[1].sum() == 65
+
+
+def test_vehicles_that_are_replayed_are_led_by_but_not_measured():
+    pair = recording(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]))
+    led = Recording(**{**vars(pair), "driven": np.array([True, False])})
+    assert len(values(measured(led), "speed")) == 65
+    assert len(values(measured(led), "gap")) == 65
+
+
+def test_segments_keep_their_unit_and_leave_out_what_was_to_be_skipped():
+    pieces = segments(recording(10.0 * TIME), 3.0, skip_s=3.5)
+    assert [piece.name for piece in pieces] == ["scene@35", "scene@65"]
+    assert {piece.unit for piece in pieces} == {"scene"}
+    assert pieces[1].x[0, 0] == pytest.approx(65.0)
+
+
+COUNTS = arrays(np.float64, (2, 7), elements=st.integers(0, 50)).filter(lambda rows: rows.sum(1).min() > 0)
+
+
+@given(COUNTS)
+def test_distance_is_that_of_scipy(rows):
+    expected = jensenshannon(rows[0], rows[1], base=2)
+    assert jensen_shannon(rows[0], rows[1]) == pytest.approx(0.0 if math.isnan(expected) else expected, abs=1e-7)
+
+
+def test_equal_shapes_are_at_0_and_disjoint_ones_at_1():
+    assert jensen_shannon(np.array([1.0, 3.0]), np.array([10.0, 30.0])) == pytest.approx(0.0, abs=1e-7)
+    assert jensen_shannon(np.array([5.0, 0.0]), np.array([0.0, 2.0])) == pytest.approx(1.0)
+    assert np.isnan(jensen_shannon(np.zeros(2), np.ones(2)))
+
+
+def test_scenes_that_are_alike_have_a_low_ceiling_and_unlike_ones_a_high_one():
+    alike = np.tile([4.0, 8.0, 4.0], (6, 1))
+    unlike = np.eye(6) * 10.0
+    assert ceiling(alike) == pytest.approx(0.0, abs=1e-7)
+    assert ceiling(unlike) == pytest.approx(1.0)
+    assert ceiling(alike[:1]) is None
+
+
+def histograms(shift, seed, number=12):
+    random = np.random.default_rng(seed)
+    return np.stack([np.bincount(random.binomial(20, 0.3 + shift, 200), minlength=21) for _ in range(number)]) * 1.0
+
+
+def test_a_model_that_is_nearer_in_every_scene_is_found_to_be_closer():
+    recorded, near, far = histograms(0.0, 0), histograms(0.02, 1), histograms(0.2, 2)
+    difference = distance_difference(near, far, recorded, resamples=400)
+    assert difference.high < 0.0
+    assert difference.value == pytest.approx(distance(near, recorded).value - distance(far, recorded).value)
+    assert verdict(difference) == "closer"
+    assert verdict(distance_difference(far, near, recorded, resamples=400)) == "farther"
+
+
+def test_two_runs_of_one_model_are_undecided():
+    difference = distance_difference(histograms(0.1, 3), histograms(0.1, 4), histograms(0.0, 5), resamples=400)
+    assert difference.low < 0.0 < difference.high
+    assert verdict(difference) == "undecided"
+
+
+def test_one_scene_gives_no_interval_and_no_verdict():
+    one = distance(histograms(0.1, 0, 1), histograms(0.0, 1, 1))
+    assert one.interval is None
+    assert verdict(Estimate(-0.5, None, None)) == "undecided"
+
+
+def draws(shift, number, trials=40):
+    """Recordings and a model that lies by ``shift`` beside them, of histograms with means of their own."""
+    random = np.random.default_rng(number)
+    for _ in range(trials):
+        means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
+        size = random.integers(15, 60, number)
+        yield [
+            np.stack([np.bincount(random.binomial(20, p, times * n), minlength=21) for p, n in zip(at, size)]) * 1.0
+            for at, times in ((means, 1), (means + shift, 4), (means + shift, 4))
+        ]
+
+
+@pytest.mark.parametrize("number", [4, 11])
+def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
+    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)]
+    assert all(each.low <= each.value <= each.high for each in intervals)
+    assert sum(each.low == 0.0 for each in intervals) >= 0.9 * len(intervals)
+
+
+@pytest.mark.parametrize("number", [4, 11])
+def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
+    many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
+    true = float(jensen_shannon(*(binom.pmf(np.arange(21)[:, None], 20, at).sum(1) for at in (many, many + 0.1))))
+    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.1, number)]
+    assert sum(each.low <= true <= each.high for each in intervals) >= 0.85 * len(intervals)
+    assert sum(each.low > 0.0 for each in intervals) >= 0.9 * len(intervals)
+
+
+@pytest.mark.parametrize(("number", "shift"), [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)])
+def test_two_equally_good_models_are_seldom_told_apart(number, shift):
+    verdicts = [
+        verdict(distance_difference(*models, recorded, resamples=300)) for recorded, *models in draws(shift, number)
+    ]
+    assert verdicts.count("undecided") >= 0.9 * len(verdicts)
+
+
+@given(COUNTS, COUNTS, COUNTS)
+def test_every_interval_holds_its_estimate(recorded, first, second):
+    for estimate in (
+        distance(first, recorded, resamples=20),
+        distance_difference(first, second, recorded, resamples=20),
+    ):
+        assert estimate.low <= estimate.value <= estimate.high
+    assert distance(first, recorded, resamples=20).low >= 0.0
+
+
+def test_a_model_does_not_differ_from_itself():
+    model = histograms(0.1, 3)
+    assert distance_difference(model, model, histograms(0.0, 5), resamples=50) == Estimate(0.0, 0.0, 0.0)
+
+
+def test_unpaired_units_are_resampled_on_the_side_of_the_model():
+    model, recorded = histograms(0.1, 3, 5), histograms(0.0, 5, 8)
+    estimate = distance(model, recorded, paired=False, resamples=100)
+    assert estimate.low <= estimate.value <= estimate.high
+    assert distance(model[:1], recorded, paired=False).interval is None

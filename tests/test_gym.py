@@ -349,7 +349,7 @@ def test_wrong_calls_are_told_in_a_sentence():
     refused(lambda: env.step(KEEP), "call reset")
     refused(lambda: envs.step(np.zeros(2, int)), "call reset")
     refused(lambda: env.reset(options={"episodes": 3}), "episodes unknown; a reset takes episode")
-    refused(lambda: env.reset(options={"episode": -3}), "expected whole numbers from 0")
+    refused(lambda: env.reset(options={"episode": -3}), "expected a whole number from 0")
     env.reset()
     envs.reset()
     refused(lambda: env.step(3), r"0 \(keep\), 1 \(left\) or 2 \(right\)")

@@ -24,6 +24,7 @@ from reference.hydra_memory import composed, own_part
 from safetensors.torch import save_file
 
 from ganlane.__main__ import COMMANDS, main
+from ganlane.checksums import seal_archive
 from ganlane.config.command_line import typed
 from ganlane.config.schemas import SCHEMAS
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
@@ -394,8 +395,10 @@ def saved(content: Any) -> bytes:
     ],
     ids=str,
 )
-def test_a_resume_checkpoint_with_other_things_in_it_is_refused(content, capsys):
-    run_folder(saved(content))
+def test_a_resume_checkpoint_with_other_things_in_it_is_refused(content, capsys, tmp_path):
+    (tmp_path / "other.pt").write_bytes(saved(content))
+    seal_archive(tmp_path / "other.pt")  # without a checksum there is a note besides the sentence
+    run_folder((tmp_path / "other.pt").read_bytes())
     assert "resume" in refusal(capsys, "train", "resume=run")
 
 

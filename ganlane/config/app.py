@@ -26,7 +26,7 @@ from ganlane.config.command_line import (
     with_shares_replaced,
     without_repetitions,
 )
-from ganlane.config.folders import cleared_after_mistakes, held, write_down
+from ganlane.config.folders import cleared_after_mistakes, held, unused, write_down
 from ganlane.config.help import print_help
 from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
 from ganlane.config.resume import refuse_stored_imports, with_resumed
@@ -115,6 +115,8 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
     if command == "train" and checked.config.resume is not None:
         refuse_stored_imports(checked.config, flags.overrides)
     folder = (checked.sweep_folder if flags.multirun else checked.run_folder).absolute()
+    if not flags.multirun and not any(each.startswith("hydra.run.dir=") for each in overrides):
+        folder = unused(folder)
     with cleared_after_mistakes(folder):
         if flags.multirun:
             # The folder's name holds the time: given here, so that it is the one that was looked at.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import socket
@@ -113,6 +114,15 @@ def _locked(folder: Path) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         file.close()
+
+
+def unused(folder: Path) -> Path:
+    """``folder``, or the same name with a number where a run is there already.
+
+    The name holds time and process: two runs of one process within a second would share it.
+    """
+    names = itertools.chain([folder.name], (f"{folder.name}_{number}" for number in itertools.count(2)))
+    return next(folder.with_name(name) for name in names if not (folder.with_name(name) / CONFIG).exists())
 
 
 def earned(folder: Path) -> set[tuple[Path, int]]:

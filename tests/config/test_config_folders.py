@@ -14,7 +14,7 @@ import torch
 from training.test_training_loop import ToyRoad, agent, settings, train
 
 from ganlane.config.app import run_command
-from ganlane.config.folders import CONFIG, LOCK, OVERRIDES, held
+from ganlane.config.folders import CONFIG, LOCK, OVERRIDES, held, unused
 from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
@@ -171,3 +171,12 @@ def test_a_run_with_a_limit_on_the_size_of_its_files_goes_on_without_it(here):
         assert "File too large; make room there" in done.stderr
         assert command(f"resume=run{limit}") == 0
         assert same(left_by(here / f"run{limit}"), left_by(here / "whole"))
+
+
+def test_two_runs_of_one_process_in_one_second_have_folders_of_their_own(tmp_path):
+    first = tmp_path / "2026-01-01_00-00-00_7"
+    assert unused(first) == first
+    for taken, following in ((first, f"{first}_2"), (tmp_path / f"{first.name}_2", f"{first}_3")):
+        taken.mkdir()
+        (taken / "config.yaml").write_text("")
+        assert unused(first) == Path(following)

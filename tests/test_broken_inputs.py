@@ -30,6 +30,7 @@ from ganlane.config.schemas import SCHEMAS
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS, conf_folder, load_weights, save_weights
+from ganlane.native.library import cache_folder
 from ganlane.parameters.checks import NO_KEY
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -606,7 +607,7 @@ def test_a_whole_command_ends_with_status_2(line, here):
         run_folder(damaged("torch pickle", AGENT))
     before = everything_below(here)
     environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(here)}
-    environment["GANLANE_CACHE"] = str(here.parent / "cache")
+    environment["GANLANE_CACHE"] = str(cache_folder().parent)  # where the kernel is built already
     start = [sys.executable, "-m", "ganlane", *line.split()]
     done = subprocess.run(start, cwd=here, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2, done.stderr

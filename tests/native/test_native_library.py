@@ -113,7 +113,8 @@ def test_a_processor_gets_the_fastest_variant_that_it_runs(monkeypatch, tmp_path
 
 @needs_compiler
 def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(monkeypatch, tmp_path):
-    (made, *_) = (path for path in library.build_all(tmp_path / "wheel") if "-default-" in path.name)
+    monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})  # the others take seconds
+    (made,) = library.build_all(tmp_path / "wheel")
     monkeypatch.setattr(library, "PREBUILT", made.parent)
     monkeypatch.setattr(library, "find_compiler", lambda: None)
     monkeypatch.setattr(library, "best_variant", lambda: "default")

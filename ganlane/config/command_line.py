@@ -27,7 +27,7 @@ VERSION_BASE = "1.3"
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.num")
 HYDRA_PLUGINS = ("launcher", "sweeper")
 #: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
-ALIASES = {"render": {"agent": "driver"}}
+ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
 
 
 def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:

@@ -1,4 +1,4 @@
-"""What a measuring command leaves in its run folder: ``results.json`` with its origin, and ``episodes.parquet``."""
+"""What a command leaves in its run folder, as files and as an object."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from datetime import datetime, timezone
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,32 @@ import torch
 
 from ganlane._version import __version__
 from ganlane.files import PACKAGE, atomic_path, write_json
+
+
+@dataclass(frozen=True, repr=False)
+class Run:
+    """A finished command: its run folder and the content of ``results.json``."""
+
+    folder: Path
+    results: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(folder={str(self.folder)!r}, results: {', '.join(self.results)})"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the table of an evaluation, else the results that are single numbers or texts."""
+        rows = self.results.get("rows")
+        if not isinstance(rows, list):
+            rows = [{name: value for name, value in self.results.items() if isinstance(value, int | float | str)}]
+        return f"<p>{escape(str(self.folder))}</p>{pl.DataFrame(rows, infer_schema_length=None)._repr_html_()}"
+
+
+@dataclass(frozen=True, repr=False)
+class TrainingRun(Run):
+    """A finished training: also the agent's file and the table of the final evaluation."""
+
+    agent: Path
+    table: pl.DataFrame
 
 
 def write_results(

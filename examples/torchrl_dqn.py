@@ -1,10 +1,8 @@
-"""TorchRL's stock DQN on the highway: nothing of ganlane's agent, only its environment.
+"""TorchRL's own DQN on the highway, behind the action mask: nothing of ganlane's agent, only its environment.
 
-Run it with ``python examples/stock_dqn.py``; a few seconds of training by default, more with
-``python examples/stock_dqn.py 500000``.
+``python examples/torchrl_dqn.py`` trains for 1 M decisions; ``python examples/torchrl_dqn.py 20000 4`` for some
+seconds, and compares on 4 episodes.
 """
-
-from __future__ import annotations
 
 import sys
 
@@ -12,47 +10,45 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import MLP, EGreedyModule, QValueActor
 from torchrl.objectives import DQNLoss, SoftUpdate
 
-from ganlane.env import HighwayEnv
-from ganlane.sim import Road
-from ganlane.traffic import IdmMobilTraffic
-from ganlane.transforms import ObservationTransform, RewardTransform
+import ganlane
 
 
-def main(decisions=8_192, num_envs=64):
-    """Collect, store, update."""
+def main(decisions="1000000", episodes="100", goal_m="5000", num_envs="64"):
+    """Collect, store, update, evaluate."""
     torch.manual_seed(0)
-    road = Road(lanes=3)
-    env = HighwayEnv(IdmMobilTraffic(road), num_envs=num_envs)
-    env = TransformedEnv(env, Compose(ObservationTransform(road, form="table3_lane_view"), RewardTransform()))
-    network = MLP(in_features=env.observation_spec["observation"].shape[-1], out_features=3, num_cells=[128, 128])
-    actor = QValueActor(network, in_keys=["observation"], spec=env.action_spec_unbatched, action_space="categorical")
-    explore = EGreedyModule(env.action_spec_unbatched, eps_init=1.0, eps_end=0.05, annealing_num_steps=decisions // 2)
-    loss = DQNLoss(actor, delay_value=True, action_space="categorical")
+    torch.set_num_threads(1)  # small networks: a second thread only costs
+    options = {"mask": "safe", "goal_m": float(goal_m)}
+    env = ganlane.make_env("idm_mobil", int(num_envs), **options)
+    spec, masked = env.action_spec_unbatched, {"action_mask_key": "action_mask"}
+    network = MLP(env.observation_spec["observation"].shape[-1], 3, num_cells=[128, 128])
+    actor = QValueActor(network, in_keys=["observation"], spec=spec, action_space="categorical", **masked)
+    explore = EGreedyModule(spec, eps_init=1.0, eps_end=0.05, annealing_num_steps=int(decisions) // 2, **masked)
+    loss = DQNLoss(actor, delay_value=True, action_space="categorical", loss_function="smooth_l1")
     loss.make_value_estimator(gamma=0.98)
     target = SoftUpdate(loss, eps=0.99)
     optimiser = torch.optim.Adam(loss.parameters(), lr=5e-4)
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=256)
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(200_000), batch_size=512)
     policy = TensorDictSequential(actor, explore)
-    wanted = ["observation", "action", ("next", "observation"), ("next", "reward")]
-    wanted += [("next", "done"), ("next", "terminated")]
-    batches = {"frames_per_batch": 8 * num_envs, "total_frames": decisions}
+    wanted = ["observation", "action", "action_mask", ("next", "observation"), ("next", "action_mask")]
+    wanted += [("next", "reward"), ("next", "done"), ("next", "terminated")]
+    batches = {"frames_per_batch": 8 * int(num_envs), "total_frames": int(decisions)}
     for batch in Collector(env, policy, **batches, auto_register_policy_transforms=False):
         explore.step(batch.numel())
         replay.extend(batch.select(*wanted).reshape(-1))
-        for _ in range(8):
+        for _ in range(4):
             losses = loss(replay.sample())
             losses["loss"].backward()
             optimiser.step()
             optimiser.zero_grad()
             target.step()
-    ego = batch["next", "ego"]
     print(f"loss {losses['loss'].item():.3f}, reward per decision {batch['next', 'reward'].mean():.2f}")
-    print(f"last batch: {int(ego['started_change'].sum())} lane changes in {batch.numel()} decisions")
+    drivers = [ganlane.Driver("torchrl_dqn", actor), "mobil"]
+    table = ganlane.api.evaluate(drivers, ["idm_mobil"], int(episodes), **options)
+    print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(*sys.argv[1:])

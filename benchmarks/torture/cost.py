@@ -30,7 +30,7 @@ RUNS = {
 }
 #: Steps of all environments in a turn.
 STEPS = 4
-#: A run with default settings writes a checkpoint as often as this allows.
+#: Pairs of checkpoints.
 CHECKPOINTS = 5
 
 
@@ -61,28 +61,35 @@ def cost(tally: Tally, minutes: float, seed: int, scratch: Path) -> None:
         while not agent.ready:
             agent.store(state.window.push(collect(state)))
         _turn(state)
-        steps, saves = _shares(state, minutes / len(RUNS), random.Random(seed), folder)
-        # A checkpoint takes at most 1 / PATIENCE of the time, whatever part of that the checksum is.
-        share = steps + max(saves, 0.0) / checkpoint.PATIENCE
-        tally.what[f"{name}: {share:+.2%} ({steps:+.2%} of a step, {saves:+.1%} of a checkpoint)"] = 1
+        every_s = config.checkpoint_every_s
+        steps, saves = _shares(state, minutes / len(RUNS), random.Random(seed), folder, every_s)
+        share = steps + saves
+        tally.what[f"{name}: {share:+.2%} ({steps:+.2%} in steps, {saves:+.2%} in checkpoints)"] = 1
         if share > AT_MOST:
             tally.fail(f"{name}: the checks take {share:.2%} of a training's time")
 
 
-def _shares(state: TrainingState, minutes: float, rng: random.Random, folder: Path) -> tuple[float, float]:
-    """How much longer steps and checkpoints take with the checks, as a share; medians of pairs in random order."""
-    saver = Checkpointer(state, folder, 0.0, True, {})
+def _shares(
+    state: TrainingState, minutes: float, rng: random.Random, folder: Path, every_s: float
+) -> tuple[float, float]:
+    """What the checks take in steps and in checkpoints, as shares of the time; medians of pairs in random order."""
+    saver = Checkpointer(state, folder, every_s, True, {})
     steps, saves, until = [], [], time.monotonic() + 60.0 * minutes
     while time.monotonic() < until or len(saves) < CHECKPOINTS:
-        found = {}
+        turns, checkpoints = {}, {}
         for checked in rng.sample((True, False), 2):
             with ExitStack() as stack:
                 if not checked:
                     stack.enter_context(without_checks())
-                found[checked] = _turn(state), _seconds_to_save(saver) if len(saves) < CHECKPOINTS else 0.0
-        steps.append(found[True][0] / found[False][0] - 1.0)
-        if len(saves) < CHECKPOINTS:
-            saves.append(found[True][1] / found[False][1] - 1.0)
+                turns[checked] = _turn(state)
+                if len(saves) < CHECKPOINTS:
+                    begun = time.monotonic()
+                    saver.save()
+                    # A longer one is followed by a longer pause.
+                    checkpoints[checked] = (time.monotonic() - begun) / saver.pause_s
+        steps.append(turns[True] / turns[False] - 1.0)
+        if checkpoints:
+            saves.append(checkpoints[True] - checkpoints[False])
     return statistics.median(steps), statistics.median(saves)
 
 
@@ -92,10 +99,4 @@ def _turn(state: TrainingState) -> float:
     for _ in range(STEPS):
         state.agent.store(state.window.push(collect(state)))
         learn(state)
-    return time.process_time() - begun
-
-
-def _seconds_to_save(saver: Checkpointer) -> float:
-    begun = time.process_time()
-    saver.save()
     return time.process_time() - begun

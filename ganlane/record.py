@@ -48,6 +48,7 @@ def record(config: RecordConfig, folder: Path) -> str:
 
     from ganlane.build import make_driver
     from ganlane.evaluation.results import plain, write_results
+    from ganlane.gym import ENV_ID
     from ganlane.gym.tensor_rows import TensorRows
     from ganlane.keys import ACTIONS
     from ganlane.runtime import set_threads
@@ -60,7 +61,7 @@ def record(config: RecordConfig, folder: Path) -> str:
     options = {"env": config.env, "observation": seen, "reward": config.reward, "mask": mask, "stream": config.stream}
     count = min(config.num_envs, config.episodes)
     rows = TensorRows(config.traffic, count, {**options, "device": config.device})
-    spec = deepcopy(gymnasium.spec("ganlane/Highway-v0"))
+    spec = deepcopy(gymnasium.spec(ENV_ID))
     spec.kwargs, spec.max_episode_steps = plain({"traffic": config.traffic, **options}), rows.episode.most_decisions()
     spec.kwargs["traffic"]["name"], env = config.traffic.label(), _env_name(config)
     spec.kwargs["env"]["name"] = env

@@ -22,11 +22,12 @@ import os
 import sys
 from typing import Final
 
+ENV_ID: Final = "ganlane/Highway-v0"
 #: Id to the arguments that differ; reference scores are in docs/gymnasium.md. The registered specs have no
 #: ``max_episode_steps``: gymnasium would cut all episodes there, whatever ``timeout_s`` and ``decision_period_s``
 #: are. That of an environment that has been made has the limit that is true for it.
 ENV_IDS: Final[dict[str, dict[str, str]]] = {
-    "ganlane/Highway-v0": {},
+    ENV_ID: {},
     "ganlane/HighwayDense-v0": {"env": "dense"},
     "ganlane/HighwayGAN-v0": {"traffic": "gan"},
     "ganlane/HighwayGANCalibrated-v0": {"traffic": "gan_calibrated"},

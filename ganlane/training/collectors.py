@@ -1,8 +1,8 @@
 """Where the steps come from: one decision of all environments at a time, in the order of time.
 
 The loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the environments in this process;
-the worker processes of :mod:`ganlane.training.overlap` drive while the loop learns. Runs with these two can be resumed
-to the same bits. The collectors of :mod:`ganlane.training.workers` are TorchRL's, in worker processes.
+in :mod:`ganlane.training.overlap` worker processes do, while the loop learns. Runs with these two can be resumed to
+the same bits. The collectors of :mod:`ganlane.training.workers` are TorchRL's, in worker processes.
 """
 
 from __future__ import annotations

@@ -31,6 +31,8 @@ from ganlane.training.workers import EPISODES_PER_WORKER, INNER, MakeEnv, why_lo
 
 #: Seconds that a worker has to end by itself.
 _PATIENCE_S = 5.0
+#: Seconds until the system has taken note of the end of a process whose pipe is closed.
+_NOTICED_S = 0.5
 
 
 class OverlapCollector(Collector):
@@ -132,6 +134,8 @@ class OverlapCollector(Collector):
         try:
             yield
         except (EOFError, OSError) as error:
+            for process in self._processes:
+                process.join(_NOTICED_S)
             raise UserError(
                 f"collector=overlap: {why_lost(self._processes)}; go on from the last checkpoint with resume."
             ) from error

@@ -14,7 +14,7 @@ from benchmarks.torture import runs
 from benchmarks.torture.tally import Tally
 
 #: Ways to end an attempt, and how often each is chosen.
-WAYS = {"kill": 4, "first second": 2, "in a write": 4, "final evaluation": 2, "SIGTERM": 2, "SIGINT": 2}
+WAYS = {"kill": 4, "first second": 2, "in a write": 4, "final evaluation": 2, "SIGTERM": 4, "SIGINT": 4}
 SIGNALS = {"SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
 
 

@@ -161,8 +161,12 @@ def work(pipe: Connection, make_env: Callable[[], EnvBase]) -> None:
     """
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         source = SingleCollector(make_env())
-        requests = {"step": partial(drive, source), "look": lambda: visible(source.env_state)}
-        requests |= {"state": source.state_dict, "load": source.load_state_dict}
+        requests: dict[str, Callable[..., Any]] = {
+            "step": partial(drive, source),
+            "look": lambda: visible(source.env_state),
+            "state": source.state_dict,
+            "load": source.load_state_dict,
+        }
         shared: TensorDictBase | None = None
         while True:
             name, *arguments = pipe.recv()

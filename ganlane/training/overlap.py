@@ -9,6 +9,7 @@ under way: a run gives the same bits every time, and so does one that was stoppe
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -84,7 +85,7 @@ class OverlapCollector(Collector):
         self._start()
         with self._failures_as_user_errors():
             for worker, pipe in enumerate(self._pipes):
-                pipe.send((name, *(each[worker] for each in arguments)))
+                send(pipe, (name, *(each[worker] for each in arguments)))
         return self._answers()
 
     def _answers(self) -> list[Any]:
@@ -174,14 +175,20 @@ def work(pipe: Connection, make_env: Callable[[], EnvBase]) -> None:
                 answer = requests[name](*arguments)
             except UserError as error:
                 answer = error
-            if name == "step" and isinstance(answer, TensorDictBase):
-                if shared is None:
-                    # A copy: what is seen and what follows are the same tensors where no episode ended.
-                    answer = shared = answer.clone().share_memory_()
-                else:
-                    shared.update_(answer)
-                    answer = None
-            pipe.send(answer)
+            if name != "step" or isinstance(answer, UserError):
+                send(pipe, answer)
+            elif shared is None:
+                # A copy: what is seen and what follows are the same tensors where no episode ended.
+                shared = answer.clone().share_memory_()
+                pipe.send(shared)
+            else:
+                shared.update_(answer)
+                pipe.send(None)
+
+
+def send(pipe: Connection, message: Any) -> None:
+    """Send by value: of a tensor in shared memory the receiver gets nothing once the sender is gone."""
+    pipe.send_bytes(pickle.dumps(message))
 
 
 def drive(source: SingleCollector, action: npt.NDArray[np.int64]) -> TensorDict:

@@ -9,8 +9,8 @@
 
 Parts: kill (kill -9, SIGTERM, SIGINT, then resumed to the same bits), disk (full disks, lost workers), damage
 (damaged files), code (ways to have code executed), misuse (of the API), soak (random configurations), memory (of a
-long run), versions (of the dependencies). Without a part's name all but the last run. Exits with 1 after a failure.
-Needs Linux.
+long run), cost (of the checks, in training), versions (of the dependencies). Without a part's name all but the last
+run. Exits with 1 after a failure. Needs Linux.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import time
 from pathlib import Path
 
 from benchmarks.script import ReportSection, add_report, make_parser
+from benchmarks.torture.cost import cost
 from benchmarks.torture.damage import Trial, damage, good_files
 from benchmarks.torture.disk import disk
 from benchmarks.torture.kill import kill
@@ -35,7 +36,7 @@ from ganlane.files import write_json
 
 MARKERS = "<!-- begin torture -->", "<!-- end torture -->"
 #: Parts, and their shares of the minutes.
-SHARES = {"kill": 4.0, "disk": 2.0, "damage": 4.0, "code": 0.5, "misuse": 2.0, "soak": 8.0, "memory": 1.0}
+SHARES = {"kill": 4, "disk": 2, "damage": 4, "code": 0.5, "misuse": 2, "soak": 8, "memory": 1, "cost": 1}
 HEAD = "| part | tried | failed | minutes |\n|---|---|---|---|"
 
 
@@ -56,6 +57,8 @@ def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -
         soak(tally, options.configurations, options.seed, minutes, options.compiled)
     elif part == "memory":
         memory(tally, minutes, options.seed)
+    elif part == "cost":
+        cost(tally, minutes, options.seed, scratch)
     else:
         table = versions(tally, scratch, options.pin)
     tally.seconds = time.monotonic() - begun

@@ -67,7 +67,7 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
 def csv_table(path: str | Path, wanted: Mapping[str, Kind]) -> TextTable:
     """Layout of a CSV file according to its header line, which must hold the ``wanted`` columns in any case."""
     path = Path(path)
-    names = tuple(name.strip().lower() for name in next(csv.reader([first_line(path)]), []))
+    names = tuple(name.strip().lower() for name in _cells(first_line(path), f"{path}, line 1"))
     _check_columns(wanted, names, path)
     return TextTable(path, names)
 
@@ -78,12 +78,13 @@ def first_line(path: Path) -> str:
         raise UserError(f"{path}: no such file; give the path of a text table.")
     with path.open("rb") as file:
         raw = file.readline(2**16)
-    if not raw.strip():
-        raise UserError(f"{path}: the file is empty; a table of text was expected.")
     try:
-        return raw.decode("utf-8-sig").strip()
+        text = raw.decode("utf-8-sig").strip()
     except UnicodeDecodeError as error:
         raise UserError(f"{path}, line 1: not text ({error.reason}); give an unpacked text or CSV file.") from error
+    if not text:
+        raise UserError(f"{path}: the file is empty; a table of text was expected.")
+    return text
 
 
 def reason(error: Exception) -> str:
@@ -154,10 +155,11 @@ def read_blocks(
     number = FIRST_LINE if table.has_header else 1
     done, total = 0, table.path.stat().st_size
     for block, has_no_end in _whole_lines(table, block_bytes):
+        place = f"{table.path}, line {number}"
         # A last line without a line break is a row only if it has all its fields.
-        if has_no_end and (found := len(_fields(table, block))) < len(table.names):
+        if has_no_end and (found := len(_fields(table, block, place))) < len(table.names):
             raise UserError(
-                f"{table.path}, line {number}, column {table.names[max(found - 1, 0)]}: the file breaks off here, "
+                f"{place}, column {table.names[max(found - 1, 0)]}: the file breaks off here, "
                 f"{found} of {len(table.names)} columns into the row; copy or download it again."
             )
         rows = block.count(b"\n") + (not block.endswith(b"\n"))
@@ -185,9 +187,18 @@ def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bo
             yield rest.rstrip(), not rest.endswith(b"\n")
 
 
-def _fields(table: TextTable, line: bytes) -> list[str]:
+def _fields(table: TextTable, line: bytes, place: str) -> list[str]:
     text = line.decode("utf-8", errors="replace")
-    return text.split() if table.blanks else next(csv.reader([text]), [])
+    return text.split() if table.blanks else _cells(text, place)
+
+
+def _cells(line: str, place: str) -> list[str]:
+    try:
+        return next(csv.reader([line]), [])
+    except csv.Error as error:
+        raise UserError(
+            f"{place}: not a line of CSV ({reason(error).partition(' - ')[0]}); correct or remove it."
+        ) from error
 
 
 def _parse(table: TextTable, block: bytes, wanted: Sequence[str], number: int, rows: int) -> pl.DataFrame:
@@ -240,7 +251,7 @@ def _raise_at_bad_line(table: TextTable, block: bytes, number: int) -> None:
             raise UserError(f"{place}: the line is not text; copy or download the file again.") from error
         if raw.count(b'"') % 2:
             raise UserError(f"{place}: a quotation mark without its counterpart; correct or remove the row.")
-        found = len(_fields(table, raw))
+        found = len(_fields(table, raw, place))
         if found > expected:
             raise UserError(f"{place}: {found} fields, expected {expected}; correct or remove the row.")
         if found < expected:

@@ -53,6 +53,21 @@ def test_a_row_that_does_not_fit_is_named_by_its_line(tmp_path, lines, message, 
         read(tmp_path / "t.csv", content, block_bytes=block_bytes)
 
 
+@pytest.mark.parametrize("content", [b"\xef\xbb\xbf", b"\xef\xbb\xbf\n1,2,3\n", b"\x1c\n"])
+def test_a_first_line_of_signs_that_nobody_sees_is_an_empty_file(tmp_path, content):
+    (tmp_path / "t.csv").write_bytes(content)
+    with pytest.raises(UserError, match=r"t.csv: the file is empty"):
+        csv_table(tmp_path / "t.csv", {"a": pl.Int64})
+
+
+def test_line_breaks_that_no_csv_has_are_refused_with_their_line(tmp_path):
+    with pytest.raises(UserError, match=r"t.csv, line 3: not a line of CSV"):
+        read(tmp_path / "t.csv", b"a,b,c\n1,2,3\n4,5\r6,7,8\n")
+    (tmp_path / "t.csv").write_bytes(b"a,b,c\r1,2,3\r4,5,6\r")
+    with pytest.raises(UserError, match=r"t.csv, line 1: not a line of CSV"):
+        csv_table(tmp_path / "t.csv", {"a": pl.Int64})
+
+
 def test_bytes_that_are_no_text_are_named_by_their_line(tmp_path):
     with pytest.raises(UserError, match=r"t.csv, line 3: the line is not text"):
         read(tmp_path / "t.csv", b"a,b,c\n1,2,3\n4,5,\xff\xfe\n")

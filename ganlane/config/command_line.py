@@ -75,7 +75,7 @@ def as_meant(command: str, override: str, multirun: bool = False) -> str:
     kinds = _kinds(SCHEMAS[""].get(command), key.split("."))
     if int in kinds:
         value = re.sub(_EXPONENT, _whole, value)
-    if kinds & {list, tuple} and value != "null" and not re.match(rf"\[|\$|$|{_SWEPT}", value):
+    if kinds & {list, tuple} and value != "null" and not re.match(rf"[\[{{$]|$|{_SWEPT}", value):
         entries = (
             value.split(",") if int in kinds or float in kinds or value[0] in "'\"" else map(quoted, value.split(","))
         )

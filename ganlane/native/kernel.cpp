@@ -17,7 +17,7 @@
 #include "arrays.hpp"
 #include "model.hpp"
 
-const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f;
+const float RECYCLE_RANGE = 200.0f, RECYCLE_DECELERATION = 4.0f, RECYCLE_SIDE = 0.4f;
 const int MOBIL_PERIOD = 10;
 enum { KEEP, LEFT, RIGHT };
 
@@ -445,7 +445,8 @@ static inline void recycle(const Settings& s, Rows& r, Mask rows) {
         r.kept[i] = r.x[i];
         if (!any(room)) continue;
         for (int j = 0; j < r.vehicles; j++) {
-            Mask counts = (r.low[i] <= r.high[j]) & (r.low[j] <= r.high[i]) & (r.valid[j] != 0.0f);
+            Mask beside = absolute(r.y[i] - r.y[j]) < r.half_width[i] + r.half_width[j] + RECYCLE_SIDE;
+            Mask counts = (((r.low[i] <= r.high[j]) & (r.low[j] <= r.high[i])) | beside) & (r.valid[j] != 0.0f);
             if (j == i || !any(counts & room)) continue;
             // Everybody where it may be put, and where it is: whoever else moves, there is room.
             room &= ~counts | (leaves_room(s, r, i, moved[i], j, moved[j], r.index[j] < r.index[i]) &

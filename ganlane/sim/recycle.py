@@ -20,6 +20,9 @@ from ganlane.sim.state import Road, Vehicles
 RANGE_M = 200.0
 #: Largest deceleration that a moved vehicle may require of any vehicle: MOBIL's safe deceleration, m/s2.
 SAFE_DECELERATION = 4.0
+#: Vehicles with less room than this between their sides count as being in one lane, m: who changes lanes drives at an
+#: angle, and its corners reach further than its lanes say.
+SIDE_M = 0.4
 
 
 def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Tensor:
@@ -40,6 +43,8 @@ def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
         low[:, None, :] <= there.attention.high[..., None]
     )
     own, other = there.observers, there.vehicles
+    sides = 0.5 * own.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
+    shares |= (own.y[..., None] - other.y[:, None, :]).abs() < sides
     itself = torch.eye(count, dtype=torch.bool, device=own.x.device).repeat(1, 2)
     counts = shares & other.valid[:, None, :] & ~itself
     speed, desired = own.speed[..., None], own.desired_speed[..., None]

@@ -67,6 +67,16 @@ def test_it_is_seen_in_the_lane_that_it_signals_too():
     assert recycled(EGO, changing, {"x": 1185.0, "lane": 2})[1] == 1190.0
 
 
+def test_nobody_is_put_beside_one_that_has_hardly_left_the_lane():
+    """Each in its own lane, but at an angle: the corners of two cars of 2.5 m, 2.6 m apart, would touch."""
+    moved = {"x": 790.0, "y": 7.28, "heading": 0.03, "target_lane": 2, "width": 2.5}
+    leaving = {"x": 1190.0, "y": 4.68, "heading": -0.06, "target_lane": 1, "width": 2.5}
+    assert recycled(EGO, moved, leaving)[1] == 790.0
+    assert recycled(EGO, moved, {**leaving, "y": 4.0})[1] == 1190.0
+    beside = vehicles(EGO, {**moved, "x": 1190.0}, leaving)
+    assert pair_overlaps(beside).any()
+
+
 def test_only_the_position_changes():
     before = vehicles(EGO, {"x": 790.0, "y": 0.3, "heading": 0.01, "speed": 17.0, "acceleration": 0.2})
     after = recycle(before, ROAD, TABLE_V)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -122,7 +123,9 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
             yield cell
         return
     # Fresh processes: torch does not survive a fork once it has computed something.
-    with ProcessPoolExecutor(config.workers, multiprocessing.get_context("spawn")) as pool:
+    # Ctrl-C reaches them too: they finish their cell.
+    quiet: Any = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_IGN)}
+    with ProcessPoolExecutor(config.workers, multiprocessing.get_context("spawn"), **quiet) as pool:
         jobs = {pool.submit(drive_cell, cell, config): cell for cell in cells}
         try:
             for job in as_completed(jobs):

@@ -63,14 +63,15 @@ def rows(cells: Cells) -> list[Row]:
     """One row per recipe and traffic.
 
     Returns:
-        Per row ``driver, traffic, trainings`` S, ``episodes`` E of each; ``mean_reward``, ``interquartile_mean``
-        (of the trainings' mean rewards) and ``reward_sd`` (over all episodes); ``minus_mobil`` and
-        ``probability_above_mobil`` (None for MOBIL); ``normalized_percent``; ``hard_crash``, ``soft_crash`` (episodes
-        with one) and ``out_of_road`` of all trainings together; ``hard_crash_share`` (exact interval of all episodes,
-        as if they were independent); ``crashes``, ``departures`` and ``failures`` (both) ``_per_1000_km``;
-        ``mean_speed_mps, lane_changes_per_km, soft_crash_behind_per_episode``; ``at_fault_share`` of the hard crashes
-        (None without any); and ``each``, mean reward and failures of every training. A key with ``_ci`` holds the
-        95 % interval of its namesake over trainings and episodes.
+        Per row ``driver, traffic, trainings`` S, ``episodes`` E of each; ``mean_reward``, ``interquartile_mean`` (of
+        the trainings' mean rewards) and ``reward_sd`` (over all episodes); ``minus_mobil`` and
+        ``probability_above_mobil`` (None for MOBIL, the latter for a single training, too); ``normalized_percent``;
+        ``hard_crash``, ``soft_crash`` (episodes with one) and ``out_of_road`` of all trainings together;
+        ``hard_crash_share`` (exact interval of all episodes, as if they were independent); ``crashes``,
+        ``departures`` and ``failures`` (both) ``_per_1000_km``; ``mean_speed_mps, lane_changes_per_km,
+        soft_crash_behind_per_episode``; ``at_fault_share`` of the hard crashes (None without any); and ``each``, mean
+        reward and failures of every training. A key with ``_ci`` holds the 95 % interval of its namesake over
+        trainings and episodes.
     """
     return [_row(recipe, traffic, trainings, cells) for (recipe, traffic), trainings in cells.items()]
 
@@ -90,7 +91,7 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     row |= entries("interquartile_mean", over_trainings([rewards], interquartile_mean))
     row["reward_sd"] = float(rewards.std(ddof=1))
     row |= entries("minus_mobil", None if above is None else difference(rewards, above))
-    row |= entries("probability_above_mobil", None if above is None else probability_of_improvement(rewards, above))
+    row |= entries("probability_above_mobil", None if above is None else _probability(rewards, above))
     row |= entries("normalized_percent", score)
     row |= {end: together.filter(_ended([end])).height for end in FAILURES}
     row["soft_crash"] = int(together["had_soft_crash"].sum())
@@ -131,8 +132,8 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
             a, b = column(first, "reward"), column(second, "reward")
             hit, struck = (column(each, _ended(FAILURES[:1])) for each in (first, second))
             row: Row = {"driver": one, "over": other, "traffic": traffic}
-            row |= entries("lead", difference(a, b)) | entries("probability", probability_of_improvement(a, b))
-            row |= entries("crash_difference_per_1000_episodes", _thousandfold(difference(hit, struck)))
+            row |= entries("lead", difference(a, b)) | entries("probability", _probability(a, b))
+            row |= entries("crash_difference_per_1000_episodes", difference(hit, struck).scaled(1000.0))
             matched = zip(first, range(len(first))) if len(second) in (1, len(first)) else []
             row["mcnemar"] = [
                 {"driver": name, **vars(mcnemar(hit[i] > 0, struck[i if len(second) > 1 else 0] > 0))}
@@ -142,8 +143,9 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     return found
 
 
-def _thousandfold(estimate: Estimate) -> Estimate:
-    return estimate.scaled(1000.0)
+def _probability(first: Array, second: Array) -> Estimate | None:
+    """None where neither has a second training: it says nothing then."""
+    return probability_of_improvement(first, second) if len(first) + len(second) > 2 else None
 
 
 def failures(episodes: pl.DataFrame, seed: int) -> list[Row]:

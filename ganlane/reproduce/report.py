@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullLocator
 
 from ganlane.errors import UserError
 from ganlane.evaluation.table import NOTHING, Table, number, with_interval
@@ -53,7 +53,7 @@ def table_vi(rows: Sequence[Row]) -> Table:
                     f"{row['trainings']} x {row['episodes']}",
                     str(row["hard_crash"]),
                     str(row["soft_crash"]),
-                    with_interval({**row, "hard_crash_share": row["hard_crash_share"]}, "hard_crash_share", 4),
+                    with_interval(row, "hard_crash_share", 4),
                     ", ".join(str(each["hard_crash"]) for each in row["each"]),
                 ]
             )
@@ -133,6 +133,10 @@ def comparison_table(rows: Sequence[Row]) -> Table:
     return Table.of("Drivers compared on the same episodes", rows, columns, names=3)
 
 
+#: Ticks of the leads: linear up to 20, logarithmic beyond.
+_LEADS = (-300, -100, -50, -20, -10, 0, 10, 20, 50, 100, 300)
+
+
 @rc_context(STYLE)
 def draw_matrix(rows: Sequence[Row]) -> Figure:
     """Lead over MOBIL, one panel per traffic: the interval over trainings and episodes, a dot for each training."""
@@ -142,13 +146,18 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     drivers = list(dict.fromkeys(row["driver"] for row in drawn))
     traffics = list(dict.fromkeys(row["traffic"] for row in drawn))
     mobil = {row["traffic"]: row["mean_reward"] for row in rows if row["driver"] == "mobil"}
+    bounds = [bound for row in drawn for bound in row["minus_mobil_ci"] or (row["minus_mobil"],)]
+    lowest, highest = min(-20.0, *bounds), max(20.0, *bounds)
     figure, grid = panel_grid(len(traffics), 3.4, 0.75 + 0.19 * len(drivers))
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
         axes.axvline(0.0, color=FAINT, lw=0.9)
         axes.set(title=traffic, xlabel="mean reward minus MOBIL's", ylim=(len(drivers) - 0.5, -0.5))
         axes.set_xscale("symlog", linthresh=20.0)
         axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
+        axes.set_xticks([x for x in _LEADS if lowest <= x <= highest], minor=False)
+        axes.set_xlim(1.15 * lowest, 1.15 * highest)
         axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
         for row in drawn:
             if row["traffic"] == traffic:
                 line, trained = drivers.index(row["driver"]), len(row["each"]) > 1
@@ -157,7 +166,8 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
                 axes.plot([low, high], [line, line], color=colour, lw=2.2, solid_capstyle="butt")
                 axes.plot(row["minus_mobil"], line, "o", color=colour)
                 each = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
-                axes.plot(each, [line] * len(each), "|", color=COLOURS[1], ms=6, mew=1) if trained else None
+                if trained:
+                    axes.plot(each, [line] * len(each), "|", color=COLOURS[1], ms=6, mew=1)
     return figure
 
 

@@ -88,7 +88,7 @@ def compare(
     return pl.concat(tables, how="diagonal")
 
 
-def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.DataFrame:
+def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
     """:func:`compare` with the traffics, episodes and environment of ``config``."""
     return compare(
         drivers,
@@ -102,6 +102,7 @@ def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.
         config.device,
         Stream[config.stream.upper()],
         config.mask,
+        quiet,
     )
 
 

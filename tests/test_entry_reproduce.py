@@ -10,7 +10,7 @@ import pytest
 from ganlane.reproduce import main, matrix
 
 SHORT = ["episodes=3", "workers=1", "env.goal_m=60", "hydra.run.dir=out"]
-SMALL = ["drivers=[random_legal,mobil,agent_idm@all+none,agent_gan+none]", "traffics=[idm,gan]"]
+SMALL = ["agents=[random_legal,mobil,agent_idm@all+none,agent_gan+none]", "traffics=[idm,gan]"]
 
 
 @pytest.fixture(autouse=True)
@@ -67,20 +67,20 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
 
 
 def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_driven, capsys):
-    drivers = "drivers=[random_legal,mobil]"
-    assert main([*SHORT, drivers, "traffics=[idm]"]) == 0
+    agents = "agents=[random_legal,mobil]"
+    assert main([*SHORT, agents, "traffics=[idm]"]) == 0
     first = json.loads(Path("out/results.json").read_text())["rows"]
-    assert main([*SHORT, drivers, "traffics=[idm]"]) == 0
+    assert main([*SHORT, agents, "traffics=[idm]"]) == 0
     assert len(cells_driven) == 2
     assert json.loads(Path("out/results.json").read_text())["rows"] == first
-    assert main([*SHORT, "drivers=[random_legal,mobil,keep_lane]", "traffics=[idm]"]) == 0
-    assert main([*SHORT, drivers, "traffics=[idm]", "seed=1"]) == 0
+    assert main([*SHORT, "agents=[random_legal,mobil,keep_lane]", "traffics=[idm]"]) == 0
+    assert main([*SHORT, agents, "traffics=[idm]", "seed=1"]) == 0
     assert cells_driven[2:] == [("keep_lane", "idm"), ("random_legal", "idm"), ("mobil", "idm")]
 
 
 def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys):
     monkeypatch.setenv("GANLANE_DATA", "nowhere")
-    assert main([*SHORT, "drivers=[random_legal,mobil]", "traffics=[idm,replay]"]) == 0
+    assert main([*SHORT, "agents=[random_legal,mobil]", "traffics=[idm,replay]"]) == 0
     assert "left out, replay:" in capsys.readouterr().err
     assert "replay" in json.loads(Path("out/results.json").read_text())["left_out"]
 
@@ -88,8 +88,8 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["drivers=[random_legal]", "traffics=[idm]"], "give mobil and another driver"),
-        (["drivers=[agent_idm@77]"], "no such training"),
+        (["agents=[random_legal]", "traffics=[idm]"], "give mobil and another driver"),
+        (["agents=[agent_idm@77]"], "no such training"),
         (["fewer={gan: 0}"], "whole numbers of at least 2"),
         (["runs=[nowhere]"], "no such file"),
         (["from=elsewhere"], "shipped, scratch"),
@@ -101,7 +101,7 @@ def test_a_mistake_ends_in_a_sentence(arguments, said, capsys):
 
 
 def test_a_damaged_cell_is_named(capsys):
-    arguments = [*SHORT, "drivers=[random_legal,mobil]", "traffics=[idm]"]
+    arguments = [*SHORT, "agents=[random_legal,mobil]", "traffics=[idm]"]
     assert main(arguments) == 0
     for cell in Path("outputs/cells").glob("*.parquet"):
         cell.write_bytes(cell.read_bytes()[:-50])

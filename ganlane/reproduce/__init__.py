@@ -1,7 +1,7 @@
 """``ganlane reproduce``: every driver on every traffic on the same episodes; the paper's tables and figures from it.
 
     ganlane reproduce
-    ganlane reproduce episodes=50 'traffics=[idm_mobil,gan]' 'drivers=[random_legal,mobil,agent_idm@all]'
+    ganlane reproduce episodes=50 'traffics=[idm_mobil,gan]' 'agents=[random_legal,mobil,agent_idm@all]'
     ganlane reproduce 'runs=[outputs/train/SEED_0,outputs/train/SEED_1]'
     ganlane reproduce from=scratch
 
@@ -137,12 +137,12 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
         asked = [f"resume={path}"] if stopped else ["experiment=paper", f"seed={seed}", f"hydra.run.dir={path}"]
         if subprocess.run([sys.executable, "-m", "ganlane.train", *asked], check=False).returncode:
             raise UserError(f"source=scratch: the training in {path} stopped; the same command goes on with it.")
-    drivers = config.drivers
+    agents = config.agents
     for recipe, phase in (("agent_idm", "pretrain"), ("agent_gan", ".")):
         file = Path(config.trained) / f"{recipe}.safetensors"
         save_agents(file, {seed: read_agent(path / phase / "agent.safetensors") for seed, path in folders.items()})
-        drivers = [name.replace(f"{recipe}@all", f"{file}@all") for name in drivers]
-    return replace(config, drivers=drivers, runs=[str(path) for path in folders.values()])
+        agents = [name.replace(f"{recipe}@all", f"{file}@all") for name in agents]
+    return replace(config, agents=agents, runs=[str(path) for path in folders.values()])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

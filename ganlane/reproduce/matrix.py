@@ -9,16 +9,15 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 from tqdm import tqdm
 
-from ganlane.agents.checkpoint import with_seeds
-from ganlane.build import Driver, make_driver, make_traffic
-from ganlane.compare import compare
+from ganlane.build import Driver, make_driver, make_drivers, make_traffic
+from ganlane.compare import compare_configured
 from ganlane.config.reproduce import ReproduceConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
@@ -70,8 +69,7 @@ def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> lis
     Raises:
         UserError: an unknown driver, or one that does not fit.
     """
-    names = dict.fromkeys(single for name in config.drivers for single in with_seeds(name))
-    drivers = [make_driver(name, config.env, device=config.device) for name in names]
+    drivers = make_drivers(config.agents, config.env, config.device)
     cells = []
     for traffic, option in traffics.items():
         for driver in drivers:
@@ -96,6 +94,7 @@ def _settings(driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, e
         "env": env,
         "reward": asdict(config.reward),
         "episodes": episodes,
+        "stream": config.stream,
         "seed": config.seed,
         "num_envs": min(config.num_envs, episodes),
         "device": config.device,
@@ -139,19 +138,8 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
 def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     """Drive one cell and write its file."""
     set_threads(config.threads)
-    table = compare(
-        [make_driver(cell.driver, config.env, device=config.device)],
-        {cell.traffic: config.chosen_traffics()[cell.traffic]},
-        config.env,
-        config.reward,
-        config.observation,
-        cell.settings["episodes"],
-        config.seed,
-        config.num_envs,
-        config.device,
-        mask=config.mask,
-        quiet=True,
-    )
+    alone = replace(config, agents=[cell.driver], traffics=[cell.traffic], episodes=cell.settings["episodes"])
+    table = compare_configured([make_driver(cell.driver, config.env, device=config.device)], alone, quiet=True)
     origin = json.dumps({"settings": cell.settings, "code": code_version()})
     with atomic_path(cell.path) as part:
         table.write_parquet(part, metadata={_ORIGIN: origin})

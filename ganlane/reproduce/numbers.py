@@ -44,9 +44,7 @@ def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.Data
         there = cells.setdefault((recipe, str(traffic)), {})
         there[str(driver)] = frame.sort("episode")
         if len({name.rpartition("@")[2] for name in there}) < len(there):
-            raise UserError(
-                f"drivers: two agents of one seed are called {recipe} ({', '.join(there)}); leave one out."
-            )
+            raise UserError(f"agents: two of one seed are called {recipe} ({', '.join(there)}); leave one out.")
     return cells
 
 

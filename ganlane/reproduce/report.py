@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, NullLocator
 
 from ganlane.errors import UserError
@@ -134,7 +135,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
 
 
 #: Ticks of the leads: linear up to 20, logarithmic beyond.
-_LEADS = (-300, -100, -50, -20, -10, 0, 10, 20, 50, 100, 300)
+_LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
 
 
 @rc_context(STYLE)
@@ -142,7 +143,7 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     """Lead over MOBIL, one panel per traffic: the interval over trainings and episodes, a dot for each training."""
     drawn = [row for row in rows if row["minus_mobil"] is not None]
     if not drawn:
-        raise UserError("drivers: the picture of the matrix shows leads over mobil; give mobil and another driver.")
+        raise UserError("agents: the picture of the matrix shows leads over mobil; give mobil and another driver.")
     drivers = list(dict.fromkeys(row["driver"] for row in drawn))
     traffics = list(dict.fromkeys(row["traffic"] for row in drawn))
     mobil = {row["traffic"]: row["mean_reward"] for row in rows if row["driver"] == "mobil"}
@@ -168,6 +169,9 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
                 each = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
                 if trained:
                     axes.plot(each, [line] * len(each), "|", color=COLOURS[1], ms=6, mew=1)
+    one = Line2D([], [], color=COLOURS[1], marker="|", ls="", ms=6, label="one training")
+    names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
+    add_legend(figure, names, [one])
     return figure
 
 

@@ -107,5 +107,5 @@ def test_every_failure_is_listed_with_its_seed_and_episode():
 
 def test_two_agents_of_one_name_and_seed_are_not_mixed():
     both = pl.concat([driven("agent_idm@1", [0, 0]), driven("mine/agent_idm.safetensors@1", [0, 0])])
-    with pytest.raises(UserError, match="two agents of one seed are called agent_idm"):
+    with pytest.raises(UserError, match="two of one seed are called agent_idm"):
         by_recipe(both)

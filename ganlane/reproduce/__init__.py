@@ -96,7 +96,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "cells": {"revisions": revisions, "files": {f"{c.driver} on {c.traffic}": c.path.name for c in cells}},
     }
     seeds = {
-        "stream": "report",
+        "stream": config.stream,
         "seed": config.seed,
         "episodes": {name: config.episodes_on(name) for name in traffics},
     }

@@ -88,8 +88,8 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["agents=[random_legal]", "traffics=[idm]"], "give mobil and another driver"),
-        (["agents=[agent_idm@77]"], "no such training"),
+        (["agents=[random_legal]", "traffics=[idm]"], "expected mobil and others"),
+        (["agents=[mobil,agent_idm@77]"], "no such training"),
         (["fewer={gan: 0}"], "whole numbers of at least 2"),
         (["runs=[nowhere]"], "no such file"),
         (["from=elsewhere"], "shipped, scratch"),

@@ -14,6 +14,9 @@ _COUNTS = Rule(
     lambda counts: isinstance(counts, dict) and all(type(n) is int and n >= 2 for n in counts.values()),
     "names of traffics with whole numbers of at least 2",
 )
+_WITH_MOBIL = Rule(
+    lambda names: "mobil" in names and len(names) > 1, "mobil and others, since every lead is one over mobil"
+)
 
 
 def _agents() -> list[str]:
@@ -44,7 +47,7 @@ class ReproduceConfig(EvaluateConfig):
     traffics: list[str] = field(default_factory=lambda: [name for name in TRAFFICS if name != "mixed"])
     episodes: int = 1000
     fewer: dict[str, int] = field(
-        default_factory=lambda: {"gan": 200, "gan_calibrated": 200, "replay": 200, "sumo": 20, "highway_env": 5}
+        default_factory=lambda: {"gan": 150, "gan_calibrated": 150, "replay": 200, "sumo": 10, "highway_env": 4}
     )
     workers: int = 2
     cells: str = "outputs/cells"
@@ -56,7 +59,7 @@ class ReproduceConfig(EvaluateConfig):
         super().__post_init__()
         check(self, source=one_of(SOURCES), fewer=_COUNTS, episodes=between(2, 10_000), workers=between(1, 64))
         check(self, training_seeds=every(between(0, 2**53)))
-        check(self, training_seeds=NAMES)
+        check(self, training_seeds=NAMES, agents=_WITH_MOBIL)
 
     def episodes_on(self, traffic: str) -> int:
         """How many episodes are driven on a traffic."""

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, NullLocator
 
-from ganlane.errors import UserError
 from ganlane.evaluation.table import NOTHING, Table, number, with_interval
 from ganlane.files import write_bytes
 from ganlane.reproduce.numbers import Row
@@ -142,8 +141,6 @@ _LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
 def draw_matrix(rows: Sequence[Row]) -> Figure:
     """Lead over MOBIL, one panel per traffic: the interval over trainings and episodes, a dot for each training."""
     drawn = [row for row in rows if row["minus_mobil"] is not None]
-    if not drawn:
-        raise UserError("agents: the picture of the matrix shows leads over mobil; give mobil and another driver.")
     drivers = list(dict.fromkeys(row["driver"] for row in drawn))
     traffics = list(dict.fromkeys(row["traffic"] for row in drawn))
     mobil = {row["traffic"]: row["mean_reward"] for row in rows if row["driver"] == "mobil"}

@@ -45,7 +45,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "TorchRL's environment": (),
     "policy": (),
     "replay": ("window", "store", "sample", "priorities"),
-    "learning": ("loss", "backward", "optimiser", "noise, clipping, target"),
+    "learning": ("compiled update", "loss", "backward", "optimiser", "noise, clipping, target"),
     REST: (),
 }
 THEIRS, OURS = "TorchRL's DistributionalDQNLoss", "lean loss"
@@ -110,7 +110,9 @@ def timed_calls(run: TrainingState, env: TransformedEnv) -> list[tuple[Any, str,
     """What is timed of a run in ``env``: owner, name, part."""
     agent, replay = run.agent, run.agent.replay
     base, transform = env.base_env, env.transform
+    graph = [] if agent.graph is None else [(agent.graph, "_update", "compiled update")]
     return [
+        *graph,
         (env, "step_and_maybe_reset", "TorchRL's environment"),
         (base, "_step", "simulator"),
         (base, "_reset", "simulator"),
@@ -228,7 +230,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
     parser.add_argument("--traffics", nargs="+", default=["idm_mobil", "gan"])
-    parser.add_argument("--mode", choices=("eager", "compiled"), default="compiled")
+    parser.add_argument("--mode", choices=("eager", "compiled", "native"), default="compiled")
     parser.add_argument("--environments", type=int, default=1024)
     parser.add_argument("--stored", type=int, default=1_000_000, help="transitions in the buffer from the start")
     parser.add_argument("--decisions", type=int, default=40, help="of every environment, with timers")

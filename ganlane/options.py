@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 from omegaconf import DictConfig, OmegaConf
 
-from ganlane.config.messages import CONFIG_ERRORS, sentence
+from ganlane.config.messages import VALUE_ERRORS, sentence
 from ganlane.config.schemas import SCHEMAS, made, node_of, option_of, options_of
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
@@ -94,7 +94,7 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
         holder: Any = OmegaConf.create({where: node}) if where else node
         merged: Any = OmegaConf.merge(holder, {where: given} if where else given)
         return made(merged.get(where) if where else merged, where)
-    except CONFIG_ERRORS as error:
+    except VALUE_ERRORS as error:
         raise UserError(sentence(error).replace("; run the command with --help to see all keys", "")) from error
 
 

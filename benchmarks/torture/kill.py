@@ -88,7 +88,8 @@ def _attempt(
         prepare, how = runs.dies_in_evaluation(delay), f"kill -9 {delay:.2f} s into the final evaluation"
     elif way is not None:
         number = SIGNALS.get(way, signal.SIGKILL)
-        after_s = rng.uniform(0.0, 1.0 if way == "first second" else wall_s)
+        # A resumed run is shorter than a whole one.
+        after_s = rng.uniform(0.0, 1.0 if way == "first second" else 0.6 * wall_s)
         how = f"{signal.Signals(number).name} after {after_s:.2f} s"
     child = runs.start(arguments, log, prepare)
     if after_s is not None:

@@ -29,6 +29,10 @@ RECORDINGS = Path(os.environ.get("GANLANE_DATA", "../shared/data")).absolute() /
 RULES = ("idm", "idm_mobil")
 TRAFFICS = (*RULES, *RULES, "idm_random", "idm_faults", "gan", "gan_calibrated", "mixed")
 SCENARIOS = ("cut_in", "stalled_car", "stop_and_go", "blocked_lane")
+#: Pairs of vehicles in all rows together; generated traffic needs a kilobyte or more for each.
+MOST_PAIRS = 2_000_000
+#: Vehicles of a scenario, at most.
+IN_SCENARIO = 44
 #: Nobody drives faster, m/s; rule-driven traffic not faster than it wants to, or did.
 FASTEST_MPS = 70.0
 #: Resident memory may vary by this share over the last half of a long run.
@@ -100,6 +104,8 @@ def _choices(rng: random.Random, compiled: bool) -> Iterator[dict[str, Any]]:
             lanes = rng.randint(1, 6)
             chosen |= {"lanes": lanes, "vehicles": rng.randint(2, min(40, 6 * lanes + 2))}
             chosen |= {"spread_m": rng.choice((200.0, 400.0, 1500.0)), "truck_share": rng.choice((0.0, 0.0, 0.3))}
+        pairs = chosen.get("vehicles", IN_SCENARIO) ** 2
+        chosen["num_envs"] = min(chosen["num_envs"], MOST_PAIRS // pairs)
         if kind == "replay":
             if not RECORDINGS.is_file():
                 continue

@@ -21,7 +21,7 @@ from ganlane.agents.network import (
     redraw_noise,
 )
 from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
-from ganlane.agents.replay import load_replay_state, make_replay, replay_state
+from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
 from ganlane.agents.update_graph import UpdateGraph, can_graph
 from ganlane.errors import ParameterError, UserError
 from ganlane.parameters.agent import RainbowConfig
@@ -110,10 +110,10 @@ class Rainbow:
         config = self.config
         if config.prioritised:
             self.replay.sampler.beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
-        batch = self.replay.sample()
+        batch = draw(self.replay)
         if self.graph is not None:
             learned = self.graph(batch, self.generators["learn"])
-            self.replay.update_priority(batch.get("index"), learned.priority[:, None])
+            self.replay.sampler.update_priority(batch.get("index"), learned.priority)
             self._count()
             return {**learned._asdict(), "priority": learned.priority.mean()}
         for module in (self.network, self.loss.target_network):
@@ -127,7 +127,7 @@ class Rainbow:
         gradient_norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip)
         self.optimizer.step()
         if config.prioritised:
-            self.replay.update_priority(batch.get("index"), batch.get("td_error"))
+            self.replay.sampler.update_priority(batch.get("index"), batch.get("td_error"))
         self._count()
         return {
             "loss": objective.detach(),

@@ -20,8 +20,8 @@ from ganlane.bench.systems import HighwayEnvRunner, Scenario, highway_env_settin
 from ganlane.build import make_road
 from ganlane.config.bench import BenchConfig
 from ganlane.evaluation.table import Table, significant
+from ganlane.training import loop
 from ganlane.training.checkpoint import TrainingState
-from ganlane.training.loop import collect, learn
 from ganlane.transforms import observation_size
 
 SYSTEM = "ganlane training"
@@ -120,7 +120,7 @@ def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[
     env = training.scenario.build(mode, device, batch)
     run = TrainingState(env, make_agent(training, device, mode))
     while not run.agent.ready:
-        run.agent.store(run.window.push(collect(run)))
+        run.agent.store(run.window.push(loop.collect(run)))
     repeat(run.agent, run.agent.replay[:].select(*TRANSITION_KEYS), training.stored)
     return run, env
 
@@ -150,9 +150,7 @@ def advance(run: TrainingState, decisions: int) -> int:
     """The body of :func:`ganlane.training.train`, so many times; the physics steps simulated, as in a runner."""
     simulated = torch.zeros((), dtype=torch.int64, device=run.agent.device)
     for _ in range(decisions):
-        step = collect(run)
-        run.agent.store(run.window.push(step))
-        learn(run)
+        step = loop.advance(run)
         simulated += (step["next", keys.STEP] - step[keys.STEP]).sum()
     return int(simulated)
 

@@ -16,7 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType, Quote, QuotedString
 from omegaconf import DictConfig, open_dict
 
-from ganlane.config.messages import CONFIG_ERRORS, sentence
+from ganlane.config.messages import VALUE_ERRORS, sentence
 from ganlane.config.schemas import made, options_of, register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
@@ -189,7 +189,7 @@ def typed(composed: DictConfig) -> Any:
     """
     try:
         return made(composed)
-    except CONFIG_ERRORS as error:
+    except VALUE_ERRORS as error:
         raise UserError(sentence(error)) from error
 
 
@@ -210,7 +210,7 @@ def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Che
         runs = single_runs(overrides, multirun)
         with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
             checked = [_check_one(command, run) for run in runs]
-    except CONFIG_ERRORS as error:
+    except VALUE_ERRORS as error:
         raise UserError(sentence(error)) from error
     return checked[0]
 

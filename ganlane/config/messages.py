@@ -21,6 +21,8 @@ from ganlane.parameters.checks import did_you_mean
 
 #: What Hydra and OmegaConf raise for a configuration that will not do.
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
+#: While values are taken over, also what a whole number of hundreds of digits raises.
+VALUE_ERRORS = (*CONFIG_ERRORS, OverflowError)
 
 #: OmegaConf's names of types in words.
 _TYPES = {"Integer": "a whole number", "Float": "a number", "bool": "true or false", "String": "a text"}
@@ -52,6 +54,9 @@ def sentence(error: BaseException) -> str:
         return file_sentence(error)
     if isinstance(error, OverrideParseException):
         return f"{error.override}: not of the form key=value; quote values with spaces or brackets, {_HELP}."
+    if isinstance(error, OverflowError):
+        key = re.search(r"full_key: (\S+)", str(error))
+        return f"{key[1] if key else 'one of the numbers'}: too large; give a number of fewer digits."
     found = error if isinstance(error, OmegaConfBaseException) else error.__cause__
     return _value(found) if isinstance(found, OmegaConfBaseException) else _composition(error)
 

@@ -33,6 +33,7 @@ from ganlane.config.train import (
     LoggerConfig,
     MultiCollectorConfig,
     NoInitConfig,
+    OverlapCollectorConfig,
     RayCollectorConfig,
     TrainConfig,
 )
@@ -71,7 +72,12 @@ SCHEMAS: dict[str, dict[str, Any]] = {
     "observation": {"observation": ObservationConfig},
     "mask": {"mask": MaskParameters},
     "reward": {"paper": RewardParameters},
-    "collector": {"single": CollectorConfig, "multi": MultiCollectorConfig, "ray": RayCollectorConfig},
+    "collector": {
+        "single": CollectorConfig,
+        "overlap": OverlapCollectorConfig,
+        "multi": MultiCollectorConfig,
+        "ray": RayCollectorConfig,
+    },
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperConfig, "calibrated": CalibratedConfig},
     "logger": {"logger": LoggerConfig},

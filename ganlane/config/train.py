@@ -77,6 +77,27 @@ class CollectorConfig:
 
 
 @dataclass
+class OverlapCollectorConfig(CollectorConfig):
+    """``collector=overlap``: worker processes drive while this one learns.
+
+    Attributes:
+        num_envs: environments of all workers, which share them out evenly.
+        workers: processes, with one thread each.
+    """
+
+    workers: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check(self, workers=between(1, 1024))
+        if self.num_envs % self.workers:
+            raise ParameterError(
+                f"{{num_envs}}={self.num_envs}: cannot be shared out evenly between {{workers}}={self.workers}; "
+                "give a multiple."
+            )
+
+
+@dataclass
 class MultiCollectorConfig(CollectorConfig):
     """``collector=multi``: worker processes on this machine.
 

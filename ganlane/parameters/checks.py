@@ -30,7 +30,8 @@ class Rule(NamedTuple):
 
 
 def _finite(value: Any) -> bool:
-    return math.isfinite(value)
+    """Whether a number is finite, and fits into 64 bits if it is whole."""
+    return abs(value) < (2**63 if isinstance(value, int) else math.inf)
 
 
 def at_least(low: float) -> Rule:
@@ -221,8 +222,6 @@ def _fits(value: Any, hint: Any) -> bool:
         return type(value).__name__ in ("bool", "bool_")  # NumPy's, by either name
     if kind is str:
         return isinstance(value, str) and "\0" not in value
-    if getattr(kind, "_is_protocol", False):  # scenes of a user's own have what is needed of them
-        return callable(value)
     return kind is Any or not inspect.isclass(kind) or isinstance(value, kind)
 
 

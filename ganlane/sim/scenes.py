@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -35,6 +35,7 @@ LARGEST = 1e6
 SMALLEST = 1e-6
 
 
+@runtime_checkable
 class Scenes(Protocol):
     """Makes the initial scene of every episode."""
 

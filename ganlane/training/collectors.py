@@ -1,7 +1,8 @@
 """Where the steps come from: one decision of all environments at a time, in the order of time.
 
-The loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the environments in this process and
-can be resumed to the same bits; those of :mod:`ganlane.training.workers` are TorchRL's, in worker processes.
+The loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the environments in this process;
+in :mod:`ganlane.training.overlap` worker processes do, while the loop learns. Runs with these two can be resumed to
+the same bits. The collectors of :mod:`ganlane.training.workers` are TorchRL's, in worker processes.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ class Collector(ABC):
     environments: int
     #: Whether a resumed run is the one it would have been, bit for bit.
     exact: bool
+    #: Whether the loop learns between :meth:`begin` and :meth:`step`, and not after them.
+    overlaps: bool = False
 
     def open(self, agent: Rainbow) -> None:  # noqa: B027 (nothing to do unless there are workers)
         """Start what collecting needs; :meth:`step` does it otherwise.
@@ -30,6 +33,9 @@ class Collector(ABC):
         Raises:
             UserError: it cannot be started.
         """
+
+    def begin(self, agent: Rainbow) -> None:  # noqa: B027 (for those that overlap)
+        """Set out on the next step with the agent's present weights, and come back before it is made."""
 
     @abstractmethod
     def step(self, agent: Rainbow) -> TensorDictBase:

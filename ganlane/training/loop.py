@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,9 +107,7 @@ def train(
             saver.save()  # so that there is something to go on from, whenever the run is killed
         with StopRequest() as stop:
             while state.decisions < config.total_decisions and stop.signal is None:
-                step = collect(state)
-                agent.store(state.window.push(step))
-                learn(state)
+                advance(state)
                 log.advance(state.decisions)
                 if state.passed(config.log_every):
                     log.write(metrics(state))
@@ -122,13 +121,30 @@ def train(
     return TrainingResult(state.decisions, agent.updates, state.wall_s, state.best, stop.signal, saver.path)
 
 
-@torch.no_grad()
-def collect(state: TrainingState) -> TensorDictBase:
-    """One decision of every environment, batch [N]."""
-    state.agent.anneal(state.decisions)
-    step = state.collector.step(state.agent)
-    state.decisions += state.environments
-    state.stats.step(step)
+def advance(state: TrainingState) -> TensorDictBase:
+    """One decision of every environment, [N], stored, and the updates that it pays for.
+
+    With a collector that overlaps the updates are those of the decisions before, made while it collects.
+    """
+    agent, overlaps = state.agent, state.collector.overlaps
+    step = collect(state, partial(learn, state) if overlaps else None)
+    agent.store(state.window.push(step))
+    if not overlaps:
+        learn(state)
+    return step
+
+
+def collect(state: TrainingState, meanwhile: Callable[[], None] | None = None) -> TensorDictBase:
+    """One decision of every environment, batch [N]; ``meanwhile`` is called while they are under way."""
+    agent, collector = state.agent, state.collector
+    agent.anneal(state.decisions)
+    collector.begin(agent)
+    if meanwhile is not None:
+        meanwhile()
+    with torch.no_grad():
+        step = collector.step(agent)
+        state.decisions += state.environments
+        state.stats.step(step)
     return step
 
 

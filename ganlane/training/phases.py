@@ -34,7 +34,7 @@ from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
 from ganlane.build import make_env, make_road, make_traffic, observation_of
 from ganlane.config.traffic import TrafficConfig
-from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
+from ganlane.config.train import MultiCollectorConfig, OverlapCollectorConfig, RayCollectorConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.parameters.observation import ObservationConfig
@@ -45,6 +45,7 @@ from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint
 from ganlane.training.collectors import Collector, SingleCollector
 from ganlane.training.logs import make_logs
 from ganlane.training.loop import Evaluate, TrainingConfig, TrainingResult, train
+from ganlane.training.overlap import OverlapCollector
 from ganlane.training.workers import ClusterCollector, ProcessCollector, WorkerPool
 from ganlane.transforms import observation_size
 
@@ -136,17 +137,19 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
 
 
 def make_collector(config: TrainConfig, phase: Phase) -> Collector:
-    """What steps the environments of a phase: ``collector=single``, ``multi`` or ``ray``.
+    """What steps the environments of a phase: ``collector=single``, ``overlap``, ``multi`` or ``ray``.
 
     Raises:
         UserError: the environments cannot be made, or Ray is not installed.
     """
     collector = config.collector
-    if not isinstance(collector, MultiCollectorConfig):
+    if not isinstance(collector, MultiCollectorConfig | OverlapCollectorConfig):
         return SingleCollector(training_env(config, phase, collector.num_envs, device=config.device))
     training_env(config, phase, 1)  # a mistake shows here, before there are workers
-    pool = WorkerPool(collector.workers, collector.num_envs, collector.weights_every)
     make_worker_env = partial(worker_env, config, phase)
+    if isinstance(collector, OverlapCollectorConfig):
+        return OverlapCollector(make_worker_env, collector.workers, collector.num_envs)
+    pool = WorkerPool(collector.workers, collector.num_envs, collector.weights_every)
     if isinstance(collector, RayCollectorConfig):
         return ClusterCollector(make_worker_env, pool, collector.address)
     return ProcessCollector(make_worker_env, pool)
@@ -327,11 +330,13 @@ def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: 
 def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     """What a resumed run must share with the one that was stopped."""
     parts = {"env": config.env, "reward": config.reward, "collector": config.collector}
+    defaults = {f"{name}.{key}": value for name, part in parts.items() for key, value in defaults_of(part).items()}
+    collector = {name: value for name, value in asdict(config.collector).items() if name != "address"}
+    if isinstance(config.collector, OverlapCollectorConfig):
+        collector["overlaps"] = True  # else the same options as those of a run that learns at other moments
     return {
         # Of a run that was begun before there was an option, the default of the option is known.
-        DEFAULTS: {
-            f"{name}.{key}": value for name, part in parts.items() for key, value in defaults_of(part).items()
-        },
+        DEFAULTS: {**defaults, "collector.overlaps": False},
         "env": plain(config.env),
         "traffic": phase.traffic.description(),
         "observation": asdict(config.observation),
@@ -339,7 +344,7 @@ def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
         # Left out where there is none, as in the runs of versions that knew no masks.
         **({"mask": asdict(config.mask)} if config.mask.form != "none" else {}),
         "init": config.init.path,
-        "collector": {name: value for name, value in asdict(config.collector).items() if name != "address"},
+        "collector": collector,
         "seed": config.seed,
     }
 

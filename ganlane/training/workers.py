@@ -37,7 +37,7 @@ Factories = Sequence[Callable[[], Any]]
 #: A worker's first episodes are so far from the next one's that no two workers ever drive the same.
 EPISODES_PER_WORKER = 2**40
 #: State of the simulation, most of a step's bytes: the workers need it, the loop does not.
-_INNER = (keys.VEHICLES, keys.TRAFFIC, keys.ROAD, PERCEIVED, SENSORS)
+INNER = (keys.VEHICLES, keys.TRAFFIC, keys.ROAD, PERCEIVED, SENSORS)
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def noise_seed(seed: int, first_episode: int) -> int:
 
 def read_by_loop(steps: TensorDictBase) -> TensorDictBase:
     """``steps`` without the state of the simulation."""
-    return steps.exclude(*_INNER, *(("next", name) for name in _INNER))
+    return steps.exclude(*INNER, *(("next", name) for name in INNER))
 
 
 class WorkerCollector(Collector):
@@ -212,20 +212,29 @@ class ProcessCollector(WorkerCollector):
         )
 
     def failure(self, error: Exception) -> str | None:
-        """A dead worker shows as a closed pipe or as TorchRL's complaint; its exit code tells of what it died."""
-        codes: dict[int, int] = {}
-        for worker, process in enumerate(getattr(self.collector, "procs", ())):
-            with suppress(ValueError):  # closed by TorchRL
-                if process.exitcode:
-                    codes[worker] = process.exitcode
-        if not codes and not isinstance(error, EOFError | BrokenPipeError | ConnectionResetError):
-            return None
-        who = ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items()) or "a worker"
-        if any(code > 0 for code in codes.values()):
-            return f"{who} failed; its own message is above"
-        return (
-            f"{who} died, killed from outside or for want of memory (fewer collector.workers or num_envs need less)"
-        )
+        """A dead worker shows as a closed pipe or as TorchRL's complaint."""
+        processes = getattr(self.collector, "procs", ())
+        closed = isinstance(error, EOFError | BrokenPipeError | ConnectionResetError)
+        return why_lost(processes) if closed or exit_codes(processes) else None
+
+
+def exit_codes(processes: Sequence[Any]) -> dict[int, int]:
+    """Of the workers that failed or were killed, by their number."""
+    codes: dict[int, int] = {}
+    for worker, process in enumerate(processes):
+        with suppress(ValueError):  # closed by TorchRL
+            if process.exitcode:
+                codes[worker] = process.exitcode
+    return codes
+
+
+def why_lost(processes: Sequence[Any]) -> str:
+    """Of what the workers died, in words for the user."""
+    codes = exit_codes(processes)
+    who = ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items()) or "a worker"
+    if any(code > 0 for code in codes.values()):
+        return f"{who} failed; its own message is above"
+    return f"{who} died, killed from outside or for want of memory (fewer collector.workers or num_envs need less)"
 
 
 class ClusterCollector(WorkerCollector):

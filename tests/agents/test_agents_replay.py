@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from ganlane.agents import RainbowConfig
 from ganlane.agents.rainbow import annealed
-from ganlane.agents.replay import load_replay_state, make_replay, replay_state
+from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
 
 
 def transitions(rows, first=0):
@@ -115,6 +115,15 @@ def test_a_restored_buffer_draws_what_the_saved_one_would_have(prioritised, tmp_
     for _ in range(3):
         ours, theirs = restored.sample(), saved.sample()
         assert (ours.select(*theirs.keys()) == theirs).all()
+
+
+@pytest.mark.parametrize("prioritised", [True, False])
+def test_drawing_gives_the_batch_of_torchrls_own_way(prioritised):
+    first, second = (buffer(prioritised=prioritised, seed=4) for _ in range(2))
+    for _ in range(3):
+        ours, theirs = draw(first), second.sample()
+        assert ours.keys() == theirs.keys()
+        assert all(torch.equal(ours[key], theirs[key]) for key in theirs.keys(True, True))
 
 
 def test_annealing_ends_at_its_end():

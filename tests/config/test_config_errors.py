@@ -16,7 +16,7 @@ from reference.hydra_memory import composed, own_part
 
 from ganlane.__main__ import COMMANDS, main
 from ganlane.config.app import Stopped
-from ganlane.config.command_line import parse, typed
+from ganlane.config.command_line import check, parse, typed
 from ganlane.config.messages import sentence
 from ganlane.errors import UserError
 
@@ -215,3 +215,15 @@ def test_a_number_too_long_or_a_list_too_deep_for_python_is_one_sentence(overrid
     with pytest.raises(UserError, match=r"too long a number or too deep a list") as caught:
         parse([override])
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize("key", ["env.goal_m", "checkpoint_every_s", "env.idm.headway_s"])
+def test_a_whole_number_that_no_float_can_hold_is_one_sentence(key):
+    with pytest.raises(UserError, match=r"too large; give a number of fewer digits"):
+        check("train", [f"{key}=1{'0' * 400}"])
+
+
+@pytest.mark.parametrize("key", ["total_decisions", "env.vehicles", "agent.capacity"])
+def test_a_whole_number_of_more_than_64_bits_is_out_of_range(key):
+    with pytest.raises(UserError, match=key):
+        check("train", [f"{key}={2**63}"])

@@ -1,0 +1,229 @@
+"""Driving while learning: whose weights choose, the same bits after every end, one sentence for a lost worker."""
+
+import dataclasses
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from training.test_training_collectors import ROAD, SMALL, gone, road
+from training.test_training_loop import agent, same, settings, train
+from training.toy import ToyRoad
+
+from ganlane import keys
+from ganlane.agents import Rainbow, RainbowConfig
+from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.config.train import CollectorConfig, OverlapCollectorConfig, TrainConfig
+from ganlane.errors import ParameterError, UserError
+from ganlane.training.checkpoint import load_checkpoint
+from ganlane.training.collectors import SingleCollector
+from ganlane.training.overlap import OverlapCollector, work
+from ganlane.training.phases import identity, make_collector, phases_of
+
+
+def toy(rows, first_episode):
+    return ToyRoad(rows)
+
+
+class Thread(threading.Thread):
+    """A worker in this process, which a pipe that is closed ends."""
+
+    exitcode = 0
+
+
+class HereCollector(OverlapCollector):
+    """Workers are threads; ``late_s`` is what a worker waits before it starts."""
+
+    late_s = 0.0
+
+    def _start_worker(self, make):
+        late_s = self.late_s * (len(self._pipes) + 1)
+
+        def target():
+            time.sleep(late_s)
+            work(theirs, make)
+
+        ours, theirs = multiprocessing.Pipe()
+        self._processes.append(Thread(target=target, daemon=True))
+        self._processes[-1].start()
+        self._pipes.append(ours)
+
+
+class Twin(SingleCollector):
+    """The same in one process: actions are chosen before the updates, and driven after them."""
+
+    overlaps = True
+
+    def begin(self, agent):
+        self.given = agent.policy(self.env_state)
+
+    def step(self, agent):
+        step, self.env_state = self.env.step_and_maybe_reset(self.given)
+        return step
+
+
+def run(source, decisions, folder, seed=0, **options):
+    """The agent and the result of a run with ``source``."""
+    learner = agent(seed)
+    try:
+        return learner, train(source, learner, settings(decisions), folder, **options)
+    finally:
+        source.close()
+
+
+# --- the same bits
+
+
+def test_driving_while_learning_is_choosing_before_the_updates_of_the_step_before(tmp_path):
+    ours, result = run(HereCollector(toy, 1, 8), 240, tmp_path / "here")
+    twin, _ = run(Twin(ToyRoad(8)), 240, tmp_path / "twin")
+    single, before = run(SingleCollector(ToyRoad(8)), 240, tmp_path / "single")
+    assert same(ours, twin)
+    assert not same(ours, single)
+    assert result.updates == before.updates - 1  # those of the last step are still to come
+
+
+def test_it_does_not_matter_which_worker_is_the_slowest(tmp_path):
+    class Late(HereCollector):
+        late_s = 0.2
+
+    assert same(run(HereCollector(toy, 2, 8), 160, tmp_path)[0], run(Late(toy, 2, 8), 160, tmp_path / "late")[0])
+
+
+@pytest.mark.parametrize("decisions", [24, 160])
+def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, tmp_path, capsys):
+    whole, _ = run(HereCollector(toy, 2, 8), 240, tmp_path / "whole")
+    _, first = run(HereCollector(toy, 2, 8), decisions, tmp_path / "parts")
+    resumed, _ = run(HereCollector(toy, 2, 8), 240, tmp_path / "parts", seed=5, resume=first.checkpoint)
+    assert same(whole, resumed)
+    assert "bit-exact" not in capsys.readouterr().err
+
+
+def test_the_state_of_a_highway_is_taken_over_row_by_row():
+    learner = Rainbow(RainbowConfig(**SMALL), 29)
+    first, second = HereCollector(road, 2, 6), HereCollector(road, 2, 6)
+    try:
+        for _ in range(3):
+            first.step(learner)
+        second.load_state_dict(first.state_dict(True), True)
+        noise = learner.generators["collect"].get_state()
+        expected = first.step(learner).clone()
+        learner.generators["collect"].set_state(noise)
+        found = second.step(learner)
+        for key in (keys.OBSERVATION, keys.ACTION, ("next", keys.OBSERVATION), ("next", "done")):
+            assert torch.equal(found[key], expected[key])
+        second.load_state_dict(first.state_dict(False), False)
+        assert second.step(learner)[keys.STEP].eq(0).all()  # the next episodes, from their start
+    finally:
+        first.close()
+        second.close()
+
+
+# --- steps
+
+
+def test_steps_come_in_the_order_of_time_and_no_two_workers_drive_the_same_episode():
+    source, learner = HereCollector(road, 2, 6), Rainbow(RainbowConfig(**SMALL), 29)
+    try:
+        seen = torch.stack([source.step(learner).clone() for _ in range(30)])
+    finally:
+        source.close()
+    going = ~seen["next", "done"][:-1, :, 0]
+    assert torch.equal(seen["next", keys.OBSERVATION][:-1][going], seen[keys.OBSERVATION][1:][going])
+    assert (~going).any()
+    assert seen[keys.EPISODE][0].tolist() == [0, 1, 2, 2**40, 2**40 + 1, 2**40 + 2]
+    driven = [set(seen[keys.EPISODE][:, row].tolist()) for row in range(6)]
+    assert len(set.union(*driven)) == sum(map(len, driven))
+    assert keys.TRAFFIC not in seen
+
+
+# --- options
+
+
+def test_a_phase_collects_as_the_option_says():
+    config = TrainConfig(collector=OverlapCollectorConfig(6, 3), traffic=IdmTrafficConfig(), env=ROAD)
+    (phase,) = phases_of(config, Path("nowhere"))
+    source = make_collector(config, phase)
+    assert isinstance(source, OverlapCollector)
+    assert (source.environments, source.rows) == (6, 2)
+    single = dataclasses.replace(config, collector=CollectorConfig(6))
+    assert identity(config, phase)["collector"] != identity(single, phase)["collector"]
+
+
+def test_environments_that_cannot_be_shared_out_are_refused():
+    with pytest.raises(ParameterError, match="evenly"):
+        OverlapCollectorConfig(7, 2)
+
+
+@pytest.mark.parametrize("resumed", [OverlapCollectorConfig(8, 2), CollectorConfig(8)])
+def test_a_run_is_not_resumed_with_the_other_collector(resumed, tmp_path):
+    started = CollectorConfig(8) if isinstance(resumed, OverlapCollectorConfig) else OverlapCollectorConfig(8, 2)
+    config = TrainConfig(collector=started, traffic=IdmTrafficConfig(), env=ROAD)
+    (phase,) = phases_of(config, tmp_path)
+    _, first = run(SingleCollector(ToyRoad(8)), 40, tmp_path, identity=identity(config, phase))
+    other = identity(dataclasses.replace(config, collector=resumed), phase)
+    with pytest.raises(UserError, match=r"collector\.overlaps="):
+        run(SingleCollector(ToyRoad(8)), 80, tmp_path, resume=first.checkpoint, identity=other)
+
+
+# --- processes
+
+
+def test_processes_give_what_threads_give_and_a_lost_one_ends_the_run_in_one_sentence():
+    learner, other = agent(), agent()
+    source, here = OverlapCollector(toy, 1, 4), HereCollector(toy, 1, 4)
+    try:
+        for _ in range(3):
+            ours, theirs = source.step(learner), here.step(other)
+            assert torch.equal(ours["next", "reward"], theirs["next", "reward"])
+        numbers = [process.pid for process in source._processes]
+        os.kill(numbers[0], signal.SIGKILL)
+        with pytest.raises(UserError, match=r"^collector=overlap: worker 0 .*died.* go on from the last") as error:
+            source.step(learner)
+        assert "\n" not in str(error.value)
+    finally:
+        source.close()
+        here.close()
+    assert not any(Path(f"/proc/{number}").exists() for number in numbers)
+
+
+KILLED = """
+import sys
+import torch
+torch.set_num_threads(1)
+sys.path[:0] = [{tests!r}]
+from training.test_training_overlap import OverlapCollector, run, toy, settings
+import ganlane.training.checkpoint as checkpoint
+import training.test_training_overlap as here
+checkpoint.PATIENCE = 0.0
+here.settings = lambda decisions: settings(decisions, checkpoint_every_s=0.0)
+if __name__ == "__main__":
+    run(OverlapCollector(toy, 2, 8), 10**9, {folder!r})
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_s", [0.1, 0.7])
+def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights_and_leaves_no_process(after_s, tmp_path):
+    folder, tests = tmp_path / "parts", Path(__file__).resolve().parent.parent
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED.format(tests=str(tests), folder=str(folder)))
+    process = subprocess.Popen([sys.executable, str(script)], cwd=tests.parent, start_new_session=True)
+    last = folder / "checkpoints" / "last.pt"
+    while not last.exists() or load_checkpoint(last)["counters"]["decisions"] < 160:
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(after_s)
+    process.kill()
+    process.wait()
+    assert gone(process.pid)
+    reached = int(load_checkpoint(last)["counters"]["decisions"])
+    resumed, _ = run(HereCollector(toy, 2, 8), reached + 400, folder, seed=5, resume=last)
+    whole, _ = run(HereCollector(toy, 2, 8), reached + 400, tmp_path / "whole")
+    assert same(whole, resumed)

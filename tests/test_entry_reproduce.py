@@ -89,7 +89,7 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
     ("arguments", "said"),
     [
         (["agents=[random_legal]", "traffics=[idm]"], "expected mobil and others"),
-        (["agents=[mobil,agent_idm@77]"], "no such training"),
+        (["agents=[mobil,agent_idm@77]", "traffics=[idm]"], "no such training"),
         (["fewer={gan: 0}"], "whole numbers of at least 2"),
         (["runs=[nowhere]"], "no such file"),
         (["from=elsewhere"], "shipped, scratch"),

@@ -52,11 +52,11 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     set_threads(config.threads)
     if config.source == "scratch":
         config = trained_from_scratch(config)
+    report.read_transfers(config.runs, [])  # a folder that cannot be read shows before hours of driving
     traffics, missing = available(config)
     for name, reason in missing.items():
         print(f"left out, {name}: {reason}", file=sys.stderr)
     cells = cells_of(config, traffics)
-    report.read_transfers(config.runs, [])  # a folder that cannot be read shows before hours of driving
     drive(cells, config)
     episodes, revisions = read_cells(cells)
     by_recipe = numbers.by_recipe(episodes)
@@ -107,7 +107,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
 def command_line(folder: Path) -> str:
     """The command whose run folder this is; without its keys where another program called."""
     path = folder / OVERRIDES
-    asked = OmegaConf.load(path) if path.is_file() else []
+    asked: Any = OmegaConf.load(path) if path.is_file() else []
     return shlex.join(["ganlane", "reproduce", *map(str, asked)])
 
 

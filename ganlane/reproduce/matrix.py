@@ -138,7 +138,7 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
 def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     """Drive one cell and write its file."""
     set_threads(config.threads)
-    alone = replace(config, agents=[cell.driver], traffics=[cell.traffic], episodes=cell.settings["episodes"])
+    alone = replace(config, traffics=[cell.traffic], episodes=cell.settings["episodes"])
     table = compare_configured([make_driver(cell.driver, config.env, device=config.device)], alone, quiet=True)
     origin = json.dumps({"settings": cell.settings, "code": code_version()})
     with atomic_path(cell.path) as part:

@@ -146,7 +146,7 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
     mobil = {row["traffic"]: row["mean_reward"] for row in rows if row["driver"] == "mobil"}
     bounds = [bound for row in drawn for bound in row["minus_mobil_ci"] or (row["minus_mobil"],)]
     lowest, highest = min(-20.0, *bounds), max(20.0, *bounds)
-    figure, grid = panel_grid(len(traffics), 3.4, 0.75 + 0.19 * len(drivers))
+    figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
     for place, (axes, traffic) in enumerate(zip(grid, traffics)):
         axes.axvline(0.0, color=FAINT, lw=0.9)
         axes.set(title=traffic, xlabel="mean reward minus MOBIL's", ylim=(len(drivers) - 0.5, -0.5))

@@ -14,6 +14,7 @@ COMMANDS = {
     "train": "train an agent on a traffic, then compare it with other drivers",
     "evaluate": "agents x traffics on the same episodes, as one table",
     "render": "episodes as a film, page or table; learning curves of runs",
+    "record": "a driver's episodes as an offline dataset in Minari's format",
     "prepare": "recordings into one schema, with a report of what they show",
     "train_generator": "fit a generator to recorded traffic",
     "realism": "how close a traffic comes to recorded driving",

@@ -19,7 +19,7 @@ import importlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -35,6 +35,7 @@ from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import Driver
 from ganlane.compare import compare_configured
 from ganlane.config.app import Stopped
+from ganlane.config.command_line import ALIASES
 from ganlane.config.env import check_reward
 from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.folders import CONFIG, cleared_after_mistakes, held
@@ -44,7 +45,7 @@ from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import TrafficConfig, all_traffics
 from ganlane.errors import UserError
 from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, write_results
-from ganlane.evaluation.results import plain
+from ganlane.evaluation.results import Run, TrainingRun, plain
 from ganlane.files import write_bytes
 from ganlane.options import Option, command_config, option
 from ganlane.parameters.checks import checked_arguments, did_you_mean, whole_number
@@ -57,22 +58,6 @@ __all__ = ["Driver", "Run", "TrainingRun", "evaluate", "load_agent", "make_env",
 Agent: TypeAlias = str | Path | Driver | TensorDictModuleBase
 #: Families of episodes: to train on, to choose on, to report on.
 STREAMS = {stream.name.lower(): stream for stream in Stream}
-
-
-@dataclass(frozen=True)
-class Run:
-    """A finished command: its run folder and the content of ``results.json``."""
-
-    folder: Path
-    results: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class TrainingRun(Run):
-    """A finished training: also the agent's file and the table of the final evaluation."""
-
-    agent: Path
-    table: pl.DataFrame
 
 
 @checked_arguments
@@ -293,7 +278,7 @@ def render(
 
 @checked_arguments
 def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
-    """Any command that writes ``results.json``: ``prepare``, ``train_generator``, ``realism``, ``bench`` ...
+    """Any command that writes ``results.json``: ``record``, ``prepare``, ``realism``, ``bench`` ...
 
     ``run("prepare", data={"name": "ngsim", "path": "raw.txt"}, out="us101")`` is ``ganlane prepare data=ngsim
     data.path=raw.txt out=us101`` on the command line.
@@ -320,7 +305,8 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
             f"resume={resumed}: no run that can go on ({LAST} is missing); give api.train() the folder of one, and "
             "resume=True."
         )
-    home, _ = _run_in(folder, command, _function(command), command_config(command, keys))
+    named = {ALIASES.get(command, {}).get(name, name): value for name, value in keys.items()}
+    home, _ = _run_in(folder, command, _function(command), command_config(command, named))
     return Run(home, json.loads((home / "results.json").read_text()))
 
 

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -141,7 +141,7 @@ class Driver:
     """
 
     name: str
-    policy: TensorDictModuleBase
+    policy: TensorDictModuleBase = field(repr=False)
     observation: ObservationConfig | None = None
     mask: MaskParameters | None = None
 

@@ -27,6 +27,7 @@ from ganlane.evaluation import (
     write_results,
 )
 from ganlane.evaluation.statistics import entries
+from ganlane.evaluation.table import show
 from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import Stream
@@ -164,9 +165,7 @@ def publish(
         numbers: further entries of the record.
     """
     rows, paired, recorded = evaluation_rows(table), paired_rows(table), recorded_crashes(table)
-    print(text_table(rows))
-    if paired:
-        print(f"\n{paired_table(paired)}")
+    show(text_table(rows), *([paired_table(paired)] if paired else []), columns=config.get("columns", "all"))
     write_episodes(folder, table)
     scenes = {"crashes_by_scene": recorded} if recorded else {}
     record = {"rows": rows, "paired": paired, **scenes, **(numbers or {})}

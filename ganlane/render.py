@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
-from ganlane.config.command_line import quoted
 from ganlane.config.render import FILMS, RenderConfig
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ def _record(config: RenderConfig, agent: str, number: int) -> Trajectory:
     seen = config.observation.read_by(driver.observation)
     mask, policy = driver.behind(config.mask)
     env = make_env(traffic, config.env, seen, config.reward, device=config.device, mask=mask)
-    end_s = config.film.end_s if config.film.end_s is not None else float("inf")
+    end_s = config.end_s if config.end_s is not None else float("inf")
     episode = record_episode(env, policy, config.seed, number, driver.name, label, end_s)
     which = f"{driver.name} on {label}, seed {config.seed}, episode {number}"
     print(f"{which}: {episode.outcome or 'cut off'} after {episode.time_s[-1]:.1f} s")
@@ -70,7 +69,7 @@ def _film(config: RenderConfig, episode: Trajectory, out: Path) -> str:
     film = config.film
     window = WindowParameters(width=film.width, height=film.height, length_m=film.road_m)
     painter = FramePainter(episode, window, DrawingParameters(film.trail_s, film.speeds, film.leader_line))
-    frames = Film(painter, film.fps, film.speedup, film.start_s, film.end_s)
+    frames = Film(painter, film.fps, film.speedup, film.start_s, config.end_s)
     return f"film: {write_film(frames, out, film.fps, film_format(out, config.kind), film.max_bytes, film.scale)}"
 
 
@@ -91,24 +90,9 @@ def _name(config: RenderConfig) -> str:
     return f"{'_'.join(parts)}.{config.kind}"
 
 
-def with_runs_listed(arguments: Sequence[str]) -> list[str]:
-    """``run=A,B`` as the list ``run=['A','B']``: to Hydra a comma means a sweep, and few folders need no quotes."""
-    if "-m" in arguments or "--multirun" in arguments:
-        return list(arguments)
-    return [_listed(argument) for argument in arguments]
-
-
-def _listed(argument: str) -> str:
-    key, _, value = argument.partition("=")
-    if key != "run" or not value or value[0] in "['\"" or value == "null":
-        return argument
-    return f"run=[{','.join(map(quoted, value.split(',')))}]"
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit status."""
-    given = sys.argv[1:] if arguments is None else arguments
-    return run_command("render", render, with_runs_listed(given))
+    return run_command("render", render, arguments)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     # Imported here, so that a mistake on the command line is reported before torch is loaded.
     from ganlane import generator
     from ganlane.evaluation import code_version, write_results
+    from ganlane.evaluation.table import show
     from ganlane.fit_report import FitProgress, ablation_table, fold_tables, metrics_table, results_of
     from ganlane.runtime import set_threads
 
@@ -54,7 +55,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     if config.ablations:
         with FitProgress() as progress:
             further["ablations"] = generator.ablate(frame, fit_config, held_out, states, progress.next_fit, progress)
-        print(ablation_table(further["ablations"]))
+        show(ablation_table(further["ablations"]), columns=config.columns)
     if config.folds:
 
         def save(number: int, fold: FitResult) -> None:
@@ -64,7 +65,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             further["folds"] = generator.cross_validate(
                 frame, fit_config, config.folds, states, progress.next_fit, progress, save, source=str(source)
             )
-        print(fold_tables(further["folds"]))
+        show(fold_tables(further["folds"]), columns=config.columns)
     with FitProgress() as progress:
         result = generator.fit_generator(
             preset,
@@ -75,7 +76,7 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
             resume_path=states / f"generator_{generator.fit_key(fit_config, split)}.pt",
             on_progress=progress,
         )
-    print(metrics_table(result.metrics))
+    show(metrics_table(result.metrics), columns=config.columns)
     weights = folder / f"generator_{preset}.safetensors"
     result.save(weights, further.get("folds"), code_version())
     print(f"weights: {weights}")

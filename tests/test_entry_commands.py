@@ -37,6 +37,16 @@ def test_help_names_options_keys_and_examples(name, capsys):
     assert "exit status" in shown
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fits_on_a_page_and_the_rest_is_behind_a_flag(name, capsys):
+    assert main([name, "--help"]) == 0
+    short = capsys.readouterr().out
+    assert short.count("\n") < 80
+    assert f"ganlane {name} --help-all" in short
+    assert main([name, "--help-all"]) == 0
+    assert capsys.readouterr().out == help_text(name) + "\n"
+
+
 def test_help_of_train_explains_every_traffic_and_start():
     text = help_text("train")
     for group in ("traffic", "init", "experiment", "agent", "observation", "reward", "collector", "logger", "env"):

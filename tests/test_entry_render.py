@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from ganlane.data import read_scenes
-from ganlane.render import main, with_runs_listed
+from ganlane.render import main
 
 SHORT = ["env.goal_m=40", "film.fps=5", "film.width=640", "film.height=160"]
 
@@ -84,22 +84,6 @@ def test_curves_of_runs_come_in_the_format_that_is_asked_for(asked, file, begins
     assert main(["run=first,it's", *asked.split()]) == 0
     assert capsys.readouterr().out == f"curves: {file}\n"
     assert (tmp_path / file).read_bytes().startswith(begins)
-
-
-@pytest.mark.parametrize(
-    ("given", "listed"),
-    [
-        ("run=a", "run=['a']"),
-        ("run=a/b=c,d e", "run=['a/b=c','d e']"),
-        ("run=it's,b", "run=['it\\'s','b']"),
-        ("run=[a,b]", "run=[a,b]"),
-        ("run=null", "run=null"),
-        ("out=a,b", "out=a,b"),
-    ],
-)
-def test_runs_need_no_quotes(given, listed):
-    assert with_runs_listed([given]) == [listed]
-    assert with_runs_listed(["-m", given]) == ["-m", given]
 
 
 @pytest.mark.usefixtures("hydra_from_memory")

@@ -19,14 +19,16 @@ EXAMPLES = {
     "own_traffic.py": r"mean speed of the others \d+\.\d m/s, \d+ % look away",
     "own_reward.py": r"random_legal courteous: mean return +-?\d+\.\d, \d+ onsets behind",
     "own_policy.py": r"(?s)mobil .*agent_idm .*random_legal .*largest_gap ",
-    "stock_dqn.py": r"loss \d+\.\d+, reward per decision -?\d+\.\d+",
+    "torchrl_dqn.py": r"(?s)loss \d+\.\d+, reward per decision -?\d+\.\d+.*torchrl_dqn .*mobil ",
+    "torchrl_ppo.py": r"(?s)reward per decision -?\d+\.\d+.*torchrl_ppo .*mobil ",
     "cleanrl_style.py": r"2048 decisions, \d+ episodes, loss \d+\.\d+\nmean return of the last \d+: -?\d+\.\d",
     "sb3_ppo.py": r"(?s)ppo .*mobil ",
     "sb3_dqn.py": r"(?s)300 decisions, mean return of the last \d+ episodes -?\d+\.\d.*sb3_dqn.*mobil.*random_legal",
 }
 #: Budgets that keep a run to seconds.
 SHORT = {
-    "stock_dqn.py": ["2048"],
+    "torchrl_dqn.py": ["2048", "2", "60", "16"],
+    "torchrl_ppo.py": ["2048", "2", "60", "16"],
     "cleanrl_style.py": ["2048"],
     "sb3_dqn.py": ["300", "4", "200"],
     "sb3_ppo.py": ["4096", "safe", "4", "200", "16"],

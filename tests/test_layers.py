@@ -32,7 +32,7 @@ ORDER = [
     # The typed calls run the commands' own functions.
     {"api"},
     {"gym"},
-    {"sb3"},
+    {"sb3", "record"},
     {"__main__"},
 ]
 LEVEL = {part: level for level, parts in enumerate(ORDER) for part in parts}

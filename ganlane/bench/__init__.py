@@ -40,6 +40,7 @@ def bench(asked: BenchConfig, folder: Path) -> str:
     """Measure, print and save; the line that names the results."""
     from ganlane.bench.measure import measure
     from ganlane.evaluation import write_results
+    from ganlane.evaluation.table import show
     from ganlane.files import split_at_markers, write_between_markers
 
     config = asked.shortened()
@@ -51,8 +52,8 @@ def bench(asked: BenchConfig, folder: Path) -> str:
         print(note, file=sys.stderr, flush=True)
     numbers = measure(suite, config.repetitions, config.seconds)
     tables = [table for table in suite.tables(numbers["rows"], numbers) if table.lines]
-    for table in tables:
-        print(table.text(), end="\n\n")
+    show(*(table.text() for table in tables), columns=config.columns)
+    print()
     for note in suite.notes:
         print(note)
     path = write_results(folder, numbers, asdict(config), {"seed": config.seed})

@@ -27,7 +27,7 @@ from ganlane.config.command_line import (
     without_repetitions,
 )
 from ganlane.config.folders import cleared_after_mistakes, held, unused, write_down
-from ganlane.config.help import print_help
+from ganlane.config.help import help_text
 from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
 from ganlane.config.resume import refuse_stored_imports, with_resumed
 from ganlane.config.schemas import register
@@ -100,8 +100,8 @@ def _refused(command: str, error: Exception) -> int:
 
 def _run(command: str, task: Task, arguments: list[str]) -> None:
     flags = parse_arguments(command, arguments)
-    if flags.help:
-        print_help(command)
+    if flags.help or flags.help_all:
+        print(help_text(command, flags.help_all))
         return
     check_process()
     parse(flags.overrides)
@@ -122,10 +122,22 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
             # The folder's name holds the time: given here, so that it is the one that was looked at.
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
             _hydra(command, task, ["-m", *with_shares_replaced(swept)])
+            _show_sweep(folder, checked.config.columns)
         else:
             given = parse(without_repetitions(overrides))
             asked = [str(override.input_line) for override in given if not of_hydra(override)]
             _do(task, checked.config, folder, checked.composed, asked)
+
+
+def _show_sweep(folder: Path, columns: str) -> None:
+    """One table of all comparisons of a sweep."""
+    # Imported here: they need torch, which a mistake on the command line should not wait for.
+    from ganlane.evaluation.results import sweep_rows
+    from ganlane.evaluation.table import show, text_table
+
+    rows = sweep_rows(folder)
+    if rows:
+        show("", text_table(rows), f"sweep: {folder}", columns=columns)
 
 
 def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import NAMES, has_cuda
+from ganlane.config.run import COLUMNS, NAMES, has_cuda
 from ganlane.config.traffic import TrafficConfig, all_traffics, chosen_traffics
 from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
@@ -56,6 +56,7 @@ class BenchConfig:
         memory: peak memory of every case, each in a fresh process.
         report: a document whose tables to rewrite, for instance docs/performance.md.
         seed: of all random numbers.
+        columns: of printed tables; auto: as many as the terminal has room for; all.
     """
 
     suite: str = "sim"
@@ -79,6 +80,7 @@ class BenchConfig:
     memory: bool = True
     report: str | None = None
     seed: int = 0
+    columns: str = "auto"
     env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
@@ -90,6 +92,7 @@ class BenchConfig:
         check(
             self,
             suite=one_of(SUITES),
+            columns=one_of(COLUMNS),
             batches=_different(sizes),
             modes=_different(one_of(MODES)),
             threads=_different(between(1, 1024)),

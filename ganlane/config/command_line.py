@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
+from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args, get_origin, get_type_hints
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -17,7 +18,7 @@ from hydra.core.override_parser.types import Override, OverrideType, Quote, Quot
 from omegaconf import DictConfig, open_dict
 
 from ganlane.config.messages import VALUE_ERRORS, sentence
-from ganlane.config.schemas import made, options_of, register
+from ganlane.config.schemas import SCHEMAS, made, options_of, register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 
@@ -27,7 +28,12 @@ VERSION_BASE = "1.3"
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.num")
 HYDRA_PLUGINS = ("launcher", "sweeper")
 #: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
-ALIASES = {"render": {"agent": "driver"}}
+ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
+#: A number with an exponent, and the functions of a sweep.
+_EXPONENT, _SWEPT = (
+    r"(?<![\w.])\d+(?:\.\d+)?[eE]\+?\d{1,2}(?![\w.])",
+    r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)",
+)
 
 
 def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
@@ -37,6 +43,7 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
         UserError: an unknown flag, or one that would have no effect.
     """
     parser = get_args_parser()
+    parser.add_argument("--help-all", action="store_true")
 
     def refuse(message: str) -> NoReturn:
         raise UserError(f"{message}; run the command with --help or --hydra-help to see the flags.")
@@ -44,7 +51,7 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
     parser.error = refuse  # type: ignore[method-assign]
     flags = parser.parse_args(list(arguments))
     _refuse_idle_flags(flags)
-    flags.overrides = [_renamed(override, ALIASES.get(command, {})) for override in flags.overrides]
+    flags.overrides = [as_meant(command, override, flags.multirun) for override in flags.overrides]
     return flags
 
 
@@ -58,9 +65,41 @@ def _refuse_idle_flags(flags: Namespace) -> None:
             raise UserError(f"--{name}: it goes with --cfg alone, which shows the configuration; add --cfg job.")
 
 
-def _renamed(override: str, aliases: Mapping[str, str]) -> str:
+def as_meant(command: str, override: str, multirun: bool = False) -> str:
+    """An override as Hydra takes it: ``agents=mobil`` as a list of one, ``1e5`` for a whole number as ``100000``.
+
+    In a list's value commas separate entries, which need no quotes; in a sweep they separate runs.
+    """
     key, equals, value = override.partition("=")
-    return f"{aliases.get(key, key)}{equals}{value}"
+    key = ALIASES.get(command, {}).get(key, key)
+    kinds = _kinds(SCHEMAS[""].get(command), key.split("."))
+    if int in kinds:
+        value = re.sub(_EXPONENT, _whole, value)
+    if kinds & {list, tuple} and value != "null" and not re.match(rf"[\[{{$]|$|{_SWEPT}", value):
+        entries = (
+            value.split(",") if int in kinds or float in kinds or value[0] in "'\"" else map(quoted, value.split(","))
+        )
+        value = "],[".join(entries) if multirun else ",".join(entries)
+        value = f"[{value}]"
+    return f"{key}{equals}{value}"
+
+
+def _whole(number: re.Match[str]) -> str:
+    exact = Decimal(number[0])
+    return str(int(exact)) if exact == int(exact) else number[0]
+
+
+def _kinds(hint: Any, path: Sequence[str]) -> set[Any]:
+    """The types that may be found at ``path`` below ``hint``: those in unions and lists, too, and of subclasses."""
+    inner = set().union(*(_kinds(each, path) for each in get_args(hint)))
+    if not path:
+        return {get_origin(hint) or hint, *inner}
+    if get_origin(hint) is dict:
+        return _kinds(get_args(hint)[1], path[1:])
+    if not is_dataclass(hint):
+        return inner
+    found = _kinds(get_type_hints(hint).get(path[0]), path[1:])
+    return found.union(*(_kinds(kind, path) for kind in type.__subclasses__(hint)))  # type: ignore[arg-type]
 
 
 def quoted(value: object) -> str:

@@ -1,4 +1,4 @@
-"""``--help``: what a command does, its options and its keys, from the commands' and dataclasses' docstrings."""
+"""``--help`` and ``--help-all``: what a command does, its options and its keys, from docstrings and YAML files."""
 
 from __future__ import annotations
 
@@ -27,25 +27,27 @@ exit status: 0 done, 2 a mistake in configuration, file or checkpoint or a disk 
 143 by SIGTERM, 141 the reader of the output has left"""
 
 
-def help_text(command: str) -> str:
-    """All that ``ganlane COMMAND --help`` prints."""
+def help_text(command: str, everything: bool = True) -> str:
+    """What ``ganlane COMMAND --help-all`` prints, or ``--help``: names of options, and the command's own keys."""
     chosen = chosen_options((conf_folder() / f"{command}.yaml").read_text())
     groups = {mount: option for mount, option in chosen.items() if "@" not in mount}
+    listed = [_options(*each) for each in chosen.items()] if everything else map(_names, groups, groups.values())
     parts = [
         inspect.getdoc(importlib.import_module(f"ganlane.{command}")) or "",
-        "options (GROUP=NAME; * is the default)\n" + "\n".join(_options(*mounted) for mounted in chosen.items()),
+        "options (GROUP=NAME; * is the default)\n" + "\n".join(listed),
         "keys (KEY=VALUE)\n" + "\n".join(key_lines(SCHEMAS[""][command], {}, 2, {*groups, "traffic_options"})),
     ]
-    for group, option in groups.items():
+    for group, option in groups.items() if everything else ():
         if option != "null":
             lines = key_lines(*option_of(group, option), 4)
             parts.append("\n".join([f"keys of {group}={option}", f"  {group}:", *lines]))
-    return "\n\n".join([*parts, _FLAGS.format(command=command)])
+    more = [] if everything else [f"ganlane {command} --help-all explains every option, and lists their keys."]
+    return "\n\n".join([*parts, *more, _FLAGS.format(command=command)])
 
 
-def print_help(command: str) -> None:
-    """Print :func:`help_text`."""
-    print(help_text(command))
+def _names(group: str, default: str) -> str:
+    names = " ".join(f"{name}*" if name == default else name for name in options_of(group))
+    return textwrap.fill(names, _END, initial_indent=f"  {group:<13}", subsequent_indent=" " * 15)
 
 
 def chosen_options(root: str) -> dict[str, str]:

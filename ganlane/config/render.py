@@ -20,6 +20,8 @@ FILMS = ("gif", "mp4", "png")
 CHARTS = ("png", "svg", "pdf")
 FORMATS = (*FILMS, "html", "csv", "parquet", "svg", "pdf")
 MOST_EPISODES = 12
+#: A GIF of a whole episode takes minutes to draw, and tens of MB.
+GIF_S = 30.0
 
 
 @dataclass
@@ -30,7 +32,7 @@ class FilmConfig:
         fps: frames per second.
         speedup: simulated seconds per second of film.
         start_s: part of the episode, for every format, s.
-        end_s: null: to its end.
+        end_s: null: to its end; of a gif, 30 s after start_s.
         width: pixels.
         height: pixels.
         road_m: length of road in the picture, m.
@@ -138,6 +140,13 @@ class RenderConfig(RunConfig):
         """The format that is asked for: ``format``, or the ending of ``out``, or png for ``run``, else gif."""
         ending = Path(self.out).suffix.removeprefix(".").lower() if self.out is not None else ""
         return self.format or ending or ("gif" if self.run is None else "png")
+
+    @property
+    def end_s(self) -> float | None:
+        """``film.end_s``, or where a GIF ends by default; None: with the episode."""
+        if self.film.end_s is not None or self.kind != "gif":
+            return self.film.end_s
+        return self.film.start_s + GIF_S
 
     def pairs(self) -> list[tuple[str, int]]:
         """The episodes to record: agent and number of each."""

@@ -47,7 +47,7 @@ class ReproduceConfig(EvaluateConfig):
     traffics: list[str] = field(default_factory=lambda: [name for name in TRAFFICS if name != "mixed"])
     episodes: int = 1000
     fewer: dict[str, int] = field(
-        default_factory=lambda: {"gan": 150, "gan_calibrated": 150, "replay": 200, "sumo": 10, "highway_env": 4}
+        default_factory=lambda: {"gan": 150, "gan_calibrated": 100, "replay": 200, "sumo": 8, "highway_env": 3}
     )
     workers: int = 2
     cells: str = "outputs/cells"

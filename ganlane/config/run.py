@@ -11,6 +11,8 @@ from ganlane.parameters.checks import Rule, at_least, between, check, one_of
 NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
 #: A number of episodes; their results stay in memory.
 EPISODES = between(1, 10_000_000)
+#: Of printed tables.
+COLUMNS = ("auto", "all")
 
 
 @dataclass
@@ -21,14 +23,17 @@ class RunConfig:
         seed: of all random numbers.
         threads: torch's threads; 0: one, which measured fastest (more are far slower where other work runs).
         device: cpu or cuda.
+        columns: of printed tables; auto: as many as the terminal has room for; all.
     """
 
     seed: int = 0
     threads: int = 0
     device: str = "cpu"
+    columns: str = "auto"
 
     def __post_init__(self) -> None:
         check(self, seed=between(0, 2**53), threads=at_least(0), device=one_of(("cpu", "cuda")))
+        check(self, columns=one_of(COLUMNS))
         if self.device == "cuda" and not has_cuda():
             raise UserError("device=cuda: torch sees no CUDA device here; use device=cpu or install torch for CUDA.")
 

@@ -16,6 +16,7 @@ from ganlane.config.bench import BenchConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.realism import RealismConfig
+from ganlane.config.record import RecordConfig
 from ganlane.config.recordings import PrepareConfig, TrainGeneratorConfig
 from ganlane.config.render import RenderConfig
 from ganlane.config.reproduce import ReproduceConfig
@@ -51,6 +52,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "train": TrainConfig,
         "evaluate": EvaluateConfig,
         "render": RenderConfig,
+        "record": RecordConfig,
         "bench": BenchConfig,
         "prepare": PrepareConfig,
         "train_generator": TrainGeneratorConfig,

@@ -1,14 +1,17 @@
-"""What a measuring command leaves in its run folder: ``results.json`` with its origin, and ``episodes.parquet``."""
+"""What a command leaves in its run folder, as files and as an object."""
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from datetime import datetime, timezone
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,32 @@ import torch
 
 from ganlane._version import __version__
 from ganlane.files import PACKAGE, atomic_path, write_json
+
+
+@dataclass(frozen=True, repr=False)
+class Run:
+    """A finished command: its run folder and the content of ``results.json``."""
+
+    folder: Path
+    results: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(folder={str(self.folder)!r}, results: {', '.join(self.results)})"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the table of an evaluation, else the results that are single numbers or texts."""
+        rows = self.results.get("rows")
+        if not isinstance(rows, list):
+            rows = [{name: value for name, value in self.results.items() if isinstance(value, int | float | str)}]
+        return f"<p>{escape(str(self.folder))}</p>{pl.DataFrame(rows, infer_schema_length=None)._repr_html_()}"
+
+
+@dataclass(frozen=True, repr=False)
+class TrainingRun(Run):
+    """A finished training: also the agent's file and the table of the final evaluation."""
+
+    agent: Path
+    table: pl.DataFrame
 
 
 def write_results(
@@ -36,6 +65,46 @@ def write_results(
     written = datetime.now(timezone.utc).isoformat(timespec="seconds")
     write_json(path, plain({**numbers, **origin, "written": written}))
     return path
+
+
+def names_of_runs(folders: Sequence[Path]) -> list[str]:
+    """What tells runs apart: the options on their command lines in which they differ, else ends of their paths.
+
+    ``seed=0`` comes last. Two runs of the same options, or one without its command line, are named by their paths.
+    """
+    given = [_overrides(folder) for folder in folders]
+    keys = sorted({key for each in given for key in each}, key=lambda key: (key == "seed", key))
+    told = [key for key in keys if len({each.get(key) for each in given}) > 1]
+    names = [", ".join(f"{key}={each[key]}" for key in told if key in each) for each in given]
+    for depth in range(1, max(len(folder.parts) for folder in folders) + 1):
+        if all(names) and len(set(names)) == len(names):
+            break
+        names = ["/".join(folder.parts[-depth:]) for folder in folders]
+    return names
+
+
+def _overrides(folder: Path) -> dict[str, str]:
+    """The command line of a run by key, the newest value of each."""
+    file = folder / "overrides.yaml"
+    lines = re.findall(r"^- (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else []
+    return {key.strip("'\" +"): value.strip("'\"") for key, _, value in (line.partition("=") for line in lines)}
+
+
+def runs_below(folder: Path, file: str) -> list[Path]:
+    """The folder itself if it holds ``file``, else those of its own folders that do, by number: those of a sweep."""
+    found = [folder] if (folder / file).is_file() else [path.parent for path in folder.glob(f"*/{file}")]
+    return sorted(
+        found, key=lambda path: (not path.name.isdigit(), int(path.name) if path.name.isdigit() else 0, path)
+    )
+
+
+def sweep_rows(folder: Path) -> list[dict[str, Any]]:
+    """The rows of all comparisons of a sweep, each with its ``run`` (:func:`names_of_runs`)."""
+    runs = runs_below(folder, "results.json")
+    records = [json.loads((run / "results.json").read_text(encoding="utf-8")) for run in runs]
+    named = zip(names_of_runs(runs) if runs else [], records)
+    rows = [{"run": name, **row} for name, record in named for row in record.get("rows") or []]
+    return rows if all("mean_reward" in row for row in rows) else []
 
 
 def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:

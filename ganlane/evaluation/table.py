@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +26,39 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
         return "  ".join(fitted).rstrip()
 
     return "\n".join([line(lines[0]), "  ".join("-" * width for width in widths), *map(line, lines[1:])])
+
+
+def show(*texts: str, columns: str = "auto") -> None:
+    """Print texts, a blank line between them, their tables as wide as the terminal (``columns`` auto) or whole (all).
+
+    Where the output is no terminal, tables are whole.
+    """
+    width = shutil.get_terminal_size().columns if columns == "auto" and sys.stdout.isatty() else None
+    print("\n\n".join(texts) if width is None else fitting("\n\n".join(texts), width))
+
+
+def fitting(text: str, width: int) -> str:
+    """``text``, without some columns of each table of :func:`aligned` that is wider; a line below names them.
+
+    A table ends with a blank line. Columns go from the right, those of :data:`_FIRST_TO_GO` before the others.
+    """
+    return "\n\n".join(_narrowed(part.split("\n"), width) for part in text.split("\n\n"))
+
+
+def _narrowed(lines: Sequence[str], width: int) -> str:
+    ruler = next((at for at, line in enumerate(lines) if re.fullmatch(r"-+(  -+)+", line)), None)
+    if ruler is None or len(lines[ruler]) <= width:
+        return "\n".join(lines)
+    spans = [slice(*found.span()) for found in re.finditer("-+", lines[ruler])]
+    names = [lines[ruler - 1][span].strip() for span in spans]
+    order = [names.index(name) for name in _FIRST_TO_GO if name in names]
+    kept = set(range(len(spans)))
+    for column in [*order, *reversed(range(1, len(spans)))]:
+        if sum(spans[each].stop - spans[each].start + 2 for each in kept) > width + 2:
+            kept.discard(column)
+    rows = ["  ".join(line[spans[each]] for each in sorted(kept)).rstrip() for line in lines[ruler - 1 :]]
+    gone = ", ".join(name for each, name in enumerate(names) if each not in kept and name)
+    return "\n".join([*lines[: ruler - 1], *rows, f"(columns=all shows: {gone})"])
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -65,7 +101,7 @@ class Table:
     def text(self) -> str:
         """Aligned columns, with the notes below."""
         table = aligned([self.headings, *self.lines], self.names)
-        return "\n".join([self.title, "", table, *self.notes])
+        return "\n".join([self.title, "", table, *(["", *self.notes] if self.notes else [])])
 
     def markdown(self, heading: bool = True) -> str:
         """The title as a heading (unless turned off), the table, and the notes below."""
@@ -107,8 +143,9 @@ def _estimate(key: str, digits: int) -> Callable[[Row], str]:
     return lambda row: with_interval(row, key, digits)
 
 
-#: Heading and cell of each column of an evaluation; the first two are names, the others numbers.
+#: Heading and cell of each column of an evaluation, names before numbers; ``run``: of a sweep.
 _COLUMNS: Mapping[str, Callable[[Row], str]] = {
+    "run": _plain("run"),
     "agent": _plain("agent"),
     "traffic": _plain("traffic"),
     "episodes": _plain("episodes"),
@@ -126,7 +163,12 @@ _COLUMNS: Mapping[str, Callable[[Row], str]] = {
     "crashes/1000 km [95 %]": _estimate("crashes_per_1000_km", 1),
 }
 #: Columns that are left out where no row has anything in them.
-_OPTIONAL = ("time-out", "scene end", "minus MOBIL, paired")
+_OPTIONAL = ("run", "time-out", "scene end", "minus MOBIL, paired")
+#: Columns that a narrow terminal does without, the least telling first; the paired leads have a table of their own.
+_FIRST_TO_GO = (
+    *("crashes/1000 km [95 %]", "% of MOBIL [95 %]", "changes/km", "minus MOBIL, paired", "episodes"),
+    *("time-out", "scene end", "soft", "m/s", "goal"),
+)
 
 
 def text_table(rows: Sequence[Row]) -> str:
@@ -142,8 +184,10 @@ def text_table(rows: Sequence[Row]) -> str:
         if reason is not None:
             reasons.setdefault(reason, {})[row["traffic"]] = None
     notes = [f"% of MOBIL on {', '.join(traffics)}: none, {reason}" for reason, traffics in reasons.items()]
-    table = aligned([list(columns), *([cell(row) for cell in columns.values()] for row in rows)], names=2)
-    return "\n".join([table, *notes])
+    table = aligned(
+        [list(columns), *([cell(row) for cell in columns.values()] for row in rows)], 2 + ("run" in columns)
+    )
+    return "\n".join([table, *(["", *notes] if notes else [])])
 
 
 def paired_table(rows: Sequence[Row]) -> str:

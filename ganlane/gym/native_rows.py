@@ -17,7 +17,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.native.batch import NativeBatch, Stepped
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.options import Option, option
-from ganlane.parameters.episode import Stream
+from ganlane.parameters.episode import EpisodeParameters, Stream
 
 #: What the kernel drives, and whether it changes lanes.
 _TRAFFICS = {"ganlane.traffic.IdmTraffic": False, "ganlane.traffic.IdmMobilTraffic": True}
@@ -62,16 +62,15 @@ def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeR
         mask,
         int(stream),
     )
-    return NativeRows(batch)
+    return NativeRows(batch, env.episode_parameters())
 
 
 class NativeRows(Rows):
     """See :class:`ganlane.gym.rows.Rows`."""
 
-    def __init__(self, batch: NativeBatch) -> None:
-        self.batch, self.count = batch, batch.rows
+    def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
+        self.batch, self.count, self.episode = batch, batch.rows, episode
         self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
-        self.decision_period_s = batch.decision_period_s
         self._started = False
         self._never = np.zeros(batch.rows, np.bool_)
 

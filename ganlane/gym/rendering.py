@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
@@ -46,11 +47,11 @@ class LiveView:
 
     def start(self, state: TensorDictBase) -> None:
         """A new episode begins at ``state``."""
-        self._recorder, self._outcome = Recorder(), ""
+        self._recorder, self._outcome, self._before = Recorder(), "", 0
         self._label = _label(self.env, state, 0, self.traffic)
         self._recorder.add(state.get(keys.VEHICLES), 0.0)
         self.env.base_env.recorder = self._recorder
-        self._show(1)
+        self._show()
 
     def before_step(self, action: int) -> None:
         """Record the action of the next step."""
@@ -62,11 +63,16 @@ class LiveView:
         """Record the outcome of the step, and show its frames."""
         self._recorder.current_return += reward
         self._outcome = outcome_of(after)
-        self._show(len(self._recorder.frames) - self._before)
+        self._show()
 
     def picture(self) -> Picture:
         """The last frame, [height, width, 3]."""
         return self._painter().draw(len(self._recorder.frames) - 1)
+
+    def pictures(self) -> Iterator[Picture]:
+        """The frames of the last decision, ten for a second; after a reset its only one."""
+        painter = self._painter()
+        return map(painter.draw, range(self._before, len(self._recorder.frames)))
 
     def close(self) -> None:
         """Close the window."""
@@ -76,15 +82,15 @@ class LiveView:
     def _painter(self) -> FramePainter:
         return FramePainter(self._recorder.trajectory(self._label, self._outcome))
 
-    def _show(self, frames: int) -> None:
-        """The last ``frames`` frames in the window, one every physics step of real time."""
+    def _show(self) -> None:
+        """The frames of the last decision in the window, one every physics step of real time."""
         if self.window is None:
             return
-        painter, count = self._painter(), len(self._recorder.frames)
-        for frame in range(max(0, count - frames), count):
-            due = time.monotonic() + PHYSICS_STEP_S
-            self.window.show(painter.draw(frame))
+        due = time.monotonic() + PHYSICS_STEP_S
+        for picture in self.pictures():
+            self.window.show(picture)
             self.window.wait(max(0.0, due - time.monotonic()))
+            due = time.monotonic() + PHYSICS_STEP_S
 
 
 class BatchView:
@@ -121,55 +127,55 @@ class BatchView:
 
 
 class FilmWindow:
-    """A window by tkinter and Pillow that shows one picture after the other until its user closes it.
+    """A window by pygame that shows one picture after the other until its user closes it.
 
     Raises:
-        UserError: there is no display, it cannot be reached, or tkinter is missing.
+        UserError: pygame is missing, or there is no display.
     """
 
     def __init__(self, title: str) -> None:
         if not has_display():
             raise UserError(
-                "render_mode=human: needs tkinter and a display, and one of them is missing here; use "
-                "render_mode=rgb_array, or ganlane render for a film."
+                "render_mode=human: needs pygame (pip install 'ganlane[human]') and a display, and one of them is "
+                "missing here; use render_mode=rgb_array, or ganlane render for a film."
             )
-        import tkinter  # not part of every Python
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame  # an extra
 
+        self._pygame: Any = pygame
+        self._screen: Any = None
         try:
-            self._root: Any = tkinter.Tk()
-        except tkinter.TclError as error:
+            pygame.display.init()
+        except pygame.error as error:
             raise UserError(
                 f"render_mode=human: no window can be opened ({error}); use render_mode=rgb_array."
             ) from error
-        self._root.title(title)
-        self._label: Any = None
+        pygame.display.set_caption(title)
 
     def show(self, picture: Picture) -> None:
         """Put a picture [height, width, 3] uint8 into the window."""
-        if self._root is None:
+        pygame = self._pygame
+        if pygame is None:
             return
-        import tkinter
-
-        from PIL import ImageTk
-
+        size = picture.shape[1::-1]
         try:
-            photo = ImageTk.PhotoImage(Image.fromarray(picture), master=self._root)
-            if self._label is None:
-                self._label = tkinter.Label(self._root, borderwidth=0)
-                self._label.pack()
-            self._label.configure(image=photo)
-            self._label.image = photo  # tkinter keeps no reference of its own
-            self._root.update()
-        except tkinter.TclError:
-            self._root = None
+            if self._screen is None:
+                self._screen = pygame.display.set_mode(size)
+            self._screen.blit(pygame.image.frombuffer(picture.tobytes(), size, "RGB"), (0, 0))
+            pygame.display.flip()
+            if pygame.event.get(pygame.QUIT):
+                self.close()
+            pygame.event.pump()
+        except pygame.error:  # somebody else has closed it: pygame has one window in a process
+            self._pygame = None
 
     def wait(self, seconds: float) -> None:
         """Wait, if the window is open."""
-        if self._root is not None:
+        if self._pygame is not None:
             time.sleep(seconds)
 
     def close(self) -> None:
         """Close the window; again does no harm."""
-        root, self._root = self._root, None
-        if root is not None:
-            root.destroy()
+        pygame, self._pygame, self._screen = self._pygame, None, None
+        if pygame is not None:
+            pygame.display.quit()

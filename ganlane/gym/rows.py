@@ -6,12 +6,14 @@ alone and without torch; :mod:`~ganlane.gym.tensor_rows` for everything else, by
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
 from ganlane.errors import UserError
@@ -19,6 +21,7 @@ from ganlane.keys import ACTIONS as ACTIONS
 from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
 from ganlane.native.library import why_not
 from ganlane.options import Option
+from ganlane.parameters.episode import EpisodeParameters
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -32,13 +35,13 @@ class Rows(ABC):
     Attributes:
         count: N.
         space: of one observation.
-        decision_period_s: time between two actions, s.
+        episode: decision period and time limit.
         env, state: the TorchRL environment and the state of its rows, where there is one.
     """
 
     count: int
     space: Box
-    decision_period_s: float
+    episode: EpisodeParameters
     env: Any = None
     state: Any = None
 
@@ -101,6 +104,14 @@ def observation_space(size: int, largest: float) -> Box:
     low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
+
+
+def with_limit(spec: EnvSpec | None, episode: EpisodeParameters) -> EnvSpec | None:
+    """A spec whose ``max_episode_steps`` says when the environment's own time limit ends an episode."""
+    limited = copy.copy(spec)
+    if limited is not None:
+        limited.max_episode_steps = episode.most_decisions()
+    return limited
 
 
 def copied(info: dict[str, Any]) -> dict[str, Any]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 
 from ganlane.errors import UserError
 from ganlane.gym import has_display
@@ -19,11 +20,18 @@ from ganlane.gym.rows import (
     known_options,
     make_rows,
     row_of,
+    with_limit,
 )
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.options import Option, option
 from ganlane.parameters.checks import checked_arguments, seed_number, whole_number
 
-RENDER_MODES = ("human", "rgb_array")
+if TYPE_CHECKING:
+    from gymnasium.wrappers import RecordVideo
+
+RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
+#: Frames per second of driving, but with ``rgb_array``.
+FPS = round(1.0 / PHYSICS_STEP_S)
 
 
 class HighwayGym(gymnasium.Env[Floats, Any]):
@@ -32,20 +40,22 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     Args:
         traffic: as in :func:`ganlane.api.make_env`, as are ``options``.
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random, as in gymnasium.
-        render_mode: None, ``rgb_array`` (a frame per decision) or ``human`` (a window, ten frames per second of
-            simulated time).
+        render_mode: None, ``rgb_array`` (a frame per decision), ``rgb_array_list`` (all frames since the last
+            ``render()``, ten per second of driving) or ``human`` (a window, in real time; needs the extra ``human``).
         options: further arguments of ``make_env``: ``observation``, ``reward``, ``mask``, ``env``, ``transforms``,
             ``stream``, ``device``, and keys of the environment.
 
     ``reset(seed=s)`` begins episode 0 of seed s, every further ``reset()`` the next one;
     ``reset(options={"episode": k})`` runs episode k. ``action`` is 0 (keep), 1 (left) or 2 (right);
-    docs/gymnasium.md lists observations and infos.
+    docs/gymnasium.md lists observations and infos. ``spec.max_episode_steps`` follows from ``timeout_s``.
 
     Raises:
         UserError: a wrong value, or ``human`` without a display.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 1}  # noqa: RUF012 - gymnasium's own form
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": FPS}  # noqa: RUF012 - gymnasium's own form
+
+    _spec: EnvSpec | None = None
 
     @checked_arguments
     def __init__(
@@ -57,15 +67,21 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         **options: Any,
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
-            raise UserError(f"render_mode={render_mode}: expected {' or '.join(RENDER_MODES)}; choose one of them.")
+            raise UserError(
+                f"render_mode={render_mode}: expected one of {', '.join(RENDER_MODES)}; choose one of them."
+            )
         self._rows = make_rows(traffic, 1, render_mode, options)
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
         # Without a display there is no window.
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
-        self.metadata = {"render_modes": modes, "render_fps": max(1, round(1.0 / self._rows.decision_period_s))}
+        decisions = max(1, round(1.0 / self._rows.episode.decision_period_s))
+        self.metadata = {"render_modes": modes, "render_fps": decisions if render_mode == "rgb_array" else FPS}
         self.render_mode = render_mode
         self._view: Any = None
+        #: Pictures since the last ``render()``, with ``rgb_array_list``.
+        self._pictures: list[Any] = []
+        self._video: RecordVideo | None = None
         if render_mode is not None:
             from ganlane.gym.rendering import FilmWindow, LiveView  # with torch, which takes seconds
 
@@ -91,6 +107,8 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         self._running = True
         if self._view is not None:
             self._view.start(self._rows.state)
+            self._pictures.clear()
+            self._collect()
         return self._rows.observation()[0].copy(), row_of(self._rows.info(), 0)
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
@@ -106,17 +124,45 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         self._running = not (terminated or truncated)
         if self._view is not None:
             self._view.after_step(self._rows.state, reward)
+            self._collect()
         return stepped.observation[0].copy(), reward, terminated, truncated, row_of(self._rows.info(), 0)
+
+    def _collect(self) -> None:
+        """Keep the pictures of the last decision for ``render()``, or give them to the video."""
+        if self.render_mode == "rgb_array_list":
+            self._pictures += self._view.pictures()
+        if self._video is not None and self._video.recording:
+            *between, _ = self._view.pictures()  # the wrapper asks for the last one itself
+            self._video.recorded_frames += between
+
+    def set_record_video_wrapper(self, wrapper: RecordVideo) -> None:
+        """Let gymnasium's ``RecordVideo`` around this environment write ten frames per second of driving.
+
+        By itself it gets one picture per decision. The name is HighwayEnv's.
+        """
+        self._video, wrapper.frames_per_sec = wrapper, FPS
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How gymnasium made it."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = with_limit(spec, self._rows.episode)
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
         """Which actions are allowed now, bool [3]; named as sb3-contrib's MaskablePPO asks for it."""
         return self._rows.mask()[0].copy()
 
     def render(self) -> Any:
-        """The picture [height, width, 3] uint8 of the last moment with ``rgb_array``; ``human`` draws by itself."""
+        """The picture [height, width, 3] uint8 of the last moment, or a list of them; ``human`` draws by itself."""
         if self._view is None:
             raise UserError(f"render(): made without render_mode; give one of {', '.join(RENDER_MODES)} to make().")
         self._rows.check_started()
+        if self.render_mode == "rgb_array_list":
+            pictures, self._pictures = self._pictures, []
+            return pictures
         return self._view.picture() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:

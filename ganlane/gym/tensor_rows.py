@@ -37,7 +37,7 @@ class TensorRows(Rows):
 
     def __init__(self, traffic: Option, count: int, options: Mapping[str, Any]) -> None:
         self.env = made = make_env(traffic, count, **options)
-        self.count, self.decision_period_s = count, made.base_env.episode.decision_period_s
+        self.count, self.episode = count, made.base_env.episode
         form = next((each.form for each in made.transform if isinstance(each, ObservationTransform)), "table3")
         largest = largest_number(form, made.base_env.scenes.longest_m)
         self.space = observation_space(made.observation_spec[keys.OBSERVATION].shape[-1], largest)

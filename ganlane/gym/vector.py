@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -24,6 +25,7 @@ from ganlane.gym.rows import (
     known_options,
     make_rows,
     row_mask,
+    with_limit,
 )
 from ganlane.options import Option, option
 from ganlane.parameters.checks import checked_arguments, seed_number
@@ -38,6 +40,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random.
         render_mode: None or ``rgb_array``.
         autoreset_mode: what happens to a row that has ended, see below.
+        max_episode_steps: as ``make_vec`` gives it for a spec of this environment; ``timeout_s`` sets the limit.
         options: as in :class:`ganlane.gym.single.HighwayGym`.
 
     ``AutoresetMode.SAME_STEP``: a row that ends is reset in the same step: ``observation`` is the first of its next
@@ -54,6 +57,8 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012
 
+    _spec: EnvSpec | None = None
+
     @checked_arguments
     def __init__(
         self,
@@ -63,6 +68,7 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         seed: int | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
@@ -72,7 +78,13 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
         self._mode = _mode_of(autoreset_mode)
         self._rows = make_rows(traffic, num_envs, render_mode, options)
         self.num_envs, self.render_mode = self._rows.count, render_mode
-        fps = max(1, round(1.0 / self._rows.decision_period_s))
+        episode = self._rows.episode
+        if max_episode_steps is not None and max_episode_steps < episode.most_decisions():
+            limit_s = max_episode_steps * episode.decision_period_s
+            raise UserError(
+                f"max_episode_steps={max_episode_steps}: a batch has its own time limit; give timeout_s={limit_s:g}."
+            )
+        fps = max(1, round(1.0 / episode.decision_period_s))
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
         self.single_observation_space, self.single_action_space = self._rows.space, Discrete(ACTIONS)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -155,6 +167,15 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
             final |= {"final_info": copied(self._rows.info()), "_final_info": ended}
             self._restart(ended)
         return self._rows.observation().copy(), reward, terminated, truncated, copied(self._rows.info()) | final
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How gymnasium made it; ``max_episode_steps`` follows from ``timeout_s``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = with_limit(spec, self._rows.episode)
 
     def action_masks(self) -> Flags:
         """Which actions are allowed now, bool [N, 3]."""

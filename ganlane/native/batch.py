@@ -131,7 +131,6 @@ class NativeBatch:
         idm, mask = idm or IdmParameters(), mask or MaskParameters()
         road = (lanes, lane_width_m, vehicles)
         self.rows, self.lanes, self.lane_width_m, self.terms = rows, lanes, lane_width_m, reward.term_names
-        self.decision_period_s = episode.decision_period_s
         view = view_of(*road, observation.scale(), observation.form)
         self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
         self.state: dict[str, npt.NDArray[Any]] = {

@@ -47,6 +47,10 @@ class EpisodeParameters:
         """Physics steps per decision."""
         return round(self.decision_period_s / PHYSICS_STEP_S)
 
+    def most_decisions(self) -> int:
+        """Decisions until the time limit."""
+        return -(-round(self.timeout_s / PHYSICS_STEP_S) // self.substeps())
+
 
 @dataclass(frozen=True)
 class SpawnParameters:

@@ -19,6 +19,7 @@ from ganlane.config.realism import RealismConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, machine
 from ganlane.evaluation.table import aligned, number, with_interval
+from ganlane.evaluation.table import show as show_tables
 from ganlane.files import split_at_markers, write_between_markers, write_bytes
 from ganlane.realism import references
 from ganlane.realism.card import Card, floors_of
@@ -57,7 +58,7 @@ def show(
     config: RealismConfig, folder: Path, tables: list[str], numbers: Mapping[str, Any], drawn: Sequence[Path]
 ) -> None:
     """Print the tables; write tables and figures into a document if asked for."""
-    print(*tables, sep="\n\n")
+    show_tables(*tables, columns=config.columns)
     if config.report is not None:
         text = document_text(tables, numbers, command_line(folder), date.today().isoformat())
         write_between_markers(Path(config.report), *markers(config.card()), f"\n{text}\n")
@@ -204,8 +205,14 @@ def draw_distributions(
         for driver, counts in {**simulated, "recorded": recorded}.items():
             if total := float(counts[name].sum()):
                 middle = 0.5 * (bounds[1:] + bounds[:-1])
-                plot_line(axes, middle, counts[name] / total / np.diff(bounds), color=colours[driver])
-    add_legend(figure, {"recorded": RECORDED, **colours})
+                density = counts[name] / total / np.diff(bounds)
+                plot_line(axes, middle, density, color=colours[driver])
+                # The bins at both ends hold all values beyond, too.
+                for end, mark in ((0, "<"), (-1, ">")):
+                    if counts[name][end]:
+                        axes.plot(middle[end], density[end], mark, color=colours[driver], clip_on=False)
+    beyond = Line2D([], [], color=FAINT, label="and all values beyond", marker=">", ls="")
+    add_legend(figure, {"recorded": RECORDED, **colours}, [beyond])
     return figure
 
 

@@ -7,10 +7,11 @@ without pyplot: they need no display, and no global list keeps them.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -25,12 +26,15 @@ from polars.exceptions import PolarsError
 
 from ganlane.data import Histogram, PooledStatistics, survival_curve
 from ganlane.errors import UserError
+from ganlane.evaluation.results import names_of_runs, runs_below
 from ganlane.files import atomic_path
 
 # It reports every table of a font that a PDF leaves out.
 logging.getLogger("fontTools").setLevel(logging.WARNING)
 
 FloatArray = npt.NDArray[np.float64]
+#: Metrics of one run, or of the same with several seeds.
+Runs: TypeAlias = "pl.DataFrame | Sequence[pl.DataFrame]"
 #: Number of decisions so far: the horizontal axis of every learning curve.
 X_COLUMN = "decisions"
 #: Prefix of the columns of ``evaluation.csv``.
@@ -124,8 +128,9 @@ def save_figure(figure: Figure, path: str | Path, kind: str | None = None) -> Pa
 
 
 def panel_grid(count: int, width_in: float = 4.0, height_in: float = 2.3) -> tuple[Figure, list[Axes]]:
-    """A figure with ``count`` panels of this size, inches, three in a row, and room for a legend above."""
-    across = min(3, count)
+    """A figure with ``count`` panels of this size, inches, about three in a row, and room for a legend above."""
+    # As many rows as need be, none with a single panel below fuller ones.
+    across = next((number for number in (3, 2, 4, 5) if count > number and count % number != 1), min(3, count))
     down = -(-count // across)
     figure = Figure(figsize=(across * width_in, down * height_in + 0.3))
     grid = figure.subplots(down, across, squeeze=False).ravel()
@@ -201,18 +206,24 @@ def read_run(path: str | Path) -> pl.DataFrame:
     return pl.concat([metrics, evaluated.rename(renamed)], how="diagonal_relaxed").sort(X_COLUMN)
 
 
-def read_runs(paths: Sequence[str | Path]) -> dict[str, pl.DataFrame]:
-    """Metrics (:func:`read_run`) of every run folder, by the shortest end of its path that tells them apart.
+def read_runs(paths: Sequence[str | Path]) -> dict[str, list[pl.DataFrame]]:
+    """Metrics (:func:`read_run`) of run folders, and of all runs in the folder of a sweep, by name.
+
+    Names are those of :func:`ganlane.evaluation.results.names_of_runs`. Runs that differ in their seeds alone share
+    one, without the seed.
 
     Raises:
         UserError: a folder comes twice, or cannot be read.
     """
-    folders = [path if path.is_dir() else path.parent for path in (Path(each).resolve() for each in paths)]
-    for depth in range(1, max(len(folder.parts) for folder in folders) + 1):
-        names = ["/".join(folder.parts[-depth:]) for folder in folders]
-        if len(set(names)) == len(names):
-            return {name: read_run(path) for name, path in zip(names, paths)}
-    raise UserError(f"run={','.join(map(str, paths))}: a folder comes twice; give each run once.")
+    given = [Path(path).resolve() for path in paths]
+    files = [path for each in given for path in (runs_below(each, "metrics.csv") if each.is_dir() else [each])]
+    files = files or given
+    if len(set(files)) < len(files):
+        raise UserError(f"run={','.join(map(str, paths))}: a folder comes twice; give each run once.")
+    runs: dict[str, list[pl.DataFrame]] = {}
+    for name, path in zip(names_of_runs([path if path.suffix != ".csv" else path.parent for path in files]), files):
+        runs.setdefault(re.sub(r"(^|, )seed=[^,]*$", "", name) or "all seeds", []).append(read_run(path))
+    return runs
 
 
 def running_mean(values: FloatArray, window: int) -> FloatArray:
@@ -225,35 +236,42 @@ def running_mean(values: FloatArray, window: int) -> FloatArray:
 
 
 @rc_context(STYLE)
-def draw_runs(runs: Mapping[str, pl.DataFrame], columns: Sequence[str] | None = None, smooth: int = 1) -> Figure:
-    """Training runs over the number of decisions, one colour per run.
+def draw_runs(runs: Mapping[str, Runs], columns: Sequence[str] | None = None, smooth: int = 1) -> Figure:
+    """Training runs over the number of decisions, one colour per name.
 
     Args:
-        runs: name to metrics (:func:`read_run`).
+        runs: name to metrics (:func:`read_run`), or to those of several seeds, of which the mean is drawn, in a band
+            from the lowest to the highest.
         columns: one panel for each of these; by default those of :data:`PANELS` that any run has numbers for.
         smooth: rows that the running mean takes in; above 1 the rows themselves are drawn faintly.
 
     Raises:
         UserError: there is nothing to draw, or a column that no run has.
     """
-    known = list(dict.fromkeys(name for frame in runs.values() for name in _number_columns(frame)))
+    seeds = {name: [each] if isinstance(each, pl.DataFrame) else list(each) for name, each in runs.items()}
+    known = list(
+        dict.fromkeys(name for frames in seeds.values() for each in frames for name in _number_columns(each))
+    )
     for name in columns or ():
         if name not in known:
             raise UserError(f"column {name}: no run has numbers there; choose among {', '.join(known)}.")
-    chosen = PANELS if columns is None else [Panel(name.replace("_", " "), name) for name in columns]
+    chosen = PANELS if columns is None else [Panel(words := name.replace("_", " "), name, words) for name in columns]
     drawn = [panel for panel in chosen if panel.column in known]
     if not drawn:
         wanted = ", ".join(panel.column for panel in PANELS)
         raise UserError(f"run={','.join(runs)}: no numbers in any of {wanted}; give the folder of a training run.")
     figure, grid = panel_grid(len(drawn))
+    labels = {
+        name: name if len(each) == 1 else f"{name} ({len(each)} seeds: mean, range)" for name, each in seeds.items()
+    }
     colours = palette(list(runs))
     for axes, panel in zip(grid, drawn):
         axes.set(title=panel.title, ylabel=panel.label, xlabel=X_COLUMN)
         axes.xaxis.set_major_formatter(EngFormatter())
-        for name, frame in runs.items():
-            _plot_column(axes, frame, panel.column, smooth, color=colours[name])
-            _plot_column(axes, frame, panel.dashed, smooth, raw=False, color=colours[name], ls="--", lw=1.2)
-    add_legend(figure, colours)
+        for name, frames in seeds.items():
+            _plot_column(axes, frames, panel.column, smooth, color=colours[name])
+            _plot_column(axes, frames, panel.dashed, smooth, raw=False, color=colours[name], ls="--", lw=1.2)
+    add_legend(figure, {labels[name]: colour for name, colour in colours.items()})
     return figure
 
 
@@ -266,15 +284,28 @@ def _number_columns(frame: pl.DataFrame) -> list[str]:
     ]
 
 
-def _plot_column(axes: Axes, frame: pl.DataFrame, column: str, smooth: int, raw: bool = True, **style: Any) -> None:
-    """A run's line for one column, if it has that column."""
-    if column not in frame.columns:
+def _plot_column(
+    axes: Axes, frames: Sequence[pl.DataFrame], column: str, smooth: int, raw: bool = True, **style: Any
+) -> None:
+    """A run's line for one column, if it has that column; of several, their mean and range where all have values."""
+    lines = []
+    for frame in (each for each in frames if column in each.columns):
+        table = frame.select(pl.col(X_COLUMN, column).cast(pl.Float64)).drop_nulls()
+        x, y = table[X_COLUMN].to_numpy(), table[column].to_numpy()
+        if smooth > 1 and raw and len(frames) == 1:
+            plot_line(axes, x, y, **{**style, "alpha": 0.3, "lw": 0.8})
+        lines.append((x, running_mean(y, smooth) if smooth > 1 else y))
+    lines = [line for line in lines if len(line[0])]
+    if len(lines) < 2:
+        for x, y in lines:
+            plot_line(axes, x, y, **style)
         return
-    table = frame.select(pl.col(X_COLUMN, column).cast(pl.Float64)).drop_nulls()
-    x, y = table[X_COLUMN].to_numpy(), table[column].to_numpy()
-    if smooth > 1 and raw:
-        plot_line(axes, x, y, **{**style, "alpha": 0.3, "lw": 0.8})
-    plot_line(axes, x, running_mean(y, smooth) if smooth > 1 else y, **style)
+    x = np.unique(np.concatenate([x for x, _ in lines]))
+    x = x[(x >= max(each[0] for each, _ in lines)) & (x <= min(each[-1] for each, _ in lines))]
+    values = np.stack([np.interp(x, *line) for line in lines])
+    plot_line(axes, x, values.mean(0), **style)
+    if raw:
+        axes.fill_between(x, values.min(0), values.max(0), color=style["color"], alpha=0.18, lw=0)
 
 
 def binned_density(histogram: Histogram, low: float, high: float) -> tuple[FloatArray, FloatArray]:
@@ -309,8 +340,13 @@ def draw_recordings(statistics: PooledStatistics) -> Figure:
     )  # fmt: skip
     for axes, title, unit, low, high, histograms in densities:
         axes.set(title=title, xlabel=unit, ylabel=f"density, per {unit}", xlim=(low, high))
-        for (label, histogram), colour in zip(histograms.items(), COLOURS):
-            axes.plot(*binned_density(histogram, low, high), color=colour, label=label)
+        for line, ((label, histogram), colour) in enumerate(zip(histograms.items(), COLOURS)):
+            middles, density = binned_density(histogram, low, high)
+            axes.plot(middles, density, color=colour, label=label)
+            beyond = 100.0 * (1.0 - float(np.sum(density)) * float(middles[1] - middles[0]))
+            if histogram.total and beyond >= 0.05:
+                text = f"{beyond:.1f} % beyond"
+                axes.text(0.99, 0.6 - 0.1 * line, text, ha="right", color=colour, size=8, transform=axes.transAxes)
         if len(histograms) > 1:
             axes.legend(loc="upper right", fontsize=8)
     _plot_durations(grid[2], statistics)

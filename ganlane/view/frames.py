@@ -1,8 +1,9 @@
 """Frames of a recorded episode, drawn with Pillow alone: no display is needed.
 
-A top view that follows the ego (orange); the others are blue, the faster the paler. White trails show where
-vehicles came from, numbers on the roofs are speeds in m/s. Overlapping vehicles have a red edge. The scale
-across the road is larger than along it (:class:`~ganlane.view.window.WindowParameters`).
+A top view that follows the ego (orange, pointed, with a white edge); the others are blue, the faster the paler.
+White trails show where vehicles came from, numbers on the roofs are speeds in m/s. Overlapping vehicles have a red
+edge. The scale across the road is larger than along it (:class:`~ganlane.view.window.WindowParameters`), as the
+header says.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class FramePainter:
         label = trajectory.label
         self.window = Window(window or WindowParameters(), label.lanes, label.lane_width_m)
         self._backdrop = Backdrop(self.window)
-        self._header = _Header(trajectory, self.window.parameters.width)
+        self._header = _Header(trajectory, self.window)
         self._overlapping = trajectory.overlapping()
         self._jumped = trajectory.jumped()
 
@@ -108,6 +109,7 @@ class FramePainter:
             braking=bool(t.acceleration[frame, vehicle] < _BRAKE_LIGHT),
             signal=self._signal(frame, vehicle),
             overlaps=bool(self._overlapping[frame, vehicle]),
+            is_ego=vehicle == 0,
         )
 
     def _signal(self, frame: int, vehicle: int) -> int:
@@ -167,8 +169,9 @@ class FramePainter:
 class _Header:
     """The line above the picture: driver, traffic, episode, and the frame's time, speed, return and action."""
 
-    def __init__(self, trajectory: Trajectory, width: int) -> None:
-        self.trajectory, self.width = trajectory, width
+    def __init__(self, trajectory: Trajectory, window: Window) -> None:
+        self.trajectory, self.width = trajectory, (width := window.parameters.width)
+        self._factor = window.across / window.along
         has_tints = width >= _WIDTH_FOR_TINTS
         values = sum(width for _, width in _VALUES)
         self._columns = width - values - (340 if has_tints else 10)
@@ -184,7 +187,10 @@ class _Header:
         title = f"{label.agent}  on  {label.traffic}"
         fitting = (size for size in _TITLE_SIZES if style.text_mask(title, size).width < self._columns - 24)
         style.put_text(fixed, (16, 8), title, next(fitting, _TITLE_SIZES[-1]), style.TEXT)
-        style.put_text(fixed, (16, 34), f"episode {label.episode}, seed {label.seed}, {lanes}", 12, style.FAINT)
+        facts = f"episode {label.episode}, seed {label.seed}, {lanes}"
+        if self._factor > 1.05:
+            facts += f"; drawn {self._factor:.1f} times as wide as it is"
+        style.put_text(fixed, (16, 34), facts, 12, style.FAINT)
         column = self._columns
         for title, width in _VALUES:
             style.put_text(fixed, (column, 9), title, 12, style.FAINT)

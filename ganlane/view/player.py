@@ -28,7 +28,7 @@ from ganlane.files import write_bytes
 from ganlane.view.trajectory import ACTION_NAMES, Trajectory
 
 #: Joined in this order.
-_SCRIPTS = ("episode.js", "road.js", "chart.js", "panel.js", "player.js")
+_SCRIPTS = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
 #: Three episodes stay under 2 MB.
 MAX_BYTES_PER_EPISODE = 660_000
 #: Frames from one sample to the next; the first that fits is taken.
@@ -136,7 +136,8 @@ def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:
         The label's fields; ``outcome``; ``time`` (series); ``x, y, heading, speed`` (a series per vehicle);
         ``length, width, target_lane, valid`` (steps per vehicle); ``acceleration`` and ``jerk`` of the ego (series);
         ``action, reward, return`` (steps, of the decision that is carried out from a sample on); ``action_values``
-        (steps per action; empty if unknown) with ``action_names``; ``comfort`` (:meth:`Trajectory.comfort`).
+        (steps per action; empty if unknown) with ``action_names``; ``comfort`` (:meth:`Trajectory.comfort`);
+        ``soft_crash``, the ends of the decisions with any, s.
     """
     t, label = trajectory, trajectory.label
     kept = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
@@ -164,4 +165,5 @@ def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:
         "action_values": [steps(row) for row in t.action_values[under_way].T] if t.action_values.size else [],
         "action_names": list(ACTION_NAMES),
         "comfort": t.comfort(),
+        "soft_crash": [round(float(time), 2) for time in t.soft_crash_s if time >= t.time_s[0]],
     }

@@ -42,6 +42,8 @@ class Recorder:
     action_values: list[np.ndarray] = field(default_factory=list)
     #: Frames recorded by the end of each decision, and its reward; empty if rewards are not recorded.
     decisions: list[tuple[int, float]] = field(default_factory=list)
+    #: Ends of the decisions with a soft crash, s.
+    soft_crash_s: list[float] = field(default_factory=list)
     current_action: int = -1
     current_return: float = 0.0
     current_values: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -84,6 +86,7 @@ class Recorder:
             outcome=outcome,
             action_values=np.stack(values) if width else np.empty((0, 0)),
             reward=reward,
+            soft_crash_s=np.array(self.soft_crash_s),
         )
 
 
@@ -161,4 +164,6 @@ def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, r
     reward = float(stepped["next", keys.REWARD][0])
     recorder.current_return += reward
     recorder.decisions.append((len(recorder.frames), reward))
+    if int(stepped["next", keys.EVENTS, keys.SOFT_CRASH][0]) > 0:
+        recorder.soft_crash_s.append(recorder.time_s[-1])
     return env.step_mdp(stepped)

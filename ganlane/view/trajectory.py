@@ -70,6 +70,9 @@ class Trajectory:
     #: Jerk, m/s3, [T, M], where frames before these were left out (:meth:`since`); empty otherwise.
     driven_jerk: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
+    #: Ends of the decisions with a soft crash, s; empty if unknown.
+    soft_crash_s: FloatArray = field(default_factory=lambda: np.empty(0))
+
     def __len__(self) -> int:
         return len(self.time_s)
 
@@ -124,7 +127,9 @@ class Trajectory:
             raise UserError(f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it.")
         arrays = {each.name: getattr(self, each.name) for each in fields(self)} | {"driven_jerk": self.jerk()}
         later: dict[str, Any] = {
-            name: value[first:] for name, value in arrays.items() if isinstance(value, np.ndarray) and value.size
+            name: value[first:]
+            for name, value in arrays.items()
+            if isinstance(value, np.ndarray) and value.size and name != "soft_crash_s"
         }
         return replace(self, **later)
 

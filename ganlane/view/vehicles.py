@@ -28,6 +28,8 @@ _OTHER_COVERAGE = (45, 80, 120)
 _BODY = np.array(
     [(-0.5, 0.42), (-0.46, 0.5), (0.38, 0.5), (0.5, 0.34), (0.5, -0.34), (0.38, -0.5), (-0.46, -0.5), (-0.5, -0.42)]
 )
+#: The ego's own shape: pointed, with a white edge.
+_EGO = np.array([(-0.5, 0.5), (0.2, 0.5), (0.5, 0.08), (0.5, -0.08), (0.2, -0.5), (-0.5, -0.5)])
 _GLASS = (
     np.array([(0.14, 0.42), (0.27, 0.34), (0.27, -0.34), (0.14, -0.42)]),
     np.array([(-0.38, 0.36), (-0.31, 0.40), (-0.31, -0.40), (-0.38, -0.36)]),
@@ -58,6 +60,7 @@ class Body:
     #: +1 signals to the left, -1 to the right, 0 not.
     signal: int = 0
     overlaps: bool = False
+    is_ego: bool = False
 
 
 def draw_body(picture: Image.Image, body: Body, window: Window, show_speed: bool = True) -> None:
@@ -75,7 +78,8 @@ def draw_body(picture: Image.Image, body: Body, window: Window, show_speed: bool
         return [(x, y) for x, y in points.tolist()]
 
     size = (2 * reach + 1) * _BODY_OVERSAMPLING
-    edge = style.CRASH if body.overlaps else style.mix(body.colour, (0, 0, 0), 0.65)
+    plain = style.TEXT if body.is_ego else style.mix(body.colour, (0, 0, 0), 0.65)
+    edge = style.CRASH if body.overlaps else plain
     patch = Image.new("RGBA", (int(size[0]), int(size[1])), (*edge, 0))
     _paint(ImageDraw.Draw(patch), body, outline, edge)
     smooth = patch.reduce(_BODY_OVERSAMPLING)
@@ -92,10 +96,11 @@ def _paint(
     edge: Colour,
 ) -> None:
     """Paint body, glass and lights; ``outline`` turns shares into pixels."""
-    draw.polygon(outline(_BODY), fill=(*edge, 255))
-    inset = 0.86 if body.overlaps else 0.93
-    draw.polygon(outline(_BODY * inset), fill=(*body.colour, 255))
-    for glass in _GLASS:
+    shape = _EGO if body.is_ego else _BODY
+    draw.polygon(outline(shape), fill=(*edge, 255))
+    inset = 0.86 if body.overlaps or body.is_ego else 0.93
+    draw.polygon(outline(shape * inset), fill=(*body.colour, 255))
+    for glass in _GLASS[1:] if body.is_ego else _GLASS:
         draw.polygon(outline(glass), fill=(*style.GLASS, 255))
     for light in _BRAKES if body.braking else ():
         draw.polygon(outline(light), fill=(*style.BRAKE, 255))

@@ -16,7 +16,7 @@ from reference.hydra_memory import composed, own_part
 
 from ganlane.__main__ import COMMANDS, main
 from ganlane.config.app import Stopped
-from ganlane.config.command_line import check, parse, typed
+from ganlane.config.command_line import as_meant, check, parse, typed
 from ganlane.config.messages import sentence
 from ganlane.errors import UserError
 
@@ -85,6 +85,43 @@ def test_a_list_refuses_a_single_value(command, key):
 @pytest.mark.parametrize(("command", "key"), [each for each in LISTS if each not in OPTIONAL_LISTS])
 def test_a_list_that_has_to_name_something_refuses_emptiness(command, key):
     assert key.rsplit(".", 1)[-1] in refuses(command, key, [])
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "meant"),
+    [
+        ("render", "run=a", "run=['a']"),
+        ("render", "run=a/b=c,d e", "run=['a/b=c','d e']"),
+        ("render", "run=it's,b", "run=['it\\'s','b']"),
+        ("render", "run=[a,b]", "run=[a,b]"),
+        ("render", "run=null", "run=null"),
+        ("render", "out=a,1e5", "out=a,1e5"),
+        ("render", "episodes=0,1e1", "episodes=[0,10]"),
+        ("evaluate", "agents=mobil", "agents=['mobil']"),
+        ("train", "env.front_speed_mps=10,12.5", "env.front_speed_mps=[10,12.5]"),
+        ("train", "evaluation.agents=mobil", "evaluation.agents=['mobil']"),
+        ("train", "total_decisions=1.5e6", "total_decisions=1500000"),
+        ("train", "total_decisions=1.5e0", "total_decisions=1.5e0"),
+        ("train", "agent.capacity=1e5", "agent.capacity=100000"),
+        ("train", "env.goal_m=1e3", "env.goal_m=1e3"),
+    ],
+)
+def test_lists_need_no_brackets_and_whole_numbers_may_have_an_exponent(command, given, meant):
+    assert as_meant(command, given) == meant
+
+
+def test_in_a_sweep_a_comma_separates_runs():
+    assert as_meant("evaluate", "agents=mobil,agent_idm", multirun=True) == "agents=['mobil'],['agent_idm']"
+    assert as_meant("evaluate", "episodes=range(1,3)", multirun=True) == "episodes=range(1,3)"
+    assert as_meant("train", "total_decisions=1e3,2e3", multirun=True) == "total_decisions=1000,2000"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_whole_number_may_have_an_exponent_and_every_list_may_lack_brackets(command):
+    whole = [key for c, key, value in KEYS if c == command and type(value) is int]
+    assert [key for key in whole if as_meant(command, f"{key}=2e1") != f"{key}=20"] == []
+    lists = [key for key in (key for c, key in LISTS if c == command) if "[" not in as_meant(command, f"{key}=1")]
+    assert lists == []
 
 
 #: Command line to a part of its sentence.

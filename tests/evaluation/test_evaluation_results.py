@@ -13,6 +13,7 @@ import torch
 
 import ganlane
 from ganlane.evaluation import code_version, results, write_episodes, write_results
+from ganlane.evaluation.results import Run
 
 
 @dataclass
@@ -60,3 +61,12 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path):
 def test_a_copy_in_somebody_elses_checkout_has_no_revision(monkeypatch, tmp_path):
     monkeypatch.setattr(results, "PACKAGE", tmp_path)
     assert code_version() == {"version": ganlane.__version__, "revision": None, "modified": None}
+
+
+def test_a_run_is_short_in_a_terminal_and_a_table_in_a_notebook(tmp_path):
+    rows = [{"agent": "mobil", "goal": 3}, {"agent": "random", "goal": 1}]
+    run = Run(tmp_path, {"rows": rows, "config": {"seed": 0}})
+    assert repr(run) == f"Run(folder={str(tmp_path)!r}, results: rows, config)"
+    assert "random" in run._repr_html_()
+    other = Run(tmp_path, {"dataset": "mine/first-v0", "decisions": 712, "config": {"seed": 0}})
+    assert "<td>712</td>" in other._repr_html_()

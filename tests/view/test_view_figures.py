@@ -22,6 +22,7 @@ from ganlane.view.figures import (
     draw_recordings,
     draw_runs,
     palette,
+    panel_grid,
     plot_line,
     read_metrics,
     read_run,
@@ -193,6 +194,38 @@ def test_runs_are_called_by_the_shortest_ends_that_tell_them_apart(tmp_path):
     assert list(read_runs([one / "metrics.csv"])) == ["one"]
     with pytest.raises(UserError, match="twice"):
         read_runs([one, one])
+
+
+def sweep_folder(folder, *lines):
+    for number, line in enumerate(lines):
+        run = run_folder(folder / str(number), slope=1.0 + number, evaluated=False)
+        (run / "overrides.yaml").write_text("".join(f"- {each}\n" for each in line.split()))
+    return folder
+
+
+def test_the_runs_of_a_sweep_are_named_by_the_options_in_which_they_differ(tmp_path):
+    folder = sweep_folder(tmp_path, "traffic=gan agent.n_step=1", "traffic=gan agent.n_step=3", "traffic=idm")
+    assert list(read_runs([folder])) == ["agent.n_step=1, traffic=gan", "agent.n_step=3, traffic=gan", "traffic=idm"]
+
+
+def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
+    lines = ["traffic=gan seed=0", "traffic=gan seed=1", "traffic=idm seed=0", "traffic=idm seed=1"]
+    runs = read_runs([sweep_folder(tmp_path, *lines)])
+    assert {name: len(frames) for name, frames in runs.items()} == {"traffic=gan": 2, "traffic=idm": 2}
+    figure = draw_runs(runs)
+    assert legend(figure)[0] == "traffic=gan (2 seeds: mean, range)"
+    axes = panels(figure)["mean return"]
+    assert axes.lines[0].get_ydata() == pytest.approx(1.5 * np.arange(1.0, 31.0))
+    assert axes.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(60.0)
+    assert list(read_runs([sweep_folder(tmp_path / "same", "seed=0", "seed=1")])) == ["all seeds"]
+
+
+@pytest.mark.parametrize("count", range(1, 14))
+def test_no_panel_is_alone_in_its_row(count):
+    figure, grid = panel_grid(count)
+    rows = [round(axes.get_position().y0, 3) for axes in grid]
+    assert len(grid) == len(figure.axes) == count
+    assert count in (1, 2, 3) or min(rows.count(row) for row in rows) > 1
 
 
 def test_the_running_mean_skips_gaps():

@@ -145,6 +145,50 @@ def test_without_following_the_ego_drives_out_of_the_picture(page):
     assert ink(page, f"{FIRST} .road", EGO) == 0
 
 
+def test_every_canvas_has_the_size_of_its_place_whatever_came_after_it(pages, tmp_path):
+    opened, _ = pages
+    opened.size(1920, 1080)
+    opened.open(write_player([learned() for _ in range(6)], tmp_path / "six.html"))
+    boxes = opened.value(
+        "[...document.querySelectorAll('canvas')].map((c) => [c.width, c.height, c.clientWidth, c.clientHeight])"
+    )
+    opened.value("document.getElementById('look').click()")
+    opened.size(1200, 900)
+    assert len(boxes) == 6 * 6
+    assert [box for box in boxes if box[:2] != box[2:]] == []
+    assert min(box[0] for box in boxes) > 500
+
+
+def test_events_are_marked_and_a_key_goes_to_the_next(pages, tmp_path):
+    opened, _ = pages
+    lane = np.ones((60, 1), int)
+    lane[30:] = 2
+    one = straight([0], [1], 60, target_lane=lane, soft_crash_s=np.array([4.0]), outcome="hard_crash")
+    opened.open(write_player([one], tmp_path / "events.html"))
+    for colour in (BLUE, (230, 167, 0), RED):
+        assert ink(opened, ".events", colour) > 15
+    visited = []
+    for _ in range(4):
+        opened.key("e", code="KeyE", windowsVirtualKeyCode=69)
+        visited.append(opened.value(CLOCK))
+    assert visited == pytest.approx([3.0, 4.0, 5.9, 5.9])
+    opened.key("E", code="KeyE", windowsVirtualKeyCode=69, modifiers=8)
+    assert opened.value(CLOCK) == pytest.approx(4.0)
+
+
+def test_keys_change_the_speed_and_the_look(page):
+    page.key("+", code="Equal", windowsVirtualKeyCode=187)
+    assert page.value("document.getElementById('speed').value") == "2"
+    page.key("-", code="Minus", windowsVirtualKeyCode=189)
+    page.key("-", code="Minus", windowsVirtualKeyCode=189)
+    assert page.value("document.getElementById('speed').value") == "0.5"
+    grounds = []
+    for _ in range(2):
+        page.key("l", code="KeyL", windowsVirtualKeyCode=76)
+        grounds.append(page.value("getComputedStyle(document.body).backgroundColor"))
+    assert sorted(grounds) == ["rgb(22, 24, 28)", "rgb(255, 255, 255)"]
+
+
 def test_a_shipped_agents_episode_plays(pages, tmp_path):
     config = EnvConfig(goal_m=60.0)
     driver = make_driver("agent_idm", config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import select
@@ -60,6 +61,16 @@ class Page:
         while not self.value(expression):
             assert time.monotonic() < end, f"still not so after {seconds} s: {expression}"
             time.sleep(0.05)
+
+    def size(self, width, height):
+        """Give the page this many CSS pixels."""
+        self._send(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+        )
+
+    def screenshot(self):
+        """The picture of what is to be seen, PNG."""
+        return base64.b64decode(self._send("Page.captureScreenshot", format="png")["data"])
 
     def click(self, selector, share=0.5):
         """A real click into an element, at this share of its width."""

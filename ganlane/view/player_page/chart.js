@@ -1,8 +1,19 @@
 // Curves over time with a line at the present moment; what stays the same is drawn once.
 
 const CHART_PX = 110;
-const PLOT = { left: 46, right: 8, top: 22, bottom: 6 };
+const PLOT = { left: 76, right: 8, top: 22, bottom: 6 };
 const COLOURS = ["#56a0dc", "#e67800", "#2fc08f"];
+
+// A colour of the present look, which style.css names.
+function look(name) { return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim(); }
+
+function columnOf(time, [from, to], width) {
+  return PLOT.left + (time - from) / Math.max(to - from, 1e-9) * (width - PLOT.left - PLOT.right);
+}
+
+function timeOf(column, [from, to], width) {
+  return from + (column - PLOT.left) / (width - PLOT.left - PLOT.right) * (to - from);
+}
 
 class Chart {
   // lines: [{name, values, stepped, scaledTo}], values over episode.time, null where there is none; scaledTo: how
@@ -16,7 +27,6 @@ class Chart {
     if (!known.length) [low, high] = [0, 1];
     const room = Math.max(0.08 * (high - low), 0.1);
     this.bounds = [low - room, high + room];
-    this.resize();
   }
 
   resize() {
@@ -24,20 +34,14 @@ class Chart {
     this.still = null;
   }
 
-  column(time) {
-    const [from, to] = this.span;
-    return PLOT.left + (time - from) / Math.max(to - from, 1e-9) * (this.width - PLOT.left - PLOT.right);
-  }
+  column(time) { return columnOf(time, this.span, this.width); }
 
   row(value) {
     const [low, high] = this.bounds;
     return this.height - PLOT.bottom - (value - low) / (high - low) * (this.height - PLOT.top - PLOT.bottom);
   }
 
-  timeAt(column) {
-    const [from, to] = this.span;
-    return from + (column - PLOT.left) / (this.width - PLOT.left - PLOT.right) * (to - from);
-  }
+  timeAt(column) { return timeOf(column, this.span, this.width); }
 
   draw(time) {
     const { pen, canvas } = this;
@@ -50,34 +54,28 @@ class Chart {
     }
     pen.drawImage(this.still, 0, 0, this.width, this.height);
     const now = this.column(Math.min(Math.max(time, this.span[0]), this.span[1]));
-    pen.fillStyle = "#ffffff";
+    pen.fillStyle = look("ink");
     pen.fillRect(now - 0.5, PLOT.top, 1, this.height - PLOT.top - PLOT.bottom);
     this.drawLegend(this.episode.place(time).index);
   }
 
   drawStill() {
     const { pen, width, height } = this;
-    pen.fillStyle = "#22252b";
+    pen.fillStyle = look("panel");
     pen.fillRect(0, 0, width, height);
     pen.font = "11px system-ui, sans-serif";
     pen.textAlign = "right";
-    for (const value of this.ticks()) {
-      pen.fillStyle = value === 0 ? "#6e747c" : "#383c44";
+    pen.fillStyle = look("grid");
+    for (const tick of roundNumbers(...this.span, Math.max(2, Math.floor(width / 110)))) {
+      pen.fillRect(this.column(tick), PLOT.top, 1, height - PLOT.top - PLOT.bottom);
+    }
+    for (const value of roundNumbers(...this.bounds)) {
+      pen.fillStyle = look(value === 0 ? "axis" : "grid");
       pen.fillRect(PLOT.left, this.row(value), width - PLOT.left - PLOT.right, 1);
-      pen.fillStyle = "#9499a0";
-      pen.fillText(String(Number(value.toPrecision(6))), PLOT.left - 5, this.row(value) + 4);
+      pen.fillStyle = look("faint");
+      pen.fillText(String(value), PLOT.left - 5, this.row(value) + 4);
     }
     this.lines.forEach((line, k) => this.drawLine(line, COLOURS[k % COLOURS.length]));
-  }
-
-  // Round numbers, 1, 2 or 5 times a power of ten apart.
-  ticks() {
-    const [low, high] = this.bounds;
-    const power = 10 ** Math.floor(Math.log10((high - low) / 3));
-    const step = [1, 2, 5, 10].map((factor) => factor * power).find((size) => size >= (high - low) / 4);
-    const found = [];
-    for (let k = Math.ceil(low / step); k * step <= high; k++) found.push(k * step);
-    return found;
   }
 
   drawLine(line, colour) {
@@ -115,7 +113,7 @@ class Chart {
       pen.fillText(text, column, 15);
       column += pen.measureText(text).width + 14;
     };
-    put(this.title, "#f0f0ec");
+    put(this.title, look("ink"));
     this.lines.forEach((line, k) => {
       const value = line.values[index];
       put(`${line.name} ${value === null ? "-" : value.toFixed(2)}`.trim(), COLOURS[k % COLOURS.length]);

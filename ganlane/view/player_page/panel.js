@@ -12,11 +12,13 @@ class Panel {
   constructor(told, units, span) {
     const element = document.getElementById("episode").content.cloneNode(true).firstElementChild;
     document.getElementById("episodes").append(element);
+    // Nothing is fitted to its place here: the panels that follow will change it (resize).
     this.episode = new Episode(told, units);
     this.now = element.querySelector(".now");
     element.querySelector(".title").textContent = `${told.agent} on ${told.traffic}`;
     element.querySelector(".facts").textContent = this.facts();
     this.road = new Road(element.querySelector(".road"), this.episode);
+    this.timeline = new Timeline(element.querySelector(".events"), this.episode, span);
     this.charts = this.curves().map(([name, title, lines]) => {
       const canvas = document.createElement("canvas");
       canvas.className = "chart";
@@ -56,7 +58,7 @@ class Panel {
   draw(time, follow) {
     const { episode } = this;
     this.road.draw(time, follow);
-    for (const chart of this.charts) chart.draw(time);
+    for (const chart of [this.timeline, ...this.charts]) chart.draw(time);
     const { index } = episode.place(time);
     const action = episode.told.action_names[episode.action[index]] || "-";
     const ending = time >= episode.end && episode.told.outcome ? ` · ${OUTCOMES[episode.told.outcome]}` : "";
@@ -65,7 +67,6 @@ class Panel {
   }
 
   resize() {
-    this.road.resize();
-    for (const chart of this.charts) chart.resize();
+    for (const part of [this.road, this.timeline, ...this.charts]) part.resize();
   }
 }

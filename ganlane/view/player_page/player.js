@@ -31,6 +31,31 @@ function setPlaying(playing) {
   if (playing) requestAnimationFrame(tick);
 }
 
+// To the next event of any episode after now, or the one before.
+function goToEvent(direction) {
+  const times = panels.flatMap((panel) => panel.timeline.events.map((event) => event.time)).sort((a, b) => a - b);
+  const found = direction > 0
+    ? times.find((time) => time > state.time + 0.005)
+    : times.filter((time) => time < state.time - 0.005).pop();
+  if (found !== undefined) goTo(found);
+}
+
+function changeSpeed(by) {
+  const choice = control("speed");
+  choice.selectedIndex = Math.min(Math.max(choice.selectedIndex + by, 0), choice.options.length - 1);
+}
+
+function changeLook() {
+  const dark = getComputedStyle(document.documentElement).colorScheme === "dark";
+  document.documentElement.dataset.look = dark ? "light" : "dark";
+  resize();
+}
+
+function resize() {
+  for (const panel of panels) panel.resize();
+  draw();
+}
+
 function tick(now) {
   if (!state.playing) return;
   const passed = state.before === null ? 0 : (now - state.before) / 1000;
@@ -60,10 +85,15 @@ function letDrag(panel) {
 
 function onKey(event) {
   if (event.target.matches("select, button, input:not([type=range])")) return;
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
   const step = event.shiftKey ? 1 : 0.1;
   if (event.key === " ") setPlaying(!state.playing);
   else if (event.key === "ArrowRight") goTo(state.time + step);
   else if (event.key === "ArrowLeft") goTo(state.time - step);
+  else if (event.key === "e" || event.key === "E") goToEvent(event.shiftKey ? -1 : 1);
+  else if (event.key === "+" || event.key === "=") changeSpeed(1);
+  else if (event.key === "-") changeSpeed(-1);
+  else if (event.key === "l") changeLook();
   else return;
   event.preventDefault();
 }
@@ -71,6 +101,10 @@ function onKey(event) {
 control("scrub").min = span[0];
 control("scrub").max = span[1];
 control("play").addEventListener("click", () => setPlaying(!state.playing));
+control("next").addEventListener("click", () => goToEvent(1));
+control("back").addEventListener("click", () => goToEvent(-1));
+control("look").addEventListener("click", changeLook);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", resize);
 control("scrub").addEventListener("input", () => goTo(Number(control("scrub").value)));
 control("follow").addEventListener("change", () => {
   for (const panel of panels) panel.road.canvas.classList.toggle("loose", !control("follow").checked);
@@ -85,13 +119,10 @@ control("road").addEventListener("change", () => {
 });
 for (const panel of panels) {
   letDrag(panel);
-  for (const chart of panel.charts) {
+  for (const chart of [panel.timeline, ...panel.charts]) {
     chart.canvas.addEventListener("click", (event) => goTo(chart.timeAt(event.offsetX)));
   }
 }
 document.addEventListener("keydown", onKey);
-window.addEventListener("resize", () => {
-  for (const panel of panels) panel.resize();
-  draw();
-});
-draw();
+window.addEventListener("resize", resize);
+resize();

@@ -3,7 +3,7 @@
 const EGO = "rgb(255,150,28)";
 const CRASH = "rgb(255,62,62)";
 const FAST_MPS = 35;
-const LATERAL_EXAGGERATION = 1.5;
+const LEAST_ACROSS = 3.5; // pixels per m
 const MARGIN_PX = 26;
 const TRAIL_S = 3;
 
@@ -32,13 +32,12 @@ class Road {
     this.episode = episode;
     this.road_m = 160;
     this.centre_m = 0; // of the picture, where it does not follow the ego
-    this.resize();
   }
 
   resize() {
     const { lanes, lane_width_m: laneWidth } = this.episode.told;
     const along = Math.max(this.canvas.clientWidth, 1) / this.road_m;
-    this.across = Math.min(Math.max(along * LATERAL_EXAGGERATION, 3), 14);
+    this.across = Math.max(along, LEAST_ACROSS);
     Object.assign(this, fitCanvas(this.canvas, lanes * laneWidth * this.across + 2 * MARGIN_PX));
     this.along = this.width / this.road_m;
   }
@@ -69,9 +68,9 @@ class Road {
     const { pen, width, height } = this;
     const { lanes, lane_width_m: laneWidth } = this.episode.told;
     const [top, bottom] = [this.row((lanes - 0.5) * laneWidth), this.row(-0.5 * laneWidth)];
-    pen.fillStyle = "#2a332e";
+    pen.fillStyle = look("verge");
     pen.fillRect(0, 0, width, height);
-    pen.fillStyle = "#3d4045";
+    pen.fillStyle = look("asphalt");
     pen.fillRect(0, top - 3, width, bottom - top + 6);
     pen.fillStyle = "#d6d6d0";
     for (const edge of [top, bottom]) pen.fillRect(0, edge - 1, width, 2);
@@ -81,8 +80,11 @@ class Road {
         pen.fillRect(this.column(x), mark - 0.75, 6 * this.along, 1.5);
       }
     }
-    pen.fillStyle = "#9499a0";
+    pen.fillStyle = look("faint");
     pen.font = "11px system-ui, sans-serif";
+    const factor = this.across / this.along;
+    pen.textAlign = "right";
+    if (factor > 1.05) pen.fillText(`drawn ${factor.toFixed(1)} times as wide as it is`, width - 8, 14);
     pen.textAlign = "left";
     const every = this.road_m > 200 ? 100 : 50;
     for (let x = Math.ceil(this.start_m / every) * every; x < this.start_m + this.road_m; x += every) {
@@ -114,9 +116,10 @@ class Road {
     pen.scale(this.along, -this.across);
     pen.rotate(vehicle.heading);
     pen.fillStyle = isEgo ? EGO : speedTint(vehicle.speed);
-    pen.fillRect(-length / 2, -width / 2, length, width);
+    if (isEgo) this.drawArrow(length, width);
+    else pen.fillRect(-length / 2, -width / 2, length, width);
     pen.fillStyle = "#181c24";
-    pen.fillRect(0.14 * length, -0.4 * width, 0.12 * length, 0.8 * width);
+    if (!isEgo) pen.fillRect(0.14 * length, -0.4 * width, 0.12 * length, 0.8 * width);
     if (vehicle.braking) {
       pen.fillStyle = "#ff3028";
       pen.fillRect(-length / 2, -width / 2, 0.07 * length, width);
@@ -130,6 +133,18 @@ class Road {
     }
     pen.restore();
     this.writeSpeed(vehicle, isEgo);
+  }
+
+  // The ego's own shape: pointed, with a white edge.
+  drawArrow(length, width) {
+    const { pen } = this;
+    pen.beginPath();
+    for (const [x, y] of [[-0.5, -0.5], [0.2, -0.5], [0.5, 0], [0.2, 0.5], [-0.5, 0.5]]) pen.lineTo(x * length, y * width);
+    pen.closePath();
+    pen.fill();
+    pen.strokeStyle = "#ffffff";
+    pen.lineWidth = 1.5 / this.along;
+    pen.stroke();
   }
 
   // On the roof, or above it where the roof is too small.

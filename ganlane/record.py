@@ -1,0 +1,184 @@
+"""``ganlane record``: a driver's episodes as an offline dataset in Minari's format (https://minari.farama.org).
+
+    ganlane record agent=mobil traffic=idm_mobil episodes=100 out=datasets
+    ganlane record agent=agent_general traffic=gan_calibrated mask=legal dataset=highway/expert-v0 out=datasets
+    MINARI_DATASETS_PATH=datasets python -c "import minari; print(minari.load_dataset('ganlane/idm_mobil/mobil-v0'))"
+
+Observations, actions, rewards, ends and infos are those of gymnasium's ganlane/Highway-v0 (docs/gymnasium.md), which
+``recover_environment()`` makes; episode k begins with ``reset(seed=seed, options={"episode": k})``. Needs the extra
+'minari'.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import asdict
+from pathlib import Path
+from shutil import rmtree
+from typing import TYPE_CHECKING, Any
+
+from ganlane.config.app import run_command
+from ganlane.config.folders import cleared_after_mistakes
+from ganlane.config.record import RecordConfig
+from ganlane.config.schemas import SCHEMAS
+from ganlane.errors import UserError
+
+if TYPE_CHECKING:
+    from minari.data_collector import EpisodeBuffer
+
+    from ganlane.gym.tensor_rows import TensorRows
+
+#: Episodes that are written at a time.
+_AT_ONCE = 64
+
+
+def record(config: RecordConfig, folder: Path) -> str:
+    """Drive and write; the line that names the dataset."""
+    try:
+        import minari
+        from minari.dataset.minari_storage import MinariStorage
+    except ImportError as error:
+        raise UserError("record: needs the extra 'minari'; run `pip install \"ganlane[minari]\"`.") from error
+    import gymnasium
+
+    from ganlane.build import make_driver
+    from ganlane.evaluation.results import plain, write_results
+    from ganlane.gym import ENV_ID
+    from ganlane.gym.tensor_rows import TensorRows
+    from ganlane.keys import ACTIONS
+    from ganlane.runtime import set_threads
+    from ganlane.sim.random import Stream
+
+    set_threads(config.threads)
+    driver = make_driver(config.driver, config.env, Stream[config.stream.upper()], config.device)
+    mask, policy = driver.behind(config.mask)
+    seen = config.observation.read_by(driver.observation)
+    options = {"env": config.env, "observation": seen, "reward": config.reward, "mask": mask, "stream": config.stream}
+    count = min(config.num_envs, config.episodes)
+    rows = TensorRows(config.traffic, count, {**options, "device": config.device})
+    spec = deepcopy(gymnasium.spec(ENV_ID))
+    spec.kwargs, spec.max_episode_steps = plain({"traffic": config.traffic, **options}), rows.episode.most_decisions()
+    spec.kwargs["traffic"]["name"], env = config.traffic.label(), _env_name(config)
+    spec.kwargs["env"]["name"] = env
+    name, root = config.dataset_name(), Path(config.out or folder).absolute()
+    about = {"dataset_id": name, "algorithm_name": driver.name, "minari_version": minari.__version__}
+    about["description"] = f"{driver.name} among {config.traffic.label()}, env={env}, seed {config.seed}"
+    with _new_folder(root / name) as part:
+        storage = MinariStorage.new(part / "data", rows.space, gymnasium.spaces.Discrete(ACTIONS), spec)
+        storage.update_metadata(about)
+        found = _write(storage, _driven(rows, policy, config), config.episodes)
+    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    write_results(folder, {"dataset": name, "root": str(root), **found}, asdict(config), seeds)
+    print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in found.items()))
+    return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
+
+
+def _env_name(config: RecordConfig) -> str:
+    return next(name for name, kind in SCHEMAS["env"].items() if kind is type(config.env))
+
+
+@contextmanager
+def _new_folder(place: Path) -> Iterator[Path]:
+    """A folder under another name, which becomes ``place`` once it is whole.
+
+    Raises:
+        UserError: there is one already.
+    """
+    if place.exists():
+        raise UserError(f"{place}: a dataset is there already; give another dataset=NAME or out=FOLDER.")
+    with cleared_after_mistakes(place.parent):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(dir=place.parent, prefix="."))
+        try:
+            yield part
+            part.chmod(0o755)
+            part.replace(place)
+        finally:
+            rmtree(part, ignore_errors=True)
+
+
+def _driven(rows: TensorRows, policy: Any, config: RecordConfig) -> Iterator[EpisodeBuffer]:
+    """The episodes as they end; row i of N drives i, i + N, i + 2N, ..."""
+    import numpy as np
+    import torch
+    from minari.data_collector import EpisodeBuffer
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    from ganlane.gym.rows import row_of
+    from ganlane.keys import ACTION, EPISODE
+
+    def seen(chosen: Iterable[int]) -> None:
+        """Add what the rows ``chosen`` are in to their episodes."""
+        observation, info = rows.observation().copy(), rows.info()
+        for row in chosen:
+            buffers[row].observations.append(observation[row])
+            _append(buffers[row].infos, row_of(info, row))
+
+    def begin(chosen: Iterable[int]) -> None:
+        for row in chosen:
+            number = int(rows.now().get(EPISODE)[row])
+            buffers[row] = EpisodeBuffer(number, config.seed, {"episode": number}, [], [], infos={})
+        seen(chosen)
+
+    buffers: dict[int, Any] = {}
+    rows.start(config.seed, np.arange(rows.count))
+    begin(range(rows.count))
+    while any(buffer.id < config.episodes for buffer in buffers.values()):
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            actions = policy(rows.now().clone(recurse=False)).get(ACTION).cpu().numpy()
+        stepped = rows.step(actions)
+        seen(buffers)
+        for row, buffer in buffers.items():
+            buffer.actions.append(actions[row])
+            buffer.rewards.append(stepped.reward[row])
+            buffer.terminations.append(stepped.terminated[row])
+            buffer.truncations.append(stepped.truncated[row])
+        ended = np.flatnonzero(stepped.terminated | stepped.truncated).tolist()
+        yield from (buffers[row] for row in ended if buffers[row].id < config.episodes)
+        if ended:
+            rows.restart(stepped.terminated | stepped.truncated)
+            begin(ended)
+
+
+def _append(lists: dict[str, Any], values: dict[str, Any]) -> None:
+    """Append every value to the list of its name, nested ones likewise."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            _append(lists.setdefault(name, {}), value)
+        else:
+            lists.setdefault(name, []).append(value)
+
+
+def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[str, Any]:
+    """Write the episodes in the order of their numbers; what they were like."""
+    from tqdm import tqdm
+
+    from ganlane.keys import END_EVENTS
+
+    waiting: dict[int | None, EpisodeBuffer] = {}
+    written, decisions, returns, ends = 0, 0, 0.0, Counter[str]()
+    for episode in tqdm(episodes, total=count, unit="episode", disable=not sys.stderr.isatty()):
+        decisions, returns = decisions + len(episode), returns + float(sum(episode.rewards))
+        ends.update(event for event in END_EVENTS if episode.infos[event][-1])
+        waiting[episode.id] = episode
+        ready = 0
+        while written + ready in waiting:
+            ready += 1
+        if ready >= _AT_ONCE or written + ready == count:
+            storage.update_episodes([waiting.pop(number) for number in range(written, written + ready)])
+            written += ready
+    return {"episodes": written, "decisions": decisions, "mean_return": round(returns / count, 2), "ends": dict(ends)}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; the exit status."""
+    return run_command("record", record, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -67,15 +67,15 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
 
 
 def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_driven, capsys):
-    agents = "agents=[random_legal,mobil]"
+    agents = "agents=[random_legal,mobil,agent_idm]"
     assert main([*SHORT, agents, "traffics=[idm]"]) == 0
     first = json.loads(Path("out/results.json").read_text())["rows"]
     assert main([*SHORT, agents, "traffics=[idm]"]) == 0
-    assert len(cells_driven) == 2
+    assert len(cells_driven) == 3
     assert json.loads(Path("out/results.json").read_text())["rows"] == first
-    assert main([*SHORT, "agents=[random_legal,mobil,keep_lane]", "traffics=[idm]"]) == 0
+    assert main([*SHORT, "agents=[random_legal,mobil,agent_idm,keep_lane]", "traffics=[idm]"]) == 0
     assert main([*SHORT, agents, "traffics=[idm]", "seed=1"]) == 0
-    assert cells_driven[2:] == [("keep_lane", "idm"), ("random_legal", "idm"), ("mobil", "idm")]
+    assert cells_driven[3:] == [(name, "idm") for name in ("keep_lane", "random_legal", "mobil", "agent_idm")]
 
 
 def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys):

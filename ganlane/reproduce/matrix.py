@@ -81,8 +81,9 @@ def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> lis
 
 def _settings(driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, episodes: int) -> dict[str, Any]:
     weights = hashlib.sha256()
-    for value in driver.policy.state_dict().values():
-        weights.update(value.cpu().numpy().tobytes())
+    for name, value in driver.policy.state_dict().items():
+        if not name.endswith("_epsilon"):  # noise for exploring, drawn anew by every process
+            weights.update(value.cpu().numpy().tobytes())
     mask, _ = driver.behind(config.mask)
     env = {key: value for key, value in asdict(config.env).items() if key != "compile"}
     settings = {

@@ -18,6 +18,7 @@ COMMANDS = {
     "prepare": "recordings into one schema, with a report of what they show",
     "train_generator": "fit a generator to recorded traffic",
     "realism": "how close a traffic comes to recorded driving",
+    "reproduce": "the paper's tables and figures, and the matrix behind them, in one folder",
     "bench": "speed and memory, compared with a peer in the same run",
 }
 #: Commands without a configuration: they take no keys.

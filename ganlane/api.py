@@ -31,6 +31,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform, TransformedEnv
 
 from ganlane import build
+from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import Driver
 from ganlane.compare import compare_configured
 from ganlane.config.app import Stopped
@@ -171,6 +172,7 @@ def evaluate(
         OSError: a folder that cannot be written to.
     """
     chosen = _named_traffics(traffics)
+    agents = [each for agent in agents for each in (with_seeds(agent) if isinstance(agent, str) else [agent])]
     keys |= {"agents": [_agent_name(agent) for agent in agents], "traffics": list(chosen)}
     keys |= {"episodes": episodes, "seed": seed, "traffic_options": {**all_traffics(), **chosen}}
     config: EvaluateConfig = command_config("evaluate", keys)

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ganlane import keys
 from ganlane.agents import load_agent
-from ganlane.agents.checkpoint import SHIPPED
+from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS
 from ganlane.agents.policy import MaskedPolicy
 from ganlane.config.env import EnvConfig
@@ -155,10 +155,10 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     """A driver by its name.
 
     Args:
-        name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent, the path of an agent's file,
-            or the import path of a policy of your own (a class or annotated function; it may have ``road``,
-            ``stream``, ``idm`` and ``mobil``). A suffix ``+safe``, ``+legal`` or ``+none`` sets its mask, in place of
-            the one that it was trained with.
+        name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent (``agent_idm@1``: the recipe
+            of ``agent_idm``, trained with seed 1), the path of an agent's file, or the import path of a policy of
+            your own (a class or annotated function; it may have ``road``, ``stream``, ``idm`` and ``mobil``). A
+            suffix ``+safe``, ``+legal`` or ``+none`` sets its mask, in place of the one that it was trained with.
         env: the environment it drives in.
         stream: of its random numbers, if it draws any.
         device: of its network.
@@ -174,7 +174,7 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     if name in DRIVERS:
         policy = call_with(DRIVERS[name], _offered(env, stream), {}, "agents")
         return Driver(name, policy.to(device))
-    if name.removesuffix("@0") in SHIPPED or os.path.isfile(name) or name.endswith(".safetensors"):
+    if names_agent(name):
         return _trained(name, env, device)
     if is_import_path(name):
         return _imported(name, env, stream, device)
@@ -183,6 +183,12 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
         f"agent {name:.100}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the "
         "import path of a policy."
     )
+
+
+def make_drivers(names: Sequence[str], env: EnvConfig, device: str = "cpu") -> list[Driver]:
+    """:func:`make_driver` for several names; ``agent_idm@all`` stands for all trainings of its recipe there are."""
+    each = dict.fromkeys(single for name in names for single in with_seeds(name))
+    return [make_driver(name, env, device=device) for name in each]
 
 
 def _trained(name: str, env: EnvConfig, device: str) -> Driver:

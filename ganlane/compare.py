@@ -46,6 +46,7 @@ def compare(
     device: str = "cpu",
     stream: int = Stream.REPORT,
     mask: MaskParameters | None = None,
+    quiet: bool = False,
 ) -> pl.DataFrame:
     """Run the episodes 0 to ``episodes - 1`` with each driver on each traffic.
 
@@ -57,6 +58,7 @@ def compare(
         episodes, seed, stream: which episodes.
         num_envs: episodes side by side, at most.
         mask: for drivers that name none.
+        quiet: without signs of progress.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
@@ -66,7 +68,8 @@ def compare(
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(num_envs, episodes), []
     made: tuple[tuple[str, ObservationConfig, MaskParameters], EnvBase] | None = None
-    bar = tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=not sys.stderr.isatty())
+    disabled = quiet or not sys.stderr.isatty()
+    bar = tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=disabled)
     with bar:
         for number, (traffic, driver) in enumerate(pairs):
             own_observation = (observation or ObservationConfig()).read_by(driver.observation)
@@ -78,14 +81,15 @@ def compare(
                 # Drivers with the same observation and mask share an environment, so that it is compiled once.
                 made = (traffic, own_observation, own_mask), make(rows)
             smaller = None if env.compile else make
-            on_progress = _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
+            title, before = f"{driver.name} on {traffic}", number * episodes
+            on_progress = None if quiet else _reporter(bar, title, before)
             table = run_episodes(made[1], policy, range(episodes), seed, on_progress, smaller)
             named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             tables.append(_with_scenes(named, modules[traffic], seed))
     return pl.concat(tables, how="diagonal")
 
 
-def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.DataFrame:
+def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
     """:func:`compare` with the traffics, episodes and environment of ``config``."""
     return compare(
         drivers,
@@ -99,6 +103,7 @@ def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig) -> pl.
         config.device,
         Stream[config.stream.upper()],
         config.mask,
+        quiet,
     )
 
 

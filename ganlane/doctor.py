@@ -294,8 +294,10 @@ def _loader(name: str, path: Path) -> Callable[[], Finding]:
             load_generator(path)
         else:
             from ganlane.agents import load_agent
+            from ganlane.agents.checkpoint import with_seeds
 
-            load_agent(path)
+            for agent in with_seeds(f"{path}@all") if name.startswith("seeds_of_") else [path]:
+                load_agent(agent)
         return Finding(name, State.OK, f"{path} ({_megabytes(path)})")
 
     return look

@@ -20,12 +20,12 @@ from ganlane.config.evaluate import EvaluateConfig
 
 def evaluate(config: EvaluateConfig, folder: Path) -> str:
     """Run, print and keep the table."""
-    from ganlane.build import make_driver
+    from ganlane.build import make_drivers
     from ganlane.compare import compare_configured, publish
     from ganlane.runtime import set_threads
 
     set_threads(config.threads)
-    drivers = [make_driver(name, config.env, device=config.device) for name in config.agents]
+    drivers = make_drivers(config.agents, config.env, config.device)
     table = compare_configured(drivers, config)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
     return publish(table, folder, asdict(config), seeds)

@@ -31,7 +31,7 @@ def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate what came out."""
     if config.resume is None and earned(folder):
         raise UserError(f"{folder}: a run is there already; go on with resume={folder}, or give another folder.")
-    from ganlane.build import make_driver, make_traffic
+    from ganlane.build import make_driver, make_drivers, make_traffic
     from ganlane.compare import compare, publish
     from ganlane.runtime import set_threads
     from ganlane.training.checkpoint import LAST
@@ -40,7 +40,7 @@ def train(config: TrainConfig, folder: Path) -> str:
     set_threads(config.threads)
     for traffic in config.all_traffic():  # a mistake in any of them shows before hours of training, not after
         make_traffic(traffic, config.env)
-    others = [make_driver(name, config.env, device=config.device) for name in config.evaluation.agents]
+    others = make_drivers(config.evaluation.agents, config.env, config.device)
     lengths: dict[str, dict[str, float]] = {}
     for phase in phases_of(config, folder):
         finished = length_if_finished(config, phase)

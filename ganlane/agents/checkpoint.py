@@ -21,23 +21,80 @@ from ganlane.parameters.removed import without_removed
 
 #: Agents that come with the package; others are given by their path.
 SHIPPED = ("agent_general", "agent_idm", "agent_gan")
+#: Kind of a file with several agents.
+SEVERAL = "agents"
 #: What says which returns the outputs of a distributional network stand for.
 SUPPORT = ("atoms", "v_min", "v_max")
 
 
+def _place(name: str | Path) -> tuple[Path, int | None]:
+    """File of an agent, and its seed if the file holds several trainings."""
+    recipe, at, digits = str(name).rpartition("@")
+    if not (at and digits.isdecimal() and (recipe in SHIPPED or recipe.endswith(".safetensors"))):
+        return CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name), None
+    seed = int(digits)
+    if recipe not in SHIPPED:
+        return Path(recipe), seed
+    return (_seeds_file(recipe), seed) if seed else (CHECKPOINTS / f"{recipe}.safetensors", None)
+
+
+def _seeds_file(recipe: str) -> Path:
+    """The file of the trainings of a shipped agent's recipe with other seeds than 0."""
+    return CHECKPOINTS / f"seeds_of_{recipe}.safetensors"
+
+
+def names_agent(name: str) -> bool:
+    """Whether ``name`` can only be that of a trained agent: one that ships, or a file; ``@SEED`` may follow."""
+    recipe, _, digits = name.rpartition("@")
+    return any(
+        each in SHIPPED or each.endswith(".safetensors") or os.path.isfile(each)
+        for each in (name, recipe if digits.isdecimal() else name)
+    )
+
+
+def with_seeds(name: str) -> list[str]:
+    """``agent_idm@all`` as ``agent_idm@0``, ``agent_idm@1`` ..., all trainings there are; other names alone.
+
+    ``FILE@all`` stands for all agents of a file of :func:`save_agents`. A mask (``+safe``) may follow.
+
+    Raises:
+        UserError: no such agent or file.
+    """
+    recipe, every, mask = name.partition("@all")
+    if not every:
+        return [name]
+    if recipe not in SHIPPED:
+        return [f"{recipe}@{seed}{mask}" for seed in _seeds_in(Path(recipe))]
+    others = _seeds_file(recipe)
+    seeds = [0, *(_seeds_in(others) if others.is_file() else [])]
+    return [f"{recipe}@{seed}{mask}" for seed in seeds]
+
+
+def _seeds_in(path: Path) -> list[int]:
+    return sorted(_read_several(path)[1])
+
+
+def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
+    """Tensors and, by seed, metadata of a file of :func:`save_agents`."""
+    tensors, metadata = load_weights(path, SEVERAL)
+    agents = metadata.get("agents")
+    if not isinstance(agents, dict) or not all(seed.isdecimal() and type(agents[seed]) is dict for seed in agents):
+        raise UserError(f"{path}: its list of agents is not understood; pack the trainings anew.")
+    return tensors, {int(seed): known for seed, known in agents.items()}
+
+
 def agent_file(name: str | Path) -> Path:
-    """The file of a shipped agent (:data:`SHIPPED`; ``@0`` may follow) or of a path.
+    """The file of a shipped agent (:data:`SHIPPED`; ``@SEED`` may follow) or of a path.
 
     Raises:
         UserError: neither a shipped agent nor a file.
     """
-    text = str(name)
-    shipped = text.removesuffix("@0")
-    path = CHECKPOINTS / f"{shipped}.safetensors" if shipped in SHIPPED else Path(text)
+    path, seed = _place(name)
     if not os.path.isfile(path):  # which takes names that are too long for a file
         known = ", ".join(sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors")))
+        which = "training" if seed and str(name).startswith(SHIPPED) else "file"
         raise UserError(
-            f"agent {text:.100}: no such file ({path!s:.200}); the agents that ship are {known}; or give a path."
+            f"agent {name!s:.100}: no such {which} ({path!s:.200}); the agents that ship are {known}; or give a path."
         )
     return path
 
@@ -55,14 +112,45 @@ def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) ->
     save_weights(path, "agent", agent.weights(), header)
 
 
+def save_agents(
+    path: str | Path, agents: Mapping[int, tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]]
+) -> None:
+    """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
+
+    The scales of the noise are kept in half precision, everything that a greedy agent computes with as it is.
+
+    Args:
+        path: ``.safetensors`` file.
+        agents: seed to what :func:`read_agent` gives.
+    """
+    tensors = {
+        f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
+        for seed, (weights, _, _) in agents.items()
+        for name, value in weights.items()
+    }
+    described = {str(seed): {**known, "network": asdict(network)} for seed, (_, network, known) in agents.items()}
+    save_weights(path, SEVERAL, tensors, {"agents": described})
+
+
+def _read_one_of(path: Path, seed: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights and metadata of one agent of a file of :func:`save_agents`."""
+    tensors, agents = _read_several(path)
+    if seed not in agents:
+        seeds = ", ".join(map(str, sorted(agents)))
+        raise UserError(f"{path}@{seed}: this file has no training with seed {seed}; choose one of {seeds}.")
+    own = f"{seed}/"
+    weights = {name.removeprefix(own): value.float() for name, value in tensors.items() if name.startswith(own)}
+    return weights, agents[seed]
+
+
 def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
     """Weights, network config and metadata of a shipped agent or an agent's file.
 
     Raises:
         UserError: no such file, not an agent that ganlane wrote, or one that needs an option that was removed.
     """
-    path = agent_file(name)
-    weights, metadata = load_weights(path, "agent")
+    path, seed = agent_file(name), _place(name)[1]
+    weights, metadata = load_weights(path, "agent") if seed is None else _read_one_of(path, seed)
     for part in ("network", "agent"):
         if isinstance(metadata.get(part), dict):
             metadata[part] = without_removed(metadata[part], str(path))

@@ -20,8 +20,9 @@ class EvaluateConfig(RunConfig):
     """Agents x traffics, the same episodes for all of them.
 
     Attributes:
-        agents: mobil, mobil_egoistic, keep_lane, random_legal, random; agent_idm and others that ship; a checkpoint's
-            path; the import path of a policy of your own. The normalised score needs mobil and random_legal.
+        agents: mobil, mobil_egoistic, keep_lane, random_legal, random; agent_idm and others that ship (agent_idm@1:
+            its recipe trained with seed 1, agent_idm@all: with every seed there is); a checkpoint's path; the import
+            path of a policy of your own. The normalised score needs mobil and random_legal.
         traffics: options of the group traffic, or the import path of a traffic model of your own.
         episodes: the episodes 0 to episodes - 1 of the seed and stream.
         num_envs: episodes driven side by side, at most.

@@ -19,6 +19,7 @@ from ganlane.config.realism import RealismConfig
 from ganlane.config.record import RecordConfig
 from ganlane.config.recordings import PrepareConfig, TrainGeneratorConfig
 from ganlane.config.render import RenderConfig
+from ganlane.config.reproduce import ReproduceConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -56,6 +57,7 @@ SCHEMAS: dict[str, dict[str, Any]] = {
         "prepare": PrepareConfig,
         "train_generator": TrainGeneratorConfig,
         "realism": RealismConfig,
+        "reproduce": ReproduceConfig,
     },
     "env": {
         "highway": EnvConfig,

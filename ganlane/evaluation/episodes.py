@@ -18,6 +18,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.errors import UserError
+from ganlane.evaluation.contact import ego_at_fault
+from ganlane.sim.state import Vehicles
 
 #: Called now and then with (episodes finished, episodes in all).
 OnProgress = Callable[[int, int], None]
@@ -66,7 +68,8 @@ def run_episodes(
         ``scene_end``; ``other`` if none of these ended it), ``soft_crash`` (onsets), ``had_soft_crash``,
         ``soft_crash_behind`` (onsets), ``reward`` (undiscounted return), ``reward_*`` (each term's sum),
         ``decisions``, ``duration_s``, ``distance_m``, ``mean_speed_mps`` (distance over time),
-        ``lane_changes``.
+        ``lane_changes``, and ``at_fault``: of a hard crash, whether the ego moved into the other
+        (:func:`ganlane.evaluation.contact.ego_at_fault`); else null.
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or its reset ignores
@@ -192,6 +195,7 @@ class _Counts:
         self.driving = driving.clone()
         self._sums: dict[str, Tensor] = {}
         self._last: dict[str, Tensor] = {}
+        self._vehicles: Vehicles | None = None
 
     def add(self, after: TensorDictBase) -> None:
         """Count one decision, from the tensordict after it (``next``)."""
@@ -209,11 +213,17 @@ class _Counts:
         for name, value in last.items():
             before = self._last.get(name)
             self._last[name] = value.clone() if before is None else torch.where(self.driving, value, before)
+        if keys.VEHICLES in after:
+            now = Vehicles.of(after[keys.VEHICLES])
+            self._vehicles = now.where(self.driving, now if self._vehicles is None else self._vehicles)
         self.driving = self.driving & ~after["done"].squeeze(-1)
 
     def of(self, rows: Tensor) -> dict[str, Tensor]:
         """All counts of ``rows`` [K] (int64) by name, each [K], on the CPU."""
-        return {name: value[rows].cpu() for name, value in (self._sums | self._last).items()}
+        counts = {name: value[rows].cpu() for name, value in (self._sums | self._last).items()}
+        if self._vehicles is not None:
+            counts["at_fault"] = ego_at_fault(Vehicles(*(field[rows] for field in self._vehicles))).cpu()
+        return counts
 
     def begin(self, rows: Tensor) -> None:
         """Count from 0 again in ``rows`` (int64), in which other episodes start."""
@@ -226,12 +236,16 @@ class _Counts:
         self.driving = self.driving[rows]
         self._sums = {name: value[rows] for name, value in self._sums.items()}
         self._last = {name: value[rows] for name, value in self._last.items()}
+        if self._vehicles is not None:
+            self._vehicles = Vehicles(*(field[rows] for field in self._vehicles))
 
 
 def _episode_rows(counts: dict[str, Tensor], numbers: list[int], seed: int) -> pl.DataFrame:
     """The rows of the episodes ``numbers``; see :func:`run_episodes` for the columns."""
     terms = [name for name in counts if name.startswith("reward_")]
     ends = (pl.when(pl.col(event)).then(pl.lit(event)) for event in keys.END_EVENTS)
+    known = pl.col("at_fault") if "at_fault" in counts else pl.lit(None, pl.Boolean)
+    fault = pl.when(pl.col("hard_crash")).then(known).alias("at_fault")
     distance, duration, integer = pl.col("distance").cast(pl.Float64), pl.col("duration_s"), pl.Int64
     return pl.DataFrame({"episode": numbers, **{name: value.numpy() for name, value in counts.items()}}).select(
         pl.col("episode").cast(integer),
@@ -247,4 +261,5 @@ def _episode_rows(counts: dict[str, Tensor], numbers: list[int], seed: int) -> p
         # Null for an episode that ended before it drove (off the road at once).
         pl.when(duration > 0).then(distance / duration).alias("mean_speed_mps"),
         pl.col("lane_changes").cast(integer),
+        fault,
     )

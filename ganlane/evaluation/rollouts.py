@@ -19,12 +19,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
 from ganlane.errors import UserError
+from ganlane.evaluation.contact import SIDES, contact_side
 from ganlane.evaluation.episodes import OTHER, start_of
-from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.state import Road, Vehicles, road_in
-
-#: Where the other vehicle of a crash was, by the numbers that :func:`contact_side` gives.
-SIDES = ("none", "ahead", "side", "behind")
+from ganlane.sim.state import Vehicles, road_in
 
 
 @dataclass(frozen=True)
@@ -113,30 +110,6 @@ class ScriptedPolicy(TensorDictModuleBase):
         decision = tensordict.get(keys.EGO).get("decisions").cpu().clamp_max(self.table.shape[1] - 1)
         action = self.table[row, decision]
         return tensordict.set(keys.ACTION, action.to(tensordict.get(keys.EPISODE).device))
-
-
-def contact_side(vehicles: Vehicles, road: Road) -> Tensor:
-    """What the ego overlaps: 0 nobody, 1 somebody ahead, 2 at the side, 3 behind (:data:`SIDES`), [N] int64.
-
-    Two bodies meet along the axis on which their extents began to overlap last; the time since then is the depth of
-    the overlap over the closing speed. Headings are small, so the axes are those of the road. Of several vehicles
-    hit in one physics step the nearest to the front counts.
-    """
-    v = vehicles
-    dx, dy = road.distance_ahead(v.x[:, :1], v.x[:, 1:]), v.y[:, 1:] - v.y[:, :1]
-    along, across = v.speed * torch.cos(v.heading), v.speed * torch.sin(v.heading)
-    met_along = _time_since(dx, along[:, 1:] - along[:, :1], 0.5 * (v.length[:, 1:] + v.length[:, :1]))
-    met_across = _time_since(dy, across[:, 1:] - across[:, :1], 0.5 * (v.width[:, 1:] + v.width[:, :1]))
-    side = torch.where(met_along < met_across, torch.where(dx > 0, 1, 3), 2)
-    nobody = len(SIDES)
-    first = torch.where(ego_overlaps(v, road), side, nobody).amin(-1)
-    return torch.where(first == nobody, 0, first)
-
-
-def _time_since(distance: Tensor, speed: Tensor, reach: Tensor) -> Tensor:
-    """For how long (s) extents that touch at ``reach`` (m) overlap; infinite where they do not close."""
-    closing = -torch.sign(distance) * speed
-    return torch.where(closing > 0, (reach - distance.abs()) / closing.clamp_min(1e-9), torch.inf)
 
 
 def base_of(env: EnvBase) -> EnvBase:

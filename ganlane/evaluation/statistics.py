@@ -73,7 +73,7 @@ def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
 
 
 @lru_cache(maxsize=2)
-def _kept_counts(size: int, resamples: int, seed: int) -> tuple[npt.NDArray[np.uint16], ...]:
+def kept_counts(size: int, resamples: int, seed: int) -> tuple[npt.NDArray[np.uint16], ...]:
     """The chunks of :func:`resample_counts`: a table's intervals draw the same ones, 0.25 s for 1000 episodes."""
     return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed))
 
@@ -81,7 +81,7 @@ def _kept_counts(size: int, resamples: int, seed: int) -> tuple[npt.NDArray[np.u
 def bootstrap_means(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> Array:
     """Means [R] or [R, K] of resampled ``values`` [E] or [E, K]; the K columns of an episode stay together."""
     size = len(values)
-    drawn = (_kept_counts if size * resamples <= _MOST_KEPT else resample_counts)(size, resamples, seed)
+    drawn = (kept_counts if size * resamples <= _MOST_KEPT else resample_counts)(size, resamples, seed)
     return np.concatenate([counts.astype(np.float64) @ values / size for counts in drawn])
 
 

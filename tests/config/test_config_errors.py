@@ -74,7 +74,7 @@ def test_a_switch_refuses_anything_but_true_and_false(command, key):
 
 
 #: Lists in which nothing need stand.
-OPTIONAL_LISTS = {("realism", "against"), ("realism", "fold_weights")}
+OPTIONAL_LISTS = {("realism", "against"), ("realism", "fold_weights"), ("reproduce", "runs")}
 
 
 @pytest.mark.parametrize(("command", "key"), LISTS)

@@ -9,7 +9,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import replay, roll_out, run_episodes
-from ganlane.evaluation.rollouts import SIDES, contact_side
+from ganlane.evaluation.contact import SIDES, contact_side, ego_at_fault
 from ganlane.sim.state import Road
 
 
@@ -44,3 +44,20 @@ def test_a_rollout_is_the_evaluated_episode_and_comes_back_from_its_actions():
 def test_where_the_ego_was_hit(other, side):
     scene = vehicles({"x": 0.0, "y": 0.0, "target_lane": 0}, {"x": 0.0, "y": 0.0, "target_lane": 0, **other})
     assert SIDES[int(contact_side(scene, Road()))] == side
+
+
+@pytest.mark.parametrize(
+    ("ego", "other", "at_fault"),
+    [
+        ({"speed": 20.0}, {"x": 4.4, "speed": 10.0}, True),  # into the one ahead
+        ({}, {"x": -4.4, "speed": 30.0}, False),  # struck from behind
+        ({}, {"y": 2.4, "heading": -0.1}, False),  # the other changes lanes into the ego
+        ({"heading": 0.1}, {"y": 2.4}, True),  # the ego into the other
+        ({"heading": 0.1}, {"y": 2.4, "heading": -0.05}, True),  # both, the ego faster
+        ({"heading": -0.05}, {"y": -2.4, "heading": 0.1}, False),  # both, the other faster
+        ({"speed": 30.0}, {"x": 10.0}, False),  # nobody was hit
+    ],
+)
+def test_who_moved_into_whom(ego, other, at_fault):
+    same = {"x": 0.0, "y": 0.0, "target_lane": 0}
+    assert bool(ego_at_fault(vehicles({**same, **ego}, {**same, **other}))) == at_fault

@@ -1,0 +1,105 @@
+"""Trained agents of one recipe, which differ in their seed alone, in one file.
+
+    python -m benchmarks.pack_seeds outputs/paper_1/pretrain outputs/paper_2/pretrain \
+        --out ganlane/checkpoints/seeds_of_agent_idm.safetensors
+    python -m benchmarks.pack_seeds outputs/paper_1 outputs/paper_2 \
+        --out ganlane/checkpoints/seeds_of_agent_gan.safetensors
+
+Each folder is a finished training's and holds agent.safetensors; an agent's file may be given as well. The agent with
+seed 1 is then ``agent_idm@1``, or ``FILE@1`` for a file elsewhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from benchmarks.script import make_parser, run_script
+from ganlane.agents import NetworkConfig, read_agent
+from ganlane.agents.checkpoint import save_agents
+from ganlane.errors import UserError
+
+#: Weights, network and metadata.
+Agent = tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]
+
+AGENT_FILE = "agent.safetensors"
+#: Largest file that is written.
+MOST_BYTES = 5_000_000
+#: What agents of one recipe have in common; of the environment all but what has no effect on the episodes.
+RECIPE = ("observation", "observation_scale", "mask", "sensors", "env", "num_envs", "agent", "reward", "network")
+WITHOUT_EFFECT = ("compile", "kernel")
+
+
+def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """What a training was, without its seed and its results."""
+    shared = {name: metadata.get(name) for name in RECIPE}
+    if isinstance(shared["env"], dict):
+        shared["env"] = {key: value for key, value in shared["env"].items() if key not in WITHOUT_EFFECT}
+    return {**shared, **{name: metadata.get("training", {}).get(name) for name in ("phase", "traffic")}}
+
+
+def collect(folders: Sequence[Path]) -> dict[int, Agent]:
+    """The agents by seed.
+
+    Raises:
+        UserError: a folder without an agent, an agent without a seed, a seed that comes twice, or two recipes.
+    """
+    found: dict[int, Agent] = {}
+    recipes: dict[str, dict[str, Any]] = {}
+    for folder in folders:
+        path = folder / AGENT_FILE if folder.is_dir() else folder
+        if not path.is_file():
+            raise UserError(f"{path}: no such file; give the folder of a finished training, which has one.")
+        agent = read_agent(path)
+        metadata = {**agent[2], "network": asdict(agent[1])}
+        seed = metadata.get("training", {}).get("seed")
+        if not isinstance(seed, int):
+            raise UserError(f"{path}: its metadata name no seed; give an agent that 'ganlane train' wrote.")
+        if seed in found:
+            raise UserError(f"{path}: another run has seed {seed}, too; give each seed once.")
+        recipes[str(path)] = recipe_of(metadata)
+        first, reference = next(iter(recipes.items()))
+        differing = [name for name, value in recipes[str(path)].items() if value != reference[name]]
+        if differing:
+            raise UserError(f"{path}: another recipe than {first} ({', '.join(differing)}); give runs of one recipe.")
+        found[seed] = agent
+    return dict(sorted(found.items()))
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = make_parser(__doc__)
+    parser.add_argument("folders", type=Path, nargs="+", metavar="RUN_FOLDER")
+    parser.add_argument("--out", type=Path, required=True, help="the .safetensors file to write")
+    return parser.parse_args(arguments)
+
+
+def pack(options: argparse.Namespace) -> str:
+    """Write the file; the line that names it."""
+    if options.out.suffix != ".safetensors":
+        raise UserError(f"--out {options.out}: the name must end in .safetensors.")
+    agents = collect(options.folders)
+    size = sum(
+        value.numel() * (2 if name.endswith("_sigma") else 4)
+        for agent in agents.values()
+        for name, value in agent[0].items()
+    )
+    if size > MOST_BYTES:
+        raise UserError(f"--out {options.out}: {size / 1e6:.1f} MB, above {MOST_BYTES / 1e6:.0f}; give fewer runs.")
+    save_agents(options.out, agents)
+    return f"{options.out}: seeds {', '.join(map(str, agents))}; {options.out.stat().st_size / 1e6:.1f} MB"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Pack; the exit status."""
+    return run_script(pack, parse(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

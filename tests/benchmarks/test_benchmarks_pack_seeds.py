@@ -1,0 +1,132 @@
+"""Several trainings of one recipe in one file: packed, named, driven and refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from benchmarks import pack_seeds
+from ganlane.agents import Rainbow, RainbowConfig, agent_file, checkpoint, load_agent, read_agent, save_agent
+from ganlane.agents.checkpoint import with_seeds
+from ganlane.build import make_drivers
+from ganlane.config.env import EnvConfig
+from ganlane.doctor import State, checkpoints
+from ganlane.errors import UserError
+from ganlane.transforms import observation_size
+
+VEHICLES = 9
+RECIPE = {
+    "observation": "lane_view_overlap",
+    "observation_scale": {"range_m": 200.0, "speed_mps": 30.0},
+    "env": {"lanes": 3, "compile": False},
+}
+
+
+def run(folder, seed, hidden=(8, 8), **more):
+    """The folder of a finished training with ``seed``."""
+    size = observation_size("lane_view_overlap", VEHICLES)
+    config = RainbowConfig(hidden=hidden, batch_size=8, warmup=8, capacity=100)
+    metadata = {**RECIPE, "training": {"seed": seed, "phase": "train", "traffic": {}}, **more}
+    save_agent(folder / "agent.safetensors", Rainbow(config, size, seed=seed), metadata)
+    return folder
+
+
+@pytest.fixture
+def packed(tmp_path, monkeypatch):
+    """A folder of shipped agents: agent_idm with seed 0, and its seeds 1 and 2 in one file."""
+    folders = [run(tmp_path / str(seed), seed) for seed in (2, 1)]
+    shipped = tmp_path / "checkpoints"
+    run(shipped, 0)
+    (shipped / "agent.safetensors").rename(shipped / "agent_idm.safetensors")
+    out = shipped / "seeds_of_agent_idm.safetensors"
+    assert pack_seeds.main([*map(str, folders), "--out", str(out)]) == 0
+    monkeypatch.setattr(checkpoint, "CHECKPOINTS", shipped)
+    return out
+
+
+def test_each_seed_drives_as_it_did_alone(packed, tmp_path):
+    data = TensorDict({"observation": torch.randn(200, observation_size("lane_view_overlap", VEHICLES))}, [200])
+    for seed in (1, 2):
+        alone, _ = load_agent(tmp_path / str(seed) / "agent.safetensors")
+        ours, metadata = load_agent(f"agent_idm@{seed}")
+        assert torch.equal(ours(data.clone())["action"], alone(data.clone())["action"])
+        assert metadata["training"]["seed"] == seed
+
+
+def test_what_a_greedy_agent_computes_with_is_kept_to_the_last_bit(packed, tmp_path):
+    own, other = read_agent("agent_idm@2")[0], read_agent(tmp_path / "2" / "agent.safetensors")[0]
+    assert own.keys() == other.keys()
+    for name, value in own.items():
+        assert value.dtype == torch.float32
+        if name.endswith("_sigma"):
+            torch.testing.assert_close(value, other[name], rtol=1e-3, atol=1e-6)
+        else:
+            assert torch.equal(value, other[name])
+
+
+def test_names_of_seeds_stand_for_their_agents(packed):
+    assert with_seeds("agent_idm@all") == ["agent_idm@0", "agent_idm@1", "agent_idm@2"]
+    assert with_seeds("agent_idm@all+safe")[1] == "agent_idm@1+safe"
+    assert with_seeds("agent_gan@all") == ["agent_gan@0"]
+    assert with_seeds(f"{packed}@all") == [f"{packed}@1", f"{packed}@2"]
+    assert with_seeds("mobil") == ["mobil"]
+    assert agent_file("agent_idm@0") == agent_file("agent_idm") != agent_file("agent_idm@1") == packed
+
+
+def test_a_table_takes_every_seed_once(packed):
+    drivers = make_drivers(["agent_idm@all+safe", "agent_idm@1+safe", "mobil"], EnvConfig())
+    assert [driver.name for driver in drivers] == [*(f"agent_idm@{seed}+safe" for seed in range(3)), "mobil"]
+    assert {driver.mask.form for driver in drivers[:3]} == {"safe"}
+
+
+def test_the_installation_check_loads_every_seed(packed, monkeypatch):
+    monkeypatch.setattr("ganlane.files.CHECKPOINTS", packed.parent)
+    monkeypatch.setattr("ganlane.doctor.NEEDED_WEIGHTS", ())
+    assert [each.state for each in checkpoints()] == [State.OK, State.OK]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("agent_idm@7", "no training with seed 7; choose one of 1, 2"),
+        ("agent_gan@1", "agent_gan@1: no such training"),
+        ("none.safetensors@1", "no such file"),
+    ],
+)
+def test_a_seed_that_is_not_there_ends_in_a_sentence(name, said, packed):
+    with pytest.raises(UserError, match=said):
+        load_agent(name)
+
+
+def test_one_agents_file_has_no_seeds_and_a_packed_one_needs_one(packed, tmp_path):
+    with pytest.raises(UserError, match="of kind agents, found agent;"):
+        load_agent(f"{tmp_path / '1' / 'agent.safetensors'}@1")
+    with pytest.raises(UserError, match="of kind agent, found agents;"):
+        load_agent(packed)
+
+
+def test_only_runs_of_one_recipe_and_different_seeds_are_packed(tmp_path, capsys):
+    one = run(tmp_path / "one", 1)
+    cases = {
+        "another recipe than": run(tmp_path / "wide", 2, hidden=(16, 8)),
+        "(env)": run(tmp_path / "lanes", 2, env={"lanes": 4}),
+        "another run has seed 1": run(tmp_path / "again", 1),
+        "no such file": tmp_path / "empty",
+        "name no seed": run(tmp_path / "foreign", 2, training={}),
+    }
+    for said, other in cases.items():
+        assert pack_seeds.main([str(one), str(other), "--out", str(tmp_path / "out.safetensors")]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_how_an_environment_was_computed_is_no_part_of_the_recipe(tmp_path):
+    folders = [run(tmp_path / "a", 1), run(tmp_path / "b", 2, env={"lanes": 3, "compile": True})]
+    assert pack_seeds.main([*map(str, folders), "--out", str(tmp_path / "out.safetensors")]) == 0
+
+
+def test_a_file_that_would_be_too_large_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(pack_seeds, "MOST_BYTES", 1000)
+    assert pack_seeds.main([str(run(tmp_path / "a", 1)), "--out", str(tmp_path / "out.safetensors")]) == 2
+    assert "give fewer runs" in capsys.readouterr().err

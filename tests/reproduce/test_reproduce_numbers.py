@@ -1,0 +1,111 @@
+"""What is made of the episodes of a matrix, on episodes made by hand."""
+
+from __future__ import annotations
+
+import polars as pl
+import pytest
+
+from ganlane.errors import UserError
+from ganlane.reproduce.numbers import by_recipe, comparisons, failures, recipe_of, rows
+
+KM = 5.0
+
+
+def driven(agent, rewards, reasons=None, traffic="gan", at_fault=None):
+    """Episodes of 5 km and 200 s with these rewards and ends."""
+    reasons = reasons or ["goal"] * len(rewards)
+    return pl.DataFrame(
+        {
+            "agent": agent,
+            "traffic": traffic,
+            "episode": list(range(len(rewards))),
+            "reason": reasons,
+            "reward": list(map(float, rewards)),
+            "distance_m": 1000.0 * KM,
+            "duration_s": 200.0,
+            "lane_changes": 10,
+            "had_soft_crash": False,
+            "soft_crash_behind": 1,
+            "at_fault": [at_fault if reason == "hard_crash" else None for reason in reasons],
+        },
+        schema_overrides={"at_fault": pl.Boolean},
+    )
+
+
+@pytest.fixture
+def matrix():
+    """Two trainings of a recipe, MOBIL and the random driver; the first training crashes and leaves the road once."""
+    return by_recipe(
+        pl.concat(
+            [
+                driven("random_legal", [0, 0, 1, 0]),
+                driven("mobil", [100, 100, 101, 100], ["goal", "goal", "goal", "hard_crash"], at_fault=False),
+                driven(
+                    "agent_idm@0", [120, 120, 121, 120], ["hard_crash", "out_of_road", "goal", "goal"], at_fault=True
+                ),
+                driven("agent_idm@1", [140, 140, 141, 140]),
+            ]
+        )
+    )
+
+
+def row_of(matrix, driver):
+    return next(row for row in rows(matrix) if row["driver"] == driver)
+
+
+def test_a_recipe_is_its_drivers_without_their_seeds():
+    assert recipe_of("agent_idm@3+safe") == recipe_of("some/folder/agent_idm.safetensors@12+safe") == "agent_idm+safe"
+    assert recipe_of("agent_idm+none") == "agent_idm+none"
+    assert recipe_of("outputs/a@b/mine.safetensors") == "outputs/a@b/mine.safetensors"
+
+
+def test_a_row_holds_the_trainings_together_and_each_alone(matrix):
+    row = row_of(matrix, "agent_idm")
+    assert (row["trainings"], row["episodes"]) == (2, 4)
+    assert row["mean_reward"] == pytest.approx(130.25)
+    assert row["minus_mobil"] == pytest.approx(30.0)
+    assert row["minus_mobil_ci"] == pytest.approx([20.0, 40.0])  # a recipe: both trainings, or one of them twice
+    assert row["probability_above_mobil"] == 1.0
+    assert row["normalized_percent"] == pytest.approx(130.0)
+    assert [each["mean_reward"] for each in row["each"]] == pytest.approx([120.25, 140.25])
+    assert [each["hard_crash"] for each in row["each"]] == [1, 0]
+
+
+def test_crashes_and_departures_are_counted_together_too(matrix):
+    row = row_of(matrix, "agent_idm")
+    assert row["crashes_per_1000_km"] == row["departures_per_1000_km"] == pytest.approx(1000 / (8 * KM))
+    assert row["failures_per_1000_km"] == pytest.approx(2000 / (8 * KM))
+    assert (row["at_fault_share"], row_of(matrix, "mobil")["at_fault_share"]) == (1.0, 0.0)
+    assert row_of(matrix, "random_legal")["at_fault_share"] is None
+
+
+def test_speeds_and_lane_changes_are_those_of_all_kilometres(matrix):
+    row = row_of(matrix, "agent_idm")
+    assert (row["mean_speed_mps"], row["lane_changes_per_km"]) == (pytest.approx(25.0), pytest.approx(2.0))
+
+
+def test_mobil_is_not_compared_with_itself_and_a_single_training_has_no_probability(matrix):
+    assert row_of(matrix, "mobil")["minus_mobil"] is None
+    assert row_of(matrix, "random_legal")["probability_above_mobil"] is None
+
+
+def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):
+    (row,) = comparisons(matrix, [("agent_idm", "mobil"), ("agent_idm", "nobody")])
+    assert row["lead"] == pytest.approx(30.0)
+    assert row["crash_difference_per_1000_episodes"] == pytest.approx(1000 * (1 / 8 - 1 / 4))
+    first, second = row["mcnemar"]
+    assert (first["only_first"], first["only_second"], first["p_value"]) == (1, 1, 1.0)
+    assert (second["only_first"], second["only_second"]) == (0, 1)
+
+
+def test_every_failure_is_listed_with_its_seed_and_episode():
+    table = driven("mobil", [0, 0, 0], ["hard_crash", "goal", "out_of_road"])
+    assert failures(table, 3) == [
+        {"driver": "mobil", "traffic": "gan", "seed": 3, "hard_crash": [0], "out_of_road": [2]}
+    ]
+
+
+def test_two_agents_of_one_name_and_seed_are_not_mixed():
+    both = pl.concat([driven("agent_idm@1", [0, 0]), driven("mine/agent_idm.safetensors@1", [0, 0])])
+    with pytest.raises(UserError, match="two of one seed are called agent_idm"):
+        by_recipe(both)

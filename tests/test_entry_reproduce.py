@@ -1,0 +1,124 @@
+"""``ganlane reproduce`` from end to end, with short episodes, in process."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ganlane.reproduce import main, matrix
+
+SHORT = ["episodes=3", "workers=1", "env.goal_m=60", "hydra.run.dir=out"]
+SMALL = ["agents=[random_legal,mobil,agent_idm@all+none,agent_gan+none]", "traffics=[idm,gan]"]
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def cells_driven(monkeypatch):
+    """The cells that were driven, by driver and traffic."""
+    driven, drive_cell = [], matrix.drive_cell
+
+    def noting(cell, config):
+        driven.append((cell.driver, cell.traffic))
+        drive_cell(cell, config)
+
+    monkeypatch.setattr(matrix, "drive_cell", noting)
+    return driven
+
+
+def curves(folder: Path, start: float) -> str:
+    for part in (folder / "pretrain", folder):
+        part.mkdir(parents=True, exist_ok=True)
+        rows = "".join(f"{1000 * n},{start + n}\n" for n in (1, 2, 3))
+        (part / "evaluation.csv").write_text(f"decisions,mean_reward\n{rows}")
+    return str(folder)
+
+
+def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_driven, capsys):
+    runs = ",".join(curves(Path(f"runs/{seed}"), 100.0 * seed) for seed in (0, 1))
+    assert main([*SHORT, *SMALL, "fewer={gan: 2}", f"runs=[{runs}]", "from=shipped"]) == 0
+    out, folder = capsys.readouterr().out, Path("out")
+    assert "Table VI: crashes" in out
+    assert len(cells_driven) == len(set(cells_driven)) == 8
+
+    page = (folder / "report.html").read_text()
+    for said in ("19", "-22.33", "114.82", "3 on idm, 2 on gan", "agent_idm", "<svg"):
+        assert said in page
+    assert "http-equiv" not in page
+    assert not any(f'{attribute}="http' in page for attribute in ("src", "href"))
+    for name in ("matrix", "figure_4"):
+        assert all((folder / f"{name}.{kind}").stat().st_size > 0 for kind in ("png", "svg", "csv"))
+    for name in ("table_vi", "table_vii", "comparisons"):
+        assert len((folder / f"{name}.csv").read_text().splitlines()) > 2
+
+    results = json.loads((folder / "results.json").read_text())
+    assert results["command"].startswith("ganlane reproduce episodes=3")
+    assert results["seeds"]["episodes"] == {"idm": 3, "gan": 2}
+    assert {(row["driver"], row["traffic"], row["episodes"]) for row in results["rows"]} >= {
+        ("agent_idm+none", "idm", 3),
+        ("agent_gan+none", "gan", 2),
+    }
+    assert {"comparisons", "failures", "left_out", "cells", "machine", "code", "config"} <= results.keys()
+
+
+def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_driven, capsys):
+    agents = "agents=[random_legal,mobil,agent_idm]"
+    assert main([*SHORT, agents, "traffics=[idm]"]) == 0
+    first = json.loads(Path("out/results.json").read_text())["rows"]
+    assert main([*SHORT, agents, "traffics=[idm]"]) == 0
+    assert len(cells_driven) == 3
+    assert json.loads(Path("out/results.json").read_text())["rows"] == first
+    assert main([*SHORT, "agents=[random_legal,mobil,agent_idm,keep_lane]", "traffics=[idm]"]) == 0
+    assert main([*SHORT, agents, "traffics=[idm]", "seed=1"]) == 0
+    assert cells_driven[3:] == [(name, "idm") for name in ("keep_lane", "random_legal", "mobil", "agent_idm")]
+
+
+def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys):
+    monkeypatch.setenv("GANLANE_DATA", "nowhere")
+    assert main([*SHORT, "agents=[random_legal,mobil]", "traffics=[idm,replay]"]) == 0
+    assert "left out, replay:" in capsys.readouterr().err
+    assert "replay" in json.loads(Path("out/results.json").read_text())["left_out"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["agents=[random_legal]", "traffics=[idm]"], "expected mobil and others"),
+        (["agents=[mobil,agent_idm@77]", "traffics=[idm]"], "no such training"),
+        (["fewer={gan: 0}"], "whole numbers of at least 2"),
+        (["runs=[nowhere]"], "no such file"),
+        (["from=elsewhere"], "shipped, scratch"),
+    ],
+)
+def test_a_mistake_ends_in_a_sentence(arguments, said, capsys):
+    assert main([*SHORT, *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_damaged_cell_is_named(capsys):
+    arguments = [*SHORT, "agents=[random_legal,mobil]", "traffics=[idm]"]
+    assert main(arguments) == 0
+    for cell in Path("outputs/cells").glob("*.parquet"):
+        cell.write_bytes(cell.read_bytes()[:-50])
+    assert main(arguments) == 2
+    assert "not the episodes of a cell" in capsys.readouterr().err
+
+
+def test_a_training_from_scratch_that_fails_is_named_after_the_hours_were(monkeypatch, capsys):
+    class Failed:
+        returncode = 2
+
+    asked = []
+    monkeypatch.setattr("ganlane.reproduce.subprocess.run", lambda command, **_: asked.append(command) or Failed)
+    assert main([*SHORT, *SMALL, "from=scratch", "training_seeds=[4,5]"]) == 2
+    error = capsys.readouterr().err
+    assert "2 trainings, one after the other: about 2.2 hours on one core." in error
+    assert "the same command goes on with it" in error
+    assert asked[0][1:] == [
+        *("-m", "ganlane.train", "experiment=paper", "seed=4", "hydra.run.dir=outputs/scratch/seed_4")
+    ]

@@ -26,7 +26,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.objectives import DistributionalDQNLoss
 
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
-from ganlane.agents import Rainbow
+from ganlane.agents import Rainbow, rainbow
 from ganlane.bench.measure import EAGER, Case, Runner, take_turns, torch_threads
 from ganlane.bench.systems import Scenario
 from ganlane.bench.train import Training, TrainSuite, advance, filled_run, make_agent, repeat, with_gradients
@@ -124,8 +124,8 @@ def timed_calls(run: TrainingState, env: TransformedEnv) -> list[tuple[Any, str,
         (run.window, "push", "window"),
         (agent, "store", "store"),
         (agent, "update", "noise, clipping, target"),
-        (replay, "sample", "sample"),
-        (replay, "update_priority", "priorities"),
+        (rainbow, "draw", "sample"),
+        (replay.sampler, "update_priority", "priorities"),
         (agent.loss, "forward", "loss"),
         (torch.autograd, "backward", "backward"),
         (agent.optimizer, "step", "optimiser"),

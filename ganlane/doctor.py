@@ -68,7 +68,10 @@ EXTRAS: Final = {
     "sweeps": ("sweeps in several processes", ("hydra-joblib-launcher>=1.2",)),
     "slurm": ("sweeps as Slurm jobs", ("hydra-submitit-launcher>=1.2",)),
     "ray-sweeps": ("sweeps on a Ray cluster", ("hydra-ray-launcher>=1.2.1",)),
-    "docs": ("building these pages", ("mkdocs-material>=9.5", "mkdocstrings[python]>=0.27", "ruff>=0.8")),
+    "docs": (
+        "building these pages",
+        ("mkdocs-material>=9.5", "mkdocstrings[python]>=0.27", "ruff>=0.8", "latex2mathml>=3.77"),
+    ),
 }
 #: Distributions whose module has another name.
 MODULES: Final = {"hydra-core": "hydra", "pillow": "PIL", "scikit-learn": "sklearn"}

@@ -158,7 +158,7 @@ def plain_kind(kind: Any) -> Any:
 
 
 #: What no key of a kind takes.
-WRONG_TYPE = {int: "many", float: "many", bool: "perhaps", str: "[a,b]", list: "{a:1}", dict: "3"}
+WRONG_TYPE = {int: "many", float: "many", bool: "perhaps", str: "[a,b]", list: "{a:1}", tuple: "{a:1}", dict: "3"}
 #: What a key of a kind with a range could refuse, the likeliest first.
 ABSURD: dict[Any, tuple[Any, ...]] = {
     int: (-(10**9), 10**15, 0),

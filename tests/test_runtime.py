@@ -63,7 +63,7 @@ def test_a_command_without_docstrings_is_refused_in_one_sentence():
 
 
 def test_without_docstrings_help_still_lists_the_keys():
-    command = [sys.executable, "-OO", "-m", "ganlane", "prepare", "--help"]
+    command = [sys.executable, "-OO", "-m", "ganlane", "prepare", "--help-all"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert "held_out" in done.stdout

@@ -222,6 +222,8 @@ def _fits(value: Any, hint: Any) -> bool:
         return type(value).__name__ in ("bool", "bool_")  # NumPy's, by either name
     if kind is str:
         return isinstance(value, str) and "\0" not in value
+    if getattr(kind, "_is_protocol", False):  # scenes of a user's own have what is needed of them
+        return callable(value)
     return kind is Any or not inspect.isclass(kind) or isinstance(value, kind)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -35,7 +35,6 @@ LARGEST = 1e6
 SMALLEST = 1e-6
 
 
-@runtime_checkable
 class Scenes(Protocol):
     """Makes the initial scene of every episode."""
 

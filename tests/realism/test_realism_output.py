@@ -74,14 +74,17 @@ def test_densities_have_area_one_and_the_quantitys_unit():
     figure = draw_distributions({"jerk": counts}, {"idm": {"jerk": rule}, "nobody": {"jerk": 0 * rule}})
     (axes,) = figure.axes
     assert (axes.get_title("left"), axes.get_xlabel(), axes.get_ylabel()) == ("jerk", "m/s³", "density, per m/s³")
-    (recorded,), (simulated,) = in_colour(axes, INK), in_colour(axes, COLOURS[0])
+    (recorded, *ends), (simulated, *left_end) = in_colour(axes, INK), in_colour(axes, COLOURS[0])
+    # The bins at the ends hold what lies beyond them, too.
+    assert ([mark.get_marker() for mark in ends], [mark.get_marker() for mark in left_end]) == (["<", ">"], ["<"])
     assert recorded.get_xdata()[[0, -1]] == pytest.approx([-4.9, 4.9])
     # A quarter of the samples in a bin of 0.2 m/s3.
     assert recorded.get_ydata()[[0, 1, 2, 49]] == pytest.approx([1.25, 2.5, 0.0, 1.25])
     assert simulated.get_ydata()[:2] == pytest.approx([5.0, 0.0])
     assert in_colour(axes, COLOURS[1]) == []
     assert axes.get_xlim() == (-5.0, 5.0)
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["recorded", "idm", "nobody"]
+    named = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert named == ["recorded", "idm", "nobody", "and all values beyond"]
 
 
 def row(distance, **against):

@@ -18,7 +18,7 @@ from ganlane.env.checks import ActionCheck
 from ganlane.traffic.base import TrafficModule
 from ganlane.training import checkpoint
 from ganlane.training.checkpoint import Checkpointer, TrainingState
-from ganlane.training.loop import collect, learn
+from ganlane.training.loop import advance
 from ganlane.training.phases import identity, make_collector, make_initial_agent, phases_of
 
 #: The share of the time that the checks may take.
@@ -59,7 +59,7 @@ def cost(tally: Tally, minutes: float, seed: int, scratch: Path) -> None:
         config, agent = make_initial_agent(config, phase, None)
         state = TrainingState(make_collector(config, phase), agent, identity(config, phase))
         while not agent.ready:
-            agent.store(state.window.push(collect(state)))
+            advance(state)
         _turn(state)
         every_s = config.checkpoint_every_s
         steps, saves = _shares(state, minutes / len(RUNS), random.Random(seed), folder, every_s)
@@ -97,6 +97,5 @@ def _turn(state: TrainingState) -> float:
     """CPU seconds of some steps of the training loop."""
     begun = time.process_time()
     for _ in range(STEPS):
-        state.agent.store(state.window.push(collect(state)))
-        learn(state)
+        advance(state)
     return time.process_time() - begun

@@ -32,8 +32,9 @@ from torchrl.envs import Transform, TransformedEnv
 
 from ganlane import build
 from ganlane.agents.checkpoint import with_seeds
+from ganlane.arguments import checked_arguments, whole_number
 from ganlane.build import Driver
-from ganlane.compare import compare_configured
+from ganlane.compare import compare
 from ganlane.config.app import Stopped
 from ganlane.config.command_line import ALIASES
 from ganlane.config.env import check_reward
@@ -48,7 +49,7 @@ from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, wri
 from ganlane.evaluation.results import Run, TrainingRun, plain
 from ganlane.files import write_bytes
 from ganlane.options import Option, command_config, option
-from ganlane.parameters.checks import checked_arguments, did_you_mean, whole_number
+from ganlane.parameters.checks import did_you_mean
 from ganlane.runtime import set_threads
 from ganlane.sim.random import Stream
 
@@ -180,7 +181,7 @@ def evaluate(
         if folder is not None:  # before hours of driving
             Path(folder).mkdir(parents=True, exist_ok=True)
         drivers = [_driver(agent, name, config) for agent, name in zip(agents, config.agents)]
-        table = compare_configured(drivers, config)
+        table = compare(drivers, config)
     rows = plain(evaluation_rows(table))
     if folder is not None:
         seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -179,9 +180,8 @@ def _distribution_table(prepared: Preparation) -> str:
     return _table(head, rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("prepare", prepare, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "prepare", prepare)
 
 
 if __name__ == "__main__":

@@ -14,17 +14,18 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
 from ganlane.config.app import run_command
+from ganlane.config.evaluate import RecordConfig
 from ganlane.config.folders import cleared_after_mistakes
-from ganlane.config.record import RecordConfig
 from ganlane.config.schemas import SCHEMAS
 from ganlane.errors import UserError
 
@@ -175,9 +176,8 @@ def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[
     return {"episodes": written, "decisions": decisions, "mean_return": round(returns / count, 2), "ends": dict(ends)}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("record", record, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "record", record)
 
 
 if __name__ == "__main__":

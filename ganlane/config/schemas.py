@@ -14,12 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
-from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.realism import RealismConfig
-from ganlane.config.record import RecordConfig
-from ganlane.config.recordings import PrepareConfig, TrainGeneratorConfig
+from ganlane.config.evaluate import EvaluateConfig, RecordConfig, ReproduceConfig
+from ganlane.config.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
 from ganlane.config.render import RenderConfig
-from ganlane.config.reproduce import ReproduceConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -43,8 +40,7 @@ from ganlane.files import conf_folder
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.data import DataConfig, HighdDataConfig, NgsimDataConfig
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 #: Group (empty at the root) to schema name to dataclass.
 SCHEMAS: dict[str, dict[str, Any]] = {

@@ -21,8 +21,8 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
+from ganlane.parameters.agent import LAST_REVISION, without_removed_overrides
 from ganlane.parameters.observation import MaskParameters
-from ganlane.parameters.removed import LAST_REVISION, without_removed_overrides
 from ganlane.runtime import COMPILERS
 from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
 from ganlane.training.phases import (

@@ -57,8 +57,6 @@ __all__ = ["Driver", "Run", "TrainingRun", "evaluate", "load_agent", "make_env",
 
 #: A driver's name, a loaded driver, or a policy of your own (named by its class).
 Agent: TypeAlias = str | Path | Driver | TensorDictModuleBase
-#: Families of episodes: to train on, to choose on, to report on.
-STREAMS = {stream.name.lower(): stream for stream in Stream}
 
 
 @checked_arguments
@@ -102,7 +100,7 @@ def make_env(
     check_reward(config, rewards)
     checked = RunConfig(seed=int(seed), device=device)
     made = build.make_env(
-        build.make_traffic(option("traffic", traffic), config, _stream(stream)),
+        build.make_traffic(option("traffic", traffic), config, Stream.named(stream)),
         config,
         option("observation", observation),
         rewards,
@@ -138,7 +136,7 @@ def load_agent(
         UserError: no such driver, or its network takes another observation.
     """
     config = option("env", env, overrides)
-    return build.make_driver(str(name), config, _stream(stream), RunConfig(device=device).device)
+    return build.make_driver(str(name), config, Stream.named(stream), RunConfig(device=device).device)
 
 
 @checked_arguments
@@ -377,9 +375,3 @@ def _with_traffic(keys: Mapping[str, Any] | None) -> dict[str, Any]:
     if given.get("traffic") is not None:
         given["traffic"] = option("traffic", given["traffic"])
     return given
-
-
-def _stream(name: str) -> Stream:
-    if name not in STREAMS:
-        raise UserError(f"stream={name}: expected one of {', '.join(STREAMS)}; choose one of them.")
-    return STREAMS[name]

@@ -45,7 +45,7 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
         with ``scene``, the recorded scene of an episode, where one of the traffics replays (null for the others).
     """
     env, seed, episodes = config.env, config.seed, config.episodes
-    stream = Stream[config.stream.upper()]
+    stream = Stream.named(config.stream)
     modules = {name: make_traffic(traffic, env, stream) for name, traffic in config.chosen_traffics().items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(config.num_envs, episodes), []

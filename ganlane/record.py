@@ -56,7 +56,7 @@ def record(config: RecordConfig, folder: Path) -> str:
     from ganlane.sim.random import Stream
 
     set_threads(config.threads)
-    driver = make_driver(config.driver, config.env, Stream[config.stream.upper()], config.device)
+    driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
     mask, policy = driver.behind(config.mask)
     seen = config.observation.read_by(driver.observation)
     options = {"env": config.env, "observation": seen, "reward": config.reward, "mask": mask, "stream": config.stream}
@@ -64,7 +64,8 @@ def record(config: RecordConfig, folder: Path) -> str:
     rows = TensorRows(config.traffic, count, {**options, "device": config.device})
     spec = deepcopy(gymnasium.spec(ENV_ID))
     spec.kwargs, spec.max_episode_steps = plain({"traffic": config.traffic, **options}), rows.episode.most_decisions()
-    spec.kwargs["traffic"]["name"], env = config.traffic.label(), _env_name(config)
+    env = next(name for name, kind in SCHEMAS["env"].items() if kind is type(config.env))
+    spec.kwargs["traffic"]["name"] = config.traffic.label()
     spec.kwargs["env"]["name"] = env
     name, root = config.dataset_name(), Path(config.out or folder).absolute()
     about = {"dataset_id": name, "algorithm_name": driver.name, "minari_version": minari.__version__}
@@ -77,10 +78,6 @@ def record(config: RecordConfig, folder: Path) -> str:
     write_results(folder, {"dataset": name, "root": str(root), **found}, asdict(config), seeds)
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in found.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
-
-
-def _env_name(config: RecordConfig) -> str:
-    return next(name for name, kind in SCHEMAS["env"].items() if kind is type(config.env))
 
 
 @contextmanager

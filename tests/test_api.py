@@ -192,7 +192,7 @@ def test_the_short_blocks_in_the_docs_run(capsys):
         (lambda: ganlane.load_agent("gone.safetensors"), "agent gone.safetensors: no such file"),
         (lambda: ganlane.api.evaluate(["mobil"], ["idm"], 0), "episodes=0: expected a number from 1"),
         (lambda: ganlane.api.evaluate(["mobil"], ["idm"], 10**30), "expected a number from 1 to"),
-        (lambda: ganlane.api.evaluate(["mobil", "mobil"], ["idm"]), "a list of different names"),
+        (lambda: ganlane.api.evaluate(["mobil", "mobil"], ["idm"]), "a list of different entries"),
         (lambda: ganlane.api.evaluate(["mobil"], ["idm", {"name": "idm"}]), "one name twice"),
         (lambda: ganlane.api.evaluate([42], ["idm"]), "agents=[42]: expected a list"),
         (lambda: ganlane.api.evaluate(["mobil"], ["idm"], generator={"path": "x"}), "env.generator: no such key"),

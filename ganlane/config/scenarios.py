@@ -55,26 +55,19 @@ class SceneEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         self.check_ranges(*TABLE_II_KEYS, "lane_width_m", "lanes", "ego_desired_speed_mps")
-        self._refuse_table_ii()
-        self._count_vehicles()
-        super().__post_init__()
-
-    def _refuse_table_ii(self) -> None:
-        """A key that would be silently without effect is a mistake."""
         for name in TABLE_II_KEYS:
             if getattr(self, name) != getattr(SpawnParameters, name):
                 raise ParameterError(
                     f"{{{name}}}={as_typed(getattr(self, name))}: has no effect on a scene set by hand; "
                     "leave it out, or take env=highway."
                 )
-
-    def _count_vehicles(self) -> None:
         there = self.fixed_scene().vehicles
         if self.vehicles not in (0, there):
             raise ParameterError(
                 f"{{vehicles}}={self.vehicles}: the scene has {there}, the ego included; leave this key out."
             )
         assign(self, vehicles=there)
+        super().__post_init__()
 
     def _check_start(self) -> None:
         scene = self.fixed_scene()

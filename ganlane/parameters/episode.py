@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
-from ganlane.errors import ParameterError
+from ganlane.errors import ParameterError, UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.checks import Positive, PositiveRange, Range, Record, Share
 
@@ -19,6 +19,18 @@ class Stream(IntEnum):
     TRAIN = 0
     SELECT = 1
     REPORT = 2
+
+    @classmethod
+    def named(cls, name: str) -> Stream:
+        """From its name in lower case.
+
+        Raises:
+            UserError: no such stream.
+        """
+        if name.upper() not in cls.__members__:
+            names = ", ".join(cls.__members__).lower()
+            raise UserError(f"stream={name}: expected one of {names}; choose one of them.")
+        return cls[name.upper()]
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,10 @@ MISTAKES = {
     "render out=nowhere/film.gif": "out=nowhere/film.gif: expected a file in a folder that exists",
     "train_generator generator=gann": "choose one of calibrated, paper, social_gan",
     "train_generator folds=1": "one fold leaves nothing to fit to",
+    "train env.lanes=many": "env.lanes=many: expected a whole number",
+    "train agent.noisy=perhaps": "agent.noisy=perhaps: expected true or false",
+    "evaluate agents={a:1}": "agents: expected a list in brackets",
+    "train traffic=mixed traffic.shares=3": "names of traffics with whole numbers",
     "fly": "fly: no such command; choose one of train, evaluate",
 }
 

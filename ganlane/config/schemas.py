@@ -83,14 +83,14 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 SUFFIX = "_schema"
 
 
-def register() -> None:
-    """Fill the ConfigStore; again does no harm."""
+def register(command: str) -> None:
+    """Put the schemas of all options and that of a command into the ConfigStore; again does no harm."""
     store = ConfigStore.instance()
     for group, options in SCHEMAS.items():
         kept = store.repo.get(group, {}) if group else store.repo
         for name, schema in options.items():
-            # Storing one takes OmegaConf milliseconds, and a command comes here twice.
-            if f"{name}{SUFFIX}.yaml" not in kept:
+            # Storing one takes OmegaConf milliseconds, that of a command up to 80; and a command comes here twice.
+            if f"{name}{SUFFIX}.yaml" not in kept and (group or name == command):
                 store.store(group=group or None, name=name + SUFFIX, node=node_of(schema), provider="ganlane")
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
 

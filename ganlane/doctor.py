@@ -28,7 +28,7 @@ from typing import Final
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
-from ganlane.runtime import check_process
+from ganlane.runtime import check_process, find_compiler
 
 NEEDED_IS_MISSING = 1
 USER_ERROR = 2
@@ -233,13 +233,9 @@ def _devices() -> Finding:
 
 def _compiler() -> Finding:
     """The C++ compiler that only ``env.compile=true`` needs; ``CXX`` names another one."""
-    from ganlane.runtime import COMPILERS
-
-    named = os.environ.get("CXX")
-    looked_for = (named,) if named else COMPILERS
-    path = next(filter(None, map(shutil.which, looked_for)), None)
+    path, looked = find_compiler()
     if path is None:
-        found = f"none (looked for {', '.join(looked_for)}); env.compile=true needs one"
+        found = f"none (looked for {looked}); env.compile=true needs one"
         fix = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
         return Finding("C++ compiler", State.ABSENT, found, fix)
     return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")

@@ -37,11 +37,6 @@ def config_of(command, *overrides):
     return check(command, list(overrides)).config
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_composes_with_its_defaults(command):
-    assert dataclasses.is_dataclass(config_of(command))
-
-
 @pytest.mark.parametrize("number", range(max(map(len, map(options_of, SCHEMAS)))))
 def test_every_option_composes(number):
     """The first of every group together, then the second; experiments are composed in the tests of the phases."""

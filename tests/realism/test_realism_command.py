@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
-from ganlane.config.realism import RealismConfig
+from ganlane.config.recordings import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.files import load_weights, save_weights
 from ganlane.generator import shipped_generator

@@ -21,8 +21,8 @@ from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.decision import run_decision
 from ganlane.env.native_step import after_decision, native_decision
+from ganlane.env.physics import run_decision
 from ganlane.parameters.observation import ObservationConfig
 from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import episode_key

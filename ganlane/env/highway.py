@@ -11,13 +11,12 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
-from ganlane.env.checks import ActionCheck, check_counter, check_sizes, usable_device
-from ganlane.env.decision import Recorder, known_false, run_decision
+from ganlane.env.checks import ActionCheck, check_counter, usable_device
 from ganlane.env.native_step import NATIVE_TAKEN, after_decision, make_kernel, native_decision, say_once
-from ganlane.env.physics import Physics, Rules, Substep, outcome
+from ganlane.env.physics import Physics, Recorder, Rules, Substep, known_false, outcome, run_decision
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
-from ganlane.parameters.checks import checked_arguments, seed_number
+from ganlane.parameters.checks import checked_arguments, seed_number, whole_number
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
@@ -91,7 +90,11 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
-        check_sizes(num_envs, vehicles, first_episode)
+        # The configuration's bounds lie within.
+        whole_number("num_envs", num_envs, 1, 2**20)
+        whole_number("first_episode", first_episode, 0, 2**62)
+        if vehicles is not None:
+            whole_number("vehicles", vehicles, 1, 1000)
         super().__init__(device=usable_device(device, dtype), batch_size=torch.Size([int(num_envs)]))
         self.traffic = traffic.to(self.device)
         self.road: Road = traffic.road
@@ -99,7 +102,12 @@ class HighwayEnv(EnvBase):
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
         self.stream, self.dtype = traffic.stream, dtype
-        self.scenes = scenes or self._own_scenes(9 if vehicles is None else vehicles)
+        if scenes is None:
+            # The traffic's own scenes if it has any, else random ones.
+            count, spawn, seen = 9 if vehicles is None else vehicles, self.spawn_parameters, self.ego.visibility
+            own = traffic.scenes(count, Visibility.named(seen), spawn.ego_desired_speed_mps)
+            scenes = own or RandomScenes(self.road, count, spawn, Visibility.named(seen), traffic.visibility)
+        self.scenes = scenes
         self.vehicles = self.scenes.vehicles
         self.first_episode, self.recycle, self.recycle_share = first_episode, recycle, recycle_share
         self.recorder: Recorder | None = None
@@ -135,14 +143,6 @@ class HighwayEnv(EnvBase):
                 f"vehicles={vehicles}: the scene has {self.vehicles}, the ego included; leave this number out."
             )
         self.scenes.check(self.road, self.rules.idm)
-
-    def _own_scenes(self, vehicles: int) -> Scenes:
-        """The traffic's own scenes if it has any, else random ones."""
-        ego_visibility = Visibility.named(self.ego.visibility)
-        recorded = self.traffic.scenes(vehicles, ego_visibility, self.spawn_parameters.ego_desired_speed_mps)
-        return recorded or RandomScenes(
-            self.road, vehicles, self.spawn_parameters, ego_visibility, self.traffic.visibility
-        )
 
     def _make_specs(self) -> None:
         n, device = self.batch_size[0], self.device

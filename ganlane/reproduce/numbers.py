@@ -85,8 +85,8 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     if mobil is not None and random_legal is not None:
         score = normalized_over_trainings(rewards, column(mobil, "reward"), column(random_legal, "reward"))
     row: Row = {"driver": recipe, "traffic": traffic, "trainings": len(rewards), "episodes": rewards.shape[1]}
-    row |= entries("mean_reward", over_trainings([rewards]))
-    row |= entries("interquartile_mean", over_trainings([rewards], interquartile_mean))
+    row |= entries("mean_reward", over_trainings(rewards))
+    row |= entries("interquartile_mean", over_trainings(rewards, interquartile_mean))
     row["reward_sd"] = float(rewards.std(ddof=1))
     row |= entries("minus_mobil", None if above is None else difference(rewards, above))
     row |= entries("probability_above_mobil", None if above is None else _probability(rewards, above))
@@ -106,7 +106,7 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
 
 
 def _training(name: str, frame: pl.DataFrame) -> Row:
-    reward = over_trainings([frame["reward"].to_numpy()[None]])
+    reward = over_trainings(frame["reward"].to_numpy()[None])
     counts = {end: frame.filter(_ended([end])).height for end in FAILURES}
     return {"driver": name, **entries("mean_reward", reward), **counts}
 

@@ -249,8 +249,15 @@ def draw_runs(runs: Mapping[str, Runs], columns: Sequence[str] | None = None, sm
         UserError: there is nothing to draw, or a column that no run has.
     """
     seeds = {name: [each] if isinstance(each, pl.DataFrame) else list(each) for name, each in runs.items()}
+    # Columns in which any run has numbers.
     known = list(
-        dict.fromkeys(name for frames in seeds.values() for each in frames for name in _number_columns(each))
+        dict.fromkeys(
+            name
+            for frames in seeds.values()
+            for frame in frames
+            for name, kind in frame.schema.items()
+            if kind.is_numeric() and name != X_COLUMN and frame[name].is_not_null().any()
+        )
     )
     for name in columns or ():
         if name not in known:
@@ -273,15 +280,6 @@ def draw_runs(runs: Mapping[str, Runs], columns: Sequence[str] | None = None, sm
             _plot_column(axes, frames, panel.dashed, smooth, raw=False, color=colours[name], ls="--", lw=1.2)
     add_legend(figure, {labels[name]: colour for name, colour in colours.items()})
     return figure
-
-
-def _number_columns(frame: pl.DataFrame) -> list[str]:
-    """Columns with any number, the number of decisions left out."""
-    return [
-        name
-        for name, kind in frame.schema.items()
-        if kind.is_numeric() and name != X_COLUMN and frame[name].is_not_null().any()
-    ]
 
 
 def _plot_column(

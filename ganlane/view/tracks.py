@@ -19,7 +19,7 @@ from ganlane.data.scenes import COLUMNS, write_prepared
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
-from ganlane.view.trajectory import EpisodeLabel, Trajectory
+from ganlane.view.record import EpisodeLabel, Trajectory
 
 TracksFormat = Literal["csv", "parquet"]
 

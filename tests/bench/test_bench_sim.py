@@ -14,7 +14,6 @@ from ganlane.bench import sim as sim_module
 from ganlane.bench.measure import measure
 from ganlane.bench.sim import ENVIRONMENT, GYMNASIUM, PHYSICS, SimSuite, bytes_of, exponent, scaling
 from ganlane.bench.systems import (
-    EnvPoolRunner,
     GymnasiumRunner,
     HighwayEnvRunner,
     Scenario,
@@ -22,6 +21,7 @@ from ganlane.bench.systems import (
     highway_env_case,
     highway_env_settings,
     start_environment,
+    start_envpool,
     start_physics,
 )
 from ganlane.bench.traffic import SYSTEM, TrafficSuite
@@ -231,7 +231,7 @@ def test_gymnasium_simulates_the_steps_that_its_episodes_last(batch):
 
 def test_envpool_drives_the_same_road():
     pytest.importorskip("envpool")
-    assert EnvPoolRunner(EnvConfig(), 4, 1, seed=0)(3) == 4 * 3 * 10
+    assert start_envpool(EnvConfig(), 4, 1, seed=0)(3) == 4 * 3 * 10
 
 
 # suite=traffic

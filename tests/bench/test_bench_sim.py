@@ -7,12 +7,11 @@ from importlib.metadata import version
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.bench import sim as sim_module
 from ganlane.bench.measure import measure
-from ganlane.bench.sim import ENVIRONMENT, GYMNASIUM, PHYSICS, SimSuite, bytes_of, exponent, scaling
+from ganlane.bench.sim import ENVIRONMENT, GYMNASIUM, PHYSICS, SimSuite, exponent, scaling
 from ganlane.bench.systems import (
     GymnasiumRunner,
     HighwayEnvRunner,
@@ -160,11 +159,6 @@ def test_cost_that_doubles_with_the_size_grows_linearly():
     assert growth["exponent"] == pytest.approx(1)
     assert exponent([9, 15, 30], [0.3 * size**1.7 for size in (9, 15, 30)]) == pytest.approx(1.7)
     assert exponent([9, 9], [1.0, 2.0]) is None
-
-
-def test_bytes_are_those_of_all_leaves():
-    nested = TensorDict({"a": torch.zeros(2, 3), "b": {"c": torch.zeros(2, dtype=torch.int64)}}, batch_size=[2])
-    assert bytes_of(nested) == 2 * 3 * 4 + 2 * 8
 
 
 # HighwayEnv

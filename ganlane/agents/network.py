@@ -167,14 +167,14 @@ def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
 
     In place of TorchRL's ``reset_noise``, which draws from the global generator; one draw serves all layers.
     """
-    for layer, (inputs, outputs) in zip(_noisy_layers(network), noise_of(network, generator)):
+    for layer, (inputs, outputs) in zip(noisy_layers(network), noise_of(network, generator)):
         torch.outer(outputs, inputs, out=layer.weight_epsilon)
         layer.bias_epsilon.copy_(outputs)
 
 
 def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tensor, Tensor]]:
     """New noise of the inputs and of the outputs of every noisy layer; empty without such layers."""
-    layers = _noisy_layers(network)
+    layers = noisy_layers(network)
     if not layers:
         return []
     sizes = [size for layer in layers for size in (layer.in_features, layer.out_features)]
@@ -183,13 +183,8 @@ def noise_of(network: nn.Module, generator: torch.Generator) -> list[tuple[Tenso
     return list(zip(noise[::2], noise[1::2]))
 
 
-def mean_sigma(network: nn.Module) -> Tensor:
-    """Mean absolute noise parameter over the weights of the noisy layers, 0-dim; 0 without noise."""
-    sigmas = [layer.weight_sigma.detach().abs().mean() for layer in _noisy_layers(network)]
-    return torch.stack(sigmas).mean() if sigmas else torch.zeros(())
-
-
-def _noisy_layers(network: nn.Module) -> list[NoisyLinear]:
+def noisy_layers(network: nn.Module) -> list[NoisyLinear]:
+    """All of them, in the order of the modules."""
     return [layer for layer in network.modules() if isinstance(layer, NoisyLinear)]
 
 

@@ -16,7 +16,7 @@ from ganlane.agents.network import (
     NetworkConfig,
     QNetwork,
     load_parameters,
-    mean_sigma,
+    noisy_layers,
     parameters_of,
     redraw_noise,
 )
@@ -144,8 +144,9 @@ class Rainbow:
             self.loss.update_target()
 
     def sigma(self) -> Tensor:
-        """Mean noise parameter, 0-dim."""
-        return mean_sigma(self.network)
+        """Mean absolute noise parameter over the weights of the noisy layers, 0-dim; 0 without noise."""
+        sigmas = [layer.weight_sigma.detach().abs().mean() for layer in noisy_layers(self.network)]
+        return torch.stack(sigmas).mean() if sigmas else torch.zeros(())
 
     def weights(self) -> dict[str, Tensor]:
         """The online network's parameters, without its momentary noise."""

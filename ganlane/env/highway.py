@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from ganlane import keys
 from ganlane.env.checks import ActionCheck, check_counter, usable_device
 from ganlane.env.native_step import NATIVE_TAKEN, after_decision, make_kernel, native_decision, say_once
-from ganlane.env.physics import Physics, Recorder, Rules, Substep, known_false, outcome, run_decision
+from ganlane.env.physics import Physics, Recorder, Rules, known_false, outcome, run_decision
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
 from ganlane.parameters.checks import checked_arguments, seed_number, whole_number
@@ -238,7 +238,9 @@ class HighwayEnv(EnvBase):
             return self._native_step(tensordict, action)
         self._check_action.values(action)
         key = episode_key(self.stream, seed, episode)
-        rules = self._rules_of(tensordict, key)
+        rules = self.rules
+        if self.traffic.own_roads:  # replayed scenes have their own roads and ends
+            rules = rules._replace(road=road_in(tensordict, self.road), scene_steps=self.traffic.steps_of(key))
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(tensordict.get(keys.EGO).items())
         step = tensordict.get(keys.STEP)
         start, command = self.physics.begin(rules, action, vehicles, ego, step)
@@ -254,7 +256,12 @@ class HighwayEnv(EnvBase):
         }
         if self.traffic.own_roads:
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
-        return pack(self._recycled(rules, end, key), ego, memory, events, rest)
+        vehicles = end.vehicles
+        if self.recycle and not known_false(out_of_range(vehicles, rules.road).any()):
+            # In running rows with recycling those left behind are moved.
+            recycled = end.running & self._recycling_rows(key)
+            vehicles = self.physics.recycle(vehicles, rules.road, rules.idm).where(recycled, vehicles)
+        return pack(vehicles, ego, memory, events, rest)
 
     def _native_step(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """One decision by the kernel."""
@@ -273,19 +280,6 @@ class HighwayEnv(EnvBase):
             self._check_action.values(action)  # says which
             raise
         return after_decision(tensordict, *decided)
-
-    def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
-        """The rules of every row: replayed scenes have their own roads and ends."""
-        if not self.traffic.own_roads:
-            return self.rules
-        return self.rules._replace(road=road_in(state, self.road), scene_steps=self.traffic.steps_of(key))
-
-    def _recycled(self, rules: Rules, end: Substep, key: Tensor) -> Vehicles:
-        """The vehicles after a decision; in running rows with recycling those left behind are moved."""
-        if not self.recycle or known_false(out_of_range(end.vehicles, rules.road).any()):
-            return end.vehicles
-        recycled = end.running & self._recycling_rows(key)
-        return self.physics.recycle(end.vehicles, rules.road, rules.idm).where(recycled, end.vehicles)
 
     def _recycling_rows(self, key: Tensor) -> Tensor:
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""

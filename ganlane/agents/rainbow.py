@@ -163,11 +163,16 @@ class Rainbow:
         Without the buffer a resume is not exact anyway, so Adam's moments are kept in bfloat16.
         """
         optimizer = self.optimizer.state_dict()
+        if not with_replay:  # loading brings the moments back to the weights' type
+            optimizer["state"] = {
+                row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in own.items()}
+                for row, own in optimizer["state"].items()
+            }
         return {
             "config": asdict(self.config),
             "network": self.weights(),
             "target": parameters_of(self.loss.target_network),
-            "optimizer": optimizer if with_replay else _halved(optimizer),
+            "optimizer": optimizer,
             "generators": {name: generator.get_state() for name, generator in self.generators.items()},
             "updates": self.updates,
             "replay": replay_state(self.replay) if with_replay else None,
@@ -201,12 +206,3 @@ class Rainbow:
 def annealed(start: float, end: float, done: int, total: int) -> float:
     """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
     return end if done >= total else start + (end - start) * done / total
-
-
-def _halved(optimizer: dict[str, Any]) -> dict[str, Any]:
-    """The optimiser's state with its moments in bfloat16; loading it brings them back to the weights' type."""
-    state = {
-        row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in moments.items()}
-        for row, moments in optimizer["state"].items()
-    }
-    return {**optimizer, "state": state}

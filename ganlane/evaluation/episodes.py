@@ -134,7 +134,11 @@ class _Evaluation:
                 after = self.env.step(self.policy(self.state))
                 self.counts.add(after["next"])
                 self.state = step_mdp(after)
-            self._collect()
+            # Save the counts of the episodes that have ended; their rows are spare then.
+            ended = ((self.place < self.total) & ~self.counts.driving).nonzero()[:, 0]
+            if len(ended) > 0:
+                self.finished.append((self.place[ended].cpu(), self.counts.of(ended)))
+                self.place[ended] = self.total
             done = sum(len(places) for places, _ in self.finished)
             if on_progress is not None:
                 on_progress(done, self.total)
@@ -143,13 +147,6 @@ class _Evaluation:
         order = torch.cat([places for places, _ in self.finished]).argsort()
         names = self.finished[0][1]
         return {name: torch.cat([counts[name] for _, counts in self.finished])[order] for name in names}
-
-    def _collect(self) -> None:
-        """Save the counts of the episodes that have ended; their rows are spare then."""
-        ended = ((self.place < self.total) & ~self.counts.driving).nonzero()[:, 0]
-        if len(ended) > 0:
-            self.finished.append((self.place[ended].cpu(), self.counts.of(ended)))
-            self.place[ended] = self.total
 
     def _go_on(self) -> None:
         """Give spare rows the next episodes; without any, start the last ones again or leave such rows out."""

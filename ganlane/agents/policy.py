@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -83,7 +84,7 @@ class ExploringPolicy(TensorDictModuleBase):
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
             # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
-            draw = {"generator": self.generator, "device": self.generator.device}
+            draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
             lottery = torch.rand(mask.shape, **draw) * mask
             action = torch.where(torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action)
         chosen = values.gather(-1, action[..., None])

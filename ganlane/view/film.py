@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from PIL import Image
@@ -164,7 +164,7 @@ def _encode_gif(frames: Film | Sequence[Picture], fps: float, scale: float, colo
     ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / (fps / every)).astype(int)
     durations_ms = (np.diff(ends).clip(min=2) * 10).tolist()
     file = io.BytesIO()
-    options = {"duration": durations_ms, "loop": 0, "optimize": False, "disposal": 1}
+    options: dict[str, Any] = {"duration": durations_ms, "loop": 0, "optimize": False, "disposal": 1}
     pictures[0].save(file, format="GIF", save_all=True, append_images=pictures[1:], **options)
     return file.getvalue()
 

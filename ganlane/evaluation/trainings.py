@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,7 @@ from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, kept_cou
 
 #: Fewer than for one mean, since every cell of a matrix needs several of these.
 RESAMPLES = 2000
-_MEAN = partial(np.mean, axis=-1)
+_MEAN: Callable[[Array], Any] = partial(np.mean, axis=-1)
 
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
@@ -30,7 +31,7 @@ def interquartile_mean(scores: npt.ArrayLike) -> Array:
     return np.asarray(trim_mean(np.asarray(scores, dtype=np.float64), 0.25, axis=-1))
 
 
-def over_trainings(scores: npt.ArrayLike, statistic: Callable[..., Array] = _MEAN, seed: int = 0) -> Estimate:
+def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Any] = _MEAN, seed: int = 0) -> Estimate:
     """``statistic`` (over the last axis) of the mean scores of trainings [S, E], with the bootstrap's interval.
 
     No interval where there is one training and one episode.

@@ -20,12 +20,12 @@ def saved_in(folder: Path, **more) -> Path:
     return path
 
 
-def transitions(size, rows=64, seed=0, scale=1.0, most_steps=1, masked=False):
-    """``rows`` transitions with observations of ``size`` numbers; every fifth or so is terminal."""
+def transitions(size, rows=64, seed=0):
+    """``rows`` single steps with observations of ``size`` numbers; every fifth or so is terminal."""
     generator = torch.Generator().manual_seed(seed)
     after = {
         "observation": torch.randn(rows, size, generator=generator),
-        "reward": scale * torch.randn(rows, 1, generator=generator),
+        "reward": torch.randn(rows, 1, generator=generator),
         "terminated": torch.rand(rows, 1, generator=generator) < 0.2,
     }
     content = {
@@ -34,11 +34,6 @@ def transitions(size, rows=64, seed=0, scale=1.0, most_steps=1, masked=False):
         "steps_to_next_obs": torch.ones(rows, 1),
         "next": after,
     }
-    if most_steps > 1:
-        content["steps_to_next_obs"] = torch.randint(1, most_steps + 1, (rows, 1), generator=generator).float()
-    if masked:
-        after["action_mask"] = torch.rand(rows, 3, generator=generator) < 0.6
-        after["action_mask"][:, 0] = True
     return TensorDict(content, [rows])
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from agents_small import transitions
+from tensordict import TensorDict
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, project
@@ -11,10 +11,26 @@ from ganlane.agents.network import NetworkConfig, QNetwork, redraw_noise
 SIZE = 5
 
 
-def batch(rows=64):
-    data = transitions(SIZE, rows, scale=3.0, most_steps=3)
-    data["next", "done"] = data["next", "terminated"].clone()
-    return data
+def batch(seed=0, rows=64, scale=3.0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(shape, generator=generator)
+
+    return TensorDict(
+        {
+            "observation": normal(rows, SIZE),
+            "action": torch.randint(0, 3, (rows,), generator=generator),
+            "steps_to_next_obs": torch.randint(1, 4, (rows, 1), generator=generator).float(),
+            "next": {
+                "observation": normal(rows, SIZE),
+                "reward": scale * normal(rows, 1),
+                "terminated": torch.rand(rows, 1, generator=generator) < 0.3,
+                "done": torch.rand(rows, 1, generator=generator) < 0.3,
+            },
+        },
+        batch_size=[rows],
+    )
 
 
 def network(**options):

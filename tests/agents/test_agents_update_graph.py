@@ -6,7 +6,7 @@ from copy import deepcopy
 
 import pytest
 import torch
-from agents_small import transitions
+from tensordict import TensorDict
 
 from ganlane.agents.rainbow import Rainbow
 from ganlane.agents.update_graph import UpdateGraph, can_graph
@@ -16,11 +16,37 @@ from ganlane.runtime import has_compiler
 SIZE, STORED = 11, 600
 
 
+def transitions(masked):
+    draw = torch.Generator().manual_seed(1)
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=draw)
+
+    following = {
+        "observation": uniform(STORED, SIZE),
+        "reward": 60.0 * uniform(STORED, 1) - 30.0,  # some targets lie outside the support
+        "terminated": uniform(STORED, 1) < 0.1,
+        "done": uniform(STORED, 1) < 0.1,
+    }
+    if masked:
+        following["action_mask"] = uniform(STORED, 3) < 0.6
+        following["action_mask"][:, 0] = True
+    return TensorDict(
+        {
+            "observation": uniform(STORED, SIZE),
+            "action": torch.randint(3, (STORED,), generator=draw),
+            "steps_to_next_obs": torch.randint(1, 4, (STORED, 1), generator=draw),
+            "next": TensorDict(following, [STORED]),
+        },
+        [STORED],
+    )
+
+
 def agent(graph=None, masked=False, **options):
     usual = {"hidden": (16, 24), "atoms": 7, "batch_size": 32, "warmup": 100, "capacity": 1000, "target_period": 3}
     config = RainbowConfig(**{**usual, "v_min": -20.0, "v_max": 20.0, **options})
     made = Rainbow(config, SIZE, seed=0)
-    made.store(transitions(SIZE, STORED, scale=15.0, most_steps=3, masked=masked))
+    made.store(transitions(masked))
     if graph is not None:
         made.graph = UpdateGraph(made.network, made.loss, made.optimizer, config, compile=graph)
     return made

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.worlds import environment, packed, placed, same_bits, step, vehicles
+from reference.worlds import environment, placed, same_bits, step, vehicles
 from torchrl.collectors import Collector
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -336,8 +336,3 @@ def test_a_soft_crash_is_no_end():
     td = step(env, placed(env, vehicles(*standing(1.5))))
     assert td[keys.EVENTS, keys.SOFT_CRASH].item() == 1
     assert flags(td) == (False, False, False)
-
-
-def test_dense_scenes_can_be_asked_for():
-    env = environment(vehicles=20, spawn=packed(150.0, 10.0))
-    assert env.reset()[keys.VEHICLES, "x"].shape == (1, 20)

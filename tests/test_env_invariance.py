@@ -167,28 +167,6 @@ def test_a_reset_runs_the_episodes_that_are_asked_for_through_transforms():
     assert torch.equal(alone["observation"][0], state["observation"][1])
 
 
-def test_rows_go_on_to_their_next_episodes_through_transforms():
-    env = transformed(4, goal_m=40.0)
-    state, seen = env.reset(), [set() for _ in range(4)]
-    for _ in range(20):
-        state["action"] = torch.zeros(4, dtype=torch.int64)
-        _, state = env.step_and_maybe_reset(state)
-        for row, episode in enumerate(state["episode"].tolist()):
-            seen[row].add(episode)
-    for row, episodes in enumerate(seen):
-        assert len(episodes) > 2
-        assert sorted(episodes) == [row + 4 * k for k in range(len(episodes))]
-
-
-def test_after_asked_episodes_the_next_ones_follow_from_those():
-    env = transformed(2, goal_m=40.0)
-    state = env.reset(asked(10, 21))
-    while (state["episode"] == torch.tensor([10, 21])).any():
-        state["action"] = torch.zeros(2, dtype=torch.int64)
-        _, state = env.step_and_maybe_reset(state)
-    assert ((state["episode"] - torch.tensor([10, 21])) % 2 == 0).all()
-
-
 def test_nonsense_in_the_padding_of_a_scene_reaches_nobody():
     """Scenes of one's own may leave anything where nobody is, NaN for one."""
 

@@ -18,7 +18,7 @@ MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
 def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
-    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, all decision periods."""
+    """1 to 6 lanes, 2 to 20 vehicles, sparse to dense, with and without MOBIL, early and late ends."""
     lanes = rng.randint(1, 6)
     vehicles = rng.randint(2, 20)
     spacing = rng.choice([8.0, 12.0, 25.0])
@@ -28,7 +28,9 @@ def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
         rows,
         vehicles,
         mobil=rng.random() < 0.75,
-        period_s=rng.choice([0.5, 1.0]),
+        period_s=rng.choice([0.3, 0.5, 1.0, 1.0, 2.0]),
+        goal_m=rng.choice([20.0, 60.0, 5000.0, 5000.0]),
+        timeout_s=rng.choice([2.5, 1000.0, 1000.0]),
         abort=rng.random() < 0.3,
         spawn=packed(spread, spacing),
         seed=rng.randrange(10**9),
@@ -100,6 +102,9 @@ def assert_same(td, row: int, state: scalar.State, outcome: scalar.Outcome, tole
     assert td[keys.VEHICLES, "target_lane"][row].tolist() == [car.target_lane for car in state.cars]
     assert td[keys.STEP][row] == state.step
     assert [name for name in keys.END_EVENTS if td[keys.EVENTS, name][row]] == outcome.reasons
+    assert td["terminated"][row].item() == any(name in keys.TERMINAL_EVENTS for name in outcome.reasons)
+    assert td["truncated"][row].item() == any(name in keys.TRUNCATING_EVENTS for name in outcome.reasons)
+    assert td["done"][row].item() == bool(outcome.reasons)
     assert td[keys.EVENTS, keys.SOFT_CRASH][row] == outcome.soft_crash
     assert td[keys.EVENTS, keys.SOFT_CRASH_BEHIND][row] == outcome.soft_crash_behind
     ego = {name: value[row].item() for name, value in td[keys.EGO].items()}

@@ -63,15 +63,10 @@ def with_seeds(name: str) -> list[str]:
     recipe, every, mask = name.partition("@all")
     if not every:
         return [name]
-    if recipe not in SHIPPED:
-        return [f"{recipe}@{seed}{mask}" for seed in _seeds_in(Path(recipe))]
-    others = _seeds_file(recipe)
-    seeds = [0, *(_seeds_in(others) if others.is_file() else [])]
-    return [f"{recipe}@{seed}{mask}" for seed in seeds]
-
-
-def _seeds_in(path: Path) -> list[int]:
-    return sorted(_read_several(path)[1])
+    shipped = recipe in SHIPPED
+    packed = _seeds_file(recipe) if shipped else Path(recipe)
+    seeds = [] if shipped and not packed.is_file() else sorted(_read_several(packed)[1])
+    return [f"{recipe}@{seed}{mask}" for seed in ([0, *seeds] if shipped else seeds)]
 
 
 def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, Any]]]:
@@ -84,11 +79,7 @@ def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, An
 
 
 def agent_file(name: str | Path) -> Path:
-    """The file of a shipped agent (:data:`SHIPPED`; ``@SEED`` may follow) or of a path.
-
-    Raises:
-        UserError: neither a shipped agent nor a file.
-    """
+    """The file of a shipped agent (:data:`SHIPPED`; ``@SEED`` may follow) or of a path; else :class:`UserError`."""
     path, seed = _place(name)
     if not os.path.isfile(path):  # which takes names that are too long for a file
         known = ", ".join(sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors")))
@@ -132,17 +123,6 @@ def save_agents(
     save_weights(path, SEVERAL, tensors, {"agents": described})
 
 
-def _read_one_of(path: Path, seed: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights and metadata of one agent of a file of :func:`save_agents`."""
-    tensors, agents = _read_several(path)
-    if seed not in agents:
-        seeds = ", ".join(map(str, sorted(agents)))
-        raise UserError(f"{path}@{seed}: this file has no training with seed {seed}; choose one of {seeds}.")
-    own = f"{seed}/"
-    weights = {name.removeprefix(own): value.float() for name, value in tensors.items() if name.startswith(own)}
-    return weights, agents[seed]
-
-
 def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]:
     """Weights, network config and metadata of a shipped agent or an agent's file.
 
@@ -150,7 +130,15 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
         UserError: no such file, not an agent that ganlane wrote, or one that needs an option that was removed.
     """
     path, seed = agent_file(name), _place(name)[1]
-    weights, metadata = load_weights(path, "agent") if seed is None else _read_one_of(path, seed)
+    if seed is None:
+        weights, metadata = load_weights(path, "agent")
+    else:
+        tensors, agents = _read_several(path)
+        if seed not in agents:
+            seeds = ", ".join(map(str, sorted(agents)))
+            raise UserError(f"{path}@{seed}: this file has no training with seed {seed}; choose one of {seeds}.")
+        own, metadata = f"{seed}/", agents[seed]
+        weights = {key.removeprefix(own): value.float() for key, value in tensors.items() if key.startswith(own)}
     for part in ("network", "agent"):
         if isinstance(metadata.get(part), dict):
             metadata[part] = without_removed(metadata[part], str(path))
@@ -168,12 +156,9 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
 def load_agent(
     name: str | Path, observation_size: int | None = None, device: torch.device | str = "cpu"
 ) -> tuple[GreedyPolicy, dict[str, Any]]:
-    """A trained agent as a greedy policy, with its metadata.
+    """A trained agent, shipped or from a file, as a greedy policy on ``device``, with its metadata.
 
-    Args:
-        name: a shipped agent or an agent's file.
-        observation_size: D of the environment it is to drive in, checked if given.
-        device: where the network goes.
+    ``observation_size`` D of the environment it is to drive in is checked if given.
 
     Raises:
         UserError: no such agent, a foreign file, or another observation size.
@@ -232,12 +217,10 @@ def _options(network: Mapping[str, Any], names: list[str]) -> str:
 
 
 def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """Let Adam go on from the ``moments`` of an agent with the same network; its learning rate stays ``agent``'s.
+    """Let ``agent``'s Adam go on from the ``moments`` of an agent with the same network, at its own learning rate.
 
-    Args:
-        agent: whose optimiser to change.
-        moments: ``step``, ``exp_avg`` and ``exp_avg_sq`` by the place of the parameter in the network; the part
-            ``state`` of an optimiser's state.
+    ``moments`` is the part ``state`` of an optimiser's state: ``step``, ``exp_avg`` and ``exp_avg_sq`` by the place
+    of the parameter in the network.
 
     Raises:
         UserError: they are those of other parameters.

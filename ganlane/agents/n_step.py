@@ -70,9 +70,26 @@ class NStepWindow:
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
-        transition = combine(self.steps, self.gamma)
+        first, *later = self.steps
+        reward, following, terminated = first.reward, first.following, first.terminated
+        mask = first.following_mask
+        length = torch.ones_like(reward)
+        running = ~first.done
+        for power, after in enumerate(later, start=1):
+            reward = reward + running * (self.gamma**power * after.reward)
+            following = torch.where(running, after.following, following)
+            if mask is not None and after.following_mask is not None:
+                mask = torch.where(running, after.following_mask, mask)
+            terminated = torch.where(running, after.terminated, terminated)
+            length = length + running
+            running = running & ~after.done
         del self.steps[0]
-        return transition
+        end = {"observation": following, "reward": reward, "terminated": terminated}
+        if mask is not None:
+            end[keys.ACTION_MASK] = mask
+        rows = reward.shape[:1]
+        content = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length}
+        return TensorDict({**content, "next": TensorDict(end, rows)}, rows)
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the window, as plain dictionaries of tensors."""
@@ -81,26 +98,3 @@ class NStepWindow:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
         self.steps = [Step(**step) for step in state["steps"]]
-
-
-def combine(steps: list[Step], gamma: float) -> TensorDict:
-    """The transition of the oldest of ``steps``, cut at the first end (see :meth:`NStepWindow.push`)."""
-    first = steps[0]
-    reward, following, terminated = first.reward, first.following, first.terminated
-    mask = first.following_mask
-    length = torch.ones_like(reward)
-    running = ~first.done
-    for power, step in enumerate(steps[1:], start=1):
-        reward = reward + running * (gamma**power * step.reward)
-        following = torch.where(running, step.following, following)
-        if mask is not None and step.following_mask is not None:
-            mask = torch.where(running, step.following_mask, mask)
-        terminated = torch.where(running, step.terminated, terminated)
-        length = length + running
-        running = running & ~step.done
-    after = {"observation": following, "reward": reward, "terminated": terminated}
-    if mask is not None:
-        after[keys.ACTION_MASK] = mask
-    rows = reward.shape[:1]
-    content = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length}
-    return TensorDict({**content, "next": TensorDict(after, rows)}, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -82,16 +83,12 @@ class ExploringPolicy(TensorDictModuleBase):
         if explore and self.epsilon > 0.0:
             if mask is None:
                 mask = torch.ones_like(values) if self.legal is None else self.legal(tensordict)
-            action = self._with_random(action, mask)
+            # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
+            draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
+            lottery = torch.rand(mask.shape, **draw) * mask
+            action = torch.where(torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action)
         chosen = values.gather(-1, action[..., None])
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
-
-    def _with_random(self, action: Tensor, legal: Tensor) -> Tensor:
-        """Replace a fraction epsilon of the actions by legal ones, drawn uniformly."""
-        device = self.generator.device
-        lottery = torch.rand(legal.shape, generator=self.generator, device=device) * legal
-        explore = torch.rand(action.shape, generator=self.generator, device=device) < self.epsilon
-        return torch.where(explore, lottery.argmax(-1), action)
 
 
 class MaskedPolicy(TensorDictModuleBase):

@@ -16,7 +16,7 @@ from ganlane.agents.network import (
     NetworkConfig,
     QNetwork,
     load_parameters,
-    mean_sigma,
+    noisy_layers,
     parameters_of,
     redraw_noise,
 )
@@ -143,8 +143,9 @@ class Rainbow:
             self.loss.update_target()
 
     def sigma(self) -> Tensor:
-        """Mean noise parameter, 0-dim."""
-        return mean_sigma(self.network)
+        """Mean absolute noise parameter over the weights of the noisy layers, 0-dim; 0 without noise."""
+        sigmas = [layer.weight_sigma.detach().abs().mean() for layer in noisy_layers(self.network)]
+        return torch.stack(sigmas).mean() if sigmas else torch.zeros(())
 
     def weights(self) -> dict[str, Tensor]:
         """The online network's parameters, without its momentary noise."""
@@ -161,11 +162,16 @@ class Rainbow:
         Without the buffer a resume is not exact anyway, so Adam's moments are kept in bfloat16.
         """
         optimizer = self.optimizer.state_dict()
+        if not with_replay:  # loading brings the moments back to the weights' type
+            optimizer["state"] = {
+                row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in own.items()}
+                for row, own in optimizer["state"].items()
+            }
         return {
             "config": asdict(self.config),
             "network": self.weights(),
             "target": parameters_of(self.loss.target_network),
-            "optimizer": optimizer if with_replay else _halved(optimizer),
+            "optimizer": optimizer,
             "generators": {name: generator.get_state() for name, generator in self.generators.items()},
             "updates": self.updates,
             "replay": replay_state(self.replay) if with_replay else None,
@@ -199,12 +205,3 @@ class Rainbow:
 def annealed(start: float, end: float, done: int, total: int) -> float:
     """From ``start`` to ``end`` in a straight line over ``total``, then ``end``."""
     return end if done >= total else start + (end - start) * done / total
-
-
-def _halved(optimizer: dict[str, Any]) -> dict[str, Any]:
-    """The optimiser's state with its moments in bfloat16; loading it brings them back to the weights' type."""
-    state = {
-        row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in moments.items()}
-        for row, moments in optimizer["state"].items()
-    }
-    return {**optimizer, "state": state}

@@ -15,12 +15,10 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.modules import NoisyLinear
 
 from ganlane import keys
-from ganlane.agents.linear import matrix_product
 from ganlane.agents.loss import LeanDistributionalLoss, outside_support, pick, project
-from ganlane.agents.network import QNetwork, noise_of
+from ganlane.agents.network import QNetwork, matrix_product, noise_of
 from ganlane.agents.policy import allowed_values
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.runtime import compiled
@@ -197,15 +195,14 @@ class UpdateGraph:
         compile: bool = True,
     ) -> None:
         self.network, self.target, self.optimizer = network, loss.target_network, optimizer
-        own = network.config
-        (group,) = optimizer.param_groups
-        self.settings = Settings(own.actions, own.atoms, config.gamma, config.gradient_clip, group["eps"])
+        own, eps = network.config, optimizer.param_groups[0]["eps"]
+        self.settings = Settings(own.actions, own.atoms, config.gamma, config.gradient_clip, eps)
         self._update: Callable[..., Learned] = compiled(update) if compile else update
 
     def __call__(self, batch: TensorDictBase, generator: torch.Generator) -> Learned:
         """One update on ``batch`` (keys as in :class:`LeanDistributionalLoss`); noise from ``generator``."""
-        online, target = (_parameters(network) for network in (self.network, self.target))
-        moments = [self._moments(parameter) for parameter in self._leaves()]
+        online, target = _parameters(self.network), _parameters(self.target)
+        moments = [self._moments(parameter) for parameter in online]
         torch._foreach_add_([each["step"] for each in moments], 1.0)
         step, (group,) = float(moments[0]["step"]), self.optimizer.param_groups
         corrections = torch.tensor([1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)])
@@ -226,12 +223,9 @@ class UpdateGraph:
         mean, square = ([each[name] for each in moments] for name in ("exp_avg", "exp_avg_sq"))
         with torch.no_grad():
             return self._update(
-                self.settings, self.network.support, online, target, mean, square, noise, target_noise, given, rate,
-                corrections,
+                self.settings, self.network.support, [value.detach() for value in online],
+                [value.detach() for value in target], mean, square, noise, target_noise, given, rate, corrections,
             )  # fmt: skip
-
-    def _leaves(self) -> list[Tensor]:
-        return [getattr(layer, name) for layer in _layers(self.network) for name in _PARAMETERS]
 
     def _moments(self, parameter: Tensor) -> dict[str, Any]:
         """Adam's state of a parameter, made as Adam makes it at its first step."""
@@ -242,9 +236,5 @@ class UpdateGraph:
         return state
 
 
-def _layers(network: QNetwork) -> list[NoisyLinear]:
-    return [*network.trunk, network.head]
-
-
 def _parameters(network: QNetwork) -> list[Tensor]:
-    return [getattr(layer, name).detach() for layer in _layers(network) for name in _PARAMETERS]
+    return [getattr(layer, name) for layer in (*network.trunk, network.head) for name in _PARAMETERS]

@@ -26,20 +26,18 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
 from ganlane.config.bench import BenchConfig
 
-if TYPE_CHECKING:
-    from ganlane.bench.measure import Suite
-    from ganlane.evaluation.table import Table
-
 
 def bench(asked: BenchConfig, folder: Path) -> str:
     """Measure, print and save; the line that names the results."""
-    from ganlane.bench.measure import measure
-    from ganlane.evaluation import write_results
+    from ganlane.bench.measure import Suite, measure
+    from ganlane.bench.sim import SimSuite
+    from ganlane.bench.traffic import TrafficSuite
+    from ganlane.bench.train import TrainSuite
+    from ganlane.evaluation import machine_sentence, write_results
     from ganlane.evaluation.table import show
     from ganlane.files import split_at_markers, write_between_markers
 
@@ -47,7 +45,8 @@ def bench(asked: BenchConfig, folder: Path) -> str:
     markers = f"<!-- begin bench {config.suite} -->", f"<!-- end bench {config.suite} -->"
     if config.report is not None:
         split_at_markers(Path(config.report), *markers)
-    suite = make_suite(config)
+    suites: tuple[type[Suite], ...] = (SimSuite, TrafficSuite, TrainSuite)
+    suite = {each.name: each for each in suites}[config.suite](config)
     for note in suite.notes:
         print(note, file=sys.stderr, flush=True)
     numbers = measure(suite, config.repetitions, config.seconds)
@@ -58,32 +57,14 @@ def bench(asked: BenchConfig, folder: Path) -> str:
         print(note)
     path = write_results(folder, numbers, asdict(config), {"seed": config.seed})
     if config.report is not None:
-        text = report_text(tables, suite.notes, command_line(folder), config.threads)
-        write_between_markers(Path(config.report), *markers, text)
+        parts = [
+            f"Written by the command on {date.today().isoformat()}:\n\n    {command_line(folder)}",
+            f"Taken on: {machine_sentence(config.threads)}",
+            *[table.markdown() for table in tables],
+            *(["\n".join(f"- {note}" for note in suite.notes)] if suite.notes else []),
+        ]
+        write_between_markers(Path(config.report), *markers, "\n" + "\n\n".join(parts) + "\n")
     return f"results: {path}"
-
-
-def make_suite(config: BenchConfig) -> Suite:
-    """The suite that ``config.suite`` names."""
-    from ganlane.bench.sim import SimSuite
-    from ganlane.bench.traffic import TrafficSuite
-    from ganlane.bench.train import TrainSuite
-
-    suites: dict[str, type[Suite]] = {suite.name: suite for suite in (SimSuite, TrafficSuite, TrainSuite)}
-    return suites[config.suite](config)
-
-
-def report_text(tables: Sequence[Table], notes: Sequence[str], command: str, threads: Sequence[int]) -> str:
-    """Content of a document: command, machine, tables, and what could not be measured."""
-    from ganlane.evaluation import machine_sentence
-
-    parts = [
-        f"Written by the command on {date.today().isoformat()}:\n\n    {command}",
-        f"Taken on: {machine_sentence(threads)}",
-        *[table.markdown() for table in tables],
-        *(["\n".join(f"- {note}" for note in notes)] if notes else []),
-    ]
-    return "\n" + "\n\n".join(parts) + "\n"
 
 
 def command_line(folder: Path) -> str:

@@ -120,6 +120,16 @@ class Sample(NamedTuple):
     decisions: int
     physics_steps: int
 
+    @property
+    def steps_per_s(self) -> float:
+        """Physics steps per second."""
+        return self.physics_steps / self.wall_s
+
+    @property
+    def steps_per_cpu_s(self) -> float:
+        """Physics steps per CPU second; the CPU clock is coarse on some systems and may not have moved."""
+        return self.physics_steps / max(self.cpu_s, 1e-6)
+
 
 @contextmanager
 def torch_threads(threads: int) -> Iterator[None]:
@@ -134,18 +144,14 @@ def torch_threads(threads: int) -> Iterator[None]:
 
 def take_turn(case: Case, run: Runner, decisions: int) -> Sample:
     """One turn of ``decisions`` per environment; in inference mode, as in collecting."""
-    _synchronize(case)
+    wait = torch.cuda.synchronize if case.labels.device == "cuda" else lambda: None
+    wait()
     wall, cpu = time.perf_counter(), time.process_time()
     with torch.inference_mode():
         physics_steps = run(decisions)
-    _synchronize(case)
+    wait()
     wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu
     return Sample(wall_s, cpu_s, decisions * case.labels.batch, physics_steps)
-
-
-def _synchronize(case: Case) -> None:
-    if case.labels.device == "cuda":
-        torch.cuda.synchronize()
 
 
 def decisions_per_turn(case: Case, run: Runner, seconds: float) -> int:
@@ -203,17 +209,15 @@ def growth_per_environment(small: Case, large: Case) -> float | None:
 
 # Rows
 
+_RATES = ("steps_per_s", "steps_per_cpu_s")
+
 
 def make_row(
     labels: Labels, samples: Sequence[Sample], reference: Sequence[Sample] = (), peak_memory_mb: float | None = None
 ) -> Row:
-    """One row: medians over the turns of a case.
+    """One row: medians over the turns ``samples`` of a case.
 
-    Args:
-        labels: of the case.
-        samples: of its turns.
-        reference: turns of the case that it is compared with, taken in turn with them; may be empty.
-        peak_memory_mb: if known.
+    ``reference``: turns of the case that it is compared with, taken in turn with them; may be empty.
 
     Returns:
         The labels; ``physics_steps_per_s``, ``decisions_per_s``, ``vehicle_steps_per_s`` (per second of wall time)
@@ -222,9 +226,14 @@ def make_row(
         median); ``ratio`` and ``ratio_cpu`` (physics steps per second of wall and CPU time over the reference's turn
         of the same round, median of the rounds; or None); ``peak_memory_mb``.
     """
-    wall = [sample.physics_steps / sample.wall_s for sample in samples]
-    cpu = [_per_cpu_s(sample) for sample in samples]
+    wall, cpu = ([getattr(sample, name) for sample in samples] for name in _RATES)
     walls_s = [sample.wall_s for sample in samples]
+    ratios = [
+        median(getattr(one, name) / getattr(other, name) for one, other in zip(samples, reference))
+        if reference
+        else None
+        for name in _RATES
+    ]
     return {
         **asdict(labels),
         "physics_steps_per_s": median(wall),
@@ -236,19 +245,10 @@ def make_row(
         "decisions": samples[0].decisions,
         "repetitions": len(samples),
         "spread": float(np.subtract(*np.quantile(walls_s, [0.75, 0.25])) / median(walls_s)),
-        "ratio": _ratio(wall, [other.physics_steps / other.wall_s for other in reference]),
-        "ratio_cpu": _ratio(cpu, [_per_cpu_s(other) for other in reference]),
+        "ratio": ratios[0],
+        "ratio_cpu": ratios[1],
         "peak_memory_mb": peak_memory_mb,
     }
-
-
-def _per_cpu_s(sample: Sample) -> float:
-    """Physics steps per CPU second; the CPU clock is coarse on some systems and may not have moved."""
-    return sample.physics_steps / max(sample.cpu_s, 1e-6)
-
-
-def _ratio(ours: Sequence[float], theirs: Sequence[float]) -> float | None:
-    return median(one / other for one, other in zip(ours, theirs)) if theirs else None
 
 
 #: Heading to cell of the columns that the suites' tables of speed choose from.

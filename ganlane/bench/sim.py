@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -24,10 +24,10 @@ from ganlane.bench.measure import (
 from ganlane.bench.systems import (
     GymnasiumRunner,
     Scenario,
-    envpool_case,
     highway_env_case,
     installed_version,
     start_environment,
+    start_envpool,
     start_physics,
 )
 from ganlane.build import make_traffic
@@ -45,6 +45,13 @@ _HEADINGS = (
     *("system", "mode", "device", "threads", "batch", "physics steps/s", "decisions/s", "vehicle-steps/s"),
     *("physics steps/CPU-s", "times the peer", "in CPU time", "spread", "peak memory, MB"),
 )
+_GROWTH: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "system": lambda row: row["system"],
+    "with the": lambda row: row["in"],
+    "sizes": lambda row: ", ".join(map(str, row["sizes"])),
+    "ms per decision": lambda row: ", ".join(map(significant, row["milliseconds"])),
+    "exponent": lambda row: NOTHING if row["exponent"] is None else f"{row['exponent']:.2f}",
+}
 _AGAINST = ("system", "mode", "device", "threads", "batch", "physics steps/s", "times the peer", "in CPU time")
 
 
@@ -81,16 +88,20 @@ class SimSuite(Suite):
                     for mode in self.config.modes
                     if system != GYMNASIUM or (mode == NATIVE and device == "cpu")
                 ]
-                + ([envpool_case(self, threads, batch)] if self.has_envpool and device == "cpu" else []),
+                + ([self._envpool(threads, batch)] if self.has_envpool and device == "cpu" else []),
                 reference,
             )
             for device, threads in self.places()
             for batch in self.config.batches
         ]
-        return [
-            *speed,
-            *(group for system in (PHYSICS, ENVIRONMENT) for group in self._growth(system) if len(group.cases) > 1),
-        ]
+        growth = [group for system in (PHYSICS, ENVIRONMENT) for group in self._growth(system)]
+        return speed + [group for group in growth if len(group.cases) > 1]
+
+    def _envpool(self, threads: int, batch: int) -> Case:
+        """HighwayEnv in C++ on the suite's road."""
+        name = f"EnvPool {installed_version('envpool')}"
+        labels = self.labels(name, "its IDM and MOBIL", NATIVE, threads, batch)
+        return Case(labels, partial(start_envpool, self.config.env, batch, threads, self.config.seed))
 
     def _growth(self, system: str) -> list[Group]:
         """Sizes side by side, on the first device."""
@@ -138,12 +149,18 @@ class SimSuite(Suite):
         }
 
     def tables(self, rows: Sequence[Row], findings: Mapping[str, Any]) -> list[Table]:
-        """Speed, ratios, growth, memory."""
+        """Speed, ratios, growth, memory in kB of 1000 bytes."""
+        memory = findings["memory"]
+        kilobytes = [["state, observation included", f"{memory['state_bytes'] / 1000:.2f}"]]
+        if memory["peak_growth_bytes"] is not None:
+            batches = " and ".join(map(str, memory["batches"]))
+            growth = f"{memory['peak_growth_bytes'] / 1000:.2f}"
+            kilobytes.append([f"growth of a process's peak between batches {batches}", growth])
         return [
             speed_table("Speed", [row for row in rows if row["part"] == "speed"], _HEADINGS, names=3),
             speed_table("The best against HighwayEnv", findings["ratios"], _AGAINST, names=3),
-            _scaling_table(findings["scaling"]),
-            _memory_table(findings["memory"]),
+            Table.of("Growth of the cost", findings["scaling"], _GROWTH, 2),
+            Table(f"Memory per environment of {memory['vehicles']} vehicles", ["what", "kB"], kilobytes),
         ]
 
 
@@ -175,24 +192,3 @@ def bytes_of(tensordict: TensorDictBase) -> int:
     """Bytes of all tensors in it."""
     leaves = tensordict.values(include_nested=True, leaves_only=True)
     return sum(leaf.numel() * leaf.element_size() for leaf in leaves)
-
-
-def _scaling_table(found: Sequence[Mapping[str, Any]]) -> Table:
-    columns = {
-        "system": lambda row: row["system"],
-        "with the": lambda row: row["in"],
-        "sizes": lambda row: ", ".join(map(str, row["sizes"])),
-        "ms per decision": lambda row: ", ".join(map(significant, row["milliseconds"])),
-        "exponent": lambda row: NOTHING if row["exponent"] is None else f"{row['exponent']:.2f}",
-    }
-    return Table.of("Growth of the cost", found, columns, 2)
-
-
-def _memory_table(memory: Mapping[str, Any]) -> Table:
-    """In kB of 1000 bytes."""
-    lines = [["state, observation included", f"{memory['state_bytes'] / 1000:.2f}"]]
-    if memory["peak_growth_bytes"] is not None:
-        batches = " and ".join(map(str, memory["batches"]))
-        growth = f"{memory['peak_growth_bytes'] / 1000:.2f}"
-        lines.append([f"growth of a process's peak between batches {batches}", growth])
-    return Table(f"Memory per environment of {memory['vehicles']} vehicles", ["what", "kB"], lines)

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,8 @@ from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.decision import run_decision
 from ganlane.env.native_step import after_decision, native_decision
+from ganlane.env.physics import run_decision
 from ganlane.parameters.observation import ObservationConfig, RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Vehicles
@@ -120,7 +121,7 @@ class EnvironmentRunner:
         self.decisions = 0
 
     def __call__(self, decisions: int) -> int:
-        """See :data:`~ganlane.bench.measure.Runner`."""
+        """Drive; the physics steps."""
         simulated = torch.zeros((), dtype=torch.int64, device=self.env.device)
         for _ in range(decisions):
             self.decisions += 1
@@ -156,7 +157,7 @@ class GymnasiumRunner:
         self.time_s = np.zeros(batch)
 
     def __call__(self, decisions: int) -> int:
-        """See :data:`~ganlane.bench.measure.Runner`."""
+        """Drive; the physics steps."""
         driven_s = 0.0
         for _ in range(decisions):
             self.decisions += 1
@@ -220,7 +221,7 @@ class HighwayEnvRunner:
         self.steps_per_decision = int(settings["simulation_frequency"] // settings["policy_frequency"])
 
     def __call__(self, decisions: int) -> int:
-        """See :data:`~ganlane.bench.measure.Runner`."""
+        """Drive; the physics steps."""
         for action in self.random.integers(self.env.action_space.n, size=decisions):
             _, _, terminated, truncated, _ = self.env.step(int(action))
             if terminated or truncated:
@@ -228,45 +229,27 @@ class HighwayEnvRunner:
         return decisions * self.steps_per_decision
 
 
-class EnvPoolRunner:
+def start_envpool(env: EnvConfig, batch: int, threads: int, seed: int) -> Runner:
     """HighwayEnv in EnvPool's C++: random actions; an episode that has ended begins anew in the next step."""
+    import envpool
 
-    def __init__(self, env: EnvConfig, batch: int, threads: int, seed: int) -> None:
-        import envpool
+    settings = highway_env_settings(env)
+    for each in ("observation", "action"):
+        del settings[each]
+    # Its rates are whole numbers.
+    settings |= {"policy_frequency": max(1, round(1 / env.decision_period_s)), "duration": round(env.timeout_s)}
+    settings |= {"max_episode_steps": round(env.timeout_s / env.decision_period_s), "seed": seed}
+    made = envpool.make_gymnasium("Highway-v0", num_envs=batch, num_threads=min(threads, batch), **settings)
+    made.reset()
+    actions = cycle(np.random.default_rng(seed).integers(5, size=(_DRAWN, batch)).astype(np.int32))
+    steps = batch * env.episode_parameters().substeps()
 
-        self.env: Any = envpool.make_gymnasium(
-            "Highway-v0", num_envs=batch, num_threads=min(threads, batch), seed=seed, **envpool_settings(env)
-        )
-        self.env.reset()
-        self.actions = np.random.default_rng(seed).integers(5, size=(_DRAWN, batch)).astype(np.int32)
-        self.steps = batch * env.episode_parameters().substeps()
-        self.decisions = 0
+    def run(decisions: int) -> int:
+        for action in islice(actions, decisions):
+            made.step(action)
+        return decisions * steps
 
-    def __call__(self, decisions: int) -> int:
-        """See :data:`~ganlane.bench.measure.Runner`."""
-        for _ in range(decisions):
-            self.decisions += 1
-            self.env.step(self.actions[self.decisions % _DRAWN])
-        return decisions * self.steps
-
-
-def envpool_settings(env: EnvConfig) -> dict[str, Any]:
-    """:func:`highway_env_settings` as EnvPool takes them; its rates are whole numbers."""
-    return {
-        "lanes_count": env.lanes,
-        "vehicles_count": env.vehicles - 1,
-        "simulation_frequency": round(1 / keys.PHYSICS_STEP_S),
-        "policy_frequency": max(1, round(1 / env.decision_period_s)),
-        "duration": round(env.timeout_s),
-        "max_episode_steps": round(env.timeout_s / env.decision_period_s),
-    }
-
-
-def envpool_case(suite: Suite, threads: int, batch: int) -> Case:
-    """EnvPool on the suite's road."""
-    config = suite.config
-    labels = suite.labels(f"EnvPool {installed_version('envpool')}", "its IDM and MOBIL", NATIVE, threads, batch)
-    return Case(labels, partial(EnvPoolRunner, config.env, batch, threads, config.seed))
+    return run
 
 
 def highway_env_case(suite: Suite) -> Case:

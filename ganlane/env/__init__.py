@@ -2,10 +2,10 @@
 
     action -> ego's target lane -> [ traffic module -> ego's motion -> events ] x substeps -> done flags
 
-:mod:`~ganlane.env.highway` has specs, reset and step, :mod:`~ganlane.env.decision` the physics steps of one decision,
-:mod:`~ganlane.env.physics` the ego in each of them, :mod:`~ganlane.env.state` the fields. Observation and reward are
-transforms (:mod:`ganlane.transforms`); without them the environment returns its raw state and no reward. The state
-travels in the TensorDict, so it can be copied, saved and branched.
+:mod:`~ganlane.env.highway` has specs, reset and step, :mod:`~ganlane.env.physics` the physics steps of one decision,
+:mod:`~ganlane.env.state` the fields. Observation and reward are transforms (:mod:`ganlane.transforms`); without them
+the environment returns its raw state and no reward. The state travels in the TensorDict, so it can be copied, saved
+and branched.
 """
 
 from ganlane.env.highway import HighwayEnv

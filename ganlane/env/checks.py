@@ -8,21 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ganlane.arguments import whole_number
 from ganlane.errors import UserError
 from ganlane.keys import ACTIONS
 from ganlane.runtime import check_default_device
-
-#: The most rows and vehicles; the configuration's bounds lie within.
-_MOST_ROWS, _MOST_VEHICLES = 2**20, 1000
-
-
-def check_sizes(num_envs: Any, vehicles: Any, first_episode: Any) -> None:
-    """Raise :class:`UserError` for numbers of rows, vehicles or episodes that there cannot be."""
-    whole_number("num_envs", num_envs, 1, _MOST_ROWS)
-    whole_number("first_episode", first_episode, 0, 2**62)
-    if vehicles is not None:
-        whole_number("vehicles", vehicles, 1, _MOST_VEHICLES)
 
 
 def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:

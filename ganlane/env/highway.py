@@ -11,11 +11,10 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
-from ganlane.arguments import checked_arguments, seed_number
-from ganlane.env.checks import ActionCheck, check_counter, check_sizes, usable_device
-from ganlane.env.decision import Recorder, known_false, run_decision
+from ganlane.arguments import checked_arguments, seed_number, whole_number
+from ganlane.env.checks import ActionCheck, check_counter, usable_device
 from ganlane.env.native_step import NATIVE_TAKEN, after_decision, make_kernel, native_decision, say_once
-from ganlane.env.physics import Physics, Rules, Substep, outcome
+from ganlane.env.physics import Physics, Recorder, Rules, known_false, outcome, run_decision
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
@@ -91,7 +90,11 @@ class HighwayEnv(EnvBase):
         recycle_share: float = 1.0,
         kernel: str = "torch",
     ) -> None:
-        check_sizes(num_envs, vehicles, first_episode)
+        # The configuration's bounds lie within.
+        whole_number("num_envs", num_envs, 1, 2**20)
+        whole_number("first_episode", first_episode, 0, 2**62)
+        if vehicles is not None:
+            whole_number("vehicles", vehicles, 1, 1000)
         super().__init__(device=usable_device(device, dtype), batch_size=torch.Size([int(num_envs)]))
         self.traffic = traffic.to(self.device)
         self.road: Road = traffic.road
@@ -99,7 +102,12 @@ class HighwayEnv(EnvBase):
         self.ego = ego or EgoParameters()
         self.episode = episode or EpisodeParameters()
         self.stream, self.dtype = traffic.stream, dtype
-        self.scenes = scenes or self._own_scenes(9 if vehicles is None else vehicles)
+        if scenes is None:
+            # The traffic's own scenes if it has any, else random ones.
+            count, spawn, seen = 9 if vehicles is None else vehicles, self.spawn_parameters, self.ego.visibility
+            own = traffic.scenes(count, Visibility.named(seen), spawn.ego_desired_speed_mps)
+            scenes = own or RandomScenes(self.road, count, spawn, Visibility.named(seen), traffic.visibility)
+        self.scenes = scenes
         self.vehicles = self.scenes.vehicles
         self.first_episode, self.recycle, self.recycle_share = first_episode, recycle, recycle_share
         self.recorder: Recorder | None = None
@@ -135,14 +143,6 @@ class HighwayEnv(EnvBase):
                 f"vehicles={vehicles}: the scene has {self.vehicles}, the ego included; leave this number out."
             )
         self.scenes.check(self.road, self.rules.idm)
-
-    def _own_scenes(self, vehicles: int) -> Scenes:
-        """The traffic's own scenes if it has any, else random ones."""
-        ego_visibility = Visibility.named(self.ego.visibility)
-        recorded = self.traffic.scenes(vehicles, ego_visibility, self.spawn_parameters.ego_desired_speed_mps)
-        return recorded or RandomScenes(
-            self.road, vehicles, self.spawn_parameters, ego_visibility, self.traffic.visibility
-        )
 
     def _make_specs(self) -> None:
         n, device = self.batch_size[0], self.device
@@ -238,7 +238,9 @@ class HighwayEnv(EnvBase):
             return self._native_step(tensordict, action)
         self._check_action.values(action)
         key = episode_key(self.stream, seed, episode)
-        rules = self._rules_of(tensordict, key)
+        rules = self.rules
+        if self.traffic.own_roads:  # replayed scenes have their own roads and ends
+            rules = rules._replace(road=road_in(tensordict, self.road), scene_steps=self.traffic.steps_of(key))
         vehicles, ego = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(tensordict.get(keys.EGO).items())
         step = tensordict.get(keys.STEP)
         start, command = self.physics.begin(rules, action, vehicles, ego, step)
@@ -254,7 +256,12 @@ class HighwayEnv(EnvBase):
         }
         if self.traffic.own_roads:
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
-        return pack(self._recycled(rules, end, key), ego, memory, events, rest)
+        vehicles = end.vehicles
+        if self.recycle and not known_false(out_of_range(vehicles, rules.road).any()):
+            # In running rows with recycling those left behind are moved.
+            recycled = end.running & self._recycling_rows(key)
+            vehicles = self.physics.recycle(vehicles, rules.road, rules.idm).where(recycled, vehicles)
+        return pack(vehicles, ego, memory, events, rest)
 
     def _native_step(self, tensordict: TensorDictBase, action: Tensor) -> TensorDictBase:
         """One decision by the kernel."""
@@ -273,19 +280,6 @@ class HighwayEnv(EnvBase):
             self._check_action.values(action)  # says which
             raise
         return after_decision(tensordict, *decided)
-
-    def _rules_of(self, state: TensorDictBase, key: Tensor) -> Rules:
-        """The rules of every row: replayed scenes have their own roads and ends."""
-        if not self.traffic.own_roads:
-            return self.rules
-        return self.rules._replace(road=road_in(state, self.road), scene_steps=self.traffic.steps_of(key))
-
-    def _recycled(self, rules: Rules, end: Substep, key: Tensor) -> Vehicles:
-        """The vehicles after a decision; in running rows with recycling those left behind are moved."""
-        if not self.recycle or known_false(out_of_range(end.vehicles, rules.road).any()):
-            return end.vehicles
-        recycled = end.running & self._recycling_rows(key)
-        return self.physics.recycle(end.vehicles, rules.road, rules.idm).where(recycled, end.vehicles)
 
     def _recycling_rows(self, key: Tensor) -> Tensor:
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""

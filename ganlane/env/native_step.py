@@ -85,16 +85,8 @@ def native_decision(
 
 
 def after_decision(state: TensorDictBase, out: Outcome, vehicles: Vehicles) -> TensorDictBase:
-    """The state after the decision from ``state``; reward 0, which a transform writes."""
-    events, flags = events_of(out)
-    rest = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.STEP: out.step}
-    rest |= {keys.REWARD: torch.zeros_like(out.distance)[:, None], **flags}
-    return pack(vehicles, ego_memory(out), traffic_memory(out), events, rest)
-
-
-def ego_memory(out: Outcome) -> dict[str, Tensor]:
-    """The ego's fields after the decision (:mod:`ganlane.env.state`)."""
-    return {
+    """The state after the decision from ``state`` (:mod:`ganlane.env.state`); reward 0, which a transform writes."""
+    ego = {
         "steering": out.ego_steering,
         "mean_acceleration": out.mean_acceleration,
         "change_progress": out.change_progress,
@@ -106,16 +98,11 @@ def ego_memory(out: Outcome) -> dict[str, Tensor]:
         "soft_crash_behind": out.ego_soft_crash_behind,
         "started_change": out.started_change,
     }
-
-
-def traffic_memory(out: Outcome) -> TensorDictBase:
-    """The traffic's memory after the decision: the wheels, the ego's too."""
-    return TensorDict._new_unsafe({"steering": out.steering}, batch_size=out.step.shape)
-
-
-def events_of(out: Outcome) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Events and done flags of the decision, each [N, 1]; recorded scenes, which end, the kernel does not drive."""
+    memory = TensorDict._new_unsafe({"steering": out.steering}, batch_size=out.step.shape)
     events = {name: getattr(out, name) for name in ("goal", "hard_crash", "out_of_road", "timeout")}
-    events["scene_end"] = torch.zeros_like(out.timeout)
+    events["scene_end"] = torch.zeros_like(out.timeout)  # of recorded scenes, which the kernel does not drive
     events |= {keys.SOFT_CRASH: out.soft_crash, keys.SOFT_CRASH_BEHIND: out.soft_crash_behind}
-    return events, {"terminated": out.terminated, "truncated": out.truncated, "done": out.done}
+    rest = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.STEP: out.step}
+    rest |= {keys.REWARD: torch.zeros_like(out.distance)[:, None]}
+    rest |= {"terminated": out.terminated, "truncated": out.truncated, "done": out.done}
+    return pack(vehicles, ego, memory, events, rest)

@@ -18,8 +18,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.evaluation.contact import ego_at_fault
-from ganlane.sim.state import Vehicles
+from ganlane.sim.collisions import ego_overlaps
+from ganlane.sim.state import STRAIGHT, Road, Vehicles
 
 #: Called now and then with (episodes finished, episodes in all).
 OnProgress = Callable[[int, int], None]
@@ -35,6 +35,9 @@ OTHER = "other"
 #: Events that are summed over the decisions of an episode, and facts about the ego at its end.
 _SUMMED_EVENTS = (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
 _LAST_EGO = ("distance", "lane_changes", "decisions")
+#: Where the other vehicle of a crash was, by the numbers that :func:`contact_side` gives.
+SIDES = ("none", "ahead", "side", "behind")
+_AHEAD, _SIDE, _BEHIND = 1, 2, 3
 
 
 def run_episodes(
@@ -69,7 +72,7 @@ def run_episodes(
         ``soft_crash_behind`` (onsets), ``reward`` (undiscounted return), ``reward_*`` (each term's sum),
         ``decisions``, ``duration_s``, ``distance_m``, ``mean_speed_mps`` (distance over time),
         ``lane_changes``, and ``at_fault``: of a hard crash, whether the ego moved into the other
-        (:func:`ganlane.evaluation.contact.ego_at_fault`); else null.
+        (:func:`ego_at_fault`); else null.
 
     Raises:
         UserError: no episodes are asked for, the environment is not batched in one dimension, or its reset ignores
@@ -131,7 +134,11 @@ class _Evaluation:
                 after = self.env.step(self.policy(self.state))
                 self.counts.add(after["next"])
                 self.state = step_mdp(after)
-            self._collect()
+            # Save the counts of the episodes that have ended; their rows are spare then.
+            ended = ((self.place < self.total) & ~self.counts.driving).nonzero()[:, 0]
+            if len(ended) > 0:
+                self.finished.append((self.place[ended].cpu(), self.counts.of(ended)))
+                self.place[ended] = self.total
             done = sum(len(places) for places, _ in self.finished)
             if on_progress is not None:
                 on_progress(done, self.total)
@@ -140,13 +147,6 @@ class _Evaluation:
         order = torch.cat([places for places, _ in self.finished]).argsort()
         names = self.finished[0][1]
         return {name: torch.cat([counts[name] for _, counts in self.finished])[order] for name in names}
-
-    def _collect(self) -> None:
-        """Save the counts of the episodes that have ended; their rows are spare then."""
-        ended = ((self.place < self.total) & ~self.counts.driving).nonzero()[:, 0]
-        if len(ended) > 0:
-            self.finished.append((self.place[ended].cpu(), self.counts.of(ended)))
-            self.place[ended] = self.total
 
     def _go_on(self) -> None:
         """Give spare rows the next episodes; without any, start the last ones again or leave such rows out."""
@@ -263,3 +263,47 @@ def _episode_rows(counts: dict[str, Tensor], numbers: list[int], seed: int) -> p
         pl.col("lane_changes").cast(integer),
         fault,
     )
+
+
+# What a crash hit
+
+
+def contact_side(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
+    """What the ego overlaps: 0 nobody, 1 somebody ahead, 2 at the side, 3 behind (:data:`SIDES`), [N] int64.
+
+    Two bodies meet along the axis on which their extents began to overlap last; the time since then is the depth of
+    the overlap over the closing speed. Headings are small, so the axes are those of the road. Of several vehicles
+    hit in one physics step the nearest to the front counts.
+    """
+    nobody = len(SIDES)
+    first = torch.where(ego_overlaps(vehicles, road), _sides(vehicles, road), nobody).amin(-1)
+    return torch.where(first == nobody, 0, first)
+
+
+def ego_at_fault(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
+    """Whether the ego moved into somebody, [N] bool; false where it hit nobody.
+
+    Along the road whoever is behind moves into the other, across it whoever is faster towards the other: a rule of
+    geometry, no law. A driver that cuts in and is struck from behind is not at fault by it.
+    """
+    v = vehicles
+    side, dy = _sides(v, road), v.y[:, 1:] - v.y[:, :1]
+    across = v.speed * torch.sin(v.heading)
+    pushes = torch.sign(dy) * across[:, :1] > -torch.sign(dy) * across[:, 1:]
+    own = torch.where(side == _SIDE, pushes, side == _AHEAD)
+    return (own & ego_overlaps(v, road)).any(-1)
+
+
+def _sides(v: Vehicles, road: Road) -> Tensor:
+    """On which side of the ego each of the others would have met it, [N, M - 1] int64."""
+    dx, dy = road.distance_ahead(v.x[:, :1], v.x[:, 1:]), v.y[:, 1:] - v.y[:, :1]
+    along, across = v.speed * torch.cos(v.heading), v.speed * torch.sin(v.heading)
+    met_along = _time_since(dx, along[:, 1:] - along[:, :1], 0.5 * (v.length[:, 1:] + v.length[:, :1]))
+    met_across = _time_since(dy, across[:, 1:] - across[:, :1], 0.5 * (v.width[:, 1:] + v.width[:, :1]))
+    return torch.where(met_along < met_across, torch.where(dx > 0, _AHEAD, _BEHIND), _SIDE)
+
+
+def _time_since(distance: Tensor, speed: Tensor, reach: Tensor) -> Tensor:
+    """For how long (s) extents that touch at ``reach`` (m) overlap; infinite where they do not close."""
+    closing = -torch.sign(distance) * speed
+    return torch.where(closing > 0, (reach - distance.abs()) / closing.clamp_min(1e-9), torch.inf)

@@ -19,8 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.evaluation.contact import SIDES, contact_side
-from ganlane.evaluation.episodes import OTHER, start_of
+from ganlane.evaluation.episodes import OTHER, SIDES, contact_side, start_of
 from ganlane.sim.state import Vehicles, road_in
 
 

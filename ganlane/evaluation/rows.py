@@ -65,6 +65,9 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
     crashes = poisson_interval(ended[_CRASH]).scaled(1e6 / distance_m) if distance_m > 0.0 else None
     score = _score(pair, same_traffic)
+    # MOBIL has no lead over itself, and without it nobody has one.
+    mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
+    lead = None if pair["agent"][0] == SCALE_TOP or mobil.height == 0 else paired_lead(pair, mobil)[0]
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
@@ -86,17 +89,11 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
         **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
         **entries("crashes_per_1000_km", crashes),
-        **entries("minus_mobil", _lead_over_mobil(pair, same_traffic)),
+        **entries("minus_mobil", lead),
         "normalized_percent": score.percent,
         "normalized_percent_ci": score.interval,
         "normalized_percent_reason": score.reason,
     }
-
-
-def _lead_over_mobil(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Estimate | None:
-    """None for MOBIL itself, and without it."""
-    mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
-    return None if pair["agent"][0] == SCALE_TOP or mobil.height == 0 else paired_lead(pair, mobil)[0]
 
 
 def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
@@ -241,17 +238,12 @@ def crashes_by_scene(
     for row in by_scene.to_dicts():
         rate = poisson_interval(row[_CRASH]).scaled(per=row["distance_km"]) if row["distance_km"] > 0.0 else None
         rows.append({**row, **entries("crashes_per_km", rate)})
-    return CrashesByScene(_ratio(crashes, km, resamples, seed), rows)
-
-
-def _ratio(crashes: Array, km: Array, resamples: int, seed: int) -> Estimate:
-    """All ``crashes`` [S] over all ``km`` [S], with its percentile interval over resampled scenes."""
     value = float(crashes.sum() / km.sum())
     if len(km) < 2:
-        return Estimate(value)
+        return CrashesByScene(Estimate(value), rows)
     if crashes.sum() == 0:
-        return Estimate(value, 0.0, (poisson_interval(0).high or 0.0) / float(km.sum()))
+        return CrashesByScene(Estimate(value, 0.0, (poisson_interval(0).high or 0.0) / float(km.sum())), rows)
     driven = km.clip(min=np.finfo(np.float64).tiny)
     ratios = [counts @ crashes / (counts @ driven) for counts in resample_counts(len(km), resamples, seed)]
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
-    return Estimate(value, float(low), float(high))
+    return CrashesByScene(Estimate(value, float(low), float(high)), rows)

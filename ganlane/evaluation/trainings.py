@@ -4,7 +4,7 @@ An interval over episodes says what other episodes would give; it says nothing a
 resampled: the trainings of a recipe, and the episodes, which are the same for all trainings and drivers and so are
 drawn once for all of them. Tables are [S, E]: S trainings (1 for a driver that is not trained), E episodes.
 
-Sources: Agarwal et al. 2021 (interquartile mean, stratified bootstrap, probability of improvement); Owen 2007
+Sources: Agarwal et al. 2021 (interquartile mean, bootstrap, probability of improvement); Owen 2007
 (resampling both factors of a crossed table); McNemar 1947, in its exact form.
 """
 
@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,13 +23,7 @@ from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, kept_cou
 
 #: Fewer than for one mean, since every cell of a matrix needs several of these.
 RESAMPLES = 2000
-#: Of the scores [..., S] of trainings along the last axis.
-Statistic = Callable[[Array], Array]
-
-
-def mean(scores: Array) -> Array:
-    """Mean over the last axis."""
-    return scores.mean(axis=-1)
+_MEAN: Callable[[Array], Any] = partial(np.mean, axis=-1)
 
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
@@ -35,23 +31,14 @@ def interquartile_mean(scores: npt.ArrayLike) -> Array:
     return np.asarray(trim_mean(np.asarray(scores, dtype=np.float64), 0.25, axis=-1))
 
 
-def over_trainings(strata: Sequence[npt.ArrayLike], statistic: Statistic = mean, seed: int = 0) -> Estimate:
-    """``statistic`` of the trainings' mean scores, with the interval of the stratified bootstrap.
+def over_trainings(scores: npt.ArrayLike, statistic: Callable[[Array], Any] = _MEAN, seed: int = 0) -> Estimate:
+    """``statistic`` (over the last axis) of the mean scores of trainings [S, E], with the bootstrap's interval.
 
-    Args:
-        strata: tables [S, E] of scores, one for each traffic; trainings are resampled within each of them.
-        statistic: of all mean scores of all strata together.
-        seed: of the bootstrap.
-
-    Returns:
-        No interval where there is one training and one episode.
+    No interval where there is one training and one episode.
     """
-    tables = [_table(table) for table in strata]
-    value = float(statistic(np.concatenate([table.mean(axis=1) for table in tables])))
-    resampled = statistic(
-        np.concatenate([_resampled([table], seed + i)[0] for i, table in enumerate(tables)], axis=1)
-    )
-    return _interval(value, resampled, all(table.size == 1 for table in tables))
+    table = _table(scores)
+    resampled = statistic(_resampled([table], seed)[0])
+    return _interval(float(statistic(table.mean(axis=1))), resampled, table.size == 1)
 
 
 def difference(first: npt.ArrayLike, second: npt.ArrayLike, seed: int = 0) -> Estimate:

@@ -74,7 +74,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         curves = [{"run": name, **row} for name, frame in transfer.runs.items() for row in frame.to_dicts()]
         report.write_csv(folder / "figure_4.csv", curves)
     for name in ("table_vi", "table_vii"):
-        report.write_csv(folder / f"{name}.csv", report.table_rows(tables[name]))
+        report.write_csv(folder / f"{name}.csv", tables[name])
     report.write_csv(folder / "matrix.csv", rows)
     report.write_csv(folder / "comparisons.csv", compared)
     counts = ", ".join(f"{config.episodes_on(name)} on {name}" for name in traffics)

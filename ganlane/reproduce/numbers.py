@@ -85,8 +85,8 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     if mobil is not None and random_legal is not None:
         score = normalized_over_trainings(rewards, column(mobil, "reward"), column(random_legal, "reward"))
     row: Row = {"driver": recipe, "traffic": traffic, "trainings": len(rewards), "episodes": rewards.shape[1]}
-    row |= entries("mean_reward", over_trainings([rewards]))
-    row |= entries("interquartile_mean", over_trainings([rewards], interquartile_mean))
+    row |= entries("mean_reward", over_trainings(rewards))
+    row |= entries("interquartile_mean", over_trainings(rewards, interquartile_mean))
     row["reward_sd"] = float(rewards.std(ddof=1))
     row |= entries("minus_mobil", None if above is None else difference(rewards, above))
     row |= entries("probability_above_mobil", None if above is None else _probability(rewards, above))
@@ -101,14 +101,12 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     row["lane_changes_per_km"] = int(together["lane_changes"].sum()) / driven if driven > 0.0 else None
     row["soft_crash_behind_per_episode"] = together["soft_crash_behind"].mean()
     row["at_fault_share"] = crashes["at_fault"].mean() if "at_fault" in crashes.columns else None
-    row["each"] = [_training(name, frame) for name, frame in trainings.items()]
+    row["each"] = []
+    for name, frame in trainings.items():
+        reward = entries("mean_reward", over_trainings(frame["reward"].to_numpy()[None]))
+        counts = {end: frame.filter(_ended([end])).height for end in FAILURES}
+        row["each"].append({"driver": name, **reward, **counts})
     return row
-
-
-def _training(name: str, frame: pl.DataFrame) -> Row:
-    reward = over_trainings([frame["reward"].to_numpy()[None]])
-    counts = {end: frame.filter(_ended([end])).height for end in FAILURES}
-    return {"driver": name, **entries("mean_reward", reward), **counts}
 
 
 def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_g
 PAPER_VI = {"agent_idm": (19, 2), "agent_gan": (9, 0)}
 #: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000 runs.
 PAPER_VII = {"agent_idm": (5.21, -22.33, 100.66), "agent_gan": (114.82, 33.62, 95.19)}
-_NOT_STATED = "not stated"
 _CSS = (
     "body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#262a30}"
     "table{border-collapse:collapse;font-size:13px;margin:1em 0}td,th{padding:2px 9px;text-align:right}"
@@ -36,58 +35,6 @@ _CSS = (
 
 def _plain(row: Row, driver: str) -> bool:
     return row["driver"] in (driver, f"{driver}+none")
-
-
-def table_vi(rows: Sequence[Row]) -> Table:
-    """Crashes among rule-followers, beside the paper's."""
-    lines = [
-        ["paper", "Traffic_IDM", name, _NOT_STATED, *map(str, counts), "", ""] for name, counts in PAPER_VI.items()
-    ]
-    for row in rows:
-        if row["traffic"] in ("idm", "idm_mobil") and any(_plain(row, name) for name in (*PAPER_VI, "mobil")):
-            lines.append(
-                [
-                    "here",
-                    row["traffic"],
-                    row["driver"],
-                    f"{row['trainings']} x {row['episodes']}",
-                    str(row["hard_crash"]),
-                    str(row["soft_crash"]),
-                    with_interval(row, "hard_crash_share", 4),
-                    ", ".join(str(each["hard_crash"]) for each in row["each"]),
-                ]
-            )
-    headings = [
-        "source",
-        "traffic",
-        "driver",
-        "episodes",
-        "hard",
-        "soft",
-        "share of hard [95 %, exact]",
-        "each training",
-    ]
-    return Table("Table VI: crashes on rule-driven traffic", headings, lines, names=3)
-
-
-def table_vii(rows: Sequence[Row]) -> Table:
-    """The normalised score on generated traffic, beside the paper's."""
-    lines = [
-        ["paper", "Traffic_GAN", name, "1000", f"{score:.2f}", f"{mean:.2f}", f"{sd:.2f}", ""]
-        for name, (score, mean, sd) in PAPER_VII.items()
-    ]
-    for row in rows:
-        if row["traffic"] == "gan" and any(_plain(row, name) for name in (*PAPER_VII, "mobil", "random_legal")):
-            each = ", ".join(number(training["mean_reward"], 1) for training in row["each"])
-            score, reward = with_interval(row, "normalized_percent", 1), with_interval(row, "mean_reward", 1)
-            count = f"{row['trainings']} x {row['episodes']}"
-            lines.append(["here", "gan", row["driver"], count, score, reward, number(row["reward_sd"], 1), each])
-    headings = ["source", "traffic", "driver", "episodes", "% of MOBIL", "mean reward", "sd", "each training"]
-    note = (
-        "% of MOBIL is 100 (R - R_random) / (R_MOBIL - R_random): 0 for random legal driving, 100 for MOBIL; the "
-        "paper does not define its own."
-    )
-    return Table("Table VII: performance on generated traffic", headings, lines, names=3, notes=[note])
 
 
 def _cell(key: str, digits: int) -> Callable[[Row], str]:
@@ -112,6 +59,50 @@ _MATRIX: Mapping[str, Callable[[Row], str]] = {
 }
 
 
+def table_vi(rows: Sequence[Row]) -> Table:
+    """Crashes among rule-followers, beside the paper's."""
+    columns: Mapping[str, Callable[[Row], str]] = {
+        "source": lambda row: "here",
+        **{name: _MATRIX[name] for name in ("traffic", "driver", "episodes", "hard")},
+        "soft": lambda row: str(row["soft_crash"]),
+        "share of hard [95 %, exact]": _cell("hard_crash_share", 4),
+        "each training": lambda row: ", ".join(str(each["hard_crash"]) for each in row["each"]),
+    }
+    drivers = (*PAPER_VI, "mobil")
+    ours = [
+        row for row in rows if row["traffic"] in ("idm", "idm_mobil") and any(_plain(row, name) for name in drivers)
+    ]
+    here = Table.of("Table VI: crashes on rule-driven traffic", ours, columns, names=3)
+    paper = [
+        ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""] for name, counts in PAPER_VI.items()
+    ]
+    return replace(here, lines=[*paper, *here.lines])
+
+
+def table_vii(rows: Sequence[Row]) -> Table:
+    """The normalised score on generated traffic, beside the paper's."""
+    columns: Mapping[str, Callable[[Row], str]] = {
+        "source": lambda row: "here",
+        **{name: _MATRIX[name] for name in ("traffic", "driver", "episodes")},
+        "% of MOBIL": _cell("normalized_percent", 1),
+        "mean reward": _MATRIX["mean reward"],
+        "sd": lambda row: number(row["reward_sd"], 1),
+        "each training": lambda row: ", ".join(number(each["mean_reward"], 1) for each in row["each"]),
+    }
+    note = (
+        "% of MOBIL is 100 (R - R_random) / (R_MOBIL - R_random): 0 for random legal driving, 100 for MOBIL; the "
+        "paper does not define its own."
+    )
+    drivers = (*PAPER_VII, "mobil", "random_legal")
+    ours = [row for row in rows if row["traffic"] == "gan" and any(_plain(row, name) for name in drivers)]
+    here = Table.of("Table VII: performance on generated traffic", ours, columns, names=3, notes=[note])
+    paper = [
+        ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in numbers), ""]
+        for name, numbers in PAPER_VII.items()
+    ]
+    return replace(here, lines=[*paper, *here.lines])
+
+
 def matrix_table(rows: Sequence[Row]) -> Table:
     """Every driver on every traffic."""
     return Table.of("Every driver on every traffic", rows, _MATRIX, names=2)
@@ -120,9 +111,9 @@ def matrix_table(rows: Sequence[Row]) -> Table:
 def comparison_table(rows: Sequence[Row]) -> Table:
     """Pairs of drivers on the same episodes."""
     columns: Mapping[str, Callable[[Row], str]] = {
-        "driver": lambda row: str(row["driver"]),
+        "driver": _MATRIX["driver"],
         "over": lambda row: str(row["over"]),
-        "traffic": lambda row: str(row["traffic"]),
+        "traffic": _MATRIX["traffic"],
         "lead in reward": _cell("lead", 1),
         "P(improvement)": _cell("probability", 2),
         "crashes per 1000 episodes, more": _cell("crash_difference_per_1000_episodes", 1),
@@ -259,8 +250,11 @@ def _html(table: Table) -> str:
     return f'<h2>{html.escape(table.title)}</h2><div class="wide">{table_itself}</div>{notes}'
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Rows as CSV: an interval as two columns (``_low``, ``_high``), lists of their own left out."""
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]] | Table) -> None:
+    """A table as it is printed, or rows, as CSV: an interval as two columns (``_low``, ``_high``), no lists."""
+    if isinstance(rows, Table):
+        shown = [["" if cell == NOTHING else cell for cell in line] for line in rows.lines]
+        rows = [dict(zip(rows.headings, line)) for line in shown]
     flat = []
     for row in rows:
         cells: dict[str, Any] = {}
@@ -274,10 +268,3 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     buffer = io.BytesIO()
     pl.DataFrame(flat, infer_schema_length=None).write_csv(buffer)
     write_bytes(path, buffer.getvalue())
-
-
-def table_rows(table: Table) -> list[dict[str, str]]:
-    """A table's lines as they are printed, by heading."""
-    return [
-        {head: "" if cell == NOTHING else cell for head, cell in zip(table.headings, line)} for line in table.lines
-    ]

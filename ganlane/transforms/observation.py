@@ -28,10 +28,6 @@ from ganlane.runtime import compiled
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.transforms.sensors import PerceptionTransform
 
-LANE_VIEW_SIZE = 18
-DRIFT_SIZE = 6
-#: Lanes of the fixed order: to the left, own, to the right.
-LANES = 3
 #: Of the lane view: lane to the left, own, to the right, each ahead (+1) and behind (-1).
 _SIDES = (1.0, 1.0, 0.0, 0.0, -1.0, -1.0)
 _AHEAD = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
@@ -71,28 +67,22 @@ class View(NamedTuple):
     direction: Tensor
 
 
-def own_state(vehicles: Vehicles, road: Road) -> Tensor:
-    """s1 to s3, [N, 3]: speed over desired speed (not clipped), a lane to the left, a lane to the right."""
-    ego = vehicles.columns(slice(0, 1))
-    lane = road.lane_of(ego.y)
-    left = (lane < road.lanes - 1).to(ego.y.dtype)
-    right = (lane > 0).to(ego.y.dtype)
-    return torch.cat((ego.speed / ego.desired_speed, left, right), dim=1)
-
-
 def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> Others:
-    """s4 and on, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
+    """The others, ordered by the vehicles' indices; an invalid one is (1, 0, 0), far ahead."""
     ego, others = vehicles.columns(slice(0, 1)), vehicles.columns(slice(1, None))
     position = (road.distance_ahead(ego.x, others.x) / scale.range_m).clamp(-1.0, 1.0)
     speed = ((others.speed - ego.speed) / scale.speed_mps).clamp(-1.0, 1.0)
-    lane = ((road.lane_of(others.y) - road.lane_of(ego.y)) / _widest(road.lanes)).clamp(-1.0, 1.0)
+    own_lane = road.lane_of(others.y)
+    lane = ((own_lane - road.lane_of(ego.y)) / _widest(road.lanes)).clamp(-1.0, 1.0)
+    # Offset to the left of the lane's centre over half of the lane's width.
+    drift = (2.0 * (others.y - road.centre_of(own_lane, others.y.dtype)) / road.lane_width_m).clamp(-1.0, 1.0)
     valid = others.valid
     return Others(
         torch.where(valid, position, 1.0),
         torch.where(valid, speed, 0.0),
         torch.where(valid, lane, 0.0),
         valid,
-        torch.where(valid, drift_of(others.y, road), 0.0),
+        torch.where(valid, drift, 0.0),
         torch.where(valid, 0.5 * ego.length + 0.5 * others.length, 0.0),
     )
 
@@ -102,55 +92,44 @@ def _widest(lanes: int | Tensor) -> int | Tensor:
     return (lanes - 1).clamp_min(1) if isinstance(lanes, Tensor) else max(lanes - 1, 1)
 
 
-def drift_of(y: Tensor, road: Road) -> Tensor:
-    """Offset to the left of the lane's centre over half of the lane's width, clipped to [-1, 1]."""
-    offset_m = y - road.centre_of(road.lane_of(y), y.dtype)
-    return (2.0 * offset_m / road.lane_width_m).clamp(-1.0, 1.0)
+# Parts of an observation: functions from a View to numbers [N, size]
 
 
-def lane_offset(others: Others, lanes: int | Tensor) -> Tensor:
-    """Lanes between the ego and each of the others, [N, M - 1]."""
-    return torch.round(others.lane * _widest(lanes))
+def own_state(view: View) -> Tensor:
+    """s1 to s3, [N, 3]: speed over desired speed (not clipped), a lane to the left, a lane to the right."""
+    ego, road = view.vehicles.columns(slice(0, 1)), view.road
+    lane = road.lane_of(ego.y)
+    left = (lane < road.lanes - 1).to(ego.y.dtype)
+    right = (lane > 0).to(ego.y.dtype)
+    return torch.cat((ego.speed / ego.desired_speed, left, right), dim=1)
 
 
-def distance_to_ego(vehicles: Vehicles, road: Road) -> Tensor:
-    """Distance along the road between the ego and each of the others, m, [N, M - 1]."""
-    return road.distance_ahead(vehicles.x[:, :1], vehicles.x[:, 1:]).abs()
+def vehicle_list(view: View) -> Tensor:
+    """s4, s5, s6, s7, ..., [N, 3 (M - 1)]: position, speed and lane of each vehicle, nearest first, invalid last."""
+    distance = view.road.distance_ahead(view.seen.x[:, :1], view.seen.x[:, 1:]).abs()
+    order = torch.where(view.others.valid, distance, torch.inf).argsort(dim=1, stable=True)
+    return torch.stack([field.gather(1, order) for field in view.others[:3]], dim=-1).flatten(1)
 
 
-def nearest_first(others: Others, distance: Tensor) -> Others:
-    """``others`` ordered by ``distance`` [N, M - 1], invalid ones last."""
-    order = torch.where(others.valid, distance, torch.inf).argsort(dim=1, stable=True)
-    return Others(*(field.gather(1, order) for field in others))
-
-
-def as_list(others: Others) -> Tensor:
-    """s4, s5, s6, s7, ...: three numbers per vehicle, [N, 3 (M - 1)]."""
-    return torch.stack(others[:3], dim=-1).flatten(1)
-
-
-def lane_view(
-    others: Others, lanes: int | Tensor, scale: ObservationScale, drift: bool = False, overlap: bool = False
-) -> Tensor:
+def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) if empty.
 
     The nearest vehicle is the one with the nearest centre; one exactly level with the ego counts as behind. The gap,
     over the range of sight, is from bumper to bumper.
 
     Args:
-        others: from :func:`other_vehicles`.
-        lanes: of the road.
-        scale: the range of sight.
+        view: of the scene.
         drift: adds a fourth number, :attr:`Others.drift`, [N, 24], which shows a lane change before its middle.
         overlap: where two bodies overlap along the road the gap is below 0, and the nearness above 1 by 1 per metre;
             otherwise the gap is 0 there.
     """
+    others, range_m = view.others, view.scale.range_m
     side, ahead = (others.position.new_tensor(each)[:, None] for each in (_SIDES, _AHEAD))
     distance = others.position[:, None, :] * ahead
     in_sight = (others.valid & (others.position.abs() < 1.0))[:, None, :]
     on_that_end = (distance > 0) | ((distance == 0) & (ahead < 0))
-    counts = in_sight & on_that_end & (lane_offset(others, lanes)[:, None, :] == side)
-    distance = torch.add(distance, ~counts, alpha=_MASKED)
+    lanes_apart = torch.round(others.lane * _widest(view.road.lanes))[:, None, :]
+    distance = torch.add(distance, ~(in_sight & on_that_end & (lanes_apart == side)), alpha=_MASKED)
     nearest = distance.amin(-1, keepdim=True)
     farther, found = distance > nearest, nearest <= 1.0
 
@@ -159,13 +138,18 @@ def lane_view(
         return torch.where(found, value, 0.0)
 
     # Of two equally near vehicles the longer one counts.
-    gap_m = nearest * scale.range_m + of_the_nearest(-others.bumpers_m)
+    gap_m = nearest * range_m + of_the_nearest(-others.bumpers_m)
     gap_m = gap_m if overlap else gap_m.clamp_min(0.0)
-    gap = torch.where(found, gap_m / scale.range_m, 1.0)
+    gap = torch.where(found, gap_m / range_m, 1.0)
     overlap_m = (-gap_m).clamp_min(0.0)
     nearness = torch.where(found, torch.exp(-gap_m.clamp_min(0.0) / NEARNESS_M) + overlap_m / OVERLAP_M, 0.0)
     numbers = (gap, nearness, of_the_nearest(others.speed), *((of_the_nearest(others.drift),) if drift else ()))
     return torch.cat(numbers, dim=-1).flatten(1)
+
+
+def lane_change(view: View) -> Tensor:
+    """The ego's own lane change, [N, 2]: progress 0 to 1, direction -1, 0 or 1."""
+    return torch.stack((view.progress, view.direction.to(view.progress.dtype)), dim=1)
 
 
 class Part(NamedTuple):
@@ -175,29 +159,12 @@ class Part(NamedTuple):
     numbers: Callable[[View], Tensor]
 
 
-def _own(view: View) -> Tensor:
-    return own_state(view.vehicles, view.road)
-
-
-def _listed(view: View) -> Tensor:
-    return as_list(nearest_first(view.others, distance_to_ego(view.seen, view.road)))
-
-
-def _lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
-    return lane_view(view.others, view.road.lanes, view.scale, drift, overlap)
-
-
-def _lane_change(view: View) -> Tensor:
-    return torch.stack((view.progress, view.direction.to(view.progress.dtype)), dim=1)
-
-
-OWN = Part(lambda others: 3, _own)
-LIST = Part(lambda others: 3 * others, _listed)
-VIEW = Part(lambda others: LANE_VIEW_SIZE, _lane_view)
-DRIFT_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True))
-OVERLAP_VIEW = Part(lambda others: LANE_VIEW_SIZE + DRIFT_SIZE, partial(_lane_view, drift=True, overlap=True))
-#: The ego's own lane change: progress 0 to 1, direction -1, 0 or 1.
-CHANGE = Part(lambda others: 2, _lane_change)
+OWN = Part(lambda others: 3, own_state)
+LIST = Part(lambda others: 3 * others, vehicle_list)
+VIEW = Part(lambda others: 18, lane_view)
+DRIFT_VIEW = Part(lambda others: 24, partial(lane_view, drift=True))
+OVERLAP_VIEW = Part(lambda others: 24, partial(lane_view, drift=True, overlap=True))
+CHANGE = Part(lambda others: 2, lane_change)
 
 #: The forms by name; ``table3`` is the paper's literal 3 + 3 (M - 1) numbers.
 OBSERVATIONS: Final[dict[str, tuple[Part, ...]]] = {
@@ -268,8 +235,7 @@ class ObservationTransform(PerceptionTransform):
         progress, direction = ego.get("change_progress"), ego.get("change_direction")
         if self.native is not None:
             return state.set(keys.OBSERVATION, self.native.observe(vehicles, progress, direction, seen))
-        observation = self.observe(vehicles, progress, direction, road, seen)
-        return state.set(keys.OBSERVATION, observation)
+        return state.set(keys.OBSERVATION, self.observe(vehicles, progress, direction, road, seen))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add ``observation`` to the spec."""

@@ -140,21 +140,17 @@ class SensorTransform(Transform):
         new = self.measured(next_tensordict)
         if self.delay == 0:
             return next_tensordict.set(PERCEIVED, new.as_tensordict())
-        kept = self._kept(tensordict)
-        moved = (torch.cat((old[:, 1:], fresh[:, None]), dim=1) for old, fresh in zip(kept, new))
-        next_tensordict.set(SENSORS, Measurement(*moved).as_tensordict())
-        oldest = Measurement(*(old[:, 0].clone() for old in kept))
-        return next_tensordict.set(PERCEIVED, oldest.as_tensordict())
-
-    def _kept(self, state: TensorDictBase) -> Measurement:
-        """The measurements in ``state``, fields [N, K, M]."""
-        kept = state.get(SENSORS, None)
-        if kept is None or kept.get("x").shape[1] != self.delay:
+        held = tensordict.get(SENSORS, None)
+        if held is None or held.get("x").shape[1] != self.delay:
             raise UserError(
                 f"the state holds no {self.delay} measurements under {SENSORS!r}: it comes from an environment with "
                 "other sensors; start from a reset of this one."
             )
-        return Measurement.of(kept)
+        kept = Measurement.of(held)
+        moved = (torch.cat((old[:, 1:], fresh[:, None]), dim=1) for old, fresh in zip(kept, new))
+        next_tensordict.set(SENSORS, Measurement(*moved).as_tensordict())
+        oldest = Measurement(*(old[:, 0].clone() for old in kept))
+        return next_tensordict.set(PERCEIVED, oldest.as_tensordict())
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         first = self.measured(tensordict_reset)

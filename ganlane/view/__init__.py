@@ -10,9 +10,8 @@ Charts are in :mod:`ganlane.view.figures` (learning curves, recordings), which a
 from ganlane.view.film import Film, film_strip, write_film
 from ganlane.view.frames import DrawingParameters, FramePainter
 from ganlane.view.player import player_page, write_player
-from ganlane.view.record import Recorder, record_episode
+from ganlane.view.record import EpisodeLabel, Recorder, Trajectory, record_episode
 from ganlane.view.tracks import to_tracks, write_tracks
-from ganlane.view.trajectory import EpisodeLabel, Trajectory
 from ganlane.view.window import WindowParameters
 
 __all__ = [

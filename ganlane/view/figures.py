@@ -249,8 +249,15 @@ def draw_runs(runs: Mapping[str, Runs], columns: Sequence[str] | None = None, sm
         UserError: there is nothing to draw, or a column that no run has.
     """
     seeds = {name: [each] if isinstance(each, pl.DataFrame) else list(each) for name, each in runs.items()}
+    # Columns in which any run has numbers.
     known = list(
-        dict.fromkeys(name for frames in seeds.values() for each in frames for name in _number_columns(each))
+        dict.fromkeys(
+            name
+            for frames in seeds.values()
+            for frame in frames
+            for name, kind in frame.schema.items()
+            if kind.is_numeric() and name != X_COLUMN and frame[name].is_not_null().any()
+        )
     )
     for name in columns or ():
         if name not in known:
@@ -273,15 +280,6 @@ def draw_runs(runs: Mapping[str, Runs], columns: Sequence[str] | None = None, sm
             _plot_column(axes, frames, panel.dashed, smooth, raw=False, color=colours[name], ls="--", lw=1.2)
     add_legend(figure, {labels[name]: colour for name, colour in colours.items()})
     return figure
-
-
-def _number_columns(frame: pl.DataFrame) -> list[str]:
-    """Columns with any number, the number of decisions left out."""
-    return [
-        name
-        for name, kind in frame.schema.items()
-        if kind.is_numeric() and name != X_COLUMN and frame[name].is_not_null().any()
-    ]
 
 
 def _plot_column(
@@ -349,19 +347,16 @@ def draw_recordings(statistics: PooledStatistics) -> Figure:
                 axes.text(0.99, 0.6 - 0.1 * line, text, ha="right", color=colour, size=8, transform=axes.transAxes)
         if len(histograms) > 1:
             axes.legend(loc="upper right", fontsize=8)
-    _plot_durations(grid[2], statistics)
-    return figure
-
-
-def _plot_durations(axes: Axes, statistics: PooledStatistics) -> None:
-    """Share of lane changes that last longer: with unfinished ones as lower bounds (censored), and without."""
+    # Share of lane changes that last longer: with unfinished ones as lower bounds (censored), and without.
+    axes = grid[2]
     axes.set(title="time to change lanes", xlabel="s", ylabel="share that lasts longer")
     changes = statistics.changes
     if not changes.complete.any():
         axes.text(0.5, 0.5, "none recorded from start to end", ha="center", transform=axes.transAxes, color=FAINT)
-        return
+        return figure
     chosen = {"unfinished ones included": np.ones(len(changes), bool), "finished ones only": changes.complete}
     for (label, those), colour in zip(chosen.items(), COLOURS):
         times, shares = survival_curve(changes.duration_s[those], changes.complete[those])
         axes.step(np.append(0.0, times), np.append(1.0, shares), where="post", color=colour, label=label)
     axes.legend(loc="upper right", fontsize=8)
+    return figure

@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from PIL import Image
@@ -115,8 +115,16 @@ def write_film(
     if len(frames) == 0:
         raise UserError(f"{path}: a film of no frames was asked for; record at least one decision.")
     if kind == "gif":
-        _write_gif(frames, path, fps, max_bytes, scale)
-    elif kind == "mp4":
+        for size, colours, every in _GIF_SIZES:
+            content = _encode_gif(frames, fps, scale * size, colours, every)
+            if max_bytes is None or len(content) <= max_bytes:
+                write_bytes(path, content)
+                return Path(path)
+        raise UserError(
+            f"{path}: the smallest GIF has {len(content)} bytes, max_bytes={max_bytes} were allowed; "
+            "show a shorter part of the episode or allow more."
+        )
+    if kind == "mp4":
         _write_mp4(frames, path, fps, scale)
     else:
         with atomic_path(path) as part:
@@ -145,21 +153,6 @@ def _scaled(picture: Picture, scale: float, multiple: int = 1) -> Image.Image:
     return image if same else image.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2.0)
 
 
-def _write_gif(
-    frames: Film | Sequence[Picture], path: str | Path, fps: float, max_bytes: int | None, scale: float
-) -> None:
-    content = b""
-    for size, colours, every in _GIF_SIZES:
-        content = _encode_gif(frames, fps, scale * size, colours, every)
-        if max_bytes is None or len(content) <= max_bytes:
-            write_bytes(path, content)
-            return
-    raise UserError(
-        f"{path}: the smallest GIF has {len(content)} bytes, max_bytes={max_bytes} were allowed; "
-        "show a shorter part of the episode or allow more."
-    )
-
-
 def _encode_gif(frames: Film | Sequence[Picture], fps: float, scale: float, colours: int, every: int) -> bytes:
     """An endless GIF with one palette for the whole film."""
     palette = _shared_palette(frames, scale, colours)
@@ -171,16 +164,8 @@ def _encode_gif(frames: Film | Sequence[Picture], fps: float, scale: float, colo
     ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / (fps / every)).astype(int)
     durations_ms = (np.diff(ends).clip(min=2) * 10).tolist()
     file = io.BytesIO()
-    pictures[0].save(
-        file,
-        format="GIF",
-        save_all=True,
-        append_images=pictures[1:],
-        duration=durations_ms,
-        loop=0,
-        optimize=False,
-        disposal=1,
-    )
+    options: dict[str, Any] = {"duration": durations_ms, "loop": 0, "optimize": False, "disposal": 1}
+    pictures[0].save(file, format="GIF", save_all=True, append_images=pictures[1:], **options)
     return file.getvalue()
 
 

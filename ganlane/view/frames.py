@@ -15,7 +15,7 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw
 
 from ganlane.view import style
-from ganlane.view.trajectory import ACTION_NAMES, Trajectory
+from ganlane.view.record import ACTION_NAMES, Trajectory
 from ganlane.view.vehicles import Body, draw_body, draw_trails
 from ganlane.view.window import HEADER_HEIGHT, Backdrop, Window, WindowParameters
 
@@ -89,7 +89,9 @@ class FramePainter:
         for vehicle in np.flatnonzero(in_picture)[::-1].tolist():  # the ego comes last, on top of the others
             draw_body(picture, self._body(frame, vehicle, columns[vehicle]), self.window, self.drawing.speeds)
         if t.outcome == "hard_crash" and frame == len(t) - 1:
-            self._draw_ring(picture, float(columns[0]), float(self.window.row(t.y[frame, 0])))
+            column, row, radius = float(columns[0]), float(self.window.row(t.y[frame, 0])), 6.0 * self.window.along
+            ring = (column - radius, row - radius, column + radius, row + radius)
+            ImageDraw.Draw(picture).ellipse(ring, outline=style.CRASH, width=3)
         self._draw_counts(picture, columns, t.valid[frame])
         self._header.draw(picture, frame)
         return np.asarray(picture)
@@ -147,12 +149,6 @@ class FramePainter:
         ImageDraw.Draw(picture).line((start, row, end, row), fill=style.LEADER, width=1)
         middle = (start + min(end, self.window.parameters.width)) / 2
         style.put_text(picture, (middle, row - 17), f"{rear - front:.0f} m", _SMALL, style.LEADER, 0.5)
-
-    def _draw_ring(self, picture: Image.Image, column: float, row: float) -> None:
-        """A red ring around the ego: it crashed."""
-        reach = 6.0 * self.window.along
-        ring = (column - reach, row - reach, column + reach, row + reach)
-        ImageDraw.Draw(picture).ellipse(ring, outline=style.CRASH, width=3)
 
     def _draw_counts(
         self, picture: Image.Image, columns: npt.NDArray[np.float64], valid: npt.NDArray[np.bool_]
@@ -224,11 +220,10 @@ class _Header:
         for value, (_, width) in zip(values, _VALUES):
             style.put_text(picture, (column, 25), value, 18, style.EGO if value in ("left", "right") else style.TEXT)
             column += width
-        if frame == len(trajectory) - 1 and trajectory.outcome in _OUTCOMES:
-            self._stamp(picture, *_OUTCOMES[trajectory.outcome])
-
-    def _stamp(self, picture: Image.Image, text: str, colour: style.Colour) -> None:
-        """The outcome, on a plate in the middle below the header."""
+        if frame < len(trajectory) - 1 or trajectory.outcome not in _OUTCOMES:
+            return
+        # The outcome, on a plate in the middle below the header.
+        text, colour = _OUTCOMES[trajectory.outcome]
         width = int(np.ceil(style.text_mask(text, 24).width)) + 40
         left = (self.width - width) // 2
         box = (left, HEADER_HEIGHT + 6, left + width, HEADER_HEIGHT + 44)

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
-from ganlane.view.trajectory import ACTION_NAMES, Trajectory
+from ganlane.view.record import ACTION_NAMES, Trajectory
 
 #: Joined in this order.
 _SCRIPTS = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
@@ -114,15 +114,15 @@ def series(values: npt.NDArray[np.float64], unit: float) -> list[int]:
 
 def steps(values: npt.NDArray[Any]) -> list[Any]:
     """[T] values as their changes, with two decimals; what is not finite becomes null."""
-    rounded = [_plain(value) for value in values.tolist()]
+
+    def plain(value: float | int | bool) -> float | int | None:
+        if isinstance(value, float):
+            return round(value, 2) if np.isfinite(value) else None
+        return int(value)
+
+    rounded = [plain(value) for value in values.tolist()]
     changed = [index for index, value in enumerate(rounded) if index == 0 or value != rounded[index - 1]]
     return [entry for index in changed for entry in (index, rounded[index])]
-
-
-def _plain(value: float | int | bool) -> float | int | None:
-    if isinstance(value, float):
-        return round(value, 2) if np.isfinite(value) else None
-    return int(value)
 
 
 def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -81,31 +80,21 @@ def draw_body(picture: Image.Image, body: Body, window: Window, show_speed: bool
     plain = style.TEXT if body.is_ego else style.mix(body.colour, (0, 0, 0), 0.65)
     edge = style.CRASH if body.overlaps else plain
     patch = Image.new("RGBA", (int(size[0]), int(size[1])), (*edge, 0))
-    _paint(ImageDraw.Draw(patch), body, outline, edge)
-    smooth = patch.reduce(_BODY_OVERSAMPLING)
-    picture.paste(smooth, (int(origin[0]), int(origin[1])), smooth)
-    if show_speed:
-        at = (body.column - 0.09 * forward[0], body.row - _SPEED_TEXT * 0.62)
-        style.put_text(picture, at, f"{body.speed_mps:.0f}", _SPEED_TEXT, style.readable_on(body.colour), 0.5)
-
-
-def _paint(
-    draw: ImageDraw.ImageDraw,
-    body: Body,
-    outline: Callable[[FloatArray], list[tuple[float, float]]],
-    edge: Colour,
-) -> None:
-    """Paint body, glass and lights; ``outline`` turns shares into pixels."""
-    shape = _EGO if body.is_ego else _BODY
-    draw.polygon(outline(shape), fill=(*edge, 255))
+    draw = ImageDraw.Draw(patch)
+    draw.polygon(outline(_EGO if body.is_ego else _BODY), fill=(*edge, 255))
     inset = 0.86 if body.overlaps or body.is_ego else 0.93
-    draw.polygon(outline(shape * inset), fill=(*body.colour, 255))
+    draw.polygon(outline((_EGO if body.is_ego else _BODY) * inset), fill=(*body.colour, 255))
     for glass in _GLASS[1:] if body.is_ego else _GLASS:
         draw.polygon(outline(glass), fill=(*style.GLASS, 255))
     for light in _BRAKES if body.braking else ():
         draw.polygon(outline(light), fill=(*style.BRAKE, 255))
     for light in _INDICATORS_LEFT if body.signal else ():
         draw.polygon(outline(light * (1.0, body.signal)), fill=(*style.AMBER, 255))
+    smooth = patch.reduce(_BODY_OVERSAMPLING)
+    picture.paste(smooth, (int(origin[0]), int(origin[1])), smooth)
+    if show_speed:
+        at = (body.column - 0.09 * forward[0], body.row - _SPEED_TEXT * 0.62)
+        style.put_text(picture, at, f"{body.speed_mps:.0f}", _SPEED_TEXT, style.readable_on(body.colour), 0.5)
 
 
 def draw_trails(

@@ -94,17 +94,13 @@ class Backdrop:
     def __init__(self, window: Window):
         self.window = window
         self.period = round(2 * PERIOD_M * window.along)
-        self.strip = self._draw()
-
-    def _draw(self) -> Image.Image:
-        """The strip; every second period's verge is a shade lighter so that movement shows."""
-        window, size = self.window, self.window.parameters
-        strip = Image.new("RGB", (size.width + self.period, size.height), style.VERGE)
+        size = window.parameters
+        self.strip = strip = Image.new("RGB", (size.width + self.period, size.height), style.VERGE)
         draw = ImageDraw.Draw(strip)
         half = self.period / 2
         upper, lower = window.edges
         starts = np.arange(0, strip.width, half)
-        for start in starts[::2]:
+        for start in starts[::2]:  # every second period's verge is a shade lighter so that movement shows
             draw.rectangle((start, 0, start + half - 1, size.height), fill=style.VERGE_STRIPE)
         draw.rectangle((0, upper - 5, strip.width, lower + 5), fill=style.ASPHALT)
         for edge in (upper, lower):
@@ -112,7 +108,6 @@ class Backdrop:
         for mark in window.row((np.arange(window.lanes - 1) + 0.5) * window.lane_width_m):
             for start in starts:
                 draw.line((start, mark, start + DASH_M * window.along, mark), fill=style.MARK, width=2)
-        return strip
 
     def at(self, ego_x_m: float) -> Image.Image:
         """A fresh picture of the road around the ego, with posts that tell the distance from the start, m."""

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from ganlane.agents import linear as module
-from ganlane.agents.linear import linear
+from ganlane.agents import network as module
+from ganlane.agents.network import linear
 
 
 @pytest.mark.parametrize(("rows", "inputs", "outputs"), [(1, 1, 1), (7, 29, 13), (256, 64, 51)])

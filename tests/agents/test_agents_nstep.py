@@ -62,17 +62,6 @@ def test_each_transition_equals_the_loop_over_its_own_steps(n, environments, see
             assert transition["next", "terminated"][row] == terminated
 
 
-def test_a_crash_after_the_first_step_is_seen_by_the_transitions_before_it():
-    """The error of TorchRL's own transform: ``terminated`` of the first step would be False here."""
-    steps = recorded(3, 1, 0)
-    for i, step in enumerate(steps):
-        step["next", "done"][:] = step["next", "terminated"][:] = i == 1
-    window = NStepWindow(3, 1.0)
-    transition = [window.push(step) for step in steps][-1]
-    assert transition["next", "terminated"].item()
-    assert transition["steps_to_next_obs"].item() == 2
-
-
 def test_a_saved_window_goes_on_as_if_nothing_had_happened():
     steps = recorded(8, 3, 1)
     whole, first, second = NStepWindow(3, 0.9), NStepWindow(3, 0.9), NStepWindow(3, 0.9)

@@ -58,16 +58,6 @@ def test_a_nap_costs_wall_time_but_no_cpu_time():
     assert (sample.decisions, sample.physics_steps) == (8, 20)
 
 
-def test_work_costs_cpu_time():
-    def busy(decisions):
-        end = time.process_time() + 0.05 * decisions
-        while time.process_time() < end:
-            pass
-        return 10 * decisions
-
-    assert take_turn(CASE, busy, 1).cpu_s >= 0.05
-
-
 def test_torch_gets_its_threads_back():
     before = torch.get_num_threads()
     with torch_threads(before + 1):

@@ -7,14 +7,12 @@ from importlib.metadata import version
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.bench import sim as sim_module
 from ganlane.bench.measure import measure
-from ganlane.bench.sim import ENVIRONMENT, GYMNASIUM, PHYSICS, SimSuite, bytes_of, exponent, scaling
+from ganlane.bench.sim import ENVIRONMENT, GYMNASIUM, PHYSICS, SimSuite, exponent, scaling
 from ganlane.bench.systems import (
-    EnvPoolRunner,
     GymnasiumRunner,
     HighwayEnvRunner,
     Scenario,
@@ -22,6 +20,7 @@ from ganlane.bench.systems import (
     highway_env_case,
     highway_env_settings,
     start_environment,
+    start_envpool,
     start_physics,
 )
 from ganlane.bench.traffic import SYSTEM, TrafficSuite
@@ -161,11 +160,6 @@ def test_cost_that_doubles_with_the_size_grows_linearly():
     assert exponent([9, 9], [1.0, 2.0]) is None
 
 
-def test_bytes_are_those_of_all_leaves():
-    nested = TensorDict({"a": torch.zeros(2, 3), "b": {"c": torch.zeros(2, dtype=torch.int64)}}, batch_size=[2])
-    assert bytes_of(nested) == 2 * 3 * 4 + 2 * 8
-
-
 # HighwayEnv
 
 
@@ -230,7 +224,7 @@ def test_gymnasium_simulates_the_steps_that_its_episodes_last(batch):
 
 def test_envpool_drives_the_same_road():
     pytest.importorskip("envpool")
-    assert EnvPoolRunner(EnvConfig(), 4, 1, seed=0)(3) == 4 * 3 * 10
+    assert start_envpool(EnvConfig(), 4, 1, seed=0)(3) == 4 * 3 * 10
 
 
 # suite=traffic

@@ -23,7 +23,6 @@ from ganlane.bench.train import (
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
-from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.observation import ObservationConfig, RewardParameters
 
@@ -109,19 +108,6 @@ def test_without_the_peer_a_sentence_says_what_to_install(monkeypatch):
     alone = suite(peers=True)
     assert "stable-baselines3" in alone.notes[0]
     assert alone.groups()[0].reference is None
-
-
-@pytest.mark.parametrize(
-    ("options", "part"),
-    [
-        ({"traffics": ["nobody"]}, "traffics=nobody"),
-        ({"train_batches": []}, "train_batches"),
-        ({"train_stored": 2_000_000}, "agent.capacity=1000000"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(options, part):
-    with pytest.raises(UserError, match=part):
-        BenchConfig(**options)
 
 
 def test_quick_is_small_and_eager():

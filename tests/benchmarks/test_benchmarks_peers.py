@@ -13,7 +13,6 @@ import pytest
 from benchmarks.peers import compare, report, simulators
 from benchmarks.peers.scene import (
     CONSTANT,
-    DESIRED_SPEED_MPS,
     FREE_ROAD,
     LAW,
     LENGTH_M,
@@ -22,7 +21,6 @@ from benchmarks.peers.scene import (
     SETTLED_MPS,
     SLOW_AND_GO,
     STEP,
-    UNEVEN_M,
     Law,
     Scene,
     Scheme,
@@ -36,9 +34,7 @@ from benchmarks.peers.tolerance import (
     ROUNDING,
     Largest,
     between,
-    difference,
     free_road_speed_mps,
-    largest,
     slopes,
     tolerance,
     unsettled_gap_m,
@@ -75,14 +71,6 @@ def need(module: str) -> None:
 # The scenes
 
 
-def test_a_scene_starts_at_the_gaps_it_names():
-    position = CONSTANT.positions_m()
-    assert np.allclose(position[:-1] - position[1:] - LENGTH_M, UNEVEN_M)
-    assert np.allclose(
-        simulators.drive_ours(Scene("start", 0.0, CONSTANT.speeds_mps, UNEVEN_M, CONSTANT.leader)).gap, UNEVEN_M
-    )
-
-
 def test_the_step_takes_one_physics_step_and_the_ramp_five_seconds():
     step, ramp = STEP.leader_speeds(), SLOW_AND_GO.leader_speeds()
     assert step[400:402].tolist() == [20.0, 10.0]
@@ -107,19 +95,6 @@ def test_on_a_free_road_the_schemes_give_one_speed_and_positions_that_half_a_ste
         assert np.array_equal(traces[scheme].speed, traces[Scheme.BALLISTIC].speed)
         ahead = traces[scheme].position - traces[Scheme.BALLISTIC].position
         assert np.allclose(ahead, (scheme.value - 0.5) * 0.1 * gained, atol=1e-9)
-
-
-def test_a_free_gap_of_ten_kilometres_costs_a_tenth_of_a_millimetre_per_second():
-    settled = integrate(Scene("long", 400.0, (24.0,)), Scheme.BALLISTIC).speed[-1, 0]
-    assert free_road_speed_mps(10_000.0) == pytest.approx(1.1e-4, rel=0.01)
-    assert DESIRED_SPEED_MPS - settled == pytest.approx(free_road_speed_mps(10_000.0), rel=0.01)
-
-
-def test_gaps_from_centre_to_centre_open_the_platoon():
-    v = 15.0
-    wider = LENGTH_M * (1.0 / np.sqrt(1.0 - (v / DESIRED_SPEED_MPS) ** 4) - 1.0)
-    assert equilibrium_gap(v, Law(offset_m=LENGTH_M)) - equilibrium_gap(v) == pytest.approx(wider)
-    assert wider == pytest.approx(0.3234, abs=1e-4)
 
 
 @pytest.mark.parametrize("law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"])
@@ -153,19 +128,6 @@ def test_the_derived_tolerance_covers_the_other_scheme_and_no_more_than_a_fifth_
     assert within(found, allowed)
     for size, limit, rest in zip(found, allowed, ROUNDING):
         assert limit <= 1.2 * size + rest
-
-
-def test_without_another_scheme_only_rounding_is_allowed():
-    trace = integrate(CONSTANT, Scheme.BALLISTIC)
-    assert tolerance(trace, CONSTANT, Scheme.BALLISTIC) == ROUNDING
-
-
-def test_half_the_step_is_half_the_difference():
-    sizes = []
-    for dt in (0.1, 0.05):
-        trace = integrate(CONSTANT, Scheme.BALLISTIC, dt=dt)
-        sizes.append(largest(difference(trace, CONSTANT, Scheme.SEMI_IMPLICIT_EULER, dt=dt).speed))
-    assert sizes[0] / sizes[1] == pytest.approx(2.0, rel=0.05)
 
 
 @pytest.mark.parametrize("offset_m", [-0.5, 0.5])

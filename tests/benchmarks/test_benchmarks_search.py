@@ -73,10 +73,6 @@ def test_a_reader_sees_only_what_is_unlike_most_runs(sweep):
     ]
 
 
-def test_runs_are_read_in_hydras_order(sweep):
-    assert [run.name for run in read_runs([sweep])] == ["sweep/2", "sweep/10"]
-
-
 def test_a_run_without_an_evaluation_yet_comes_last_with_empty_cells(sweep):
     make_run(sweep / "11", "seed: 0\nagent: {gamma: 0.9}\n", metrics=())
     last = table(read_runs([sweep]))[-1]

@@ -14,13 +14,12 @@ from benchmarks.train_profile import (
     Clock,
     compare_losses,
     instrumented,
-    random_transitions,
     share_table,
     take_shares,
     timed_calls,
 )
 from ganlane.bench.systems import Scenario
-from ganlane.bench.train import Training, TrainSuite, filled_run, make_agent
+from ganlane.bench.train import Training, TrainSuite, filled_run
 from ganlane.config.bench import BenchConfig
 from ganlane.parameters.agent import RainbowConfig
 
@@ -108,21 +107,7 @@ def test_every_part_of_the_real_loop_takes_time():
     assert len(table.lines) == len(PARTS) + sum(map(len, PARTS.values()))
 
 
-def test_whole_parts_add_up():
-    shares = {"simulator": 0.25, "window": 0.125, "store": 0.125, "loss": 0.25, "rest": 0.25}
-    whole = {line[0]: line[2] for line in share_table({"idm": (shares, 1.0)}, "").lines if line[0]}
-    assert [whole[part] for part in ("simulator", "replay", "learning", "policy")] == ["25 %", "25 %", "25 %", "0 %"]
-
-
 def test_both_losses_and_the_whole_update_are_measured_for_every_number_of_threads():
     table = compare_losses(TrainSuite(CONFIG), TRAINING, 2, 0.001)
     names = [train_profile.THEIRS, train_profile.OURS, train_profile.WHOLE_UPDATE]
     assert [line[:3] for line in table.lines] == [[name, str(n), "32"] for n in (1, 2) for name in names]
-
-
-def test_random_transitions_are_such_as_the_window_gives():
-    agent = make_agent(TRAINING)
-    rows = random_transitions(agent, 40)
-    assert rows["observation"].shape == (40, agent.network.config.observation_size)
-    assert rows["next", "reward"].shape == rows["next", "terminated"].shape == (40, 1)
-    assert set(rows["action"].tolist()) == {0, 1, 2}

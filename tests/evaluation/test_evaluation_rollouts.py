@@ -9,7 +9,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import replay, roll_out, run_episodes
-from ganlane.evaluation.contact import SIDES, contact_side, ego_at_fault
+from ganlane.evaluation.episodes import SIDES, contact_side, ego_at_fault
 from ganlane.sim.state import Road
 
 

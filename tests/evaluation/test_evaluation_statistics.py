@@ -10,7 +10,6 @@ from scipy import stats
 
 from ganlane.evaluation.statistics import (
     Estimate,
-    bootstrap_means,
     clopper_pearson,
     entries,
     mean_interval,
@@ -32,11 +31,6 @@ def test_a_resample_draws_as_many_episodes_as_there_are():
     assert counts.shape == (1200, 7)
     assert np.all(counts.sum(axis=1) == 7)
     assert counts.mean(axis=0) == pytest.approx(np.ones(7), abs=0.15)
-
-
-def test_the_bootstrapped_mean_spreads_like_the_standard_error(skewed):
-    means = bootstrap_means(skewed, 10_000, seed=0)
-    assert means.std() == pytest.approx(skewed.std() / np.sqrt(len(skewed)), rel=0.03)
 
 
 def test_the_interval_is_scipys_bca_and_repeats_with_its_seed(skewed):

@@ -19,12 +19,11 @@ from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, MaskedPolicy
 from ganlane.build import make_driver
 from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError
-from ganlane.parameters.observation import MASKS as OFFERED
 from ganlane.parameters.observation import MaskParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.state import Road
-from ganlane.transforms import MASKS, ActionMaskTransform
-from ganlane.transforms.mask import braking_demand, obeyed_actions, on_road_actions
+from ganlane.transforms import ActionMaskTransform
+from ganlane.transforms.mask import obeyed_actions, on_road_actions
 
 KEEP_ONLY, ALL = [True, False, False], [True, True, True]
 
@@ -51,10 +50,6 @@ def idm(speed, desired, gap, leader_speed):
 def test_commands_off_the_road_are_never_allowed(lane, expected):
     assert allowed({"x": 0.0, "lane": lane}, {"x": 500.0, "lane": 0}, form="legal")[0] == expected
     assert on_road_actions(torch.tensor([lane]), 3)[0].tolist() == expected
-
-
-def test_on_one_lane_only_keeping_is_allowed():
-    assert allowed({"x": 0.0, "lane": 0}, {"x": 50.0, "lane": 0}, lanes=1)[0] == KEEP_ONLY
 
 
 def test_every_row_has_the_lanes_of_its_own_road():
@@ -120,12 +115,6 @@ def test_keeping_the_lane_is_allowed_when_nothing_is_safe_and_that_is_reported()
     assert allowed(*boxed_in, {"x": 500.0, "lane": 1}) == (KEEP_ONLY, False)
 
 
-def test_the_demand_is_the_smaller_of_egos_and_followers_acceleration():
-    row = vehicles({"x": 0.0, "lane": 0, "speed": 20.0}, {"x": -40.0, "lane": 1}, {"x": 60.0, "lane": 1})
-    ahead, behind = idm(20.0, 25.0, 55.5, 20.0), idm(20.0, 25.0, 35.5, 20.0)
-    torch.testing.assert_close(braking_demand(row, Road())[0, 1].item(), min(ahead, behind), rtol=1e-9, atol=1e-9)
-
-
 # --- in the environment
 
 
@@ -179,12 +168,6 @@ def test_the_mask_sees_what_the_ego_perceives_and_not_the_truth():
     legal = ganlane.make_env("idm_mobil", 64, mask="legal", spread_m=60, min_spacing_m=18)
     assert torch.equal(env.reset()["action_mask"], legal.reset()["action_mask"])
     assert not torch.equal(seeing.reset()["action_mask"], legal.reset()["action_mask"])
-
-
-@pytest.mark.parametrize("size", [{"vehicles": 4, "lanes": 2}, {"vehicles": 20, "lanes": 5, "spread_m": 300}])
-def test_any_number_of_vehicles_and_lanes_has_a_mask(size):
-    env = ganlane.make_env("idm_mobil", 3, mask="safe", **size)
-    assert env.rollout(5, break_when_any_done=False)["next", "action_mask"].shape == (3, 5, 3)
 
 
 # --- who obeys it
@@ -241,10 +224,6 @@ def test_the_next_state_brings_its_mask_to_the_transition_it_ends():
 
 
 # --- names on the command line
-
-
-def test_the_masks_of_the_command_line_are_those_of_the_transform():
-    assert OFFERED == MASKS
 
 
 def test_a_suffix_puts_any_driver_behind_a_mask():

@@ -14,7 +14,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.parameters.observation import largest_number
-from ganlane.sim import Road, Vehicles
+from ganlane.sim import Road
 from ganlane.traffic import IdmMobilTraffic
 from ganlane.transforms import (
     OBSERVATIONS,
@@ -32,21 +32,16 @@ LORRY = {"length": 12.0}
 
 def scene(rows, valid=None):
     """One environment from (x, lane, speed, desired speed, 25 m/s if left out) per vehicle, the ego first."""
-    columns = zip(*((*row, 25.0)[:4] for row in rows))
-    x, lane, speed, desired = (torch.tensor([column], dtype=torch.float64) for column in columns)
-    zero = torch.zeros_like(x)
-    flags = torch.ones_like(x, dtype=torch.bool) if valid is None else torch.tensor([valid])
-    return Vehicles(
-        x, lane * 4.0, zero, speed, zero, zero + 4.5, zero + 2.5, desired, lane.long(), zero.long(), flags
-    )
+    names = ("x", "lane", "speed", "desired_speed")
+    return vehicles(*({**dict(zip(names, row)), "valid": valid is None or valid[i]} for i, row in enumerate(rows)))
 
 
 def observe(form, rows, valid=None, lanes=3, progress=0.0, direction=0, sideways=0.0):
     transform = ObservationTransform(Road(lanes), len(rows), form)
     ones = torch.ones(1, dtype=torch.float64)
-    vehicles = scene(rows, valid)
-    vehicles = vehicles.with_(y=vehicles.y + sideways)
-    return transform.observe(vehicles, progress * ones, torch.tensor([direction]), transform.road)[0]
+    cars = scene(rows, valid)
+    cars = cars.with_(y=cars.y + sideways)
+    return transform.observe(cars, progress * ones, torch.tensor([direction]), transform.road)[0]
 
 
 def test_the_ego_reports_its_speed_over_its_desired_speed_and_the_lanes_beside_it():

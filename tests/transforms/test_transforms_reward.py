@@ -12,7 +12,6 @@ from ganlane.env import HighwayEnv
 from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.traffic import IdmMobilTraffic, IdmTraffic
 from ganlane.transforms import RewardParameters, RewardTransform
-from ganlane.transforms.reward import speed_reward
 
 
 def outcome(speed=20.0, mean_acceleration=0.0, started=False, soft=0, behind=0, **events):
@@ -64,11 +63,6 @@ def test_each_event_has_its_price(what, term, value):
 def test_terms_that_accrue_with_time_follow_the_decision_period():
     assert terms(period=0.1, speed=25.0)["speed"] == pytest.approx(0.1)
     assert terms(period=0.1, hard_crash=True)["hard_crash"] == -100.0
-
-
-def test_speeds_broadcast_over_a_batch():
-    speed, desired = torch.tensor([[15.0], [25.0]]), torch.tensor([[25.0], [25.0]])
-    assert speed_reward(speed, desired, torch.zeros(2, 1)).flatten().tolist() == [0.0, 1.0]
 
 
 def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset():

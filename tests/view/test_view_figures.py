@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -111,6 +111,7 @@ def test_long_names_share_the_legend_over_several_rows():
         assert -(-4 // figure.legends[0]._ncols) == rows
 
 
+@settings(max_examples=30)
 @given(st.lists(st.floats(0.0, 9.99), min_size=1, max_size=200), st.sampled_from([10, 80, 400, 8000]))
 def test_the_area_below_a_density_is_one(values, bins):
     histogram = Histogram(Bins(0.0, 10.0, bins))
@@ -157,7 +158,8 @@ def test_lane_changes_are_drawn_as_the_share_that_lasts_longer():
 
 @pytest.mark.parametrize(("ending", "begins"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_the_ending_chooses_the_format_and_the_same_figure_gives_the_same_file(runs, tmp_path, ending, begins):
-    first, again = (save_figure(draw_runs(runs), tmp_path / f"{name}.{ending}") for name in ("first", "again"))
+    one = draw_runs(runs, ["loss"])
+    first, again = (save_figure(one, tmp_path / f"{name}.{ending}") for name in ("first", "again"))
     assert first.read_bytes().startswith(begins)
     assert first.read_bytes() == again.read_bytes()
 
@@ -167,14 +169,14 @@ def test_a_figure_is_written_whole_or_not_at_all(runs, tmp_path):
     with Image.open(save_figure(draw_runs(runs), tmp_path / "curves.png")) as picture:
         assert picture.size == (3 * 480, 2 * 276 + 36)
     with pytest.raises(UserError, match="png, svg, pdf"):
-        save_figure(draw_runs(runs), tmp_path / "curves.jpg")
+        save_figure(Figure(), tmp_path / "curves.jpg")
     assert set(tmp_path.iterdir()) - before == {tmp_path / "curves.png"}
 
 
 def test_a_program_s_own_matplotlib_settings_stay(runs, tmp_path):
     with matplotlib.rc_context():
         own = dict(matplotlib.rcParams)
-        save_figure(draw_runs(runs), tmp_path / "curves.svg")
+        save_figure(draw_runs(runs, ["loss"]), tmp_path / "curves.svg")
         assert dict(matplotlib.rcParams) == own
 
 
@@ -220,12 +222,12 @@ def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
     assert list(read_runs([sweep_folder(tmp_path / "same", "seed=0", "seed=1")])) == ["all seeds"]
 
 
-@pytest.mark.parametrize("count", range(1, 14))
-def test_no_panel_is_alone_in_its_row(count):
-    figure, grid = panel_grid(count)
-    rows = [round(axes.get_position().y0, 3) for axes in grid]
-    assert len(grid) == len(figure.axes) == count
-    assert count in (1, 2, 3) or min(rows.count(row) for row in rows) > 1
+def test_no_panel_is_alone_in_its_row():
+    for count in (1, 2, 3, 4, 5, 7, 10, 13):
+        figure, grid = panel_grid(count)
+        rows = [axes.get_subplotspec().rowspan.start for axes in grid]
+        assert len(grid) == len(figure.axes) == count
+        assert count in (1, 2, 3) or min(rows.count(row) for row in rows) > 1
 
 
 def test_the_running_mean_skips_gaps():

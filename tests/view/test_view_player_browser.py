@@ -7,11 +7,7 @@ import pytest
 from view_browser import browser_page, find_browser
 from view_scenes import straight
 
-from ganlane.build import make_driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmMobilTrafficConfig
-from ganlane.sim.random import Stream
-from ganlane.view import EpisodeLabel, record_episode, write_player
+from ganlane.view import EpisodeLabel, write_player
 
 BROWSER = find_browser()
 if BROWSER is None:
@@ -90,7 +86,7 @@ def test_speed_is_simulated_seconds_per_second(page):
     page.click("#play")
     passed = page.value(
         f"new Promise((done) => {{ const from = [performance.now(), {CLOCK}];"
-        f"setTimeout(() => done(({CLOCK} - from[1]) / (performance.now() - from[0]) * 1000), 2000); }})"
+        f"setTimeout(() => done(({CLOCK} - from[1]) / (performance.now() - from[0]) * 1000), 1000); }})"
     )
     assert passed == pytest.approx(0.25, abs=0.12)
 
@@ -187,14 +183,3 @@ def test_keys_change_the_speed_and_the_look(page):
         page.key("l", code="KeyL", windowsVirtualKeyCode=76)
         grounds.append(page.value("getComputedStyle(document.body).backgroundColor"))
     assert sorted(grounds) == ["rgb(22, 24, 28)", "rgb(255, 255, 255)"]
-
-
-def test_a_shipped_agents_episode_plays(pages, tmp_path):
-    config = EnvConfig(goal_m=60.0)
-    driver = make_driver("agent_idm", config)
-    env = make_env(make_traffic(IdmMobilTrafficConfig(), config, Stream.REPORT), config, driver.observation)
-    episode = record_episode(env, driver.policy, 0, 0, driver.name, "idm_mobil")
-    opened, _ = pages
-    opened.open(write_player([episode], tmp_path / "agent.html"))
-    assert [ink(opened, "[data-chart=q]", colour) > 50 for colour in (BLUE, ORANGE, GREEN)] == [True] * 3
-    assert opened.errors == []

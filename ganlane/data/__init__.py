@@ -8,7 +8,7 @@
 - ``prepare`` turns any recording into Parquet and pooled statistics.
 """
 
-from ganlane.data.download import ByteProgress, data_folder, default_scenes, download
+from ganlane.data.download import byte_progress, data_folder, default_scenes, download
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lanes import (
     Tracks,
@@ -39,7 +39,6 @@ __all__ = [
     "TRACK",
     "TRACK_STRIDE",
     "Bins",
-    "ByteProgress",
     "DrivingStatistics",
     "Histogram",
     "NgsimParameters",
@@ -50,6 +49,7 @@ __all__ = [
     "SceneSummary",
     "SyntheticTraffic",
     "Tracks",
+    "byte_progress",
     "data_folder",
     "default_scenes",
     "download",

@@ -17,7 +17,7 @@ import polars as pl
 from ganlane.checksums import PLACE, has_checksum, sealed
 from ganlane.data.lanes import lane_width, scene_lane_widths
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
-from ganlane.data.tables import raise_where, read_table, reason
+from ganlane.data.tables import LINE, raise_where, read_table, reason
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
 
@@ -77,7 +77,7 @@ def parquet_name(scene: str) -> str:
 
 def _read_csv(path: Path) -> pl.DataFrame:
     table = read_table(path, COLUMNS).rename({"v": "speed"})
-    raise_where(table["lane"] < 1, table["lane"], path, "is below 1, the leftmost lane")
+    raise_where(table["lane"] < 1, table["lane"], path, "is below 1, the leftmost lane", table[LINE])
     rows = validate(table, str(path))
     scenes = []
     for (name,), scene in rows.group_by("scene"):

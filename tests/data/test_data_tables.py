@@ -86,7 +86,7 @@ def test_quoted_fields_may_hold_commas(tmp_path):
 @pytest.mark.parametrize("text", ["1,23", "12,34,567", "1,2345", "1.234,5", ",5"])
 def test_a_comma_that_parts_no_thousands_makes_no_number(tmp_path, text):
     with pytest.raises(UserError, match="is not a number"):
-        convert(pl.Series("x", [text]), pl.Float64, tmp_path, thousands=True)
+        convert(pl.Series("x", [text]), pl.Float64, tmp_path, pl.Series([1]), thousands=True)
 
 
 def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path):

@@ -43,10 +43,8 @@ def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> 
     return sort(pl.concat(scenes))
 
 
-def write_scene_csv(
-    frame: pl.DataFrame, path: str | Path, lane_width_m: float = SyntheticTraffic.lane_width_m
-) -> None:
-    """Write a frame in the schema as the scene CSV that :func:`ganlane.data.read_scenes` reads.
+def write_scene_csv(frame: pl.DataFrame, path: str | Path) -> None:
+    """Write a frame in the schema, with lanes of 3.5 m, as the scene CSV that :func:`ganlane.data.read_scenes` reads.
 
     Lanes are counted from the left, and ``y`` is 0 at the centre of the leftmost; the heading is that of the path.
     """
@@ -57,7 +55,7 @@ def write_scene_csv(
         "vehicle",
         "frame",
         pl.col("x").round(4),
-        (pl.col("y") - leftmost * lane_width_m).round(4).alias("y"),
+        (pl.col("y") - leftmost * SyntheticTraffic.lane_width_m).round(4).alias("y"),
         pl.arctan2(aside, ahead).backward_fill().over("scene", "vehicle").fill_null(0.0).round(4).alias("heading"),
         pl.col("speed").round(4).alias("v"),
         leftmost + 1 - pl.col("lane"),

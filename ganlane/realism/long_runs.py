@@ -236,7 +236,7 @@ def _snapshot(state: Vehicles) -> tuple[np.ndarray, ...]:
 def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     """Counts, samples and speeds of one batch."""
     flat = trajectories.y.reshape(len(trajectories.y), -1)
-    changes, _ = lane_changes_of_arrays(flat, float(road.lane_width_m))
+    changes = lane_changes_of_arrays(flat, float(road.lane_width_m))
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)
     # The same filter as for recordings; one sample a second is enough.

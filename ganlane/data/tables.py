@@ -122,8 +122,8 @@ def convert(text: pl.Series, kind: Kind, path: Path, lines: pl.Series, thousands
 
 def raise_where(bad: pl.Series, values: pl.Series, path: Path, what: str, lines: pl.Series) -> None:
     """Raise a UserError that names the first row that is ``bad``, if there is one; null is not bad."""
-    if bad.any():
-        row = bad.fill_null(False).arg_max()
+    row = bad.fill_null(False).arg_max() if bad.any() else None
+    if row is not None:
         field = "the field" if values[row] in (None, "") else repr(values[row])
         raise UserError(
             f"{path}, line {lines[row]}, column {values.name}: {field} {what}; correct or remove the row."

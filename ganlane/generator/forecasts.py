@@ -23,12 +23,10 @@ from torch import Tensor
 from ganlane.generator.closed_loop import displacement_of, moved_by
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
-    DriverParams,
     common_driver_params,
     driven_positions,
     evaluation_params,
-    fit_anchor,
-    rollout,
+    rollout_as_fitted,
     typical_driver_params,
 )
 from ganlane.generator.segments import (
@@ -36,7 +34,6 @@ from ganlane.generator.segments import (
     PRESENT,
     SceneTracks,
     Segments,
-    constant_velocity,
     segment_batches,
 )
 from ganlane.generator.windows import Groups, Windows, cut_windows
@@ -241,10 +238,10 @@ def calibrated_forecasts(
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        headway, desired = evaluation_params(config)(segments)
-        noise = torch.randn(1 + horizon, 1 + samples, *headway.shape, generator.sizes.noise, generator=random)
+        shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
+        noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        return rollout(generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config))
+        return rollout_as_fitted(generator, segments, evaluation_params(segments, config), noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
@@ -259,8 +256,8 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
     at which each driver is in balance at present, the calibrated preset's anchor.
     """
 
-    def driver(segments: Segments, driver_params: DriverParams) -> Tensor:
-        headway, desired = driver_params(segments)
+    def driver(segments: Segments, own_headway: bool) -> Tensor:
+        headway, desired = typical_driver_params(segments) if own_headway else common_driver_params(segments)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
             acceleration = following_acceleration(perceive(vehicles, segments.road), TABLE_V, headway)
@@ -269,10 +266,9 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
 
         return driven_positions(segments, desired, move)[None]
 
-    kinds = {"idm": common_driver_params, "idm_own_headway": typical_driver_params}
     return {
-        name: driven_windows(partial(driver, driver_params=params), scenes, horizon, stride)[0]
-        for name, params in kinds.items()
+        name: driven_windows(partial(driver, own_headway=own), scenes, horizon, stride)[0]
+        for name, own in (("idm", False), ("idm_own_headway", True))
     }
 
 
@@ -291,8 +287,8 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
-    """:func:`constant_velocity` for arrays: positions [W, T, 2] when ``displacement`` [W, 2] is repeated."""
-    return constant_velocity(torch.from_numpy(displacement), steps).numpy()
+    """Positions [W, T, 2] in m relative to the present when ``displacement`` [W, 2] per 0.1 s is repeated."""
+    return displacement[:, None] * np.arange(1.0, steps + 1.0)[:, None]
 
 
 def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:

@@ -120,11 +120,6 @@ def _first_and_last(present: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return present.argmax(0), len(present) - 1 - present[::-1].argmax(0)
 
 
-def constant_velocity(displacement: Tensor, steps: int) -> Tensor:
-    """Positions [..., steps, 2] in m relative to the present when ``displacement`` [..., 2] per 0.1 s is repeated."""
-    return displacement[..., None, :] * torch.arange(1, steps + 1, dtype=displacement.dtype)[:, None]
-
-
 @dataclass(frozen=True)
 class Segments:
     """B segments of recorded scenes: 9 observed frames and H more, padded to V vehicles.
@@ -165,9 +160,9 @@ class Segments:
     @property
     def constant_velocity(self) -> Tensor:
         """Positions [B, H, V, 2] when the last observed displacement is repeated."""
-        now, before = self.positions[:, PRESENT], self.positions[:, PRESENT - 1]
-        ahead = constant_velocity(now - before, self.positions.shape[1] - OBSERVED_POSITIONS)
-        return now[:, None] + ahead.transpose(1, 2)
+        now, before = self.positions[:, PRESENT, None], self.positions[:, PRESENT - 1, None]
+        steps = torch.arange(1, self.positions.shape[1] - PRESENT, dtype=now.dtype)
+        return now + (now - before) * steps[:, None, None]
 
     @property
     def road(self) -> Road:

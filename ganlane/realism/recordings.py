@@ -16,15 +16,12 @@ from typing import Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from ganlane.data import FRAME_S, SCHEMA
-from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
+from ganlane.data.lanes import STANDARD_LANE_WIDTH_M, Flags, Floats
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 #: A scene must last longer than the seconds that every measure leaves out, s.
 SHORTEST_S = 4.0
 #: Name to file.

@@ -111,7 +111,7 @@ class Card:
         }
 
 
-def card_rows(starts: Starts, traffic: str, resamples: int = RESAMPLES) -> dict[str, Any]:
+def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
     """The rows of a traffic's card by quantity, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
     return quantity_rows(traffic, starts.driven, starts.recorded, floors, starts.paired, resamples)
@@ -213,21 +213,18 @@ def _quantiles_near(own: Mapping[str, Any], recorded: Mapping[str, Any]) -> bool
 
 def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float) -> dict[str, Any]:
     changes, overlaps = run["lane_changes_per_vehicle_km"], run["overlaps_per_1000_vehicle_km"]
+    known = changes is not None and recorded_rate
     spreads = [at["spread_mps"] for at in run["speeds"].values() if at["spread_mps"] is not None]
     wide = None if not spreads else min(spreads) >= 0.5 * spread_mps
     return {
         "vehicles": run["vehicles"],
-        "lane_changes_inside_recorded_interval": _inside(changes, recorded_rate),
+        "lane_changes_inside_recorded_interval": recorded_rate[0] <= changes <= recorded_rate[1] if known else None,
         "overlaps_under_1_per_1000_vehicle_km": None if overlaps is None else overlaps < 1.0,
         "nobody_off_the_road": run["off_road"] == 0,
         "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,
         "spread_at_least_half_the_recorded": wide,
         "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < _MOST_GUARD,
     }
-
-
-def _inside(value: float | None, interval: Sequence[float] | None) -> bool | None:
-    return None if value is None or not interval else interval[0] <= value <= interval[1]
 
 
 def drive_card(config: RealismConfig, path: Path | None) -> Card:

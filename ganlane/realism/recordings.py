@@ -66,16 +66,13 @@ class Recording:
         return float(self.x[self.present].max())
 
 
-def recordings_of(
-    frame: pl.DataFrame, lane_widths: Mapping[str, float], scenes: Sequence[str] | None = None
-) -> list[Recording]:
+def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:
     """The scenes of a frame in the schema, whose tracks have no gaps, in the order of their names.
 
-    ``lane_widths`` are in m, by scene; ``scenes`` are names, all by default.
+    ``lane_widths`` are in m, by scene.
     """
-    names = sorted(frame["scene"].unique().to_list() if scenes is None else scenes)
     made = []
-    for name in names:
+    for name in sorted(frame["scene"].unique().to_list()):
         rows = frame.filter(pl.col("scene") == name).with_columns(driven=pl.lit(True))
         track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
         made.append(_recording(name, rows, track, int(rows["lane"].to_numpy().max()) + 1, lane_widths[name]))

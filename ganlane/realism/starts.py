@@ -29,7 +29,7 @@ from ganlane.realism.measures import (
     measure_recordings,
     pooled_distance,
 )
-from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of, units_of
+from ganlane.realism.recordings import SHORTEST_S, Recording, recorded_frame, recordings_of, units_of
 from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
 from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
 from ganlane.sim.spawn import SpawnParameters
@@ -253,21 +253,17 @@ def recorded_starts(
 
 
 def spawned_starts(
-    factories: Mapping[str, Factory],
-    road: Road,
-    spawn: SpawnParameters,
-    repeats: int,
-    seed: int,
-    path: Path = SHIPPED_REFERENCE,
+    factories: Mapping[str, Factory], road: Road, spawn: SpawnParameters, repeats: int, seed: int
 ) -> Starts:
     """Drive every traffic from the same spawned scenes: ``repeats`` times 8 episodes of 30 vehicles and 30 s each.
 
-    ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density); ``path`` is the file of
-    the histograms that they are compared with.
+    ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density). They are compared with
+    the histograms that ship.
     """
-    reference, rows = Reference.load(path), _SPAWNED_ROWS * repeats
+    reference, rows = Reference.load(SHIPPED_REFERENCE), _SPAWNED_ROWS * repeats
     print_progress(
-        f"no recordings here: spawned starts against {path.name}; give data.path=FILE for the fair comparison"
+        f"no recordings here: spawned starts against {SHIPPED_REFERENCE.name}; give data.path=FILE for the fair "
+        "comparison"
     )
     parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
     scenes, driven = [f"spawned-{row}" for row in range(rows)], {}
@@ -283,12 +279,10 @@ def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows
     """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` s, in the form of measured recordings."""
     paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
-    frames = []
+    lanes, width = int(road.lanes), float(road.lane_width_m)
+    made = []
     for row in range(rows):
-        name, x, y, speed = f"spawned-{row}", paths.x[:, row], paths.y[:, row], paths.speed[:, row]
-        made = Recording(
-            name, name, int(road.lanes), float(road.lane_width_m), x, y, speed, everywhere,
-            paths.length[row], paths.width[row], everywhere[0],
-        )  # fmt: skip
-        frames.append(frame_of(made, x, y, everywhere, name))
-    return pl.concat(frames)
+        dense = (paths.x[:, row], paths.y[:, row], paths.speed[:, row], everywhere)
+        name, sizes = f"spawned-{row}", (paths.length[row], paths.width[row])
+        made.append(Recording(name, name, lanes, width, *dense, *sizes, everywhere[0]))
+    return recorded_frame(made)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ganlane.data import (
@@ -119,6 +119,7 @@ def test_vehicles_of_a_simulation_are_measured_one_by_one():
     assert changes.tau_s == pytest.approx([1.55, 1.55])
 
 
+@settings(max_examples=20)
 @given(seed=st.integers(0, 500))
 def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(seed):
     frame = synthetic_scenes(seed=seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks, read_table
@@ -17,6 +17,7 @@ def read(path, content: bytes, blanks: bool = False, block_bytes: int = 2**20) -
     return pl.concat(read_blocks(table, ["c", "a"], block_bytes))
 
 
+@settings(max_examples=30)
 @given(
     rows=st.lists(st.tuples(*[st.integers(-999, 999)] * 3), min_size=1, max_size=12),
     block_bytes=st.integers(1, 60),

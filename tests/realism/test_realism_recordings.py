@@ -2,6 +2,7 @@
 
 import polars as pl
 import pytest
+from reference.recordings import following_file
 
 from ganlane.errors import UserError
 from ganlane.realism.measures import measure_recordings
@@ -20,12 +21,6 @@ def pairs_file(path):
         for role, number, start in (("follower", 2, 0.0), ("leader", 1, 25.0))
     ]
     names = ["pair", "role", "vehicle", "frame", "x", "y_right", "v", "lane", "length", "width"]
-    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
-
-
-def following_file(path):
-    rows = [("0400pm", 2, 1, frame, 0.7 * frame, 0.7 * frame + 16.0, 6.0) for frame in range(200)]
-    names = ["period", "follower", "leader", "frame", "x_follower", "x_leader", "leader_length"]
     pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
 
 

@@ -89,6 +89,13 @@ def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> pl.Data
     return pl.read_csv(folder / f"{name}_tracks.csv")
 
 
+def following_file(path: Path) -> None:
+    """An I-80 file of one follower behind its leader: 20 s at 7 m/s, a gap of 10 m."""
+    rows = [("0400pm", 2, 1, frame, 0.7 * frame, 0.7 * frame + 16.0, 6.0) for frame in range(200)]
+    names = ["period", "follower", "leader", "frame", "x_follower", "x_leader", "leader_length"]
+    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
+
+
 #: Vehicle: first centre along the picture, speed, centre across the picture (downwards), highD's lane number.
 HIGHD_CARS = {
     1: (400.0, -30.0, 10.0, 2),

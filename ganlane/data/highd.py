@@ -140,27 +140,12 @@ def _scene(
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
-    tracks = number_tracks(_in_driving_direction(rows, direction, name), str(path))
-    begins = (tracks["vehicle"].diff() != 0).fill_null(True).to_numpy()
-    new = resample(begins, tracks["frame"].to_numpy(), rate_hz)
-    columns = {name: tracks[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
-    columns["frame"] = new.frame
-    columns |= {name: new.linear(tracks[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
-    columns["lane"] = new.nearest(tracks["lane"].to_numpy())
-    frame = pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
-    if frame.is_empty():
-        return None
-    return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
-
-
-def _in_driving_direction(rows: pl.DataFrame, direction: _Direction, name: str) -> pl.DataFrame:
-    """The schema's coordinates and lanes, at the recorded frame rate."""
     forward = -1.0 if direction.number == UPPER else 1.0
     along = forward * (pl.col("x") + 0.5 * pl.col("width"))
     # Upper lanes: left is down in the image, where y grows; lower lanes: left is up.
     left = -forward * (pl.col("y") + 0.5 * pl.col("height") - direction.right_edge)
     numbers = {lane_id: lane for lane, lane_id in enumerate(direction.lane_ids)}
-    return rows.select(
+    turned = rows.select(
         pl.lit(name).alias("scene"),
         pl.col("id").alias("vehicle"),
         "frame",
@@ -171,6 +156,17 @@ def _in_driving_direction(rows: pl.DataFrame, direction: _Direction, name: str) 
         length="width",
         width="height",
     )
+    tracks = number_tracks(turned, str(path))
+    begins = (tracks["vehicle"].diff() != 0).fill_null(True).to_numpy()
+    new = resample(begins, tracks["frame"].to_numpy(), rate_hz)
+    columns = {name: tracks[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
+    columns["frame"] = new.frame
+    columns |= {name: new.linear(tracks[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
+    columns["lane"] = new.nearest(tracks["lane"].to_numpy())
+    frame = pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
+    if frame.is_empty():
+        return None
+    return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
 
 
 class Resampling(NamedTuple):

@@ -146,7 +146,6 @@ def _read_rows(
     """Blocks with :data:`COLUMNS`, ``location`` and ``line``, in feet, in the order of the file."""
     path, has_location = table.path, LOCATION in table.names
     wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
-    last_row = pl.DataFrame()
     for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
         count.read += text.height
         if has_location:
@@ -158,11 +157,7 @@ def _read_rows(
         for name in ("v_length", "v_width"):
             raise_where(columns[name] <= 0.0, columns[name], path, "is not above 0", lines)
         raise_where(columns["v_vel"] < 0.0, columns["v_vel"], path, "is below 0", lines)
-        rows = pl.DataFrame([*columns.values(), text[LOCATION], lines])
-        if table.blanks:
-            _check_raw_order(last_row.vstack(rows) if last_row.height else rows, path)
-            last_row = rows.tail(1)
-        yield rows
+        yield pl.DataFrame([*columns.values(), text[LOCATION], lines])
 
 
 def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount) -> pl.DataFrame:
@@ -175,16 +170,6 @@ def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], 
     for location, rows in found.filter(~kept).value_counts().iter_rows():
         count.drop(f"location {location}", rows)
     return text.with_columns(found).filter(kept)
-
-
-def _check_raw_order(rows: pl.DataFrame, path: Path) -> None:
-    """In the raw files the rows of a vehicle are in the order of time."""
-    same_vehicle = pl.col("vehicle_id").diff() == 0
-    # In concatenated files the same vehicle number may follow itself, in another period.
-    same_period = pl.col("global_time").diff().abs() < MINUTE_MS
-    backwards = rows.select(same_vehicle & same_period & (pl.col("frame_id").diff() < 0)).to_series()
-    what = "is before the last frame of its vehicle; frames must grow"
-    raise_where(backwards, rows["frame_id"], path, what, rows[LINE])
 
 
 def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) -> list[_Period]:

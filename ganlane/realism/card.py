@@ -31,7 +31,7 @@ from ganlane.realism.measures import (
     measure_recordings,
     pooled_distance,
 )
-from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
+from ganlane.realism.recordings import I80_FILES, read_i80
 from ganlane.realism.replay_starts import Factory, StartOptions
 from ganlane.realism.starts import (
     FLOORS,
@@ -197,18 +197,15 @@ def card_checks(
     for name in CLOSER_IN:
         for other, row in quantities[name]["against"].items():
             rivals.setdefault(other, {})[name] = row["verdict"]
+    pairs = [(own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")]
+    near = None
+    if not any(value is None for pair in pairs for value in pair):
+        near = all(abs(mine - theirs) <= _QUANTILE_SHARE * abs(theirs) for mine, theirs in pairs)
     return {
         "compared_with": rivals,
-        "acceleration_quantiles_within_30_percent": _quantiles_near(own, recorded),
+        "acceleration_quantiles_within_30_percent": near,
         "long_runs": [_run_checks(run, recorded_rate, spread_mps) for run in runs],
     }
-
-
-def _quantiles_near(own: Mapping[str, Any], recorded: Mapping[str, Any]) -> bool | None:
-    pairs = [(own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")]
-    if any(value is None for pair in pairs for value in pair):
-        return None
-    return all(abs(mine - theirs) <= _QUANTILE_SHARE * abs(theirs) for mine, theirs in pairs)
 
 
 def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float) -> dict[str, Any]:
@@ -328,7 +325,8 @@ def drive_from_starts(config: RealismConfig, factories: Mapping[str, Factory], p
 
 def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
     """The I-80 files next to the scenes that ``config`` asks for, by name."""
-    files = {} if path is None or config.i80 is False else i80_files(path.parent)
+    folder = None if config.i80 is False or path is None else path.parent
+    files = {name: folder / file for name, file in I80_FILES.items() if folder and (folder / file).is_file()}
     if config.i80 and not files:
         raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use i80=false.")
     return files

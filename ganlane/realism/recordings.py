@@ -145,11 +145,6 @@ def segments(recording: Recording, seconds: float, skip_s: float = 0.0) -> list[
     return pieces
 
 
-def i80_files(folder: Path) -> dict[str, Path]:
-    """The I-80 files that exist in ``folder``, by name."""
-    return {name: folder / file for name, file in I80_FILES.items() if (folder / file).is_file()}
-
-
 def read_i80(name: str, path: Path) -> list[Recording]:
     """Segments of 15 s from the file ``path``, which is the one of :data:`I80_FILES` called ``name``.
 

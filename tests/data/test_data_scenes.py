@@ -80,7 +80,7 @@ def field(row: int, column: str, value: str) -> list[str]:
         (field(8, "frame", "1"), r"line 10, column frame: 1 comes twice"),
         (field(9, "frame", "0"), r"line 11, column frame: 0 is before"),
         (field(10, "length", "0"), r"line 12, column length: 0.0 is not above 0"),
-        ([*ROWS[:-1], "s,2,5,45.0"], r"line 13, column y: the field is empty; the row is incomplete"),
+        ([*ROWS[:-1], "s,2,5,45.0"], r"line 13, column x: the row ends after 4 of 10 fields"),
     ],
 )
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, lines, message):

@@ -40,7 +40,6 @@ from ganlane.realism.long_runs import (
     batch_statistics,
     drive_spawned,
     summary,
-    watched,
 )
 from ganlane.runtime import keep_freed_memory
 from ganlane.sim.state import Road
@@ -89,8 +88,8 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     while sum(part["vehicle_km"] for part in parts) < parameters.vehicle_km:
         traffic = variant.make()
         clock = StepClock(traffic)
-        with watched(traffic, meter):
-            course = drive_spawned(traffic, parameters, batch * len(parts), batch, events)
+        meter.watch(traffic)
+        course = drive_spawned(traffic, parameters, batch * len(parts), batch, events)
         parts.append(batch_statistics(course, Road()))
         ends.append(speeds_at_the_end(course))
         seconds += clock.seconds

@@ -7,8 +7,7 @@ time, and quantiles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -130,6 +129,12 @@ class GuardMeter:
         self._altered = torch.zeros((), dtype=torch.int64)
         self._steps = torch.zeros((), dtype=torch.int64)
 
+    def watch(self, traffic: TrafficModule) -> None:
+        """Be called by every guard in ``traffic`` from now on."""
+        for part in traffic.modules():
+            if isinstance(part, Guard):
+                part.observer = self
+
     def __call__(self, before: Vehicles, moved: Vehicles, guarded: Vehicles) -> None:
         """Called by the guard at every step; index 0 is the ego's and does not count."""
         wanted = (moved.speed - before.speed) / PHYSICS_STEP_S
@@ -148,20 +153,6 @@ class GuardMeter:
         return int(self._altered) / steps if steps else None
 
 
-@contextmanager
-def watched(traffic: TrafficModule, meter: GuardMeter) -> Iterator[None]:
-    """Attach ``meter`` to every guard in ``traffic`` within the context."""
-    guards = [part for part in traffic.modules() if isinstance(part, Guard)]
-    before = [guard.observer for guard in guards]
-    for guard in guards:
-        guard.observer = meter
-    try:
-        yield
-    finally:
-        for guard, observer in zip(guards, before):
-            guard.observer = observer
-
-
 def long_run(
     make: Factory, road: Road, parameters: LongRunParameters, report: Callable[[float], None] | None = None
 ) -> dict[str, Any]:
@@ -170,12 +161,11 @@ def long_run(
     ``report`` is called with the vehicle-km driven so far.
     """
     traffic, meter, events, parts = make(road), GuardMeter(), EventCounter(road), []
+    meter.watch(traffic)
     km, episodes = 0.0, 0
     while km < parameters.vehicle_km:
         rows = _rows(parameters, parameters.vehicle_km - km)
-        with watched(traffic, meter):
-            trajectories = drive_spawned(traffic, parameters, episodes, rows, events)
-        part = batch_statistics(trajectories, road)
+        part = batch_statistics(drive_spawned(traffic, parameters, episodes, rows, events), road)
         parts.append(part)
         km, episodes = km + part["vehicle_km"], episodes + rows
         if report is not None:

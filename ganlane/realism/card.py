@@ -92,7 +92,7 @@ class Card:
         starts, held_out = self.starts, self.starts.separately_held_out
         apart = card_rows(starts.restricted_to(held_out), self.traffic, self.resamples) if held_out else None
         driving = {name: each.summary() for name, each in starts.driven.items()}
-        recorded, own = starts.recorded_summary, driving[self.traffic]
+        recorded, own = starts.recorded.summary(), driving[self.traffic]
         rate, spread = starts.reference.rate(), starts.reference.spread_mps
         checks = card_checks(
             self.quantities, own["quantiles"], recorded["quantiles"], rate["per_vehicle_km_ci"], spread, self.runs
@@ -114,7 +114,7 @@ class Card:
 def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
     """The rows of a traffic's card by quantity, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
-    return quantity_rows(traffic, starts.driven, starts.recorded, floors, starts.paired, resamples)
+    return quantity_rows(traffic, starts.driven, starts.recorded.counts, floors, starts.paired, resamples)
 
 
 def quantity_rows(

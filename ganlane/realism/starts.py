@@ -18,17 +18,9 @@ import polars as pl
 
 from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.evaluation.statistics import Array
 from ganlane.files import load_weights
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
-from ganlane.realism.measures import (
-    QUANTITIES,
-    Measured,
-    lane_change_rate,
-    measure,
-    measure_recordings,
-    pooled_distance,
-)
+from ganlane.realism.measures import QUANTITIES, Measured, measure, measure_recordings, pooled_distance
 from ganlane.realism.recordings import SHORTEST_S, Recording, recorded_frame, recordings_of, units_of
 from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
 from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
@@ -109,8 +101,7 @@ class Starts:
         held_out: by fold, the scenes that desired speeds were not fitted on.
         options: by traffic, how it was driven; over several folds the mean of what was fitted.
         driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded starts only).
-        recorded: by quantity, [units, bins] of the same scenes (spawned starts: of all).
-        recorded_summary: lane changes and quantiles of those scenes.
+        recorded: the same scenes (spawned starts: all recordings).
         reference: all recordings.
     """
 
@@ -119,8 +110,7 @@ class Starts:
     held_out: list[list[str]]
     options: Mapping[str, StartOptions]
     driven: Mapping[str, Measured]
-    recorded: Mapping[str, Array]
-    recorded_summary: Mapping[str, Any]
+    recorded: Measured | Reference
     reference: Reference
 
     @property
@@ -138,10 +128,10 @@ class Starts:
 
     def restricted_to(self, scenes: Sequence[str]) -> Starts:
         """The same driving from some of its scenes, compared with these alone."""
+        assert isinstance(self.recorded, Measured)  # spawned starts are of no scenes
         rows = [self.scenes.index(name) for name in scenes]
-        recorded = {name: counts[rows] for name, counts in self.recorded.items()}
         driven = {name: each.restricted_to(rows) for name, each in self.driven.items()}
-        return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
+        return replace(self, scenes=list(scenes), driven=driven, recorded=self.recorded.restricted_to(rows))
 
     def description(self) -> dict[str, Any]:
         """The entries of ``results.json`` about starts and recordings."""
@@ -231,7 +221,6 @@ def recorded_starts(
             chosen += scenes
     if not chosen:
         raise UserError(f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all.")
-    recorded = measure_recordings(chosen)
     statistics = driving_statistics(frame, widths)
     whole = {
         "lane_changes": statistics.lane_changes.count,
@@ -246,8 +235,7 @@ def recorded_starts(
         held_out=[list(fold.held_out) for fold in folds],
         options={name: replace(options, desired_above_mps=excess) for name, excess in means.items()},
         driven={name: Measured.joined([part[name] for part in driven]) for name in driven[0]},
-        recorded=recorded.counts,
-        recorded_summary=recorded.summary(),
+        recorded=measure_recordings(chosen),
         reference=Reference.of(measure_recordings(every), names, whole, source),
     )
 
@@ -270,9 +258,7 @@ def spawned_starts(
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
         driven[name] = measure(spawned_frame(make, road, parameters, rows), scenes)
-    rate = lane_change_rate(reference.lane_changes, reference.vehicle_km)
-    summary = {**rate, "quantiles": reference.quantiles}
-    return Starts("spawned", [], [], {}, driven, reference.counts, summary, reference)
+    return Starts("spawned", [], [], {}, driven, reference, reference)
 
 
 def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows: int) -> pl.DataFrame:

@@ -33,9 +33,9 @@ def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
     assert starts.separately_held_out == NAMES[1:3]
     alone = card_rows(starts.restricted_to(starts.separately_held_out), "cruise", 100)
     for name in ("speed", "gap"):
-        assert alone[name]["ceiling"] == ceiling(starts.recorded[name][1:3])
+        assert alone[name]["ceiling"] == ceiling(starts.recorded.counts[name][1:3])
         assert alone[name]["ceiling"] != card_rows(starts, "cruise", 100)[name]["ceiling"]
-        assert alone[name]["recorded_samples"] == starts.recorded[name][1:3].sum()
+        assert alone[name]["recorded_samples"] == starts.recorded.counts[name][1:3].sum()
 
 
 def test_folds_are_driven_one_by_one_and_joined(frame):

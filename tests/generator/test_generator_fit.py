@@ -66,10 +66,10 @@ def test_fitting_the_calibrated_preset_reports_the_held_out_scenes(frame):
 
 def test_the_calibrated_loss_falls(frame):
     fitted, held_out = scene_tracks(frame)
-    task = CalibratedTask([fitted], [held_out], calibrated_config(24))
+    task = CalibratedTask([fitted], [held_out], calibrated_config(16))
     for optimiser in task.optimisers.values():
         optimiser.param_groups[0]["lr"] = 5e-3
-    losses = [task.update(0)["mean"] for _ in range(24)]
+    losses = [task.update(0)["mean"] for _ in range(16)]
     assert sum(losses[-5:]) < sum(losses[:5])
 
 

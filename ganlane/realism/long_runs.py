@@ -153,26 +153,67 @@ class GuardMeter:
         return int(self._altered) / steps if steps else None
 
 
+class LongRun:
+    """The driving of a long run, added up batch by batch."""
+
+    def __init__(self, road: Road, parameters: LongRunParameters) -> None:
+        self.road, self.parameters, self.episodes = road, parameters, 0
+        self._events, self._meter, self._parts = EventCounter(road), GuardMeter(), list[dict[str, Any]]()
+
+    @property
+    def vehicle_km(self) -> float:
+        """Driven so far."""
+        return sum(part["vehicle_km"] for part in self._parts)
+
+    @property
+    def finished(self) -> bool:
+        """Whether enough was driven, or nobody moves."""
+        stuck = self._parts and self._parts[-1]["vehicle_km"] <= 0.0
+        return bool(stuck) or self.vehicle_km >= self.parameters.vehicle_km
+
+    def drive(self, traffic: TrafficModule, rows: int) -> Trajectories:
+        """One batch of ``rows`` further episodes."""
+        self._meter.watch(traffic)
+        trajectories = drive_spawned(traffic, self.parameters, self.episodes, rows, self._events)
+        self._parts.append(batch_statistics(trajectories, self.road))
+        self.episodes += rows
+        return trajectories
+
+    def numbers(self) -> dict[str, Any]:
+        """Counts, rates per vehicle-km with exact 95 % intervals (None where no vehicle moved), speeds, quantiles."""
+        parts, events, km = self._parts, self._events, self.vehicle_km
+        changes = sum(part["lane_changes"] for part in parts)
+        durations = np.concatenate([part["durations"] for part in parts])
+        acceleration = np.concatenate([part["acceleration"] for part in parts])
+        return {
+            "vehicles": self.parameters.vehicles,
+            "episodes": self.episodes,
+            "vehicle_km": km,
+            "lane_changes": changes,
+            "lane_change_duration_mean_s": float(durations.mean()) if len(durations) else None,
+            "overlaps": events.overlaps,
+            **rates(changes, events.overlaps, km),
+            "off_road": events.off_road,
+            "standstills_in_free_flow": events.standstills,
+            "acceleration_quantiles": {f"{level:g}": float(np.quantile(acceleration, level)) for level in QUANTILES},
+            "speeds": {
+                name: _mean_speeds([row for part in parts for row in part["speeds"][name]], name.endswith(" m"))
+                for name in parts[0]["speeds"]
+            },
+            "guard_share": self._meter.share,
+        }
+
+
 def long_run(
     make: Factory, road: Road, parameters: LongRunParameters, report: Callable[[float], None] | None = None
 ) -> dict[str, Any]:
-    """Drive ``parameters.vehicle_km`` and count; the numbers of :func:`summary`.
-
-    ``report`` is called with the vehicle-km driven so far.
-    """
-    traffic, meter, events, parts = make(road), GuardMeter(), EventCounter(road), []
-    meter.watch(traffic)
-    km, episodes = 0.0, 0
-    while km < parameters.vehicle_km:
-        rows = _rows(parameters, parameters.vehicle_km - km)
-        part = batch_statistics(drive_spawned(traffic, parameters, episodes, rows, events), road)
-        parts.append(part)
-        km, episodes = km + part["vehicle_km"], episodes + rows
+    """Drive ``parameters.vehicle_km``; ``report`` is called with the vehicle-km driven so far."""
+    traffic, run = make(road), LongRun(road, parameters)
+    while not run.finished:
+        run.drive(traffic, _rows(parameters, parameters.vehicle_km - run.vehicle_km))
         if report is not None:
-            report(km)
-        if part["vehicle_km"] <= 0.0:
-            break
-    return summary(parts, events, meter, episodes, parameters.vehicles)
+            report(run.vehicle_km)
+    return run.numbers()
 
 
 def _rows(parameters: LongRunParameters, km: float) -> int:
@@ -253,33 +294,6 @@ def _speeds(trajectories: Trajectories, row: int, time: int) -> tuple[float, flo
     """Mean and standard deviation of an episode's speeds, m/s, and the time, s."""
     speed = trajectories.speed[time, row].astype(np.float64)
     return float(speed.mean()), float(speed.std(ddof=1)) if len(speed) > 1 else 0.0, time * PHYSICS_STEP_S
-
-
-def summary(
-    parts: list[dict[str, Any]], events: EventCounter, meter: GuardMeter, episodes: int, vehicles: int
-) -> dict[str, Any]:
-    """The numbers of a long run; rates are per vehicle-km, with exact 95 % intervals, None where no vehicle moved."""
-    km = sum(part["vehicle_km"] for part in parts)
-    changes = sum(part["lane_changes"] for part in parts)
-    durations = np.concatenate([part["durations"] for part in parts])
-    acceleration = np.concatenate([part["acceleration"] for part in parts])
-    return {
-        "vehicles": vehicles,
-        "episodes": episodes,
-        "vehicle_km": km,
-        "lane_changes": changes,
-        "lane_change_duration_mean_s": float(durations.mean()) if len(durations) else None,
-        "overlaps": events.overlaps,
-        **rates(changes, events.overlaps, km),
-        "off_road": events.off_road,
-        "standstills_in_free_flow": events.standstills,
-        "acceleration_quantiles": {f"{level:g}": float(np.quantile(acceleration, level)) for level in QUANTILES},
-        "speeds": {
-            name: _mean_speeds([row for part in parts for row in part["speeds"][name]], name.endswith(" m"))
-            for name in parts[0]["speeds"]
-        },
-        "guard_share": meter.share,
-    }
 
 
 def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:

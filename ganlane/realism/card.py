@@ -210,12 +210,14 @@ def card_checks(
 
 def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float) -> dict[str, Any]:
     changes, overlaps = run["lane_changes_per_vehicle_km"], run["overlaps_per_1000_vehicle_km"]
-    known = changes is not None and recorded_rate
+    inside = None
+    if changes is not None and recorded_rate:
+        inside = recorded_rate[0] <= changes <= recorded_rate[1]
     spreads = [at["spread_mps"] for at in run["speeds"].values() if at["spread_mps"] is not None]
     wide = None if not spreads else min(spreads) >= 0.5 * spread_mps
     return {
         "vehicles": run["vehicles"],
-        "lane_changes_inside_recorded_interval": recorded_rate[0] <= changes <= recorded_rate[1] if known else None,
+        "lane_changes_inside_recorded_interval": inside,
         "overlaps_under_1_per_1000_vehicle_km": None if overlaps is None else overlaps < 1.0,
         "nobody_off_the_road": run["off_road"] == 0,
         "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,

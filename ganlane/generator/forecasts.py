@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import RidgeCV
-from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
@@ -282,7 +282,7 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
         BASELINE: repeated(past[:, -1], steps),
         "mean_velocity": repeated(past.mean(axis=1), steps),
         "constant_acceleration": constant_acceleration(past, steps),
-        "ridge": RidgeForecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps))(past),
+        "ridge": ridge_forecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps), past),
     }
 
 
@@ -298,26 +298,18 @@ def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
     return repeated(past[:, -1], steps) + 0.5 * change * ahead * (ahead + 1.0)
 
 
-class RidgeForecast:
-    """Ridge regression from the last displacement and all observed differences to the error of constant velocity.
+def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
+    """Positions [W, T, 2] in m that follow the displacements ``past`` [W, 8, 2].
 
-    It is fitted to ``windows`` as they are and mirrored.
+    Ridge regression from the last displacement and all observed differences to the error of constant velocity; it is
+    fitted to the windows ``fitted``, as they are and mirrored.
     """
 
-    def __init__(self, windows: Windows):
-        past, future = windows.past, windows.future
-        past = np.concatenate([past, past * (1.0, -1.0)])
-        future = np.concatenate([future, future * (1.0, -1.0)])
-        self.steps = future.shape[1]
-        error = (future - repeated(past[:, -1], self.steps)).reshape(len(past), -1)
-        self.model: Pipeline = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
-        self.model.fit(self._features(past), error)
-
-    def __call__(self, past: np.ndarray) -> np.ndarray:
-        """Positions [W, T, 2] in m that follow the displacements ``past`` [W, 8, 2]."""
-        error = self.model.predict(self._features(past)).reshape(len(past), self.steps, 2)
-        return repeated(past[:, -1], self.steps) + error
-
-    @staticmethod
-    def _features(past: np.ndarray) -> np.ndarray:
+    def features(past: np.ndarray) -> np.ndarray:
         return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)
+
+    known, future = (np.concatenate([each, each * (1.0, -1.0)]) for each in (fitted.past, fitted.future))
+    steps = future.shape[1]
+    model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
+    model.fit(features(known), (future - repeated(known[:, -1], steps)).reshape(len(known), -1))
+    return repeated(past[:, -1], steps) + model.predict(features(past)).reshape(len(past), steps, 2)

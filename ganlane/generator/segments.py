@@ -59,8 +59,9 @@ class SceneTracks:
 
     @cached_property
     def target_lane(self) -> np.ndarray:
-        """:func:`intended_lanes`."""
-        return intended_lanes(self.lane, self.present)
+        """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its track."""
+        ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
+        return np.take_along_axis(self.lane, np.clip(ahead, *_first_and_last(self.present)), axis=0)
 
 
 def _scene_arrays(name: str, lane_width_m: float, rows: pl.DataFrame) -> SceneTracks:
@@ -107,12 +108,6 @@ def extrapolate(positions: np.ndarray, present: np.ndarray) -> np.ndarray:
     after = end + late * (frames - last)[..., None]
     inside = np.where(present[..., None], positions, 0.0)
     return np.where((frames < first)[..., None], before, np.where((frames > last)[..., None], after, inside))
-
-
-def intended_lanes(lane: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its track."""
-    ahead = np.arange(len(present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
-    return np.take_along_axis(lane, np.clip(ahead, *_first_and_last(present)), axis=0)
 
 
 def _first_and_last(present: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

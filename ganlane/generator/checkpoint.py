@@ -106,7 +106,7 @@ def _generator_of(path: str | Path, sizes: Any, tensors: Mapping[str, Tensor]) -
     complete = isinstance(sizes, dict) and set(kinds) - _ADDED_LATER <= set(sizes) <= set(kinds)
     # The bound keeps a damaged file from requesting all memory.
     if not complete or not all(
-        isinstance(value, int) and type(value) is kinds[name] and 0 <= value <= 4096 for name, value in sizes.items()
+        isinstance(value, int) and 0 <= value <= 4096 and type(value) is kinds[name] for name, value in sizes.items()
     ):
         raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(kinds)}); fit it again.")
     try:

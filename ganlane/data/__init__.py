@@ -20,7 +20,7 @@ from ganlane.data.lanes import (
 )
 from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.prepare import PooledStatistics, Preparation, SceneSummary, prepare_recordings, read_recordings
-from ganlane.data.scenes import read_scenes, write_prepared
+from ganlane.data.scenes import read_scenes, write_prepared, write_scene_csv
 from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, TRACK_STRIDE, RowCount, Scene, sort, validate
 from ganlane.data.statistics import (
     Bins,
@@ -30,7 +30,7 @@ from ganlane.data.statistics import (
     leader_gaps,
     survival_curve,
 )
-from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes
 from ganlane.parameters.data import NgsimParameters
 
 __all__ = [

@@ -19,7 +19,7 @@ from ganlane.data.lanes import lane_width, scene_lane_widths
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
 from ganlane.data.tables import LINE, raise_where, read_table, reason
 from ganlane.errors import UserError
-from ganlane.files import write_bytes
+from ganlane.files import atomic_path, write_bytes
 
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0 at the centre of
 #: lane 1, which is the leftmost.
@@ -57,6 +57,18 @@ def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
     file = io.BytesIO()
     frame.write_parquet(file, compression="zstd", metadata={"checksum": PLACE})
     write_bytes(path, sealed(file.getvalue()))
+
+
+def write_scene_csv(frame: pl.DataFrame, path: str | Path, lane_width_m: float = 3.5) -> None:
+    """Write a frame in the schema as a scene CSV; the leftmost lane is the leftmost of a scene's vehicles."""
+    with atomic_path(path) as part:
+        scene_csv(frame, pl.col("lane").max().over("scene"), lane_width_m).write_csv(part)
+
+
+def scene_csv(frame: pl.DataFrame, leftmost: pl.Expr, lane_width_m: float) -> pl.DataFrame:
+    """A frame in the schema as the columns of a scene CSV; ``leftmost`` is the number of the leftmost lane."""
+    y = pl.col("y") - leftmost * lane_width_m
+    return frame.with_columns(v=pl.col("speed"), lane=leftmost + 1 - pl.col("lane"), y=y).select(COLUMNS.keys())
 
 
 def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:

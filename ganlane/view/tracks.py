@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from ganlane import keys
-from ganlane.data.scenes import COLUMNS, write_prepared
+from ganlane.data.scenes import scene_csv, write_prepared
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
@@ -41,7 +41,10 @@ def write_tracks(trajectories: Sequence[Trajectory], path: str | Path, format: T
     if format == "parquet":
         write_prepared(sort(pl.concat([to_tracks(each, name) for each, name in zip(trajectories, names)])), path)
     else:
-        tables = [scene_csv(to_tracks(each, name), each.label) for each, name in zip(trajectories, names)]
+        tables = [
+            scene_csv(to_tracks(each, name), pl.lit(each.label.lanes - 1), each.label.lane_width_m)
+            for each, name in zip(trajectories, names)
+        ]
         with atomic_path(path) as part:
             pl.concat(tables).write_csv(part)
     return Path(path)
@@ -79,10 +82,3 @@ def scene_names(labels: Sequence[EpisodeLabel]) -> list[str]:
         again = sum(other == name or other.startswith(f"{name}-") for other in names)
         names.append(f"{name}-{again + 1}" if again else name)
     return names
-
-
-def scene_csv(tracks: pl.DataFrame, label: EpisodeLabel) -> pl.DataFrame:
-    """Tracks in the schema as the columns of a scene CSV."""
-    left = (label.lanes - 1) * label.lane_width_m
-    turned = tracks.with_columns(v=pl.col("speed"), lane=label.lanes - pl.col("lane"), y=pl.col("y") - left)
-    return turned.select(COLUMNS.keys())

@@ -86,7 +86,6 @@ def damaged(path, column, row, value):
     ("column", "row", "value", "message"),
     [
         ("x", 10, "left", r"01_tracks.csv, line 12, column x: 'left' is not a number"),
-        ("xVelocity", 3, "NaN", r"01_tracks.csv, line 5, column xvelocity: 'NaN' is not a finite number"),
         ("frame", 6, "4", r"01_tracks.csv, line 8, column frame: 4 is not after the last frame"),
         ("id", 250, "77", r"01_tracks.csv, line 252, column id: 77 is not in the tracksMeta file"),
         ("width", 0, "0", r"01_tracks.csv, line 2, column width: 0.0 is not above 0"),

@@ -122,16 +122,11 @@ def changed(row: int, column: str, value: str) -> list[str]:
         (9, "frame_id", "9000000", r"line 11, columns frame_id and global_time: frame 9000000 .* fits no recording"),
         (9, "frame_id", "7", r"line 11, column frame_id: 7 does not grow with global_time"),
         (9, "global_time", f"{START_MS + 950}", r"line 11, column global_time: .* is not 100 ms a frame"),
-        (5, "v_acc", "0.0,7", r"line 7: 20 fields, expected 19"),
-        (5, "v_acc", "drop", r"line 7, column time_headway: the row ends after 18 of 19 fields"),
     ],
 )
 @pytest.mark.parametrize("block_bytes", [20_000, 2**25])
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message, block_bytes):
-    lines = changed(row, column, value)
-    if value == "drop":
-        lines[row + 1] = lines[row + 1].replace(",drop,", ",")
-    path = portal_file(tmp_path, "\n".join(lines) + "\n")
+    path = portal_file(tmp_path, "\n".join(changed(row, column, value)) + "\n")
     with pytest.raises(UserError, match=message) as caught:
         read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
     assert str(path) in str(caught.value)

@@ -59,10 +59,10 @@ def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
     write_bytes(path, sealed(file.getvalue()))
 
 
-def write_scene_csv(frame: pl.DataFrame, path: str | Path, lane_width_m: float = 3.5) -> None:
-    """Write a frame in the schema as a scene CSV; the leftmost lane is the leftmost of a scene's vehicles."""
+def write_scene_csv(frame: pl.DataFrame, path: str | Path) -> None:
+    """Write a frame in the schema, with lanes of 3.5 m, as a scene CSV; lane 1 is the leftmost in use in a scene."""
     with atomic_path(path) as part:
-        scene_csv(frame, pl.col("lane").max().over("scene"), lane_width_m).write_csv(part)
+        scene_csv(frame, pl.col("lane").max().over("scene"), 3.5).write_csv(part)
 
 
 def scene_csv(frame: pl.DataFrame, leftmost: pl.Expr, lane_width_m: float) -> pl.DataFrame:

@@ -6,14 +6,13 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
-from reference.recordings import made_by_hand
+from reference.recordings import made_by_hand, recorded_cars
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
-from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.generator.rollout import balanced_headway
 from ganlane.realism.measures import measure_recordings, pooled_distance
-from ganlane.realism.recordings import recorded_frame, recordings_of
+from ganlane.realism.recordings import recorded_frame
 from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
 from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways
 from ganlane.realism.starts import simulate
@@ -118,8 +117,7 @@ def test_repeats_differ_and_the_same_seed_repeats_them():
 
 @pytest.mark.parametrize("make", [IdmMobilTraffic, gan_traffic, gan_calibrated_traffic, RandomDriving])
 def test_every_traffic_stays_finite_from_recorded_starts(make):
-    frame = synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=8, seconds=5.0))
-    there = drive_recordings(make, recordings_of(frame, scene_lane_widths(frame)), StartOptions())
+    there = drive_recordings(make, recorded_cars(scenes=1, vehicles=8, seconds=5.0), StartOptions())
     for name in ("x", "y"):
         assert there[name].is_finite().all()
     assert there["lane"].is_between(0, 2).all()

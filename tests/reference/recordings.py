@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes
-from ganlane.realism.recordings import Recording
+from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
+from ganlane.realism.recordings import Recording, recordings_of
 
 FOOT_M = 0.3048
 LANE_M = 3.5
@@ -89,6 +89,12 @@ def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> pl.Data
     recording = {"id": 1, "frameRate": 25, "upperLaneMarkings": "8.00;12.00;16.00", "lowerLaneMarkings": "20;24;28"}
     pl.DataFrame(recording).write_csv(folder / f"{name}_recordingMeta.csv")
     return pl.read_csv(folder / f"{name}_tracks.csv")
+
+
+def recorded_cars(**size) -> list[Recording]:
+    """Synthetic scenes as recordings."""
+    frame = synthetic_scenes(SyntheticTraffic(**size))
+    return recordings_of(frame, scene_lane_widths(frame))
 
 
 def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Recording:

@@ -29,13 +29,7 @@ from ganlane.generator.rollout import (
     rollout_as_fitted,
     typical_driver_params,
 )
-from ganlane.generator.segments import (
-    OBSERVED_POSITIONS,
-    PRESENT,
-    SceneTracks,
-    Segments,
-    segment_batches,
-)
+from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks, Segments, segment_batches
 from ganlane.generator.windows import Groups, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig

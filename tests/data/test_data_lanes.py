@@ -5,12 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ganlane.data import (
-    find_lane_changes,
-    lane_changes_of_arrays,
-    synthetic_scenes,
-    tracks_of_frame,
-)
+from ganlane.data import find_lane_changes, lane_changes_of_arrays, synthetic_scenes, tracks_of_frame
 from ganlane.data.lanes import Tracks, lane_width
 
 

@@ -31,7 +31,6 @@ from ganlane.data.tables import (
     convert,
     csv_table,
     first_line,
-    is_number,
     raise_where,
     read_blocks,
 )
@@ -130,7 +129,7 @@ def _layout(path: Path) -> TextTable:
     """Raw text if the first line begins with a number and has no comma, else a CSV with a header."""
     first = first_line(path)
     fields = first.split()
-    if "," in first or not is_number(fields[0]):
+    if "," in first or not fields[0].replace(".", "", 1).isdecimal():
         return csv_table(path, COLUMNS)
     if len(fields) != len(RAW_NAMES):
         raise UserError(

@@ -246,12 +246,3 @@ def _raise_at_bad_line(table: TextTable, block: bytes, number: int) -> None:
             raise UserError(
                 f"{place}, column {column}: the row ends after {found} of {expected} fields; correct or remove it."
             )
-
-
-def is_number(text: str) -> bool:
-    """Whether a field holds a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -48,9 +48,7 @@ def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptio
 
 
 def simulate_all(
-    factories: Mapping[str, Factory],
-    recordings: Sequence[Recording],
-    options: Mapping[str, StartOptions],
+    factories: Mapping[str, Factory], recordings: Sequence[Recording], options: Mapping[str, StartOptions]
 ) -> dict[str, Measured]:
     """Drive every traffic and both reference drivers from the same starts."""
     driven = {}

@@ -167,7 +167,7 @@ def draws(shift, number, trials=40):
 
 @pytest.mark.parametrize("number", [4, 11])
 def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
-    intervals = [distance(model, recorded, resamples=200) for recorded, model, _ in draws(0.0, number)]
+    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)]
     assert all(each.low <= each.value <= each.high for each in intervals)
     assert sum(each.low == 0.0 for each in intervals) >= 0.9 * len(intervals)
 
@@ -176,7 +176,7 @@ def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
 def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
     many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
     true = float(jensen_shannon(*(binom.pmf(np.arange(21)[:, None], 20, at).sum(1) for at in (many, many + 0.1))))
-    intervals = [distance(model, recorded, resamples=200) for recorded, model, _ in draws(0.1, number)]
+    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.1, number)]
     assert sum(each.low <= true <= each.high for each in intervals) >= 0.85 * len(intervals)
     assert sum(each.low > 0.0 for each in intervals) >= 0.9 * len(intervals)
 
@@ -184,7 +184,7 @@ def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
 @pytest.mark.parametrize(("number", "shift"), [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)])
 def test_two_equally_good_models_are_seldom_told_apart(number, shift):
     verdicts = [
-        verdict(distance_difference(*models, recorded, resamples=200)) for recorded, *models in draws(shift, number)
+        verdict(distance_difference(*models, recorded, resamples=300)) for recorded, *models in draws(shift, number)
     ]
     assert verdicts.count("undecided") >= 0.9 * len(verdicts)
 

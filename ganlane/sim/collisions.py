@@ -5,7 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ganlane.sim.state import STRAIGHT, Road, Vehicles
+from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
+
+#: Pairs below which choosing the near ones takes longer than testing all of them.
+FEW = 1000
 
 
 def _separated(
@@ -56,31 +59,23 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     v = vehicles
     dx = road.distance_ahead(v.x[:, :1], v.x[:, 1:])
     both = v.valid[:, 1:] & v.valid[:, :1]
-    if _all_apart(dx, v):
+    if not reads_are_cheap(dx):
+        return _ego_hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
+    # Boxes overlap only within the sum of their half diagonals, each at most half of length plus width.
+    row, column = (dx.abs() < v.length.amax() + v.width.amax()).nonzero().unbind(1)
+    if len(row) == 0:
         return torch.zeros_like(both)
-    hit = boxes_overlap(
-        dx,
-        v.y[:, 1:] - v.y[:, :1],
-        v.heading[:, :1],
-        v.length[:, :1],
-        v.width[:, :1],
-        v.heading[:, 1:],
-        v.length[:, 1:],
-        v.width[:, 1:],
+    if dx.numel() < FEW:
+        return _ego_hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
+    ego, near = (Vehicles(*(field[row, which] for field in v)) for which in (0, column + 1))
+    return torch.zeros_like(both).index_put((row, column), _ego_hits(dx[row, column], ego, near)) & both
+
+
+def _ego_hits(dx: Tensor, ego: Vehicles, others: Vehicles) -> Tensor:
+    """Whether the boxes of others, ``dx`` m ahead of the ego, overlap its own."""
+    return boxes_overlap(
+        dx, others.y - ego.y, ego.heading, ego.length, ego.width, others.heading, others.length, others.width
     )
-    return hit & both
-
-
-def _all_apart(dx: Tensor, vehicles: Vehicles) -> bool:
-    """Whether all vehicles of all rows are too far from the ego along the road to overlap it.
-
-    Boxes overlap only within the sum of their half diagonals, each at most half of length plus width. On a CPU this
-    test is cheap and saves small batches most of the exact tests. It is skipped while compiling and on a GPU, since
-    reading the result would break the graph or synchronise the device.
-    """
-    if torch.compiler.is_compiling() or dx.device.type != "cpu":
-        return False
-    return not bool((dx.abs() < vehicles.length.amax() + vehicles.width.amax()).any())
 
 
 def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:

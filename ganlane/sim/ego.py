@@ -76,9 +76,9 @@ class Surroundings(NamedTuple):
 def ego_surroundings(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> Surroundings:
     """IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that its body is
     in."""
-    body = spanned(scene.body)
-    ahead = leader(scene, torch.cat((spanned(scene.attention), body), dim=-1))
-    followed, near = (Neighbour(*(number[..., half] for number in ahead)) for half in (slice(0, 3), slice(3, 6)))
+    attention, body = spanned(scene.attention), spanned(scene.body)
+    ahead, lanes = leader(scene, torch.cat((attention, body), dim=-1)), (attention.shape[-1], body.shape[-1])
+    followed, near = map(Neighbour, *(number.split(lanes, dim=-1) for number in ahead))
     behind, speed = follower(scene, body), scene.observers.speed[..., None]
     closing = torch.where(behind.exists, behind.speed - speed, 0.0)
     limits = (ego.soft_crash_ttc_s, ego.soft_crash_gap_m)

@@ -25,6 +25,10 @@ class DriverIdm(NamedTuple):
         """The parameters as [N, M, 1], to broadcast over lanes or pairs."""
         return DriverIdm(self.min_gap_m, *(value[..., None] for value in self[1:]))
 
+    def of(self, rows: Tensor, columns: Tensor) -> DriverIdm:
+        """The parameters of some drivers: indices [R], and [R, W] in these rows."""
+        return DriverIdm(self.min_gap_m, *(value[rows].gather(1, columns) for value in self[1:]))
+
     def brake_scale(self) -> Tensor:
         """As :meth:`IdmParameters.brake_scale`."""
         return 2.0 * torch.sqrt(self.max_acceleration * self.comfortable_deceleration)

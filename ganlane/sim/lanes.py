@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, reads_are_cheap
 
 ENTRY_M = 0.1
 #: In an initial scene: the traffic sets a :class:`Visibility` per episode.
@@ -38,10 +38,12 @@ class LaneRange(NamedTuple):
 
 
 def spanned(lanes: LaneRange) -> Tensor:
-    """The lanes of a range, [..., 3]: lowest, middle and highest.
+    """The lanes of a range, [..., 3]: lowest, middle and highest; [..., 2] or [..., 1] where that is seen to suffice.
 
     A vehicle at an angle can be in three lanes, if lanes are narrow, vehicles long or changes consecutive.
     """
+    if reads_are_cheap(lanes.low) and (most := int((lanes.high - lanes.low).amax())) < 2:
+        return torch.stack(lanes[: most + 1], dim=-1)
     return torch.stack((lanes.low, torch.minimum(lanes.low + 1, lanes.high), lanes.high), dim=-1)
 
 

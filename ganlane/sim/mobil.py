@@ -9,10 +9,10 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import MobilParameters
-from ganlane.sim.idm import TABLE_V, AnyIdm, acceleration_behind, idm_acceleration
+from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, acceleration_behind, idm_acceleration
 from ganlane.sim.lanes import lane_change_done
-from ganlane.sim.neighbours import FREE_GAP_M, Scene, follower, leader
-from ganlane.sim.state import Road
+from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
+from ganlane.sim.state import Road, Vehicles, compact, reads_are_cheap
 
 
 class DriverMobil(NamedTuple):
@@ -97,13 +97,27 @@ def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyM
     Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking. MOBIL's criteria
     do not cover this case, since neither vehicle is in that lane yet.
     """
-    vehicles, wants = scene.observers, wish != 0
-    target = vehicles.target_lane + wish
+    wants, vehicles = wish != 0, scene.vehicles
+    if not reads_are_cheap(wish):
+        return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
+    rows, columns = compact(wants & (wants.sum(1, keepdim=True) > 1))
+    if len(rows) == 0:
+        return wish
+    few, wishes = Vehicles(*(field[rows] for field in vehicles)).columns(columns), wish[rows]
+    some = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
+    asked = wishes.gather(1, columns)
+    kept = torch.where(_gives_way(few, scene.road, asked, some, mobil), 0, asked)
+    return wish.index_copy(0, rows, wishes.scatter(1, columns, kept))
+
+
+def _gives_way(vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: AnyMobil) -> Tensor:
+    """Whether a vehicle ahead that wants the same lane is too close, bool [N, M]."""
+    pairs, wants, target = compare(vehicles, road), wish != 0, vehicles.target_lane + wish
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
     speed, desired = vehicles.speed[:, :, None], vehicles.desired_speed[:, :, None]
-    demand = idm_acceleration(speed, desired, scene.ahead, vehicles.speed[:, None, :], idm.per_lane())
-    near = (scene.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
-    return torch.where((same & near & (scene.order > 0)).any(-1), 0, wish)
+    demand = idm_acceleration(speed, desired, pairs.ahead, vehicles.speed[:, None, :], idm.per_lane())
+    near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
+    return (same & near & (pairs.order > 0)).any(-1)
 
 
 def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:

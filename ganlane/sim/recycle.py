@@ -14,7 +14,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.idm import idm_acceleration
 from ganlane.sim.neighbours import Scene, perceive
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, reads_are_cheap
 
 #: Range of the positions in Table III, m.
 RANGE_M = 200.0
@@ -45,12 +45,13 @@ def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
     own, other = there.observers, there.vehicles
     sides = 0.5 * own.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
     shares |= (own.y[..., None] - other.y[:, None, :]).abs() < sides
+    pairs = there.pairs
     itself = torch.eye(count, dtype=torch.bool, device=own.x.device).repeat(1, 2)
     counts = shares & other.valid[:, None, :] & ~itself
     speed, desired = own.speed[..., None], own.desired_speed[..., None]
-    behind = idm_acceleration(speed, desired, there.ahead, other.speed[:, None, :], idm)
-    before = idm_acceleration(other.speed[:, None, :], other.desired_speed[:, None, :], there.behind, speed, idm)
-    asked = torch.where(there.order > 0, behind, before)
+    behind = idm_acceleration(speed, desired, pairs.ahead, other.speed[:, None, :], idm)
+    before = idm_acceleration(other.speed[:, None, :], other.desired_speed[:, None, :], pairs.behind, speed, idm)
+    asked = torch.where(pairs.order > 0, behind, before)
     return (~counts | (asked >= -safe)).all(-1)
 
 
@@ -66,6 +67,8 @@ def recycle(
     Room is tested against every other vehicle at its current *and* at its new position.
     """
     away = out_of_range(vehicles, road, range_m)
+    if reads_are_cheap(away) and not bool(away.any()):
+        return vehicles
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
     moved = vehicles.with_(x=torch.where(away, vehicles.x - 2.0 * range_m * torch.sign(distance), vehicles.x))
     both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))

@@ -280,7 +280,7 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     ahead = shares & (vehicles.x[:, None, :] > vehicles.x[:, :, None])
     varied = (vehicles.speed > 0) * scene.jitter_mps
     slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
-    gap = seen.ahead - torch.minimum(slack[:, None], slack[None, :])
+    gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
     fastest, slowest = vehicles.speed + varied, (vehicles.speed - varied).clamp_min(0.0)
     needed = torch.where(ahead, needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap), 0.0)[0]
     if bool((needed > -idm.min_acceleration).any()):

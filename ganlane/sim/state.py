@@ -11,6 +11,22 @@ from torch import Tensor
 from ganlane.keys import VEHICLE_FIELDS
 
 
+def compact(chosen: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the few true entries of ``chosen`` [N, M] are: rows [R], and columns [R, W] that hold all of theirs.
+
+    Reads values, so it belongs on a CPU and in no graph (:func:`reads_are_cheap`).
+    """
+    rows = chosen.any(1).nonzero()[:, 0]
+    chosen = chosen[rows]
+    most = int(chosen.sum(1).max()) if len(rows) else 0
+    return rows, chosen.to(torch.uint8).sort(dim=1, descending=True, stable=True).indices[:, :most]
+
+
+def reads_are_cheap(tensor: Tensor) -> bool:
+    """Whether a value can be read without breaking a graph that is being compiled, or stalling a GPU's queue."""
+    return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
+
+
 class Vehicles(NamedTuple):
     """Fields of ``vehicles`` (:mod:`ganlane.keys`), each of shape [N, M] (or [N] for one vehicle per row)."""
 
@@ -44,11 +60,11 @@ class Vehicles(NamedTuple):
         """Vehicle ``index`` of every row, fields [N]."""
         return Vehicles(*(field[:, index] for field in self))
 
-    def columns(self, which: slice) -> Vehicles:
-        """A slice of the vehicles of every row, fields [N, K]."""
-        if which == slice(None):
-            return self
-        return Vehicles(*(field[:, which] for field in self))
+    def columns(self, which: slice | Tensor) -> Vehicles:
+        """A slice of the vehicles of every row, or those with the indices [N, K]; fields [N, K]."""
+        if isinstance(which, Tensor):
+            return Vehicles(*(field.gather(1, which) for field in self))
+        return self if which == slice(None) else Vehicles(*(field[:, which] for field in self))
 
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""

@@ -64,13 +64,14 @@ def start_braking(vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m:
     ``reaction_s`` [N, M].
     """
     scene = perceive(vehicles, road)
+    pairs = scene.pairs
     shares = in_lane(scene, scene.attention.low) | in_lane(scene, scene.attention.high)
-    ahead = shares & (scene.order > 0)
-    distance = torch.where(ahead, scene.distance, torch.inf)
+    ahead = shares & (pairs.order > 0)
+    distance = torch.where(ahead, pairs.distance, torch.inf)
     between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
     space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
     speed, leader_speed = vehicles.speed[:, :, None], vehicles.speed[:, None, :]
-    gap = scene.ahead - between * space - (speed - leader_speed).clamp_min(0.0) * reaction_s[..., None]
+    gap = pairs.ahead - between * space - (speed - leader_speed).clamp_min(0.0) * reaction_s[..., None]
     needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
     return torch.where(ahead, needed, 0.0).amax(-1)
 

@@ -171,11 +171,11 @@ class CalibratedLaneChange(Overlay):
 
     def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
         """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
-        vehicles = scene.vehicles
+        vehicles, pairs = scene.vehicles, scene.pairs
         target = vehicles.target_lane.to(lane.dtype)
         changing = (self.road.lane_of(vehicles.y) != target) & vehicles.valid
         changing = torch.cat((torch.zeros_like(changing[:, :1]), changing[:, 1:]), dim=1)
-        near = torch.minimum(scene.ahead, scene.behind) < self.changes.exclusive_m
+        near = torch.minimum(pairs.ahead, pairs.behind) < self.changes.exclusive_m
         return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
 
     def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:

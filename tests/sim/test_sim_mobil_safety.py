@@ -98,11 +98,11 @@ def new_demands(before: Vehicles, change: torch.Tensor, road: Road) -> tuple[tor
     leads = torch.zeros_like(attends)
     for lane in range(road.lanes):
         here = (scene.presence.low <= lane) & (lane <= scene.presence.high)
-        gap = torch.where(here[:, None, :], scene.ahead, FREE_GAP_M)
+        gap = torch.where(here[:, None, :], scene.pairs.ahead, FREE_GAP_M)
         nearest = (gap == gap.amin(-1, keepdim=True)) & (gap < FREE_GAP_M)
         leads |= nearest & (entered == lane)
     asked = idm_acceleration(
-        before.speed[:, :, None], before.desired_speed[:, :, None], scene.ahead, before.speed[:, None, :]
+        before.speed[:, :, None], before.desired_speed[:, :, None], scene.pairs.ahead, before.speed[:, None, :]
     )
     return asked, leads & attends & (change != 0)[:, None, :]
 

@@ -198,8 +198,8 @@ def courses(scene: str, lane: int) -> Figure:
     def make(road: Road) -> TrafficModule:
         return gan_calibrated_traffic(road, Stream.REPORT)
 
-    frame = read_scenes(default_scenes())
-    (recording,) = recordings_of(frame, scene_lane_widths(frame), [scene])
+    frame = read_scenes(default_scenes()).filter(pl.col("scene") == scene)
+    (recording,) = recordings_of(frame, scene_lane_widths(frame))
     driven = drive_recordings(make, [recording], StartOptions(desired_above_mps=11.0))
     return draw_space_time(scene, lane, {"recorded": recorded_frame([recording]), "gan_calibrated": driven})
 

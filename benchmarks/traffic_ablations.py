@@ -32,16 +32,7 @@ from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table
 from ganlane.files import write_json
-from ganlane.realism.long_runs import (
-    EventCounter,
-    GuardMeter,
-    LongRunParameters,
-    Trajectories,
-    batch_statistics,
-    drive_spawned,
-    summary,
-    watched,
-)
+from ganlane.realism.long_runs import LongRun, LongRunParameters, Trajectories
 from ganlane.runtime import keep_freed_memory
 from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
@@ -82,24 +73,17 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     Returns:
         The numbers of a long run, mean speed and its spread at the end, physics steps per CPU second.
     """
-    events, meter = EventCounter(Road()), GuardMeter()
-    parts: list[dict[str, Any]] = []
+    run = LongRun(Road(), parameters)
     ends: list[tuple[float, float]] = []
     seconds: list[float] = []
-    while sum(part["vehicle_km"] for part in parts) < parameters.vehicle_km:
+    while not run.finished:
         traffic = variant.make()
         clock = StepClock(traffic)
-        with watched(traffic, meter):
-            course = drive_spawned(traffic, parameters, batch * len(parts), batch, events)
-        parts.append(batch_statistics(course, Road()))
-        ends.append(speeds_at_the_end(course))
+        ends.append(speeds_at_the_end(run.drive(traffic, batch)))
         seconds += clock.seconds
-        if parts[-1]["vehicle_km"] <= 0.0:
-            break
-    numbers = summary(parts, events, meter, batch * len(parts), parameters.vehicles)
     mean, spread = (sum(values) / len(values) for values in zip(*ends))
     return {
-        **numbers,
+        **run.numbers(),
         "mean_speed_mps": mean,
         "spread_mps": spread,
         "physics_steps_per_cpu_s": batch / median(seconds),

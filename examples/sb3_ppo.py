@@ -1,8 +1,8 @@
 """PPO of stable-baselines3 on 256 highways at once, and its policy compared with MOBIL on the same episodes.
 
 ``python examples/sb3_ppo.py`` trains sb3-contrib's MaskablePPO behind the safe action mask for 3 M decisions, two
-minutes on one core; ``python examples/sb3_ppo.py 4500000 none PPO`` plain PPO without a mask, and ``... safe PPO`` a PPO
-that learns without one and drives behind it. Needs ``pip install 'ganlane[sb3]'``.
+minutes on one core. ``python examples/sb3_ppo.py 4500000 none PPO`` trains plain PPO without a mask; ``... safe PPO``
+trains it without one as well and lets it drive behind the mask. Needs ``pip install 'ganlane[sb3]'``.
 """
 
 import sys

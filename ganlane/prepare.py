@@ -41,7 +41,7 @@ _SHOWN_LEVELS: Final = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 def prepare(config: PrepareConfig, folder: Path) -> str:
     """Fetch where asked to, read, write, measure, report."""
-    from ganlane.data import ByteProgress, default_scenes, download, prepare_recordings
+    from ganlane.data import byte_progress, default_scenes, download, prepare_recordings
     from ganlane.evaluation import write_results
     from ganlane.files import write_bytes
     from ganlane.parameters.data import NgsimDataConfig
@@ -51,10 +51,10 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     source = Path(config.data.path) if config.data.path else default_scenes()
     parameters = config.data.parameters()
     if isinstance(config.data, NgsimDataConfig) and config.data.download:
-        with ByteProgress("download") as progress:
+        with byte_progress("download") as progress:
             download(config.data.url, source, config.data.sha256, progress)
     out = Path(config.out) if config.out else folder / "scenes"
-    with ByteProgress("read") as progress:
+    with byte_progress("read") as progress:
         prepared = prepare_recordings(config.data.format, source, out, parameters, config.scene_s, progress, _show)
     sheet = save_figure(draw_recordings(prepared.statistics), folder / "report.png")
     write_bytes(folder / "report.md", long_report(prepared, str(source), sheet.name).encode())

@@ -88,15 +88,15 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
 
 def _recordings(data: DataConfig) -> tuple[Path, pl.DataFrame]:
     """Path of the recordings, downloaded first if asked for, and all of their scenes."""
-    from ganlane.data import ByteProgress, default_scenes, download, read_recordings
+    from ganlane.data import byte_progress, default_scenes, download, read_recordings
 
     if data.format != "scenes" and data.path is None:
         raise UserError(f"data={data.format}: which file is missing; give data.path=FILE.")
     source = Path(data.path) if data.path else default_scenes()
     if isinstance(data, NgsimDataConfig) and data.download:
-        with ByteProgress("download") as progress:
+        with byte_progress("download") as progress:
             download(data.url, source, data.sha256, progress)
-    with ByteProgress("read") as progress:
+    with byte_progress("read") as progress:
         return source, read_recordings(data.format, source, data.parameters(), progress)
 
 

@@ -21,12 +21,14 @@ from ganlane.files import CHECKPOINTS, load_weights, save_weights
 from ganlane.generator import load_generator
 from ganlane.generator.fit import FitLoop
 from ganlane.generator.windows import cached, load_arrays, save_arrays
-from ganlane.parameters.generator import LoopConfig
+from ganlane.parameters.generator import LoopConfig, PaperConfig
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 
 
 class SmallFit:
     """As little as a loop can fit."""
+
+    config = PaperConfig(loop=LoopConfig(updates=1, evaluate_every=1))
 
     def __init__(self):
         self.modules = {"net": torch.nn.Linear(2, 2)}
@@ -41,7 +43,7 @@ class SmallFit:
 
 
 def fit(path: Path) -> FitLoop:
-    return FitLoop(SmallFit(), LoopConfig(updates=1, evaluate_every=1), path)
+    return FitLoop(SmallFit(), path)
 
 
 def copied(source: Path) -> Callable[[Path], None]:

@@ -8,7 +8,7 @@
 - ``prepare`` turns any recording into Parquet and pooled statistics.
 """
 
-from ganlane.data.download import ByteProgress, data_folder, default_scenes, download
+from ganlane.data.download import byte_progress, data_folder, default_scenes, download
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lanes import (
     Tracks,
@@ -20,7 +20,7 @@ from ganlane.data.lanes import (
 )
 from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.prepare import PooledStatistics, Preparation, SceneSummary, prepare_recordings, read_recordings
-from ganlane.data.scenes import read_scenes, write_prepared
+from ganlane.data.scenes import read_scenes, write_prepared, write_scene_csv
 from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, TRACK_STRIDE, RowCount, Scene, sort, validate
 from ganlane.data.statistics import (
     Bins,
@@ -30,7 +30,7 @@ from ganlane.data.statistics import (
     leader_gaps,
     survival_curve,
 )
-from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes, write_scene_csv
+from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes
 from ganlane.parameters.data import NgsimParameters
 
 __all__ = [
@@ -39,7 +39,6 @@ __all__ = [
     "TRACK",
     "TRACK_STRIDE",
     "Bins",
-    "ByteProgress",
     "DrivingStatistics",
     "Histogram",
     "NgsimParameters",
@@ -50,6 +49,7 @@ __all__ = [
     "SceneSummary",
     "SyntheticTraffic",
     "Tracks",
+    "byte_progress",
     "data_folder",
     "default_scenes",
     "download",

@@ -36,8 +36,8 @@ _PIECE_BYTES: Final = 2**18
 _SCHEMES: Final = ("http", "https")
 #: Larger files are refused, bytes: NGSIM's largest has 2 GB.
 MOST_BYTES: Final = 64 * 2**30
-#: Seconds between two progress lines where there is no terminal.
-LINE_EVERY_S: Final = 10.0
+#: Where there is no terminal, progress is shown from this time on and as rarely, s.
+_QUIET_S: Final = 10.0
 
 
 def data_folder() -> Path | None:
@@ -82,37 +82,6 @@ class _BrokenConnection(Exception):
     """The connection ended before the file did."""
 
 
-class _Part:
-    """The incomplete ``file`` ``.NAME.part`` next to ``path``, and a note of its version."""
-
-    def __init__(self, path: Path) -> None:
-        self.file = path.with_name(f".{path.name}.part")
-        self._note = path.with_name(f".{path.name}.part.json")
-
-    @property
-    def size(self) -> int:
-        """Bytes received so far."""
-        return self.file.stat().st_size if self.file.is_file() else 0
-
-    @property
-    def version(self) -> str | None:
-        """The server's identifier of the version; None where the download cannot be resumed."""
-        try:
-            version = json.loads(self._note.read_text())["version"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-        return version if isinstance(version, str) and not version.startswith("W/") else None
-
-    @version.setter
-    def version(self, version: str | None) -> None:
-        write_json(self._note, {"version": version})
-
-    def remove(self) -> None:
-        """Remove the incomplete file and its note."""
-        self.file.unlink(missing_ok=True)
-        self._note.unlink(missing_ok=True)
-
-
 def download(
     url: str,
     path: str | Path,
@@ -145,9 +114,13 @@ def download(
         _check_sha256(path, sha256, "remove it, or correct data.sha256")
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = _Part(path)
-    with name_in_errors(path, nameless=True):
-        _fetch(url, part, on_progress, timeout_s, attempts, wait_s, most_bytes)
+    part = _Part(url, path, most_bytes)
+    try:
+        _fetch(part, on_progress, timeout_s, attempts, wait_s)
+    except OSError as error:  # The disk's, for the network's are caught below.
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     try:
         _check_sha256(part.file, sha256, "it was removed; download again, or correct data.sha256")
     except UserError:
@@ -158,36 +131,68 @@ def download(
     return path
 
 
-def _fetch(
-    url: str,
-    part: _Part,
-    on_progress: OnProgress | None,
-    timeout_s: float,
-    attempts: int,
-    wait_s: float,
-    most_bytes: int,
-) -> None:
+class _Part:
+    """The incomplete file ``.NAME.part`` of ``url`` next to ``path``, and a note of its version."""
+
+    def __init__(self, url: str, path: Path, most_bytes: int) -> None:
+        self.url, self.most_bytes = url, most_bytes
+        self.file = path.with_name(f".{path.name}.part")
+        self._note = path.with_name(f".{path.name}.part.json")
+
+    @property
+    def size(self) -> int:
+        """Bytes received so far."""
+        return self.file.stat().st_size if self.file.is_file() else 0
+
+    @property
+    def version(self) -> str | None:
+        """The server's identifier of the version; None where the download cannot be resumed."""
+        try:
+            version = json.loads(self._note.read_text())["version"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return version if isinstance(version, str) and not version.startswith("W/") else None
+
+    @version.setter
+    def version(self, version: str | None) -> None:
+        write_json(self._note, {"version": version})
+
+    def check_size(self, size: int) -> None:
+        """Refuse more bytes than wanted; what came of them is removed."""
+        if size > self.most_bytes:
+            self.remove()
+            raise UserError(
+                f"{self.url}: the file has {size / 1e9:.3g} GB or more, more than {self.most_bytes / 1e9:.3g}; check "
+                "data.url, or fetch it yourself and give data.path."
+            )
+
+    def remove(self) -> None:
+        """Remove the incomplete file and its note."""
+        self.file.unlink(missing_ok=True)
+        self._note.unlink(missing_ok=True)
+
+
+def _fetch(part: _Part, on_progress: OnProgress | None, timeout_s: float, attempts: int, wait_s: float) -> None:
     """Connect until the file is complete; give up after ``attempts`` connections in a row that bring nothing."""
     failures = 0
     while True:
         before = part.size
         try:
-            _connect(url, part, on_progress, timeout_s, most_bytes)
+            _connect(part, on_progress, timeout_s)
             return
         except urllib.error.HTTPError as error:
             if error.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and before:
                 part.remove()  # It is longer than the file, so it is of another version.
             elif error.code < 500:
-                raise UserError(
-                    f"{url}: the server says {error.code} {' '.join(str(error.reason).split())}; check data.url."
-                ) from error
+                what = f"{error.code} {' '.join(str(error.reason).split())}"
+                raise UserError(f"{part.url}: the server says {what}; check data.url.") from error
             reason = f"{error.code} {error.reason}"
         except _BrokenConnection as error:
             reason = str(error)
         failures = 0 if part.size > before else failures + 1
         if failures >= attempts:
             raise UserError(
-                f"{url}: cannot be fetched, {part.size} bytes came ({reason}); check the network and run the "
+                f"{part.url}: cannot be fetched, {part.size} bytes came ({reason}); check the network and run the "
                 "command again, it continues from there."
             )
         if failures:
@@ -206,26 +211,25 @@ class _HttpOnly(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: float, most_bytes: int) -> None:
+def _connect(part: _Part, on_progress: OnProgress | None, timeout_s: float) -> None:
     """One connection: the rest of the file, or all of it."""
-    received, version = part.size, part.version
+    received, headers = part.size, {"User-Agent": "ganlane", "Accept-Encoding": "identity"}
+    if received and (version := part.version):
+        headers |= {"Range": f"bytes={received}-", "If-Range": version}
     with _network_errors():
-        request = urllib.request.Request(url, headers={"User-Agent": "ganlane", "Accept-Encoding": "identity"})
-    if received and version:
-        request.add_header("Range", f"bytes={received}-")
-        request.add_header("If-Range", version)
-    with _network_errors():
+        request = urllib.request.Request(part.url, headers=headers)
         answer = urllib.request.build_opener(_HttpOnly).open(request, timeout=timeout_s)
     with answer:
         resumes = answer.status == http.HTTPStatus.PARTIAL_CONTENT
-        if resumes and _range_start(answer) != received:
+        # Content-Range is ``bytes 100-199/200``.
+        if resumes and not (answer.headers.get("Content-Range") or "").startswith(f"bytes {received}-"):
             part.remove()
             raise _BrokenConnection("the server sent another part than the one asked for")
         received = received if resumes else 0
         length = (answer.headers.get("Content-Length") or "").strip()
         # A length that is no number tells nothing; 19 digits are more bytes than there are.
         total = received + int(length[:19]) if length.isdecimal() else None
-        _check_size(url, part, max(received, total or 0), most_bytes)
+        part.check_size(max(received, total or 0))
         if not resumes:
             part.version = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
         with part.file.open("ab" if received else "wb") as file:
@@ -234,23 +238,13 @@ def _connect(url: str, part: _Part, on_progress: OnProgress | None, timeout_s: f
                     piece = answer.read1(_PIECE_BYTES)
                 if not piece:
                     break
-                _check_size(url, part, received + len(piece), most_bytes)
-                file.write(piece)
                 received += len(piece)
+                part.check_size(received)
+                file.write(piece)
                 if on_progress is not None:
                     on_progress(received, total)
     if total is not None and received < total:
         raise _BrokenConnection(f"{received} of {total} bytes came")
-
-
-def _check_size(url: str, part: _Part, size: int, most_bytes: int) -> None:
-    """Refuse more bytes than wanted; what came of them is removed."""
-    if size > most_bytes:
-        part.remove()
-        raise UserError(
-            f"{url}: the file has {size / 1e9:.3g} GB or more, more than {most_bytes / 1e9:.3g}; check data.url, or "
-            "fetch it yourself and give data.path."
-        )
 
 
 @contextmanager
@@ -263,13 +257,6 @@ def _network_errors() -> Iterator[None]:
     # A ValueError comes from an address that is none.
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise _BrokenConnection(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
-
-
-def _range_start(answer: http.client.HTTPResponse) -> int | None:
-    """First byte of the answer, by its Content-Range: ``bytes 100-199/200``."""
-    _, _, place = (answer.headers.get("Content-Range") or "").partition("bytes ")
-    start = place.partition("-")[0]
-    return int(start) if start.isdigit() else None
 
 
 def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
@@ -285,63 +272,15 @@ def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
 
 
 @contextmanager
-def name_in_errors(path: Path, nameless: bool = False) -> Iterator[None]:
-    """Make OSErrors name ``path``, which the user gave, instead of its temporary counterpart ``.NAME....``.
+def byte_progress(what: str) -> Iterator[OnProgress]:
+    """Shows bytes done, rate and time left on stderr; without a terminal only what takes more than 10 s."""
+    quiet_s = 0.0 if sys.stderr.isatty() else _QUIET_S
+    with tqdm(
+        desc=what, unit="B", unit_scale=True, file=sys.stderr, delay=quiet_s, mininterval=max(0.1, quiet_s)
+    ) as bar:
 
-    With ``nameless``, errors without a file name, as those of a write, name ``path`` too.
-    """
-    try:
-        yield
-    except OSError as error:
-        known = path if nameless and error.filename is None else _final_path(error.filename, path)
-        if known is None or error.errno is None:
-            raise
-        raise OSError(error.errno, error.strerror, str(known)) from error
+        def show(done: int, total: int | None) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
 
-
-def _final_path(temporary: str | None, path: Path) -> Path | None:
-    """``path``, or a file in it, for the name of its temporary counterpart; None for any other file."""
-    if not isinstance(temporary, str):
-        return None
-    place, full = Path(os.path.abspath(path)).parent, Path(os.path.abspath(temporary))
-    if not full.is_relative_to(place) or full == place:
-        return None
-    hidden, *inside = full.relative_to(place).parts
-    return path.joinpath(*inside) if hidden.startswith(f".{path.name}.") else None
-
-
-class ByteProgress:
-    """Context that shows bytes done, rate and time left: a bar on a terminal, elsewhere a line every 10 s."""
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._bar: tqdm | None = None
-        self._begun = time.monotonic()
-        self._last_line = self._begun
-        self._first: int | None = None
-
-    def __call__(self, done: int, total: int | None) -> None:
-        """Show the bytes done so far, of a ``total`` where that is known."""
-        self._first = done if self._first is None else self._first
-        if sys.stderr.isatty():
-            self._bar = self._bar or tqdm(
-                total=total, initial=done, desc=self._what, unit="B", unit_scale=True, file=sys.stderr
-            )
-            self._bar.update(done - self._bar.n)
-        elif time.monotonic() - self._last_line >= LINE_EVERY_S:
-            self._last_line = time.monotonic()
-            print(self.line(done, total), file=sys.stderr, flush=True)
-
-    def line(self, done: int, total: int | None) -> str:
-        """``read: 120 of 1200 MB, 40.0 MB/s, 27 s left``."""
-        rate = (done - (self._first or 0)) / max(time.monotonic() - self._begun, 1e-3)
-        share = f"{done / 1e6:.0f} MB" if total is None else f"{done / 1e6:.0f} of {total / 1e6:.0f} MB"
-        left = f", {(total - done) / rate:.0f} s left" if total is not None and rate > 0.0 else ""
-        return f"{self._what}: {share}, {rate / 1e6:.1f} MB/s{left}"
-
-    def __enter__(self) -> ByteProgress:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        yield show

@@ -20,7 +20,7 @@ import polars as pl
 
 from ganlane.data.lanes import Flags, Floats, Integers
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, number_tracks, sort, validate
-from ganlane.data.tables import FIRST_LINE, LINE, convert, csv_table, raise_where, read_blocks, read_table
+from ganlane.data.tables import LINE, raise_where, read_table
 from ganlane.errors import UserError
 
 _TRACKS: Final = "_tracks.csv"
@@ -83,15 +83,16 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
 
 def _read_recording_meta(path: Path) -> tuple[float, tuple[_Direction, _Direction]]:
     """Frame rate in Hz, and both directions. Lane ids grow downwards; the id between the directions is unused."""
-    columns = {"frameRate": pl.Float64, "upperLaneMarkings": pl.String, "lowerLaneMarkings": pl.String}
+    columns = {"framerate": pl.Float64, "upperlanemarkings": pl.String, "lowerlanemarkings": pl.String}
     row = read_table(path, columns).row(0, named=True)
-    if row["frameRate"] < 10.0:
-        raise UserError(f"{path}, line 2, column frameRate: {row['frameRate']}, expected 10 Hz or more.")
-    upper, lower = (_markings(row[name], path, name) for name in ("upperLaneMarkings", "lowerLaneMarkings"))
+    rate_hz = row["framerate"]
+    if rate_hz < 10.0:
+        raise UserError(f"{path}, line 2, column framerate: {rate_hz}, expected 10 Hz or more.")
+    upper, lower = (_markings(row[name], path, name) for name in ("upperlanemarkings", "lowerlanemarkings"))
     n_upper, n_lower = len(upper) - 1, len(lower) - 1
     upper_ids = tuple(range(2, 2 + n_upper))
     lower_ids = tuple(range(n_upper + 2 + n_lower, n_upper + 2, -1))
-    return row["frameRate"], (
+    return rate_hz, (
         _Direction(UPPER, upper_ids, upper[0], (upper[-1] - upper[0]) / n_upper),
         _Direction(LOWER, lower_ids, lower[-1], (lower[-1] - lower[0]) / n_lower),
     )
@@ -105,26 +106,18 @@ def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
         found = ()
     if len(found) < 2 or any(b <= a for a, b in pairwise(found)):
         raise UserError(
-            f"{path}, line {FIRST_LINE}, column {column}: {text!r}; "
-            "expected two or more growing numbers separated by ;"
+            f"{path}, line 2, column {column}: {text!r}; expected two or more growing numbers separated by ;"
         )
     return found
 
 
 def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     """Rows of a recording, sorted by vehicle and frame; ``direction`` is its vehicle's in the ``meta`` file."""
-    table = read_table(meta, {"id": pl.Int64, "drivingDirection": pl.Int64})
-    direction = table["drivingDirection"]
+    table = read_table(meta, {"id": pl.Int64, "drivingdirection": pl.Int64})
+    direction = table["drivingdirection"]
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
-    raise_where(~direction.is_in([UPPER, LOWER]), direction, meta, what)
-    direction_of = dict(table.iter_rows())
-    blocks = []
-    for text in read_blocks(csv_table(path, COLUMNS), list(COLUMNS)):
-        columns = [convert(text[name], kind, path, text[LINE]) for name, kind in COLUMNS.items()]
-        blocks.append(pl.DataFrame([*columns, text[LINE]]))
-    if not blocks:
-        raise UserError(f"{path}: a header but no rows; copy or unpack the recording again.")
-    rows = pl.concat(blocks)
+    raise_where(~direction.is_in([UPPER, LOWER]), direction, meta, what, table[LINE])
+    rows = read_table(path, COLUMNS)
     count.read += rows.height
     lines = rows[LINE]
     for name in ("width", "height"):
@@ -132,7 +125,7 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
     what = "is not after the last frame of its vehicle; frames must grow"
     raise_where(step <= 0, rows["frame"], path, what, lines)
-    directions = rows["id"].replace_strict(direction_of, default=None, return_dtype=pl.Int64)
+    directions = rows["id"].replace_strict(table["id"], direction, default=None, return_dtype=pl.Int64)
     raise_where(directions.is_null(), rows["id"], path, "is not in the tracksMeta file", lines)
     return rows.with_columns(directions.alias("direction")).sort("id", "frame")
 
@@ -147,27 +140,12 @@ def _scene(
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
-    tracks = number_tracks(_in_driving_direction(rows, direction, name), str(path))
-    begins = (tracks["vehicle"].diff() != 0).fill_null(True).to_numpy()
-    new = resample(begins, tracks["frame"].to_numpy(), rate_hz)
-    columns = {name: tracks[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
-    columns["frame"] = new.frame
-    columns |= {name: new.linear(tracks[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
-    columns["lane"] = new.nearest(tracks["lane"].to_numpy())
-    frame = pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
-    if frame.is_empty():
-        return None
-    return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
-
-
-def _in_driving_direction(rows: pl.DataFrame, direction: _Direction, name: str) -> pl.DataFrame:
-    """The schema's coordinates and lanes, at the recorded frame rate."""
     forward = -1.0 if direction.number == UPPER else 1.0
     along = forward * (pl.col("x") + 0.5 * pl.col("width"))
     # Upper lanes: left is down in the image, where y grows; lower lanes: left is up.
     left = -forward * (pl.col("y") + 0.5 * pl.col("height") - direction.right_edge)
     numbers = {lane_id: lane for lane, lane_id in enumerate(direction.lane_ids)}
-    return rows.select(
+    turned = rows.select(
         pl.lit(name).alias("scene"),
         pl.col("id").alias("vehicle"),
         "frame",
@@ -178,6 +156,17 @@ def _in_driving_direction(rows: pl.DataFrame, direction: _Direction, name: str) 
         length="width",
         width="height",
     )
+    tracks = number_tracks(turned, str(path))
+    begins = (tracks["vehicle"].diff() != 0).fill_null(True).to_numpy()
+    new = resample(begins, tracks["frame"].to_numpy(), rate_hz)
+    columns = {name: tracks[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
+    columns["frame"] = new.frame
+    columns |= {name: new.linear(tracks[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
+    columns["lane"] = new.nearest(tracks["lane"].to_numpy())
+    frame = pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
+    if frame.is_empty():
+        return None
+    return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
 
 
 class Resampling(NamedTuple):

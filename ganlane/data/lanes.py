@@ -48,11 +48,7 @@ SEARCH_S: Final = 20.0
 
 
 def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
-    """Lane width in metres of every scene of a frame in the schema.
-
-    Raises:
-        UserError: a scene's lanes are less than 2 m or more than 6 m apart, or numbered from the left.
-    """
+    """Lane width in metres of every scene of a frame in the schema; errors are :func:`lane_width`'s."""
     return {
         str(name): lane_width(rows["y"].to_numpy(), rows["lane"].to_numpy(), str(name))
         for (name,), rows in frame.group_by("scene", maintain_order=True)
@@ -65,7 +61,7 @@ def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
     return {str(scene): int(lanes) for scene, lanes in counts.iter_rows()}
 
 
-def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> float:
+def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
     """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number.
 
     The first estimate is the median slope between the median positions of each pair of lanes (Theil and Sen), which
@@ -92,7 +88,7 @@ def lane_width(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "sc
     return guess if low <= guess <= high else 0.5 * (low + high)
 
 
-def lane_grid(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "scene") -> tuple[float, float]:
+def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
     """Lane width (:func:`lane_width`) and position of lane 0's centre, both m, where ``y`` has any origin.
 
     Each lane's median position gives an estimate of the centre; their median is returned.
@@ -106,7 +102,7 @@ def lane_grid(y: NDArray[np.float64], lane: NDArray[np.int64], scene: str = "sce
     return lane_width(y - centre, lane, scene), centre
 
 
-def _best_range(y: NDArray[np.float64], lane: NDArray[np.int64], guess: float) -> tuple[float, float]:
+def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
     """Widths within 10 % of the guess that most rows agree with; of several ranges, the nearest to the guess."""
     # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no upper end.
     begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5))
@@ -120,7 +116,7 @@ def _best_range(y: NDArray[np.float64], lane: NDArray[np.int64], guess: float) -
     return float(edges[nearest]), float(edges[nearest + 1])
 
 
-def _median_spacing(y: NDArray[np.float64], lane: NDArray[np.int64]) -> float | None:
+def _median_spacing(y: Floats, lane: Integers) -> float | None:
     """Median slope between the lanes' median positions; None with fewer than two lanes."""
     numbers, centres = _centres(y, lane)
     if len(numbers) < 2:
@@ -129,7 +125,7 @@ def _median_spacing(y: NDArray[np.float64], lane: NDArray[np.int64]) -> float | 
     return float(np.median((centres[other] - centres[one]) / (numbers[other] - numbers[one])))
 
 
-def _centres(y: NDArray[np.float64], lane: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _centres(y: Floats, lane: Integers) -> tuple[Integers, Floats]:
     """Lanes with enough rows, and their median positions."""
     numbers, rows = np.unique(lane, return_counts=True)
     numbers = numbers[rows >= _FEWEST_ROWS]
@@ -138,19 +134,17 @@ def _centres(y: NDArray[np.float64], lane: NDArray[np.int64]) -> tuple[NDArray[n
 
 @dataclass(frozen=True)
 class Tracks:
-    """R samples of any number of tracks, track by track; a missing sample ends a track.
+    """R samples, 0.1 s apart, of any number of tracks, track by track; a missing sample ends a track.
 
     Attributes:
         y: [R] m; lane k's centre is at ``k * lane_width``.
         lane_width: [R] m.
         begins: [R] true at the first sample of each track.
-        step_s: time between two samples.
     """
 
     y: Floats
     lane_width: Floats
     begins: Flags
-    step_s: float = FRAME_S
 
     @property
     def lane(self) -> Integers:
@@ -227,44 +221,28 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     part = (boundary - tracks.y[sample]) / (tracks.y[sample + 1] - tracks.y[sample])
     start, start_found = _find_end(tracks, sample, side, old, -1)
     end, end_found = _find_end(tracks, sample + 1, side, new, 1)
-    tau_s = (sample - start + part) * tracks.step_s
-    tau_e = (end - sample - part) * tracks.step_s
+    tau_s = (sample - start + part) * FRAME_S
+    tau_e = (end - sample - part) * FRAME_S
     moved = side * (tracks.y[end] - tracks.y[start])
     return LaneChanges(sample, old, new, tau_s, tau_e, ~start_found, ~end_found, moved / (tau_s + tau_e))
 
 
-def lane_changes_of_arrays(
-    y: ArrayLike,
-    lane_width: float,
-    valid: ArrayLike | None = None,
-    begins: ArrayLike | None = None,
-    step_s: float = FRAME_S,
-) -> tuple[LaneChanges, Integers]:
-    """Lane changes of a simulation, and [C, 2] the (time, column) of each one's ``sample``.
+def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
+    """Lane changes of a simulation: ``y`` [T, K] are the lateral positions, m, of K vehicles every 0.1 s.
 
-    Args:
-        y: [T, K] lateral positions, m, of K vehicles at T samples.
-        valid: [T, K] where there is a vehicle; everywhere by default.
-        begins: [T, K] true where the column continues with another vehicle; the first valid sample after a gap always
-            begins a track.
+    ``sample`` counts vehicle by vehicle.
     """
     columns = np.asarray(y, dtype=np.float64).T
-    present = np.ones(columns.shape, bool) if valid is None else np.asarray(valid, bool).T
-    starts = present.copy()
-    starts[:, 1:] &= ~present[:, :-1]
-    if begins is not None:
-        starts |= np.asarray(begins, bool).T
-    column, time = np.nonzero(present)
-    widths = np.full(len(time), float(lane_width))
-    changes = find_lane_changes(Tracks(columns[present], widths, starts[present], step_s))
-    return changes, np.stack((time, column), axis=1)[changes.sample]
+    begins = np.zeros(columns.shape, bool)
+    begins[:, 0] = True
+    return find_lane_changes(Tracks(columns.ravel(), np.full(columns.size, lane_width), begins.ravel()))
 
 
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:
     """[C] last samples in an old lane, where both the old and the new lane are kept long enough."""
     starts_run = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
     lengths = np.diff(np.flatnonzero(starts_run), append=len(lane))
-    long_enough = lengths >= round(HOLD_S / tracks.step_s)
+    long_enough = lengths >= round(HOLD_S / FRAME_S)
     run = np.cumsum(starts_run) - 1
     after = np.flatnonzero(starts_run & ~tracks.begins)
     return after[long_enough[run[after]] & long_enough[run[after - 1]]] - 1
@@ -278,7 +256,7 @@ def _find_end(
     Returns:
         [C] the samples, or the first or last samples of their tracks; and [C] whether the end lies within the track.
     """
-    reach = round(SEARCH_S / tracks.step_s)
+    reach = round(SEARCH_S / FRAME_S)
     limit = (tracks.first if direction < 0 else tracks.last)[sample]
     path = sample[:, None] + direction * np.arange(reach + 1)
     inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
@@ -293,7 +271,7 @@ def _find_end(
 
 def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
     """Mean lateral speed over 1 s, centred at the samples ``at``, m/s; the window is shorter at a track's ends."""
-    half = round(SPEED_HALF_WINDOW_S / tracks.step_s)
+    half = round(SPEED_HALF_WINDOW_S / FRAME_S)
     before = np.maximum(at - half, tracks.first[at])
     after = np.minimum(at + half, tracks.last[at])
-    return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * tracks.step_s)
+    return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * FRAME_S)

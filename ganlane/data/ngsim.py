@@ -15,8 +15,8 @@ one period, never the file, and tracks that extend over several blocks are not c
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -31,7 +31,6 @@ from ganlane.data.tables import (
     convert,
     csv_table,
     first_line,
-    is_number,
     raise_where,
     read_blocks,
 )
@@ -76,24 +75,6 @@ PACE: Final = (0.94, 1.06)
 _PACE_FRAMES, _PACE_FT_S = 20, 10.0
 
 
-@dataclass(frozen=True)
-class _Period:
-    """Rows of one location and recording period, in the files where they are stored."""
-
-    location: str
-    number: int
-    parts: list[Path]
-
-    @property
-    def name(self) -> str:
-        """``us-101-1`` for the first period of US-101."""
-        return f"{self.location}-{self.number}"
-
-    def read(self) -> pl.DataFrame:
-        """All its rows, not sorted."""
-        return pl.concat([pl.read_ipc(part) for part in self.parts])
-
-
 def ngsim_scenes(
     path: str | Path,
     parameters: NgsimParameters | None = None,
@@ -120,8 +101,8 @@ def ngsim_scenes(
         if not periods:
             places = ", ".join(parameters.locations)
             raise UserError(f"{path}: no rows of {places}; check data.locations.")
-        for period in periods:
-            scene = _scene(period, path, parameters.lanes, count)
+        for name, parts in periods.items():
+            scene = _scene(name, _read(parts), path, parameters.lanes, count)
             if scene is not None:
                 yield scene
 
@@ -130,7 +111,7 @@ def _layout(path: Path) -> TextTable:
     """Raw text if the first line begins with a number and has no comma, else a CSV with a header."""
     first = first_line(path)
     fields = first.split()
-    if "," in first or not is_number(fields[0]):
+    if "," in first or not fields[0].replace(".", "", 1).isdecimal():
         return csv_table(path, COLUMNS)
     if len(fields) != len(RAW_NAMES):
         raise UserError(
@@ -146,7 +127,6 @@ def _read_rows(
     """Blocks with :data:`COLUMNS`, ``location`` and ``line``, in feet, in the order of the file."""
     path, has_location = table.path, LOCATION in table.names
     wanted = [*COLUMNS, LOCATION] if has_location else list(COLUMNS)
-    last_row = pl.DataFrame()
     for text in read_blocks(table, wanted, parameters.block_bytes, on_progress):
         count.read += text.height
         if has_location:
@@ -158,11 +138,7 @@ def _read_rows(
         for name in ("v_length", "v_width"):
             raise_where(columns[name] <= 0.0, columns[name], path, "is not above 0", lines)
         raise_where(columns["v_vel"] < 0.0, columns["v_vel"], path, "is below 0", lines)
-        rows = pl.DataFrame([*columns.values(), text[LOCATION], lines])
-        if table.blanks:
-            _check_raw_order(last_row.vstack(rows) if last_row.height else rows, path)
-            last_row = rows.tail(1)
-        yield rows
+        yield pl.DataFrame([*columns.values(), text[LOCATION], lines])
 
 
 def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount) -> pl.DataFrame:
@@ -177,18 +153,8 @@ def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], 
     return text.with_columns(found).filter(kept)
 
 
-def _check_raw_order(rows: pl.DataFrame, path: Path) -> None:
-    """In the raw files the rows of a vehicle are in the order of time."""
-    same_vehicle = pl.col("vehicle_id").diff() == 0
-    # In concatenated files the same vehicle number may follow itself, in another period.
-    same_period = pl.col("global_time").diff().abs() < MINUTE_MS
-    backwards = rows.select(same_vehicle & same_period & (pl.col("frame_id").diff() < 0)).to_series()
-    what = "is before the last frame of its vehicle; frames must grow"
-    raise_where(backwards, rows["frame_id"], path, what, rows[LINE])
-
-
-def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) -> list[_Period]:
-    """Store the rows of all blocks under ``folder`` and return the periods, by location and time."""
+def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) -> dict[str, list[Path]]:
+    """Store the rows of all blocks under ``folder``; the files of each period, by its name: ``us-101-1``."""
     parts: dict[tuple[str, int], list[Path]] = {}
     start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // MINUTE_MS
     for number, block in enumerate(blocks):
@@ -201,37 +167,33 @@ def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) 
                 f"{source}, columns global_time and frame_id: they hold {len(parts)} recording periods or more; "
                 "expected global_time in milliseconds and frame_id in steps of 100 ms."
             )
-    periods: list[_Period] = []
+    periods: dict[str, list[Path]] = {}
+    numbers = Counter[str]()
     for location, minute in sorted(parts):
-        files = parts[location, minute]
-        if (location, minute - 1) in parts:
-            periods[-1].parts.extend(files)
-        else:
-            number = 1 + sum(period.location == location for period in periods)
-            periods.append(_Period(location, number, files))
-    for period in periods:
-        has_others = sum(other.location == period.location for other in periods) > 1
-        if has_others and len(period.parts) == 1:
-            _check_size(period, source)
+        numbers[location] += (location, minute - 1) not in parts
+        periods.setdefault(f"{location}-{numbers[location]}", []).extend(parts[location, minute])
+    for name, files in periods.items():
+        location = name.rpartition("-")[0]
+        # A few rows that make a period of their own have a wrong time or frame.
+        if numbers[location] > 1 and len(files) == 1 and (rows := _read(files)).height < MIN_ROWS:
+            first = rows.sort(LINE).row(0, named=True)
+            raise UserError(
+                f"{source}, line {first[LINE]}, columns frame_id and global_time: frame {first['frame_id']} at "
+                f"{first['global_time']} ms fits no recording period of {location} ({rows.height} rows alone); "
+                "correct or remove the row."
+            )
     return periods
 
 
-def _check_size(period: _Period, source: str) -> None:
-    """A few rows that make a period of their own have a wrong time or frame."""
-    rows = period.read()
-    if rows.height < MIN_ROWS:
-        first = rows.sort(LINE).row(0, named=True)
-        raise UserError(
-            f"{source}, line {first[LINE]}, columns frame_id and global_time: frame {first['frame_id']} at "
-            f"{first['global_time']} ms fits no recording period of {period.location} ({rows.height} rows alone); "
-            "correct or remove the row."
-        )
+def _read(parts: list[Path]) -> pl.DataFrame:
+    """The rows of a period, not sorted."""
+    return pl.concat([pl.read_ipc(part) for part in parts])
 
 
-def _scene(period: _Period, path: Path, lanes: int, count: RowCount) -> Scene | None:
-    """One period in the schema; None where none of its rows is on a lane."""
-    source = f"{path}, {period.name}"
-    rows = _drop_duplicates(period.read(), count)
+def _scene(name: str, rows: pl.DataFrame, path: Path, lanes: int, count: RowCount) -> Scene | None:
+    """The ``rows`` of one period in the schema; None where none of them is on a lane."""
+    source = f"{path}, {name}"
+    rows = _drop_duplicates(rows, count)
     _check_order(rows, path)
     _check_units(rows, source)
     count.drop("lane below 1", int((rows["lane_id"] < 1).sum()))
@@ -246,7 +208,7 @@ def _scene(period: _Period, path: Path, lanes: int, count: RowCount) -> Scene | 
     width, first_centre = lane_grid(right_m[part], from_left[part], source)
     last = int(from_left.max())
     frame = rows.select(
-        pl.lit(period.name).alias("scene"),
+        pl.lit(name).alias("scene"),
         pl.col("vehicle_id").alias("vehicle"),
         pl.col("frame_id").alias("frame"),
         x=FOOT_M * (pl.col("local_y") - 0.5 * pl.col("v_length")),
@@ -256,7 +218,7 @@ def _scene(period: _Period, path: Path, lanes: int, count: RowCount) -> Scene | 
         length=FOOT_M * pl.col("v_length"),
         width=FOOT_M * pl.col("v_width"),
     )
-    return Scene(period.name, sort(number_tracks(frame, str(path))).select(SCHEMA.names()), width)
+    return Scene(name, sort(number_tracks(frame, str(path))).select(SCHEMA.names()), width)
 
 
 def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:

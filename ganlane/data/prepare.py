@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from ganlane.data.download import name_in_errors
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lanes import LaneChanges, find_lane_changes, tracks_of_frame
 from ganlane.data.ngsim import ngsim_scenes
@@ -282,13 +281,18 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
     if path.is_file() or (path.is_dir() and any(path.iterdir())):
         raise UserError(f"{path}: there already; choose another folder with out=FOLDER, or remove it.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with name_in_errors(path):
-        part = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part"))
-        try:
-            yield part
-            part.chmod(0o755)
-            if path.is_dir():
-                path.rmdir()
-            part.replace(path)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)  # of a killed process that had the same number
+        part.mkdir()
+        yield part
+        if path.is_dir():
+            path.rmdir()
+        part.replace(path)
+    except OSError as error:
+        name = str(error.filename)
+        if not name.startswith(str(part)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path) + name.removeprefix(str(part))) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

@@ -17,9 +17,9 @@ import polars as pl
 from ganlane.checksums import PLACE, has_checksum, sealed
 from ganlane.data.lanes import lane_width, scene_lane_widths
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
-from ganlane.data.tables import raise_where, read_table, reason
+from ganlane.data.tables import LINE, raise_where, read_table, reason
 from ganlane.errors import UserError
-from ganlane.files import write_bytes
+from ganlane.files import atomic_path, write_bytes
 
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0 at the centre of
 #: lane 1, which is the leftmost.
@@ -59,6 +59,18 @@ def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
     write_bytes(path, sealed(file.getvalue()))
 
 
+def write_scene_csv(frame: pl.DataFrame, path: str | Path) -> None:
+    """Write a frame in the schema, with lanes of 3.5 m, as a scene CSV; lane 1 is the leftmost in use in a scene."""
+    with atomic_path(path) as part:
+        scene_csv(frame, pl.col("lane").max().over("scene"), 3.5).write_csv(part)
+
+
+def scene_csv(frame: pl.DataFrame, leftmost: pl.Expr, lane_width_m: float) -> pl.DataFrame:
+    """A frame in the schema as the columns of a scene CSV; ``leftmost`` is the number of the leftmost lane."""
+    y = pl.col("y") - leftmost * lane_width_m
+    return frame.with_columns(v=pl.col("speed"), lane=leftmost + 1 - pl.col("lane"), y=y).select(COLUMNS.keys())
+
+
 def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
     """Cut each recording into scenes of at most ``seconds``, so that some of them can be held out.
 
@@ -77,7 +89,7 @@ def parquet_name(scene: str) -> str:
 
 def _read_csv(path: Path) -> pl.DataFrame:
     table = read_table(path, COLUMNS).rename({"v": "speed"})
-    raise_where(table["lane"] < 1, table["lane"], path, "is below 1, the leftmost lane")
+    raise_where(table["lane"] < 1, table["lane"], path, "is below 1, the leftmost lane", table[LINE])
     rows = validate(table, str(path))
     scenes = []
     for (name,), scene in rows.group_by("scene"):

@@ -124,17 +124,15 @@ def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LI
         raise UserError(f"{source}: no column {', '.join(missing)}; expected {', '.join(SCHEMA)}.")
     if frame.is_empty():
         raise UserError(f"{source}: no rows; a recording with at least one vehicle was expected.")
-    frame = frame.select(_typed(frame[name], kind, source) for name, kind in SCHEMA.items())
+    for name, kind in SCHEMA.items():
+        try:
+            frame = frame.with_columns(frame[name].cast(kind))
+        except pl.exceptions.PolarsError as error:
+            raise UserError(f"{source}, column {name}: {frame[name].dtype} found, {kind} expected.") from error
+    frame = frame.select(SCHEMA.names())
     _check_rows(frame, source, first_line)
     _check_units(frame, source, first_line)
     return frame
-
-
-def _typed(column: pl.Series, kind: pl.DataType, source: str) -> pl.Series:
-    try:
-        return column.cast(kind)
-    except pl.exceptions.PolarsError as error:
-        raise UserError(f"{source}, column {column.name}: {column.dtype} found, {kind} expected.") from error
 
 
 def _place(source: str, row: int, first_line: int | None) -> str:
@@ -162,23 +160,18 @@ def _check_rows(frame: pl.DataFrame, source: str, first_line: int | None) -> Non
             raise UserError(f"{_place(source, rows[0], first_line)}, column {column}: {value} {what}.")
 
 
-def _check_frame_step(frame: pl.DataFrame, source: str, first_line: int | None) -> None:
-    """Refuse scenes in which most rows are further apart than a frame: nothing could be measured between them."""
+def _check_units(frame: pl.DataFrame, source: str, first_line: int | None) -> None:
+    """Frames, positions, speeds or sizes that cannot be in 0.1 s and metres; the first row that shows it is named."""
+    # With most rows further apart than a frame, nothing could be measured between them.
     steps = frame.select("scene", step=pl.col("frame").diff().over(TRACK)).with_row_index("row")
-    usual = pl.col("step").median().over("scene")
-    found = steps.filter((usual > 1) & (pl.col("step") > 1)).head(1)
-    if not found.is_empty():
-        row, scene, step = found.row(0)
+    far = steps.filter((pl.col("step").median().over("scene") > 1) & (pl.col("step") > 1)).head(1)
+    if not far.is_empty():
+        row, scene, step = far.row(0)
         raise UserError(
             f"{_place(source, row, first_line)}, column frame: most rows of scene {scene} come {step} frames after "
             f"their track's last one; expected {1 / FRAME_S:.0f} frames a second, numbered one by one: resample the "
             "recording."
         )
-
-
-def _check_units(frame: pl.DataFrame, source: str, first_line: int | None) -> None:
-    """Positions, speeds or sizes that cannot be in metres and seconds; the first row that shows it is named."""
-    _check_frame_step(frame, source, first_line)
     rates = pl.col("x").diff().over(TRACK) / (pl.col("frame").diff().over(TRACK) * FRAME_S)
     speed, length, rate = frame.select(pl.col("speed", "length").median(), rate=rates.median()).row(0)
     for column, median, bound, unit in (

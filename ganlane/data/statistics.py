@@ -226,13 +226,13 @@ def raw_accelerations(frame: pl.DataFrame) -> pl.Series:
     return steps["acceleration"].drop_nulls()
 
 
-def smoothed_accelerations(frame: pl.DataFrame, over_s: float = 1.0) -> pl.Series:
+def smoothed_accelerations(frame: pl.DataFrame) -> pl.Series:
     """Mean speed of one second minus the mean speed of the second before, per second, m/s2.
 
-    The filter is ``(x[t] - 2 x[t - k] + x[t - 2k]) / (k * 0.1 s)^2`` with ``k`` frames in ``over_s``: the true
-    acceleration weighted by a triangle of two seconds' width. A track of less than two seconds gives no value.
+    The filter is ``(x[t] - 2 x[t - 1 s] + x[t - 2 s]) / (1 s)^2``: the true acceleration weighted by a triangle of
+    two seconds' width. A track of less than two seconds gives no value.
     """
-    lag = round(over_s / FRAME_S)
+    lag = round(1.0 / FRAME_S)
     bend = (pl.col("x") - 2.0 * _earlier("x", lag) + _earlier("x", 2 * lag)) / (lag * FRAME_S) ** 2
     return frame.select(bend.alias("acceleration"))["acceleration"].drop_nulls()
 
@@ -251,17 +251,17 @@ def srlc(changes: int, vehicles: int, road_m: float) -> float:
     return changes / vehicles * 1000.0 / road_m
 
 
-def steps_between_changes(rate_per_km: float, speed_mps: float, step_s: float = FRAME_S) -> float:
-    """Equation 10's ``t_m``: mean time between two lane changes of a vehicle, in steps of ``step_s``.
+def steps_between_changes(rate_per_km: float, speed_mps: float) -> float:
+    """Equation 10's ``t_m``: mean time between two lane changes of a vehicle, in steps of 0.1 s.
 
     ``rate_per_km`` counts lane changes per vehicle-km and is above 0.
     """
-    return 1000.0 / (rate_per_km * speed_mps * step_s)
+    return 1000.0 / (rate_per_km * speed_mps * FRAME_S)
 
 
-def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact confidence interval of a Poisson mean after ``count`` events (Garwood 1936)."""
-    tail = 0.5 * (1.0 - level)
+def poisson_interval(count: int) -> tuple[float, float]:
+    """Exact 95 % confidence interval of a Poisson mean after ``count`` events (Garwood 1936)."""
+    tail = 0.5 * (1.0 - 0.95)
     low = gammaincinv(count, tail) if count else 0.0
     return float(low), float(gammaincinv(count + 1, 1.0 - tail))
 

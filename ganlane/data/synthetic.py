@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import polars as pl
 
 from ganlane.data.schema import FRAME_S, SCHEMA, sort
-from ganlane.files import atomic_path
 
 
 @dataclass(frozen=True)
@@ -41,31 +39,6 @@ def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> 
     traffic = traffic or SyntheticTraffic()
     scenes = [_scene(traffic, number, np.random.default_rng((seed, number))) for number in range(traffic.scenes)]
     return sort(pl.concat(scenes))
-
-
-def write_scene_csv(
-    frame: pl.DataFrame, path: str | Path, lane_width_m: float = SyntheticTraffic.lane_width_m
-) -> None:
-    """Write a frame in the schema as the scene CSV that :func:`ganlane.data.read_scenes` reads.
-
-    Lanes are counted from the left, and ``y`` is 0 at the centre of the leftmost; the heading is that of the path.
-    """
-    leftmost = pl.col("lane").max().over("scene")
-    ahead, aside = (pl.col(name).diff().over("scene", "vehicle") for name in ("x", "y"))
-    table = frame.select(
-        "scene",
-        "vehicle",
-        "frame",
-        pl.col("x").round(4),
-        (pl.col("y") - leftmost * lane_width_m).round(4).alias("y"),
-        pl.arctan2(aside, ahead).backward_fill().over("scene", "vehicle").fill_null(0.0).round(4).alias("heading"),
-        pl.col("speed").round(4).alias("v"),
-        leftmost + 1 - pl.col("lane"),
-        "length",
-        "width",
-    )
-    with atomic_path(path) as part:
-        table.write_csv(part)
 
 
 def _scene(traffic: SyntheticTraffic, number: int, random: np.random.Generator) -> pl.DataFrame:

@@ -1,13 +1,13 @@
 """Text tables as typed columns, with every error traced to its line and column.
 
-:func:`read_table` reads a small CSV file at once. :func:`read_blocks` reads a file of any size block by block, as
-text that :func:`convert` turns into numbers.
+Files are read block by block (:func:`read_blocks`), as text that :func:`convert` turns into numbers;
+:func:`read_table` does both for a CSV file that fits into memory.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -43,32 +43,30 @@ class TextTable:
 
 
 def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
-    """Read the named ``columns`` of a CSV file with a header, in file order, as :func:`convert` types them.
+    """The named ``columns`` of a CSV file, typed by :func:`convert`, and ``line``; rows in the order of the file.
 
     Raises:
         UserError: no such file, no text table, no rows, a missing column, or a field that is empty or not the
             number expected; the message names file, line and column.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; give the path of a CSV file.")
-    try:
-        text = pl.read_csv(path, infer_schema=False)
-    except pl.exceptions.NoDataError as error:
-        raise UserError(f"{path}: the file is empty; a CSV file with a header was expected.") from error
-    except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not a readable CSV table ({reason(error)}).") from error
-    _check_columns(columns, text.columns, path)
-    if text.is_empty():
+    blocks = [
+        pl.DataFrame([*(convert(text[name], kind, path, text[LINE]) for name, kind in columns.items()), text[LINE]])
+        for text in read_blocks(csv_table(path, columns), list(columns))
+    ]
+    if not blocks:
         raise UserError(f"{path}: a header but no rows; give a file with at least one row of data.")
-    return text.select(convert(text[name], kind, path) for name, kind in columns.items())
+    return pl.concat(blocks)
 
 
-def csv_table(path: str | Path, wanted: Mapping[str, Kind]) -> TextTable:
+def csv_table(path: Path, wanted: Iterable[str]) -> TextTable:
     """Layout of a CSV file according to its header line, which must hold the ``wanted`` columns in any case."""
-    path = Path(path)
     names = tuple(name.strip().lower() for name in _cells(first_line(path), f"{path}, line 1"))
-    _check_columns(wanted, names, path)
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise UserError(
+            f"{path}, line 1: no column {', '.join(missing)}; found {', '.join(names)}; expected {', '.join(wanted)}."
+        )
     return TextTable(path, names)
 
 
@@ -92,22 +90,12 @@ def reason(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
 
 
-def _check_columns(wanted: Mapping[str, Kind], found: Sequence[str], path: Path) -> None:
-    missing = [name for name in wanted if name not in found]
-    if missing:
-        raise UserError(
-            f"{path}, line 1: no column {', '.join(missing)}; found {', '.join(found)}; expected {', '.join(wanted)}."
-        )
-
-
-def convert(
-    text: pl.Series, kind: Kind, path: Path, lines: pl.Series | None = None, thousands: bool = False
-) -> pl.Series:
+def convert(text: pl.Series, kind: Kind, path: Path, lines: pl.Series, thousands: bool = False) -> pl.Series:
     """Convert one column of text to ``kind``.
 
     Args:
         kind: ``String``, ``Int64`` (a whole number; ``3.0`` counts as one) or ``Float64`` (a finite number).
-        lines: the line of each row, for messages; by default the rows follow a header.
+        lines: the line of each row, for messages.
         thousands: whether commas may separate thousands.
 
     Raises:
@@ -132,15 +120,14 @@ def convert(
     return numbers.cast(kind)
 
 
-def raise_where(bad: pl.Series, values: pl.Series, path: Path, what: str, lines: pl.Series | None = None) -> None:
+def raise_where(bad: pl.Series, values: pl.Series, path: Path, what: str, lines: pl.Series) -> None:
     """Raise a UserError that names the first row that is ``bad``, if there is one; null is not bad."""
     row = bad.fill_null(False).arg_max() if bad.any() else None
-    if row is None:
-        return
-    value = values[row]
-    field = "the field" if value in (None, "") else repr(value)
-    line = row + FIRST_LINE if lines is None else lines[row]
-    raise UserError(f"{path}, line {line}, column {values.name}: {field} {what}; correct or remove the row.")
+    if row is not None:
+        field = "the field" if values[row] in (None, "") else repr(values[row])
+        raise UserError(
+            f"{path}, line {lines[row]}, column {values.name}: {field} {what}; correct or remove the row."
+        )
 
 
 def read_blocks(
@@ -259,12 +246,3 @@ def _raise_at_bad_line(table: TextTable, block: bytes, number: int) -> None:
             raise UserError(
                 f"{place}, column {column}: the row ends after {found} of {expected} fields; correct or remove it."
             )
-
-
-def is_number(text: str) -> bool:
-    """Whether a field holds a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

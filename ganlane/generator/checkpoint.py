@@ -104,7 +104,10 @@ def _generator_of(path: str | Path, sizes: Any, tensors: Mapping[str, Tensor]) -
     """A generator of the stored sizes with the stored weights."""
     kinds = {field.name: type(field.default) for field in fields(GeneratorSizes)}
     complete = isinstance(sizes, dict) and set(kinds) - _ADDED_LATER <= set(sizes) <= set(kinds)
-    if not complete or not all(_is_size(value, kinds[name]) for name, value in sizes.items()):
+    # The bound keeps a damaged file from requesting all memory.
+    if not complete or not all(
+        isinstance(value, int) and 0 <= value <= 4096 and type(value) is kinds[name] for name, value in sizes.items()
+    ):
         raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(kinds)}); fit it again.")
     try:
         with torch.random.fork_rng(devices=[]):
@@ -115,8 +118,3 @@ def _generator_of(path: str | Path, sizes: Any, tensors: Mapping[str, Tensor]) -
             f"{path}: its weights do not have the shapes that its sizes {sizes} ask for; fit it again."
         ) from error
     return generator
-
-
-def _is_size(value: Any, kind: type) -> bool:
-    """A bool or an integer in a range that layers have, so that a damaged file cannot request all memory."""
-    return isinstance(value, int) and type(value) is kind and (kind is bool or 0 <= value <= 4096)

@@ -76,7 +76,6 @@ class ScoredFit:
     Long forecasts are made by the calibrated preset only, and only if a vehicle was recorded for long enough.
     """
 
-    task: Task
     loop: FitLoop
     short: HeldOut
     long: HeldOut | None
@@ -86,12 +85,12 @@ def fit_and_forecast(config: Config, split: Split, folder: Path, on_progress: On
     """Fit to ``split`` and forecast its held-out scenes; resumes from what ``folder`` holds."""
     task = fit_task(config, split)
     path = folder / f"{config.preset}_{fit_key(config, split)}.pt"
-    loop = FitLoop(task, config.loop, path)
+    loop = FitLoop(task, path)
     loop.run(on_progress)
     short = _forecasts(path, task, split, config.sizes.predicted, STRIDE)
     frames = OBSERVED_POSITIONS + LONG_STEPS
     far = isinstance(task, CalibratedTask) and any((each.present.sum(0) >= frames).any() for each in split.held_out)
-    return ScoredFit(task, loop, short, _forecasts(path, task, split, LONG_STEPS, LONG_STRIDE) if far else None)
+    return ScoredFit(loop, short, _forecasts(path, task, split, LONG_STEPS, LONG_STRIDE) if far else None)
 
 
 def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) -> HeldOut:
@@ -154,7 +153,7 @@ def cross_validate(
         fits.append(fit)
         if on_fold is not None:
             others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
-            on_fold(number, fit_result(fit.task, fit.loop, split, frame, source, {}, others))
+            on_fold(number, fit_result(fit.loop, split, frame, source, {}, others))
     scores: dict[str, Any] = {
         "splits": [split.names for split in splits],
         "open_loop": open_loop_scores(*pooled([fit.short for fit in fits])),

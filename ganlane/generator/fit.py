@@ -13,11 +13,11 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import polars as pl
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ganlane.checksums import has_checksum, note_without_checksum, sealed_archive
 from ganlane.data import TRACK, driving_statistics
@@ -57,31 +57,15 @@ class Progress:
 OnProgress = Callable[[Progress], None]
 
 
-class FitTask(Protocol):
-    """What a loop fits: networks, their optimisers, one update, one evaluation."""
-
-    modules: dict[str, nn.Module]
-    optimisers: dict[str, torch.optim.Optimizer]
-    random: torch.Generator
-
-    def update(self, number: int) -> dict[str, float]:
-        """Do update ``number`` and return its losses."""
-
-    def evaluate(self) -> float:
-        """Score on the validation scenes; lower is better."""
-
-
 class FitLoop:
     """Runs a task until it stops improving.
 
-    Args:
-        resume_path: file that keeps the state after every evaluation; the fit resumes from it if it exists.
-
-    ``seconds`` is the time that the updates took, in earlier runs of the same fit too.
+    ``resume_path`` keeps the state after every evaluation; the fit resumes from it if it exists. ``seconds`` is the
+    time that the updates took, in earlier runs of the same fit too.
     """
 
-    def __init__(self, task: FitTask, config: LoopConfig, resume_path: str | Path | None = None):
-        self.task, self.config = task, config
+    def __init__(self, task: Task, resume_path: str | Path | None = None):
+        self.task, self.config = task, task.config.loop
         self.path = None if resume_path is None else Path(resume_path)
         self.done, self.waited, self.best_update, self.best = 0, 0, 0, math.inf
         self.seconds = 0.0
@@ -285,9 +269,9 @@ def fit_generator(
     Raises:
         UserError: unknown preset, a config of the other preset, unusable recordings or scene names.
     """
-    if preset not in _CONFIGS:
+    expected = _CONFIGS.get(preset)
+    if expected is None:
         raise UserError(f"preset {preset!r}: expected one of {sorted(_CONFIGS)}.")
-    expected = _CONFIGS[preset]
     config = expected() if config is None else config
     if not isinstance(config, expected):
         raise UserError(
@@ -295,21 +279,16 @@ def fit_generator(
         )
     split = split_for_fit(scene_tracks(frame), held_out)
     task = fit_task(config, split)
-    loop = FitLoop(task, config.loop, resume_path)
+    loop = FitLoop(task, resume_path)
     loop.run(on_progress)
-    return fit_result(task, loop, split, frame, source, task.metrics(split.held_out))
+    return fit_result(loop, split, frame, source, task.metrics(split.held_out), frame)
 
 
 def fit_result(
-    task: Task,
-    loop: FitLoop,
-    split: Split,
-    frame: pl.DataFrame,
-    source: str,
-    metrics: Metrics,
-    statistics_of: pl.DataFrame | None = None,
+    loop: FitLoop, split: Split, frame: pl.DataFrame, source: str, metrics: Metrics, others: pl.DataFrame
 ) -> FitResult:
-    """The result of a finished ``loop``; ``statistics_of`` are the recordings of the driving statistics, else all."""
+    """The result of a finished ``loop``; ``others`` are the recordings of the driving statistics."""
+    task = loop.task
     return FitResult(
         preset=task.config.preset,
         module=task.generator.eval().requires_grad_(False),
@@ -321,7 +300,7 @@ def fit_result(
             "tracks": frame.select(TRACK).n_unique(),
             **split.names,
         },
-        statistics=driving_statistics(frame if statistics_of is None else statistics_of).to_dict(),
+        statistics=driving_statistics(others).to_dict(),
         updates=loop.best_update,
         seconds=loop.seconds,
     )

@@ -16,29 +16,20 @@ import numpy as np
 import torch
 from sklearn.ensemble import HistGradientBoostingClassifier
 from sklearn.linear_model import RidgeCV
-from sklearn.pipeline import Pipeline, make_pipeline
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from ganlane.generator.closed_loop import displacement_of, moved_by
 from ganlane.generator.networks import Generator
 from ganlane.generator.rollout import (
-    DriverParams,
     common_driver_params,
     driven_positions,
     evaluation_params,
-    fit_anchor,
-    rollout,
+    rollout_as_fitted,
     typical_driver_params,
 )
-from ganlane.generator.segments import (
-    OBSERVED_POSITIONS,
-    PRESENT,
-    SceneTracks,
-    Segments,
-    constant_velocity,
-    segment_batches,
-)
+from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks, Segments, segment_batches
 from ganlane.generator.windows import Groups, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
@@ -241,10 +232,10 @@ def calibrated_forecasts(
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
-        headway, desired = evaluation_params(config)(segments)
-        noise = torch.randn(1 + horizon, 1 + samples, *headway.shape, generator.sizes.noise, generator=random)
+        shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
+        noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        return rollout(generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config))
+        return rollout_as_fitted(generator, segments, evaluation_params(segments, config), noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
@@ -259,8 +250,8 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
     at which each driver is in balance at present, the calibrated preset's anchor.
     """
 
-    def driver(segments: Segments, driver_params: DriverParams) -> Tensor:
-        headway, desired = driver_params(segments)
+    def driver(segments: Segments, own_headway: bool) -> Tensor:
+        headway, desired = typical_driver_params(segments) if own_headway else common_driver_params(segments)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
             acceleration = following_acceleration(perceive(vehicles, segments.road), TABLE_V, headway)
@@ -269,10 +260,9 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
 
         return driven_positions(segments, desired, move)[None]
 
-    kinds = {"idm": common_driver_params, "idm_own_headway": typical_driver_params}
     return {
-        name: driven_windows(partial(driver, driver_params=params), scenes, horizon, stride)[0]
-        for name, params in kinds.items()
+        name: driven_windows(partial(driver, own_headway=own), scenes, horizon, stride)[0]
+        for name, own in (("idm", False), ("idm_own_headway", True))
     }
 
 
@@ -286,13 +276,13 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
         BASELINE: repeated(past[:, -1], steps),
         "mean_velocity": repeated(past.mean(axis=1), steps),
         "constant_acceleration": constant_acceleration(past, steps),
-        "ridge": RidgeForecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps))(past),
+        "ridge": ridge_forecast(cut_windows(others, stride, OBSERVED_POSITIONS + steps), past),
     }
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
-    """:func:`constant_velocity` for arrays: positions [W, T, 2] when ``displacement`` [W, 2] is repeated."""
-    return constant_velocity(torch.from_numpy(displacement), steps).numpy()
+    """Positions [W, T, 2] in m relative to the present when ``displacement`` [W, 2] per 0.1 s is repeated."""
+    return displacement[:, None] * np.arange(1.0, steps + 1.0)[:, None]
 
 
 def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
@@ -302,26 +292,18 @@ def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
     return repeated(past[:, -1], steps) + 0.5 * change * ahead * (ahead + 1.0)
 
 
-class RidgeForecast:
-    """Ridge regression from the last displacement and all observed differences to the error of constant velocity.
+def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
+    """Positions [W, T, 2] in m that follow the displacements ``past`` [W, 8, 2].
 
-    It is fitted to ``windows`` as they are and mirrored.
+    Ridge regression from the last displacement and all observed differences to the error of constant velocity; it is
+    fitted to the windows ``fitted``, as they are and mirrored.
     """
 
-    def __init__(self, windows: Windows):
-        past, future = windows.past, windows.future
-        past = np.concatenate([past, past * (1.0, -1.0)])
-        future = np.concatenate([future, future * (1.0, -1.0)])
-        self.steps = future.shape[1]
-        error = (future - repeated(past[:, -1], self.steps)).reshape(len(past), -1)
-        self.model: Pipeline = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
-        self.model.fit(self._features(past), error)
-
-    def __call__(self, past: np.ndarray) -> np.ndarray:
-        """Positions [W, T, 2] in m that follow the displacements ``past`` [W, 8, 2]."""
-        error = self.model.predict(self._features(past)).reshape(len(past), self.steps, 2)
-        return repeated(past[:, -1], self.steps) + error
-
-    @staticmethod
-    def _features(past: np.ndarray) -> np.ndarray:
+    def features(past: np.ndarray) -> np.ndarray:
         return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)
+
+    known, future = (np.concatenate([each, each * (1.0, -1.0)]) for each in (fitted.past, fitted.future))
+    steps = future.shape[1]
+    model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
+    model.fit(features(known), (future - repeated(known[:, -1], steps)).reshape(len(known), -1))
+    return repeated(past[:, -1], steps) + model.predict(features(past)).reshape(len(past), steps, 2)

@@ -32,8 +32,6 @@ DESIRED_EXCESS_MPS = (1.0, 11.0)
 COMMON_SPEED_MPS = 22.0
 #: In fitting, standard deviation of the headways' logarithm about the balanced ones, so that drivers are off balance.
 _SCATTER = 0.25
-#: Headways in s and desired speeds in m/s, [B, V] each, of the drivers in segments.
-DriverParams = Callable[[Segments], tuple[Tensor, Tensor]]
 
 
 def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> Vehicles:
@@ -175,11 +173,14 @@ def typical_driver_params(segments: Segments) -> tuple[Tensor, Tensor]:
     return balanced_headway(now.with_(desired_speed=desired), segments.road, median), desired
 
 
-def fit_anchor(config: CalibratedConfig) -> AnchorParameters:
-    """The anchor with a fit's washout and inputs."""
-    return replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
+def rollout_as_fitted(
+    generator: Generator, segments: Segments, drivers: tuple[Tensor, Tensor], noise: Tensor, config: CalibratedConfig
+) -> Tensor:
+    """:func:`rollout` with a fit's settings; ``drivers`` are the headways and desired speeds."""
+    anchor = replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
+    return rollout(generator, segments, *drivers, noise, config.noise_period_s, anchor)
 
 
-def evaluation_params(config: CalibratedConfig) -> DriverParams:
-    """Headways and desired speeds for evaluation."""
-    return typical_driver_params if config.traits else common_driver_params
+def evaluation_params(segments: Segments, config: CalibratedConfig) -> tuple[Tensor, Tensor]:
+    """Headways and desired speeds for evaluation, [B, V] each."""
+    return typical_driver_params(segments) if config.traits else common_driver_params(segments)

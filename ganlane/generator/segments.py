@@ -59,8 +59,9 @@ class SceneTracks:
 
     @cached_property
     def target_lane(self) -> np.ndarray:
-        """:func:`intended_lanes`."""
-        return intended_lanes(self.lane, self.present)
+        """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its track."""
+        ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
+        return np.take_along_axis(self.lane, np.clip(ahead, *_first_and_last(self.present)), axis=0)
 
 
 def _scene_arrays(name: str, lane_width_m: float, rows: pl.DataFrame) -> SceneTracks:
@@ -109,20 +110,9 @@ def extrapolate(positions: np.ndarray, present: np.ndarray) -> np.ndarray:
     return np.where((frames < first)[..., None], before, np.where((frames > last)[..., None], after, inside))
 
 
-def intended_lanes(lane: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its track."""
-    ahead = np.arange(len(present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
-    return np.take_along_axis(lane, np.clip(ahead, *_first_and_last(present)), axis=0)
-
-
 def _first_and_last(present: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First and last present frame of each vehicle, [V] each."""
     return present.argmax(0), len(present) - 1 - present[::-1].argmax(0)
-
-
-def constant_velocity(displacement: Tensor, steps: int) -> Tensor:
-    """Positions [..., steps, 2] in m relative to the present when ``displacement`` [..., 2] per 0.1 s is repeated."""
-    return displacement[..., None, :] * torch.arange(1, steps + 1, dtype=displacement.dtype)[:, None]
 
 
 @dataclass(frozen=True)
@@ -165,9 +155,9 @@ class Segments:
     @property
     def constant_velocity(self) -> Tensor:
         """Positions [B, H, V, 2] when the last observed displacement is repeated."""
-        now, before = self.positions[:, PRESENT], self.positions[:, PRESENT - 1]
-        ahead = constant_velocity(now - before, self.positions.shape[1] - OBSERVED_POSITIONS)
-        return now[:, None] + ahead.transpose(1, 2)
+        now, before = self.positions[:, PRESENT, None], self.positions[:, PRESENT - 1, None]
+        steps = torch.arange(1, self.positions.shape[1] - PRESENT, dtype=now.dtype)
+        return now + (now - before) * steps[:, None, None]
 
     @property
     def road(self) -> Road:

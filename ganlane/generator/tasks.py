@@ -1,4 +1,4 @@
-"""What is fitted: the losses, updates and scores of both presets, each a :class:`ganlane.generator.fit.FitTask`.
+"""What is fitted: the losses, updates and scores of both presets.
 
 **paper**, open loop: adversarial, variety, single-sample and mean terms on k-means groups of windows. Losses after
 Gupta et al. (2018), with the changes that the fit needs here.
@@ -19,8 +19,7 @@ from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Genera
 from ganlane.generator.rollout import (
     common_driver_params,
     evaluation_params,
-    fit_anchor,
-    rollout,
+    rollout_as_fitted,
     sampled_driver_params,
 )
 from ganlane.generator.segments import SceneTracks, Segments, cut_segments, segment_batches, segment_starts
@@ -66,19 +65,30 @@ def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
     return 0.5 * ((recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean())
 
 
-class PaperTask:
-    """The Social-GAN on windows; see :class:`ganlane.generator.fit.FitTask`."""
+class _Networks:
+    """A generator with its optimiser and random numbers, to which a task adds other networks."""
+
+    def __init__(self, config: PaperConfig | CalibratedConfig):
+        torch.manual_seed(config.seed)
+        self.generator = Generator(config.sizes)
+        self.modules: dict[str, nn.Module] = {}
+        self.optimisers: dict[str, torch.optim.Optimizer] = {}
+        self.add("generator", self.generator)
+        self.random = torch.Generator().manual_seed(config.seed)
+
+    def add(self, name: str, module: nn.Module) -> None:
+        """One more network to fit, with an optimiser of its own."""
+        self.modules[name], self.optimisers[name] = module, torch.optim.Adam(module.parameters())
+
+
+class PaperTask(_Networks):
+    """The Social-GAN on windows."""
 
     def __init__(self, fitted: list[SceneTracks], validation: list[SceneTracks], config: PaperConfig):
-        torch.manual_seed(config.seed)
+        super().__init__(config)
         self.config = config
-        self.generator = Generator(config.sizes)
         self.discriminator = Discriminator(config.sizes.embedding, config.sizes.hidden)
-        self.modules: dict[str, nn.Module] = {"generator": self.generator, "discriminator": self.discriminator}
-        self.optimisers: dict[str, torch.optim.Optimizer] = {
-            name: torch.optim.Adam(module.parameters()) for name, module in self.modules.items()
-        }
-        self.random = torch.Generator().manual_seed(config.seed)
+        self.add("discriminator", self.discriminator)
         _, self.groups = self._grouped_windows(fitted, config.stride)
         self.validation = self._grouped_windows(validation, config.held_out_stride)
 
@@ -181,12 +191,10 @@ def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: Cali
     for scene in scenes:
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
-            headway, desired = evaluation_params(config)(segments)
-            fresh = torch.randn(1 + horizon, 2, *headway.shape, generator.sizes.noise, generator=random)
+            fresh = torch.randn(1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            mean, one, other = rollout(
-                generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config)
-            )
+            drivers = evaluation_params(segments, config)
+            mean, one, other = rollout_as_fitted(generator, segments, drivers, noise, config)
             future = segments.future
             errors = {
                 "mean": distance(mean, future),
@@ -220,19 +228,12 @@ def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> 
     return metrics | {"end_s": 0.1 * horizon, "windows": windows}
 
 
-class CalibratedTask:
-    """The anchored generator on whole scenes; see :class:`ganlane.generator.fit.FitTask`."""
+class CalibratedTask(_Networks):
+    """The anchored generator on whole scenes."""
 
     def __init__(self, fitted: list[SceneTracks], validation: list[SceneTracks], config: CalibratedConfig):
-        torch.manual_seed(config.seed)
-        self.config = config
-        self.generator = Generator(config.sizes)
-        self.modules: dict[str, nn.Module] = {"generator": self.generator}
-        self.optimisers: dict[str, torch.optim.Optimizer] = {
-            "generator": torch.optim.Adam(self.generator.parameters())
-        }
-        self.random = torch.Generator().manual_seed(config.seed)
-        self.validation = validation
+        super().__init__(config)
+        self.config, self.validation = config, validation
         longest = max(config.horizons)
         cuts = [(scene, row) for scene in fitted for row in segment_starts(scene, longest)]
         #: All possible segments, sorted by their vehicles, so that neighbours need little padding.
@@ -245,15 +246,11 @@ class CalibratedTask:
         """One rollout of a batch of segments and one step: alternately of the mean driver and of two samples."""
         config = self.config
         segments = self._batch()
-        headway, desired = (
-            sampled_driver_params(segments, self.random) if config.traits else common_driver_params(segments)
-        )
+        drivers = sampled_driver_params(segments, self.random) if config.traits else common_driver_params(segments)
         sampled = number % 2 == 1
-        shape = (1 + segments.future.shape[1], 2 if sampled else 1, *headway.shape, config.sizes.noise)
+        shape = (1 + segments.future.shape[1], 2 if sampled else 1, *segments.length.shape, config.sizes.noise)
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
-        positions = rollout(
-            self.generator, segments, headway, desired, noise, config.noise_period_s, fit_anchor(config)
-        )
+        positions = rollout_as_fitted(self.generator, segments, drivers, noise, config)
         if sampled:
             name, losses = "energy", energy_score(positions[0], positions[1], segments.future)
         else:

@@ -101,9 +101,9 @@ def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
     return running[frames:] - running[:-frames] == frames
 
 
-def count_windows(scene: SceneTracks, frames: int = WINDOW_FRAMES) -> int:
-    """Number of windows of ``frames`` frames in a scene, one per possible start."""
-    return int(_present_throughout(scene, frames).sum())
+def count_windows(scene: SceneTracks) -> int:
+    """Number of windows of 17 frames in a scene, one per possible start."""
+    return int(_present_throughout(scene, WINDOW_FRAMES).sum())
 
 
 def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW_FRAMES) -> Windows:

@@ -31,7 +31,7 @@ from ganlane.realism.measures import (
     measure_recordings,
     pooled_distance,
 )
-from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
+from ganlane.realism.recordings import I80_FILES, read_i80
 from ganlane.realism.replay_starts import Factory, StartOptions
 from ganlane.realism.starts import (
     FLOORS,
@@ -92,7 +92,7 @@ class Card:
         starts, held_out = self.starts, self.starts.separately_held_out
         apart = card_rows(starts.restricted_to(held_out), self.traffic, self.resamples) if held_out else None
         driving = {name: each.summary() for name, each in starts.driven.items()}
-        recorded, own = starts.recorded_summary, driving[self.traffic]
+        recorded, own = starts.recorded.summary(), driving[self.traffic]
         rate, spread = starts.reference.rate(), starts.reference.spread_mps
         checks = card_checks(
             self.quantities, own["quantiles"], recorded["quantiles"], rate["per_vehicle_km_ci"], spread, self.runs
@@ -111,10 +111,10 @@ class Card:
         }
 
 
-def card_rows(starts: Starts, traffic: str, resamples: int = RESAMPLES) -> dict[str, Any]:
+def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
     """The rows of a traffic's card by quantity, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
-    return quantity_rows(traffic, starts.driven, starts.recorded, floors, starts.paired, resamples)
+    return quantity_rows(traffic, starts.driven, starts.recorded.counts, floors, starts.paired, resamples)
 
 
 def quantity_rows(
@@ -197,37 +197,33 @@ def card_checks(
     for name in CLOSER_IN:
         for other, row in quantities[name]["against"].items():
             rivals.setdefault(other, {})[name] = row["verdict"]
+    pairs = [(own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")]
+    near = None
+    if not any(value is None for pair in pairs for value in pair):
+        near = all(abs(mine - theirs) <= _QUANTILE_SHARE * abs(theirs) for mine, theirs in pairs)
     return {
         "compared_with": rivals,
-        "acceleration_quantiles_within_30_percent": _quantiles_near(own, recorded),
+        "acceleration_quantiles_within_30_percent": near,
         "long_runs": [_run_checks(run, recorded_rate, spread_mps) for run in runs],
     }
 
 
-def _quantiles_near(own: Mapping[str, Any], recorded: Mapping[str, Any]) -> bool | None:
-    pairs = [(own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")]
-    if any(value is None for pair in pairs for value in pair):
-        return None
-    return all(abs(mine - theirs) <= _QUANTILE_SHARE * abs(theirs) for mine, theirs in pairs)
-
-
 def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float) -> dict[str, Any]:
     changes, overlaps = run["lane_changes_per_vehicle_km"], run["overlaps_per_1000_vehicle_km"]
+    inside = None
+    if changes is not None and recorded_rate:
+        inside = recorded_rate[0] <= changes <= recorded_rate[1]
     spreads = [at["spread_mps"] for at in run["speeds"].values() if at["spread_mps"] is not None]
     wide = None if not spreads else min(spreads) >= 0.5 * spread_mps
     return {
         "vehicles": run["vehicles"],
-        "lane_changes_inside_recorded_interval": _inside(changes, recorded_rate),
+        "lane_changes_inside_recorded_interval": inside,
         "overlaps_under_1_per_1000_vehicle_km": None if overlaps is None else overlaps < 1.0,
         "nobody_off_the_road": run["off_road"] == 0,
         "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,
         "spread_at_least_half_the_recorded": wide,
         "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < _MOST_GUARD,
     }
-
-
-def _inside(value: float | None, interval: Sequence[float] | None) -> bool | None:
-    return None if value is None or not interval else interval[0] <= value <= interval[1]
 
 
 def drive_card(config: RealismConfig, path: Path | None) -> Card:
@@ -331,7 +327,8 @@ def drive_from_starts(config: RealismConfig, factories: Mapping[str, Factory], p
 
 def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
     """The I-80 files next to the scenes that ``config`` asks for, by name."""
-    files = {} if path is None or config.i80 is False else i80_files(path.parent)
+    folder = None if config.i80 is False or path is None else path.parent
+    files = {name: folder / file for name, file in I80_FILES.items() if folder and (folder / file).is_file()}
     if config.i80 and not files:
         raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use i80=false.")
     return files

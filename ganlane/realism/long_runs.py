@@ -7,8 +7,7 @@ time, and quantiles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -130,6 +129,12 @@ class GuardMeter:
         self._altered = torch.zeros((), dtype=torch.int64)
         self._steps = torch.zeros((), dtype=torch.int64)
 
+    def watch(self, traffic: TrafficModule) -> None:
+        """Be called by every guard in ``traffic`` from now on."""
+        for part in traffic.modules():
+            if isinstance(part, Guard):
+                part.observer = self
+
     def __call__(self, before: Vehicles, moved: Vehicles, guarded: Vehicles) -> None:
         """Called by the guard at every step; index 0 is the ego's and does not count."""
         wanted = (moved.speed - before.speed) / PHYSICS_STEP_S
@@ -148,41 +153,67 @@ class GuardMeter:
         return int(self._altered) / steps if steps else None
 
 
-@contextmanager
-def watched(traffic: TrafficModule, meter: GuardMeter) -> Iterator[None]:
-    """Attach ``meter`` to every guard in ``traffic`` within the context."""
-    guards = [part for part in traffic.modules() if isinstance(part, Guard)]
-    before = [guard.observer for guard in guards]
-    for guard in guards:
-        guard.observer = meter
-    try:
-        yield
-    finally:
-        for guard, observer in zip(guards, before):
-            guard.observer = observer
+class LongRun:
+    """The driving of a long run, added up batch by batch."""
+
+    def __init__(self, road: Road, parameters: LongRunParameters) -> None:
+        self.road, self.parameters, self.episodes = road, parameters, 0
+        self._events, self._meter, self._parts = EventCounter(road), GuardMeter(), list[dict[str, Any]]()
+
+    @property
+    def vehicle_km(self) -> float:
+        """Driven so far."""
+        return sum(part["vehicle_km"] for part in self._parts)
+
+    @property
+    def finished(self) -> bool:
+        """Whether enough was driven, or nobody moves."""
+        stuck = self._parts and self._parts[-1]["vehicle_km"] <= 0.0
+        return bool(stuck) or self.vehicle_km >= self.parameters.vehicle_km
+
+    def drive(self, traffic: TrafficModule, rows: int) -> Trajectories:
+        """One batch of ``rows`` further episodes."""
+        self._meter.watch(traffic)
+        trajectories = drive_spawned(traffic, self.parameters, self.episodes, rows, self._events)
+        self._parts.append(batch_statistics(trajectories, self.road))
+        self.episodes += rows
+        return trajectories
+
+    def numbers(self) -> dict[str, Any]:
+        """Counts, rates per vehicle-km with exact 95 % intervals (None where no vehicle moved), speeds, quantiles."""
+        parts, events, km = self._parts, self._events, self.vehicle_km
+        changes = sum(part["lane_changes"] for part in parts)
+        durations = np.concatenate([part["durations"] for part in parts])
+        acceleration = np.concatenate([part["acceleration"] for part in parts])
+        return {
+            "vehicles": self.parameters.vehicles,
+            "episodes": self.episodes,
+            "vehicle_km": km,
+            "lane_changes": changes,
+            "lane_change_duration_mean_s": float(durations.mean()) if len(durations) else None,
+            "overlaps": events.overlaps,
+            **rates(changes, events.overlaps, km),
+            "off_road": events.off_road,
+            "standstills_in_free_flow": events.standstills,
+            "acceleration_quantiles": {f"{level:g}": float(np.quantile(acceleration, level)) for level in QUANTILES},
+            "speeds": {
+                name: _mean_speeds([row for part in parts for row in part["speeds"][name]], name.endswith(" m"))
+                for name in parts[0]["speeds"]
+            },
+            "guard_share": self._meter.share,
+        }
 
 
 def long_run(
     make: Factory, road: Road, parameters: LongRunParameters, report: Callable[[float], None] | None = None
 ) -> dict[str, Any]:
-    """Drive ``parameters.vehicle_km`` and count; the numbers of :func:`summary`.
-
-    ``report`` is called with the vehicle-km driven so far.
-    """
-    traffic, meter, events, parts = make(road), GuardMeter(), EventCounter(road), []
-    km, episodes = 0.0, 0
-    while km < parameters.vehicle_km:
-        rows = _rows(parameters, parameters.vehicle_km - km)
-        with watched(traffic, meter):
-            trajectories = drive_spawned(traffic, parameters, episodes, rows, events)
-        part = batch_statistics(trajectories, road)
-        parts.append(part)
-        km, episodes = km + part["vehicle_km"], episodes + rows
+    """Drive ``parameters.vehicle_km``; ``report`` is called with the vehicle-km driven so far."""
+    traffic, run = make(road), LongRun(road, parameters)
+    while not run.finished:
+        run.drive(traffic, _rows(parameters, parameters.vehicle_km - run.vehicle_km))
         if report is not None:
-            report(km)
-        if part["vehicle_km"] <= 0.0:
-            break
-    return summary(parts, events, meter, episodes, parameters.vehicles)
+            report(run.vehicle_km)
+    return run.numbers()
 
 
 def _rows(parameters: LongRunParameters, km: float) -> int:
@@ -236,7 +267,7 @@ def _snapshot(state: Vehicles) -> tuple[np.ndarray, ...]:
 def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
     """Counts, samples and speeds of one batch."""
     flat = trajectories.y.reshape(len(trajectories.y), -1)
-    changes, _ = lane_changes_of_arrays(flat, float(road.lane_width_m))
+    changes = lane_changes_of_arrays(flat, float(road.lane_width_m))
     second = round(1.0 / PHYSICS_STEP_S)
     x = trajectories.x.astype(np.float64)
     # The same filter as for recordings; one sample a second is enough.
@@ -263,33 +294,6 @@ def _speeds(trajectories: Trajectories, row: int, time: int) -> tuple[float, flo
     """Mean and standard deviation of an episode's speeds, m/s, and the time, s."""
     speed = trajectories.speed[time, row].astype(np.float64)
     return float(speed.mean()), float(speed.std(ddof=1)) if len(speed) > 1 else 0.0, time * PHYSICS_STEP_S
-
-
-def summary(
-    parts: list[dict[str, Any]], events: EventCounter, meter: GuardMeter, episodes: int, vehicles: int
-) -> dict[str, Any]:
-    """The numbers of a long run; rates are per vehicle-km, with exact 95 % intervals, None where no vehicle moved."""
-    km = sum(part["vehicle_km"] for part in parts)
-    changes = sum(part["lane_changes"] for part in parts)
-    durations = np.concatenate([part["durations"] for part in parts])
-    acceleration = np.concatenate([part["acceleration"] for part in parts])
-    return {
-        "vehicles": vehicles,
-        "episodes": episodes,
-        "vehicle_km": km,
-        "lane_changes": changes,
-        "lane_change_duration_mean_s": float(durations.mean()) if len(durations) else None,
-        "overlaps": events.overlaps,
-        **rates(changes, events.overlaps, km),
-        "off_road": events.off_road,
-        "standstills_in_free_flow": events.standstills,
-        "acceleration_quantiles": {f"{level:g}": float(np.quantile(acceleration, level)) for level in QUANTILES},
-        "speeds": {
-            name: _mean_speeds([row for part in parts for row in part["speeds"][name]], name.endswith(" m"))
-            for name in parts[0]["speeds"]
-        },
-        "guard_share": meter.share,
-    }
 
 
 def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:

@@ -73,9 +73,7 @@ def pooled_distance(simulated: Array, recorded: Array) -> float:
     return float(jensen_shannon(simulated.sum(0), recorded.sum(0)))
 
 
-def distance(
-    simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES, seed: int = 0
-) -> Estimate:
+def distance(simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES) -> Estimate:
     """Distance with its 95 % bootstrap interval over units; both are [units, bins]. One unit gives no interval.
 
     A resample holds some units twice and others not at all, so its distance is biased upwards; near 0 all of them lie
@@ -86,7 +84,7 @@ def distance(
     ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """
     value = pooled_distance(simulated, recorded)
-    (drawn,) = _resampled((simulated,), recorded, paired, resamples, seed)
+    (drawn,) = _resampled((simulated,), recorded, paired, resamples)
     known = drawn[np.isfinite(drawn)]
     if not np.isfinite(value) or len(known) < 2:
         return Estimate(value)
@@ -96,7 +94,7 @@ def distance(
 
 
 def distance_difference(
-    first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES, seed: int = 0
+    first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
 ) -> Estimate:
     """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval; see :func:`distance`.
 
@@ -106,7 +104,7 @@ def distance_difference(
     equally good models closer too often.
     """
     one, other = pooled_distance(first, recorded), pooled_distance(second, recorded)
-    ours, theirs = _resampled((first, second), recorded, paired, resamples, seed)
+    ours, theirs = _resampled((first, second), recorded, paired, resamples)
     known = (ours**2 - theirs**2)[np.isfinite(ours) & np.isfinite(theirs)]
     units, value = len(first), one - other
     if not np.isfinite(value) or len(known) < 2:
@@ -116,20 +114,20 @@ def distance_difference(
     return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 
-def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int, seed: int) -> list[Array]:
+def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int) -> list[Array]:
     """Distances [R] of each of ``models`` from resampled units, the same ones for all; none of a single unit."""
     units = len(recorded) if paired else len(models[0])
     if units < 2:
         return [np.empty(0) for _ in models]
     drawn: list[list[Array]] = [[] for _ in models]
-    for counts in resample_counts(units, resamples, seed):
+    for counts in resample_counts(units, resamples, seed=0):
         against = counts @ recorded if paired else recorded.sum(0)
         for values, model in zip(drawn, models):
             values.append(jensen_shannon(counts @ model, against))
     return [np.concatenate(values) for values in drawn]
 
 
-def ceiling(recorded: Array, splits: int = SPLITS, seed: int = 0) -> float | None:
+def ceiling(recorded: Array) -> float | None:
     """Mean distance of one half of the units [units, bins] to the other, over random halves; None for one unit.
 
     What no model can be expected to beat: halves hold half of the driving, so it errs on the high side.
@@ -137,8 +135,8 @@ def ceiling(recorded: Array, splits: int = SPLITS, seed: int = 0) -> float | Non
     units = len(recorded)
     if units < 2:
         return None
-    generator = np.random.default_rng(seed)
-    one = np.zeros((splits, units))
+    generator = np.random.default_rng(0)
+    one = np.zeros((SPLITS, units))
     for row in one:
         row[generator.permutation(units)[: units // 2]] = 1.0
     values = jensen_shannon(one @ recorded, (1.0 - one) @ recorded)
@@ -203,21 +201,26 @@ def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
     """
     motion = _motion(frame)
     own = motion.filter(pl.col("counts"))
-    followers = _followers(motion)
+    near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)
+    followers = leader_gaps(motion).filter(near).drop_nulls(["speed", "leader_speed"])
     closing = pl.col("speed") - pl.col("leader_speed")
     crowded = own.drop_nulls("speed").group_by("unit", "scene", "frame").agg(pl.col("speed").std(), pl.len())
     fast_enough = followers.filter(pl.col("speed") >= SLOWEST_FOLLOWER_MPS)
     changes = _lane_changes(motion)
-    samples = {
-        "speed": _values(own, pl.col("speed")),
-        "speed_spread": _values(crowded.filter(pl.col("len") >= FEWEST_IN_FRAME), pl.col("speed")),
-        "acceleration": _values(own, pl.col("acceleration")),
-        "jerk": _values(own, pl.col("jerk")),
-        "time_headway": _values(fast_enough, pl.col("gap") / pl.col("speed")),
-        "gap": _values(followers, pl.col("gap")),
-        "time_to_collision": _values(followers.filter(closing > CLOSING_MPS), pl.col("gap") / closing),
-        "lane_change_duration": changes,
+    values = {
+        "speed": (own, pl.col("speed")),
+        "speed_spread": (crowded.filter(pl.col("len") >= FEWEST_IN_FRAME), pl.col("speed")),
+        "acceleration": (own, pl.col("acceleration")),
+        "jerk": (own, pl.col("jerk")),
+        "time_headway": (fast_enough, pl.col("gap") / pl.col("speed")),
+        "gap": (followers, pl.col("gap")),
+        "time_to_collision": (followers.filter(closing > CLOSING_MPS), pl.col("gap") / closing),
     }
+    samples = {
+        name: rows.select("unit", value=value).drop_nulls().filter(pl.col("value").is_finite())
+        for name, (rows, value) in values.items()
+    }
+    samples["lane_change_duration"] = changes
     counts = {name: _histograms(table, units, QUANTITIES[name]) for name, table in samples.items()}
     km = own.group_by("unit").agg((pl.col("stride").sum() / 1000.0).alias("km"))
     return Measured(samples, counts, changes.height, sum(km["km"].to_list()))
@@ -255,12 +258,6 @@ def _motion(frame: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _followers(motion: pl.DataFrame) -> pl.DataFrame:
-    """Rows that count and have a leader near enough, neither overlapping it nor without a speed."""
-    near = pl.col("gap").is_between(0.0, FOLLOWING_M)
-    return leader_gaps(motion).filter(pl.col("counts") & near).drop_nulls(["speed", "leader_speed"])
-
-
 def _lane_changes(motion: pl.DataFrame) -> pl.DataFrame:
     """Unit and duration of the changes that cross in a row that counts, censored ones as far as seen.
 
@@ -270,7 +267,3 @@ def _lane_changes(motion: pl.DataFrame) -> pl.DataFrame:
     changes = find_lane_changes(tracks_of_frame(motion, widths))
     rows = motion[changes.sample].select("unit", "counts").with_columns(value=pl.Series(changes.duration_s))
     return rows.filter(pl.col("counts")).select("unit", "value")
-
-
-def _values(rows: pl.DataFrame, value: pl.Expr) -> pl.DataFrame:
-    return rows.select("unit", value.alias("value")).drop_nulls().filter(pl.col("value").is_finite())

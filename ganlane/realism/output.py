@@ -78,7 +78,7 @@ def command_line(folder: Path) -> str:
 def publish(starts: Starts) -> None:
     """Write the file that ships, with the distances of the reference drivers measured in this run."""
     source = Path(starts.reference.source).name
-    floors = floors_of(starts.driven, starts.recorded)
+    floors = floors_of(starts.driven, starts.recorded.counts)
     replace(starts.reference, floors=floors, source=source).save(references.SHIPPED_REFERENCE)
     print_progress(f"wrote {references.SHIPPED_REFERENCE}")
 
@@ -274,7 +274,7 @@ def draw(card: Card, to: Path) -> list[Path]:
         for name, driven in starts.driven.items()
         if name not in FLOORS
     }
-    recorded = {name: counts.sum(0) for name, counts in starts.recorded.items()}
+    recorded = {name: counts.sum(0) for name, counts in starts.recorded.counts.items()}
     figures = {
         "distributions": draw_distributions(recorded, simulated),
         "distances": draw_distances(card.quantities, card.traffic),

@@ -16,15 +16,12 @@ from typing import Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from ganlane.data import FRAME_S, SCHEMA
-from ganlane.data.lanes import STANDARD_LANE_WIDTH_M
+from ganlane.data.lanes import STANDARD_LANE_WIDTH_M, Flags, Floats
 from ganlane.data.tables import read_table
 from ganlane.errors import UserError
 
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 #: A scene must last longer than the seconds that every measure leaves out, s.
 SHORTEST_S = 4.0
 #: Name to file.
@@ -69,16 +66,13 @@ class Recording:
         return float(self.x[self.present].max())
 
 
-def recordings_of(
-    frame: pl.DataFrame, lane_widths: Mapping[str, float], scenes: Sequence[str] | None = None
-) -> list[Recording]:
+def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:
     """The scenes of a frame in the schema, whose tracks have no gaps, in the order of their names.
 
-    ``lane_widths`` are in m, by scene; ``scenes`` are names, all by default.
+    ``lane_widths`` are in m, by scene.
     """
-    names = sorted(frame["scene"].unique().to_list() if scenes is None else scenes)
     made = []
-    for name in names:
+    for name in sorted(frame["scene"].unique().to_list()):
         rows = frame.filter(pl.col("scene") == name).with_columns(driven=pl.lit(True))
         track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
         made.append(_recording(name, rows, track, int(rows["lane"].to_numpy().max()) + 1, lane_widths[name]))
@@ -149,11 +143,6 @@ def segments(recording: Recording, seconds: float, skip_s: float = 0.0) -> list[
         name = f"{recording.name}@{start}"
         pieces.append(Recording(name, recording.unit, recording.lanes, recording.lane_width_m, **dense, **flat))
     return pieces
-
-
-def i80_files(folder: Path) -> dict[str, Path]:
-    """The I-80 files that exist in ``folder``, by name."""
-    return {name: folder / file for name, file in I80_FILES.items() if (folder / file).is_file()}
 
 
 def read_i80(name: str, path: Path) -> list[Recording]:

@@ -63,6 +63,10 @@ class Reference:
         changes, km = measured.lane_changes, measured.vehicle_km
         return cls(source, list(units), measured.counts, measured.quantiles(), changes, km, whole, floors={})
 
+    def summary(self) -> dict[str, Any]:
+        """As :meth:`Measured.summary`."""
+        return {**lane_change_rate(self.lane_changes, self.vehicle_km), "quantiles": self.quantiles}
+
     @property
     def spread_mps(self) -> float:
         """Recorded spread of speeds within a frame, its mean over the frames, m/s."""

@@ -18,18 +18,10 @@ import polars as pl
 
 from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.evaluation.statistics import Array
 from ganlane.files import load_weights
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
-from ganlane.realism.measures import (
-    QUANTITIES,
-    Measured,
-    lane_change_rate,
-    measure,
-    measure_recordings,
-    pooled_distance,
-)
-from ganlane.realism.recordings import SHORTEST_S, Recording, frame_of, recordings_of, units_of
+from ganlane.realism.measures import QUANTITIES, Measured, measure, measure_recordings, pooled_distance
+from ganlane.realism.recordings import SHORTEST_S, Recording, recorded_frame, recordings_of, units_of
 from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
 from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
 from ganlane.sim.spawn import SpawnParameters
@@ -56,9 +48,7 @@ def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptio
 
 
 def simulate_all(
-    factories: Mapping[str, Factory],
-    recordings: Sequence[Recording],
-    options: Mapping[str, StartOptions],
+    factories: Mapping[str, Factory], recordings: Sequence[Recording], options: Mapping[str, StartOptions]
 ) -> dict[str, Measured]:
     """Drive every traffic and both reference drivers from the same starts."""
     driven = {}
@@ -109,8 +99,7 @@ class Starts:
         held_out: by fold, the scenes that desired speeds were not fitted on.
         options: by traffic, how it was driven; over several folds the mean of what was fitted.
         driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded starts only).
-        recorded: by quantity, [units, bins] of the same scenes (spawned starts: of all).
-        recorded_summary: lane changes and quantiles of those scenes.
+        recorded: the same scenes (spawned starts: all recordings).
         reference: all recordings.
     """
 
@@ -119,8 +108,7 @@ class Starts:
     held_out: list[list[str]]
     options: Mapping[str, StartOptions]
     driven: Mapping[str, Measured]
-    recorded: Mapping[str, Array]
-    recorded_summary: Mapping[str, Any]
+    recorded: Measured | Reference
     reference: Reference
 
     @property
@@ -138,10 +126,10 @@ class Starts:
 
     def restricted_to(self, scenes: Sequence[str]) -> Starts:
         """The same driving from some of its scenes, compared with these alone."""
+        assert isinstance(self.recorded, Measured)  # spawned starts are of no scenes
         rows = [self.scenes.index(name) for name in scenes]
-        recorded = {name: counts[rows] for name, counts in self.recorded.items()}
         driven = {name: each.restricted_to(rows) for name, each in self.driven.items()}
-        return replace(self, scenes=list(scenes), driven=driven, recorded=recorded)
+        return replace(self, scenes=list(scenes), driven=driven, recorded=self.recorded.restricted_to(rows))
 
     def description(self) -> dict[str, Any]:
         """The entries of ``results.json`` about starts and recordings."""
@@ -231,7 +219,6 @@ def recorded_starts(
             chosen += scenes
     if not chosen:
         raise UserError(f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all.")
-    recorded = measure_recordings(chosen)
     statistics = driving_statistics(frame, widths)
     whole = {
         "lane_changes": statistics.lane_changes.count,
@@ -246,49 +233,40 @@ def recorded_starts(
         held_out=[list(fold.held_out) for fold in folds],
         options={name: replace(options, desired_above_mps=excess) for name, excess in means.items()},
         driven={name: Measured.joined([part[name] for part in driven]) for name in driven[0]},
-        recorded=recorded.counts,
-        recorded_summary=recorded.summary(),
+        recorded=measure_recordings(chosen),
         reference=Reference.of(measure_recordings(every), names, whole, source),
     )
 
 
 def spawned_starts(
-    factories: Mapping[str, Factory],
-    road: Road,
-    spawn: SpawnParameters,
-    repeats: int,
-    seed: int,
-    path: Path = SHIPPED_REFERENCE,
+    factories: Mapping[str, Factory], road: Road, spawn: SpawnParameters, repeats: int, seed: int
 ) -> Starts:
     """Drive every traffic from the same spawned scenes: ``repeats`` times 8 episodes of 30 vehicles and 30 s each.
 
-    ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density); ``path`` is the file of
-    the histograms that they are compared with.
+    ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density). They are compared with
+    the histograms that ship.
     """
-    reference, rows = Reference.load(path), _SPAWNED_ROWS * repeats
+    reference, rows = Reference.load(SHIPPED_REFERENCE), _SPAWNED_ROWS * repeats
     print_progress(
-        f"no recordings here: spawned starts against {path.name}; give data.path=FILE for the fair comparison"
+        f"no recordings here: spawned starts against {SHIPPED_REFERENCE.name}; give data.path=FILE for the fair "
+        "comparison"
     )
     parameters = LongRunParameters(_SPAWNED_VEHICLES, most_s=_SPAWNED_S, seed=seed, spawn=spawn)
     scenes, driven = [f"spawned-{row}" for row in range(rows)], {}
     for name, make in factories.items():
         print_progress(f"{name} from {rows} spawned starts")
         driven[name] = measure(spawned_frame(make, road, parameters, rows), scenes)
-    rate = lane_change_rate(reference.lane_changes, reference.vehicle_km)
-    summary = {**rate, "quantiles": reference.quantiles}
-    return Starts("spawned", [], [], {}, driven, reference.counts, summary, reference)
+    return Starts("spawned", [], [], {}, driven, reference, reference)
 
 
 def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows: int) -> pl.DataFrame:
     """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` s, in the form of measured recordings."""
     paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
-    frames = []
+    lanes, width = int(road.lanes), float(road.lane_width_m)
+    made = []
     for row in range(rows):
-        name, x, y, speed = f"spawned-{row}", paths.x[:, row], paths.y[:, row], paths.speed[:, row]
-        made = Recording(
-            name, name, int(road.lanes), float(road.lane_width_m), x, y, speed, everywhere,
-            paths.length[row], paths.width[row], everywhere[0],
-        )  # fmt: skip
-        frames.append(frame_of(made, x, y, everywhere, name))
-    return pl.concat(frames)
+        dense = (paths.x[:, row], paths.y[:, row], paths.speed[:, row], everywhere)
+        name, sizes = f"spawned-{row}", (paths.length[row], paths.width[row])
+        made.append(Recording(name, name, lanes, width, *dense, *sizes, everywhere[0]))
+    return recorded_frame(made)

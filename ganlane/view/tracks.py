@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from ganlane import keys
-from ganlane.data.scenes import COLUMNS, write_prepared
+from ganlane.data.scenes import scene_csv, write_prepared
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
@@ -41,12 +41,10 @@ def write_tracks(trajectories: Sequence[Trajectory], path: str | Path, format: T
     if format == "parquet":
         write_prepared(sort(pl.concat([to_tracks(each, name) for each, name in zip(trajectories, names)])), path)
     else:
-        tables = []
-        for each, name in zip(trajectories, names):
-            tracks, lanes = to_tracks(each, name), each.label.lanes
-            left = (lanes - 1) * each.label.lane_width_m
-            turned = tracks.with_columns(v=pl.col("speed"), lane=lanes - pl.col("lane"), y=pl.col("y") - left)
-            tables.append(turned.select(COLUMNS.keys()))
+        tables = [
+            scene_csv(to_tracks(each, name), pl.lit(each.label.lanes - 1), each.label.lane_width_m)
+            for each, name in zip(trajectories, names)
+        ]
         with atomic_path(path) as part:
             pl.concat(tables).write_csv(part)
     return Path(path)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from reference.file_server import CONTENT, SHA256, Server
 
-from ganlane.data import ByteProgress, data_folder, default_scenes, download
+from ganlane.data import byte_progress, data_folder, default_scenes, download
 from ganlane.errors import UserError
 
 QUICK = {"timeout_s": 5.0, "attempts": 3, "wait_s": 0.01}
@@ -134,12 +134,13 @@ def test_a_disk_that_refuses_the_part_is_told_with_the_name_of_the_file(tmp_path
     assert len(server.asked) == 1
 
 
-def test_progress_tells_share_and_time_left():
-    progress = ByteProgress("read")
-    progress(0, 4_000_000)
-    assert progress.line(2_000_000, 4_000_000).startswith("read: 2 of 4 MB, ")
-    assert progress.line(2_000_000, 4_000_000).endswith(" s left")
-    assert "left" not in progress.line(2_000_000, None)
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_shows_bytes_on_a_terminal_and_nothing_of_short_work_elsewhere(terminal, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    with byte_progress("read") as show:
+        show(2_000_000, 4_000_000)
+    err = capsys.readouterr().err
+    assert ("read:  50%" in err and "2.00M/4.00M" in err) if terminal else err == ""
 
 
 def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):

@@ -2,16 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ganlane.data import (
-    find_lane_changes,
-    lane_changes_of_arrays,
-    synthetic_scenes,
-    tracks_of_frame,
-)
-from ganlane.data.lanes import lane_width
+from ganlane.data import find_lane_changes, lane_changes_of_arrays, synthetic_scenes, tracks_of_frame
+from ganlane.data.lanes import Tracks, lane_width
 
 
 @given(width=st.floats(3.0, 4.0), seed=st.integers(0, 10_000))
@@ -48,9 +43,9 @@ TIME = np.arange(80) * 0.1
 RAMP = np.clip(TIME - 2.05, 0.0, WIDTH)
 
 
-def found(y, **more):
-    changes, _ = lane_changes_of_arrays(np.asarray(y)[:, None], WIDTH, **more)
-    return changes
+def found(y, new_track_at=()):
+    begins = np.isin(np.arange(len(y)), [0, *new_track_at])
+    return find_lane_changes(Tracks(np.asarray(y), np.full(len(y), WIDTH), begins))
 
 
 def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
@@ -106,42 +101,27 @@ def test_two_lanes_in_one_go_are_two_changes():
     assert changes.new_lane.tolist() == [1, 2]
 
 
-def test_a_gap_in_a_track_and_a_change_of_vehicle_are_no_lane_changes():
+def test_a_change_of_vehicle_is_no_lane_change():
     y = np.r_[np.zeros(20), np.full(20, WIDTH)]
-    valid = np.ones((40, 1), bool)
-    begins = np.zeros((40, 1), bool)
     assert len(found(y)) == 1
-    begins[20] = True
-    assert len(found(y, begins=begins)) == 0
-    valid[20] = False
-    assert len(found(y, valid=valid)) == 0
+    assert len(found(y, new_track_at=[20])) == 0
 
 
-def test_each_change_is_told_by_its_time_and_column():
-    y = np.stack((np.zeros(80), RAMP, WIDTH - RAMP), axis=1)
-    changes, where = lane_changes_of_arrays(y, WIDTH)
-    assert where.tolist() == [[38, 1], [38, 2]]
+def test_vehicles_of_a_simulation_are_measured_one_by_one():
+    changes = lane_changes_of_arrays(np.stack((np.zeros(80), RAMP, WIDTH - RAMP), axis=1), WIDTH)
+    assert changes.sample.tolist() == [80 + 38, 160 + 38]
     assert changes.new_lane.tolist() == [1, 0]
     assert changes.tau_s == pytest.approx([1.55, 1.55])
 
 
-def test_no_vehicles_no_changes():
-    assert len(lane_changes_of_arrays(np.zeros((10, 2)), WIDTH, np.zeros((10, 2), bool))[0]) == 0
-
-
-def test_a_coarser_step_finds_the_same_change():
-    coarse = found(RAMP[::2], step_s=0.2)
-    assert coarse.duration_s[0] == pytest.approx(3.1, abs=0.4)
-
-
+@settings(max_examples=20)
 @given(seed=st.integers(0, 500))
 def test_recordings_and_arrays_are_measured_alike_and_mirroring_changes_nothing_but_the_side(seed):
     frame = synthetic_scenes(seed=seed)
     widths = {"synthetic-0": 3.5, "synthetic-1": 3.5}
     of_frame = find_lane_changes(tracks_of_frame(frame, widths))
     y = frame["y"].to_numpy().reshape(24, 100).T
-    of_arrays, _ = lane_changes_of_arrays(y, 3.5)
-    mirrored, _ = lane_changes_of_arrays(7.0 - y, 3.5)
+    of_arrays, mirrored = (lane_changes_of_arrays(each, 3.5) for each in (y, 7.0 - y))
     np.testing.assert_array_equal(of_frame.sample, of_arrays.sample)
     np.testing.assert_array_equal(of_frame.duration_s, of_arrays.duration_s)
     np.testing.assert_array_equal(of_frame.new_lane, 2 - mirrored.new_lane)

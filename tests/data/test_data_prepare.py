@@ -128,35 +128,26 @@ def test_recordings_without_anybody_on_the_lanes_are_refused(tmp_path):
         read_recordings("highd", tmp_path)
 
 
-@pytest.fixture(params=["absolute", "relative"])
-def out(request, tmp_path, monkeypatch):
-    """Where the folder is to be, as a user may give it."""
+@pytest.mark.parametrize("absolute", [True, False])
+def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(absolute, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    return (tmp_path if request.param == "absolute" else Path()) / "scenes"
-
-
-def test_a_refused_file_is_named_as_in_the_folder_to_be(out):
-    with pytest.raises(OSError, match="too long") as caught, whole_folder(out) as folder:
-        write_bytes(folder / TOO_LONG, b"")
-    assert (caught.value.errno, caught.value.filename) == (errno.ENAMETOOLONG, str(out / TOO_LONG))
-    assert list(Path.cwd().iterdir()) == []
-
-
-def test_a_refusal_about_the_folder_names_it(out):
-    with pytest.raises(FileExistsError) as caught, whole_folder(out) as folder:
-        folder.mkdir()
-    assert caught.value.filename == str(out)
-
-
-def test_a_folder_that_cannot_be_made_is_named(out):
+    out = (tmp_path if absolute else Path()) / "scenes"
     long = out.with_name(TOO_LONG[:250])  # the hidden one beside it has a longer name
-    with pytest.raises(OSError, match="too long") as caught, whole_folder(long):
-        raise AssertionError("nothing to write into")
-    assert (caught.value.errno, caught.value.filename) == (errno.ENAMETOOLONG, str(long))
 
+    def raised(path, fill) -> OSError:
+        with pytest.raises(OSError) as caught, whole_folder(path) as folder:  # noqa: PT011
+            fill(folder)
+        return caught.value
 
-@pytest.mark.parametrize("name", ["scenes.csv", ".hidden/scenes.csv", None])
-def test_other_files_keep_their_names(out, name):
-    with pytest.raises(FileNotFoundError) as caught, whole_folder(out):
+    def absent(name):
         raise FileNotFoundError(errno.ENOENT, "No such file or directory", name)
-    assert caught.value.filename == name
+
+    refused = raised(out, lambda folder: write_bytes(folder / TOO_LONG, b""))
+    assert (refused.errno, refused.filename) == (errno.ENAMETOOLONG, str(out / TOO_LONG))
+    refused = raised(out, Path.mkdir)
+    assert (refused.errno, refused.filename) == (errno.EEXIST, str(out))
+    refused = raised(long, absent)
+    assert (refused.errno, refused.filename) == (errno.ENAMETOOLONG, str(long))
+    for name in ("scenes.csv", ".hidden/scenes.csv", None):
+        assert raised(out, lambda folder, name=name: absent(name)).filename == name
+    assert list(tmp_path.iterdir()) == []

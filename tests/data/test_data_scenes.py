@@ -73,14 +73,13 @@ def field(row: int, column: str, value: str) -> list[str]:
     [
         (field(3, "x", "abc"), r"line 5, column x: 'abc' is not a number"),
         (field(0, "y", "NaN"), r"line 2, column y: 'NaN' is not a finite number"),
-        (field(2, "v", "inf"), r"line 4, column v: 'inf' is not a finite number"),
         (field(4, "frame", "4.5"), r"line 6, column frame: '4.5' is not a whole number"),
         (field(5, "lane", ""), r"line 7, column lane: the field is empty"),
         (field(7, "lane", "0"), r"line 9, column lane: 0 is below 1"),
         (field(8, "frame", "1"), r"line 10, column frame: 1 comes twice"),
         (field(9, "frame", "0"), r"line 11, column frame: 0 is before"),
         (field(10, "length", "0"), r"line 12, column length: 0.0 is not above 0"),
-        ([*ROWS[:-1], "s,2,5,45.0"], r"line 13, column y: the field is empty; the row is incomplete"),
+        ([*ROWS[:-1], "s,2,5,45.0"], r"line 13, column x: the row ends after 4 of 10 fields"),
     ],
 )
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, lines, message):
@@ -131,7 +130,7 @@ def test_files_that_hold_nothing_or_no_table_are_refused(tmp_path):
     with pytest.raises(UserError, match="a header but no rows"):
         read_scenes(path)
     path.write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50)
-    with pytest.raises(UserError, match=r"not a readable CSV|no column"):
+    with pytest.raises(UserError, match=r"line 1: not text"):
         read_scenes(path)
     with pytest.raises(UserError, match="no such file"):
         read_scenes(tmp_path)

@@ -47,7 +47,6 @@ def test_equation_9_counts_changes_per_vehicle_and_kilometre_of_road():
 def test_equation_10s_mean_time_between_changes():
     # Half a change per km at 20 m/s: a change every 2 km, that is every 100 s, that is every 1000 steps.
     assert steps_between_changes(0.5, 20.0) == pytest.approx(1000.0)
-    assert steps_between_changes(0.5, 20.0, step_s=1.0) == pytest.approx(100.0)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from reference.small_networks import silenced, small_generator
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.forecasts import (
-    RidgeForecast,
     baseline_forecasts,
     by_kind,
     calibrated_forecasts,
@@ -20,6 +19,7 @@ from ganlane.generator.forecasts import (
     paper_forecasts,
     parts_of,
     repeated,
+    ridge_forecast,
     rmse_by_second,
     scene_metrics,
     side_classifier_share,
@@ -227,8 +227,7 @@ def noisy_followers(count: int) -> np.ndarray:
 
 
 def test_ridge_regression_finds_a_linear_law_and_keeps_left_and_right_alike():
-    ridge = RidgeForecast(windows_of(noisy_followers(400)))
-    fresh = windows_of(noisy_followers(50))
-    predicted = ridge(fresh.past)
+    known, fresh = windows_of(noisy_followers(400)), windows_of(noisy_followers(50))
+    predicted = ridge_forecast(known, fresh.past)
     assert np.abs(predicted - fresh.future).mean() < 0.02 * np.abs(fresh.future).mean()
-    np.testing.assert_allclose(ridge(fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8)
+    np.testing.assert_allclose(ridge_forecast(known, fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8)

@@ -9,11 +9,7 @@ from reference.small_networks import small_generator
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.forecasts import distance
-from ganlane.generator.rollout import (
-    rollout,
-    sampled_driver_params,
-    typical_driver_params,
-)
+from ganlane.generator.rollout import rollout, sampled_driver_params, typical_driver_params
 from ganlane.generator.segments import cut_segments, extrapolate, scene_tracks
 from ganlane.generator.tasks import rollout_errors
 from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig

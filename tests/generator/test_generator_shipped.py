@@ -25,14 +25,6 @@ def recordings():
         pytest.skip(str(error))
 
 
-@pytest.mark.parametrize("preset", CONFIGS)
-def test_the_shipped_weights_are_small_and_come_from_the_default_settings(preset):
-    path = shipped_generator(preset)
-    _, metadata = load_generator(path, preset)
-    assert metadata["config"] == json.loads(json.dumps(asdict(CONFIGS[preset])))
-    assert path.stat().st_size < 5_000_000
-
-
 @pytest.mark.parametrize(
     ("preset", "most"),
     [
@@ -40,8 +32,13 @@ def test_the_shipped_weights_are_small_and_come_from_the_default_settings(preset
         ("calibrated", {"ade_m/mean": 0.91, "end_m/mean": 0.75}),
     ],
 )
-def test_a_preset_beats_constant_velocity_on_scenes_it_was_not_fitted_to(preset, most):
-    held_out = load_generator(shipped_generator(preset))[1]["metrics"]["all"]
+def test_the_shipped_weights_are_of_the_default_settings_and_beat_constant_velocity(preset, most):
+    path = shipped_generator(preset)
+    _, metadata = load_generator(path, preset)
+    assert metadata["config"] == json.loads(json.dumps(asdict(CONFIGS[preset])))
+    assert path.stat().st_size < 5_000_000
+    assert 0 < metadata["metrics"]["fit"]["seconds"] < 1800
+    held_out = metadata["metrics"]["all"]
     for name, share in most.items():
         assert held_out[name] < share * held_out[f"{name.partition('/')[0]}/constant_velocity"], name
 
@@ -84,16 +81,11 @@ def test_the_docs_show_the_figures_that_the_weights_carry(preset):
 
 
 @pytest.mark.parametrize("preset", CONFIGS)
-def test_fitting_the_shipped_weights_took_less_than_half_an_hour(preset):
-    _, metadata = load_generator(shipped_generator(preset), preset)
-    assert 0 < metadata["metrics"]["fit"]["seconds"] < 1800
-
-
-@pytest.mark.parametrize("preset", CONFIGS)
 def test_the_stated_errors_are_those_of_the_shipped_weights(preset, recordings):
     generator, metadata = load_generator(shipped_generator(preset), preset)
     config = CONFIGS[preset]
-    held_out = split_for_fit(scene_tracks(recordings), tuple(metadata["data"]["held_out"])).held_out
+    held_out = split_for_fit(scene_tracks(recordings), tuple(metadata["data"]["held_out"])).held_out[:1]
+    stated = metadata["metrics"][held_out[0].name]
     if preset == "paper":
         windows = cut_windows(held_out, config.held_out_stride)
         groups = group_windows(windows, config.group_size, config.seed)
@@ -104,4 +96,4 @@ def test_the_stated_errors_are_those_of_the_shipped_weights(preset, recordings):
         measured = rollout_errors(generator, held_out, config)["all"]
         names = ("end_m/mean", "end_m/constant_velocity")
     for name in ("ade_m/mean", "windows", *names):
-        assert measured[name] == pytest.approx(metadata["metrics"]["all"][name], rel=0.01), name
+        assert measured[name] == pytest.approx(stated[name], rel=0.01), name

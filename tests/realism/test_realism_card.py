@@ -1,10 +1,10 @@
 """The rows and checks of a card."""
 
-from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
+from reference.recordings import recorded_cars
+
 from ganlane.realism.card import card_checks, quantity_rows
 from ganlane.realism.long_runs import LongRunParameters, long_run
 from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
-from ganlane.realism.recordings import recordings_of
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.realism.replay_starts import StartOptions
 from ganlane.realism.starts import simulate
@@ -12,11 +12,6 @@ from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"]
-
-
-def recorded_cars(**size):
-    frame = synthetic_scenes(SyntheticTraffic(**size))
-    return recordings_of(frame, scene_lane_widths(frame))
 
 
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors():

@@ -8,6 +8,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 from PIL import Image
+from reference.recordings import following_file
 
 from ganlane.config.recordings import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
@@ -100,22 +101,15 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsy
     assert results["i80"] == {}
 
 
-def test_a_users_own_traffic_gets_a_card(recordings, capsys):
+def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
+    following_file(recordings.parent / "i80_following.csv")
     own = ["traffic=idm", "traffic._target_=entry_own_parts.Cruise", "against=[idm]"]
-    status, results, _, _ = run(capsys, *own, f"data.path={recordings}", "scenes=all")
+    more = ["scenes=all", "i80=true", "vehicle_km=0"]
+    status, results, out, _ = run(capsys, *own, f"data.path={recordings}", *more)
     assert status == 0
     assert results["traffic"] == "entry_own_parts.Cruise"
     assert results["quantities"]["speed"]["against"].keys() == {"idm"}
     assert len(results["scenes"]) == 4
-
-
-def test_i80_beside_the_scenes_gets_cards_of_its_own(recordings, capsys):
-    rows = [("0400pm", 2, 1, frame, 0.7 * frame, 0.7 * frame + 16.0, 6.0) for frame in range(200)]
-    names = ["period", "follower", "leader", "frame", "x_follower", "x_leader", "leader_length"]
-    pl.DataFrame(rows, schema=names, orient="row").write_csv(recordings.parent / "i80_following.csv")
-    _, results, out, _ = run(
-        capsys, "traffic=idm", f"data.path={recordings}", "i80=true", "against=[]", "vehicle_km=0"
-    )
     assert results["i80"]["following"].keys() == {"speed", "acceleration", "time_headway"}
     assert "I-80, following" in out
 

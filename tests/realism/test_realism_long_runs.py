@@ -10,7 +10,6 @@ from ganlane.realism.long_runs import (
     long_run,
     spawned_vehicles,
     totals,
-    watched,
 )
 from ganlane.realism.references import ConstantVelocity, RandomDriving
 from ganlane.sim.random import episode_key
@@ -124,17 +123,16 @@ class Swerver(TrafficModule):
         return vehicles.with_(speed=speed, y=vehicles.y + torch.where(index == 2, 0.5, 0.0)), memory
 
 
-def test_the_guard_meter_counts_what_the_guard_alters_and_lets_go_afterwards():
+def test_the_guard_meter_counts_what_the_guard_alters_and_changes_nothing():
     guard, meter = Guard(Road()), GuardMeter()
     vehicles = start(Road())
     x = 200.0 * torch.arange(10.0).expand(3, 10)
     vehicles = vehicles.with_(x=x, speed=torch.full_like(x, 15.0))
     moved, _ = Swerver().move(vehicles, {}, torch.zeros(3), torch.zeros(3))
     assert meter.share is None
-    with watched(guard, meter):
-        guarded, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
-    assert guard.observer is None
+    unwatched, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
+    meter.watch(guard)
+    guarded, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
     # Vehicle 1 brakes with 20 m/s2, vehicle 2 moves by 0.5 m of which a fifth is damped; the other seven do neither.
     assert meter.share == pytest.approx(2 / 9)
-    unwatched, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
     assert torch.equal(unwatched.x, guarded.x)

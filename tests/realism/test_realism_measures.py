@@ -7,22 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from reference.recordings import made_by_hand
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
 from ganlane.evaluation.statistics import Estimate
 from ganlane.realism.card import verdict
 from ganlane.realism.measures import QUANTITIES, ceiling, distance, distance_difference, jensen_shannon, measure
-from ganlane.realism.recordings import Recording, recorded_frame, segments
-
-
-def recording(x, y=None, name="scene", lanes=3, present=None):
-    """Cars of 4 m on lanes of 3.5 m; ``x`` [T, V]."""
-    x = np.asarray(x, dtype=np.float64)
-    y = np.zeros_like(x) if y is None else np.asarray(y, dtype=np.float64)
-    present = np.ones(x.shape, bool) if present is None else present
-    size = np.ones(x.shape[1])
-    return Recording(name, name, lanes, 3.5, x, y, np.zeros_like(x), present, 4.0 * size, 2.0 * size, size > 0)
+from ganlane.realism.recordings import recorded_frame, segments
 
 
 def measured(*recordings):
@@ -37,13 +29,13 @@ TIME = np.arange(100)[:, None] * 0.1
 
 
 def test_constant_acceleration_shows_as_it_is_and_has_no_jerk():
-    result = measured(recording(10.0 * TIME + 0.5 * 0.8 * TIME**2))
+    result = measured(made_by_hand(10.0 * TIME + 0.5 * 0.8 * TIME**2))
     assert values(result, "acceleration") == pytest.approx(0.8)
     assert values(result, "jerk") == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_cubic_path_has_its_jerk_and_speed_of_the_second():
-    result = measured(recording(10.0 * TIME + 0.3 * TIME**3 / 6.0))
+    result = measured(made_by_hand(10.0 * TIME + 0.3 * TIME**3 / 6.0))
     assert values(result, "jerk") == pytest.approx(0.3)
     # Mean over the second about t: 10 + 0.3 t^2 / 2 + 0.3 / 24.
     t = TIME[30:95, 0]
@@ -53,14 +45,14 @@ def test_a_cubic_path_has_its_jerk_and_speed_of_the_second():
 def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     present = np.ones((100, 2), bool)
     present[:50, 1] = False
-    result = measured(recording(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present))
+    result = measured(made_by_hand(np.hstack([20.0 * TIME, 20.0 * TIME + 30.0]), present=present))
     # The first: samples 30 to 94. The second appears at 50: samples 80 to 94.
     assert len(values(result, "speed")) == 65 + 15
     assert result.vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
 
 
 def test_gap_headway_and_time_to_collision_of_two_cars():
-    result = measured(recording(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])))
+    result = measured(made_by_hand(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])))
     t = TIME[30:95, 0]
     gap = 60.0 - 2.0 * t
     assert values(result, "gap") == pytest.approx(gap)
@@ -70,29 +62,29 @@ def test_gap_headway_and_time_to_collision_of_two_cars():
 
 def test_cars_in_different_lanes_do_not_follow_each_other():
     beside = np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)])
-    result = measured(recording(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]), beside))
+    result = measured(made_by_hand(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]), beside))
     assert len(values(result, "gap")) == 0
     assert result.quantile("gap", 0.5) is None
 
 
 def test_spread_of_speeds_is_that_within_a_frame():
     x = np.hstack([(10.0 + 2.0 * k) * TIME + 40.0 * k for k in range(3)])
-    assert values(measured(recording(x)), "speed_spread") == pytest.approx(2.0)
-    assert len(values(measured(recording(x[:, :2])), "speed_spread")) == 0
+    assert values(measured(made_by_hand(x)), "speed_spread") == pytest.approx(2.0)
+    assert len(values(measured(made_by_hand(x[:, :2])), "speed_spread")) == 0
 
 
 def test_a_lane_change_counts_once_with_its_duration_unless_it_comes_too_early():
     for start, expected in ((4.0, 1), (0.2, 0)):
         part = np.clip((TIME - start) / 4.0, 0.0, 1.0)
         y = 3.5 * 0.5 * (1.0 - np.cos(np.pi * part))
-        result = measured(recording(20.0 * TIME, y))
+        result = measured(made_by_hand(20.0 * TIME, y))
         assert result.lane_changes == expected
         if expected:
             assert 2.0 < values(result, "lane_change_duration")[0] < 4.0
 
 
 def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
-    slow, fast = recording(10.5 * TIME, name="slow"), recording(55.0 * TIME, name="fast")
+    slow, fast = made_by_hand(10.5 * TIME, name="slow"), made_by_hand(55.0 * TIME, name="fast")
     counts = measured(slow, fast).counts["speed"]
     assert counts.shape == (2, QUANTITIES["speed"].number)
     assert counts[0, -1] == counts[0].sum() == 65
@@ -100,14 +92,13 @@ def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
 
 
 def test_vehicles_that_are_replayed_are_led_by_but_not_measured():
-    pair = recording(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]))
-    led = Recording(**{**vars(pair), "driven": np.array([True, False])})
+    led = made_by_hand(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]), driven=np.array([True, False]))
     assert len(values(measured(led), "speed")) == 65
     assert len(values(measured(led), "gap")) == 65
 
 
 def test_segments_keep_their_unit_and_leave_out_what_was_to_be_skipped():
-    pieces = segments(recording(10.0 * TIME), 3.0, skip_s=3.5)
+    pieces = segments(made_by_hand(10.0 * TIME), 3.0, skip_s=3.5)
     assert [piece.name for piece in pieces] == ["scene@35", "scene@65"]
     assert {piece.unit for piece in pieces} == {"scene"}
     assert pieces[1].x[0, 0] == pytest.approx(65.0)
@@ -143,15 +134,15 @@ def histograms(shift, seed, number=12):
 
 def test_a_model_that_is_nearer_in_every_scene_is_found_to_be_closer():
     recorded, near, far = histograms(0.0, 0), histograms(0.02, 1), histograms(0.2, 2)
-    difference = distance_difference(near, far, recorded, resamples=400)
+    difference = distance_difference(near, far, recorded, resamples=200)
     assert difference.high < 0.0
     assert difference.value == pytest.approx(distance(near, recorded).value - distance(far, recorded).value)
     assert verdict(difference) == "closer"
-    assert verdict(distance_difference(far, near, recorded, resamples=400)) == "farther"
+    assert verdict(distance_difference(far, near, recorded, resamples=200)) == "farther"
 
 
 def test_two_runs_of_one_model_are_undecided():
-    difference = distance_difference(histograms(0.1, 3), histograms(0.1, 4), histograms(0.0, 5), resamples=400)
+    difference = distance_difference(histograms(0.1, 3), histograms(0.1, 4), histograms(0.0, 5), resamples=200)
     assert difference.low < 0.0 < difference.high
     assert verdict(difference) == "undecided"
 

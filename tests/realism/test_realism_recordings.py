@@ -2,10 +2,11 @@
 
 import polars as pl
 import pytest
+from reference.recordings import following_file
 
 from ganlane.errors import UserError
 from ganlane.realism.measures import measure_recordings
-from ganlane.realism.recordings import I80_FILES, i80_files, read_i80
+from ganlane.realism.recordings import I80_FILES, read_i80
 
 
 def lane_file(path):
@@ -20,12 +21,6 @@ def pairs_file(path):
         for role, number, start in (("follower", 2, 0.0), ("leader", 1, 25.0))
     ]
     names = ["pair", "role", "vehicle", "frame", "x", "y_right", "v", "lane", "length", "width"]
-    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
-
-
-def following_file(path):
-    rows = [("0400pm", 2, 1, frame, 0.7 * frame, 0.7 * frame + 16.0, 6.0) for frame in range(200)]
-    names = ["period", "follower", "leader", "frame", "x_follower", "x_leader", "leader_length"]
     pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
 
 
@@ -52,9 +47,7 @@ def test_a_lane_is_driven_as_a_whole_in_stretches_of_their_own(tmp_path):
     assert measure_recordings(recordings).quantile("gap", 0.5) == pytest.approx(31.5, abs=1e-6)
 
 
-def test_only_files_that_are_there_are_taken_and_damaged_ones_named(tmp_path):
-    following_file(tmp_path / I80_FILES["following"])
-    assert list(i80_files(tmp_path)) == ["following"]
+def test_damaged_files_are_named(tmp_path):
     path = tmp_path / I80_FILES["lane_1"]
     path.write_text("vehicle,frame,x\n1,2,three\n")
     with pytest.raises(UserError, match="line 2, column x"):

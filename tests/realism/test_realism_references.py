@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reference.recordings import recorded_cars
 
-from ganlane.data import SyntheticTraffic, default_scenes, read_scenes, scene_lane_widths, synthetic_scenes
+from ganlane.data import default_scenes, read_scenes, scene_lane_widths
 from ganlane.errors import UserError
 from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
 from ganlane.realism.recordings import recordings_of
@@ -15,8 +16,7 @@ from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 
 @pytest.fixture
 def reference():
-    frame = synthetic_scenes(SyntheticTraffic(scenes=3))
-    recordings = recordings_of(frame, scene_lane_widths(frame))
+    recordings = recorded_cars(scenes=3)
     whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
     floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
     names = [each.name for each in recordings]

@@ -6,13 +6,13 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.recordings import made_by_hand, recorded_cars
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
-from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
 from ganlane.generator.rollout import balanced_headway
 from ganlane.realism.measures import measure_recordings, pooled_distance
-from ganlane.realism.recordings import Recording, recorded_frame, recordings_of
+from ganlane.realism.recordings import recorded_frame
 from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
 from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways
 from ganlane.realism.starts import simulate
@@ -27,15 +27,11 @@ def steady(**changed):
     """Three cars for 10 s at speeds of their own, the last of which appears after 4 s and leaves after 8."""
     time = np.arange(100)[:, None] * 0.1
     speed = np.array([10.0, 12.0, 15.0])
-    x = np.array([0.0, 40.0, 20.0]) + speed * time
-    y = np.broadcast_to(np.array([0.0, 0.0, 3.5]), x.shape).copy()
-    present = np.ones(x.shape, bool)
+    present = np.ones((100, 3), bool)
     present[:40, 2] = present[80:, 2] = False
-    size = np.ones(3)
-    fields = {"x": x, "y": y, "speed": np.broadcast_to(speed, x.shape).copy(), "present": present}
-    return Recording(
-        "steady", "steady", 2, 3.5, **{**fields, **changed}, length=4 * size, width=2 * size, driven=size > 0
-    )
+    x = np.array([0.0, 40.0, 20.0]) + speed * time
+    fields = {"x": x, "y": np.array([0.0, 0.0, 3.5]), "speed": speed, "present": present, **changed}
+    return made_by_hand(**fields, lanes=2, name="steady")
 
 
 def test_constant_velocity_repeats_a_recording_of_constant_velocity():
@@ -88,7 +84,7 @@ def test_nobody_drives_beyond_the_end_of_the_recorded_road():
 
 
 def test_replayed_vehicles_drive_as_recorded_whatever_the_model_does():
-    recording = Recording(**{**vars(steady()), "driven": np.array([True, False, True])})
+    recording = steady(driven=np.array([True, False, True]))
     there = drive_recordings(RandomDriving, [recording], StartOptions())
     replayed = there.filter(pl.col("vehicle") == 1)
     assert replayed["x"].to_numpy() == pytest.approx(recording.x[:, 1], abs=1e-3)
@@ -121,8 +117,7 @@ def test_repeats_differ_and_the_same_seed_repeats_them():
 
 @pytest.mark.parametrize("make", [IdmMobilTraffic, gan_traffic, gan_calibrated_traffic, RandomDriving])
 def test_every_traffic_stays_finite_from_recorded_starts(make):
-    frame = synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=8, seconds=5.0))
-    there = drive_recordings(make, recordings_of(frame, scene_lane_widths(frame)), StartOptions())
+    there = drive_recordings(make, recorded_cars(scenes=1, vehicles=8, seconds=5.0), StartOptions())
     for name in ("x", "y"):
         assert there[name].is_finite().all()
     assert there["lane"].is_between(0, 2).all()
@@ -183,10 +178,7 @@ def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are()
 def test_a_recorded_platoon_keeps_its_gaps_behind_a_leader_at_constant_speed():
     time = np.arange(60)[:, None] * 0.1
     x = np.array([0.0, 12.0, 40.0, 55.0]) + 10.0 * time
-    size = np.ones(4)
-    driven = np.array([True, True, True, False])
-    dense = (x, 0 * x, 0 * x + 10.0, x > -1)
-    scene = Recording("platoon", "platoon", 1, 4.0, *dense, 4 * size, 2 * size, driven)
+    scene = made_by_hand(x, speed=10.0, lanes=1, driven=np.array([True, True, True, False]))
     there = drive_recordings(HeadwayIdm, [scene], StartOptions(desired_above_mps=5.0))
     ends = there.filter(there["frame"] == 59).sort("vehicle")["x"].to_numpy()
     assert np.abs(ends - x[59]).max() < 0.01

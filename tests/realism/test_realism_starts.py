@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from reference.recordings import made_by_hand
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
 from ganlane.realism.card import card_rows
 from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.measures import ceiling
-from ganlane.realism.recordings import Recording
 from ganlane.realism.references import ConstantVelocity
 from ganlane.realism.replay_starts import StartOptions
 from ganlane.realism.starts import Fold, fit_excess, recorded_starts, spawned_frame
@@ -33,9 +33,9 @@ def test_scenes_alone_have_the_ceiling_of_their_own_halves(frame):
     assert starts.separately_held_out == NAMES[1:3]
     alone = card_rows(starts.restricted_to(starts.separately_held_out), "cruise", 100)
     for name in ("speed", "gap"):
-        assert alone[name]["ceiling"] == ceiling(starts.recorded[name][1:3])
+        assert alone[name]["ceiling"] == ceiling(starts.recorded.counts[name][1:3])
         assert alone[name]["ceiling"] != card_rows(starts, "cruise", 100)[name]["ceiling"]
-        assert alone[name]["recorded_samples"] == starts.recorded[name][1:3].sum()
+        assert alone[name]["recorded_samples"] == starts.recorded.counts[name][1:3].sum()
 
 
 def test_folds_are_driven_one_by_one_and_joined(frame):
@@ -76,7 +76,6 @@ def test_the_excess_that_was_used_is_the_one_that_is_fitted():
     random = np.random.default_rng(0)
     speed = 10.0 + 8.0 * random.uniform(size=30)
     x = 100.0 * np.arange(30) + speed * time
-    shown = np.broadcast_to(np.where(np.arange(80)[:, None] == 0, 10.0, speed), x.shape).copy()
-    size = np.ones(30)
-    scene = Recording("a", "a", 1, 3.5, x, 0 * x, shown, x >= 0, 4 * size, 2 * size, size > 0)
+    shown = np.where(np.arange(80)[:, None] == 0, 10.0, speed)
+    scene = made_by_hand(x, speed=shown, lanes=1)
     assert fit_excess(eager, [scene], StartOptions(repeats=1), (1.0, 4.0, 8.0)) == 4.0

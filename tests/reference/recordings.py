@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 
-from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.data import SyntheticTraffic, scene_lane_widths, synthetic_scenes
+from ganlane.realism.recordings import Recording, recordings_of
 
 FOOT_M = 0.3048
 LANE_M = 3.5
@@ -87,6 +89,28 @@ def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> pl.Data
     recording = {"id": 1, "frameRate": 25, "upperLaneMarkings": "8.00;12.00;16.00", "lowerLaneMarkings": "20;24;28"}
     pl.DataFrame(recording).write_csv(folder / f"{name}_recordingMeta.csv")
     return pl.read_csv(folder / f"{name}_tracks.csv")
+
+
+def recorded_cars(**size) -> list[Recording]:
+    """Synthetic scenes as recordings."""
+    frame = synthetic_scenes(SyntheticTraffic(**size))
+    return recordings_of(frame, scene_lane_widths(frame))
+
+
+def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Recording:
+    """Cars of 4 m at positions ``x`` [T, V] on lanes of 3.5 m, all of them present and driven."""
+    x = np.asarray(x, dtype=np.float64)
+    size = np.ones(x.shape[1])
+    y, speed = (np.broadcast_to(each, x.shape).astype(np.float64) for each in (0.0 if y is None else y, speed))
+    fields = {"y": y, "speed": speed, "present": np.ones(x.shape, bool), "driven": size > 0, **changed}
+    return Recording(name, name, lanes, 3.5, x, length=4.0 * size, width=2.0 * size, **fields)
+
+
+def following_file(path: Path) -> None:
+    """An I-80 file of one follower behind its leader: 20 s at 7 m/s, a gap of 10 m."""
+    rows = [("0400pm", 2, 1, frame, 0.7 * frame, 0.7 * frame + 16.0, 6.0) for frame in range(200)]
+    names = ["period", "follower", "leader", "frame", "x_follower", "x_leader", "leader_length"]
+    pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
 
 
 #: Vehicle: first centre along the picture, speed, centre across the picture (downwards), highD's lane number.

@@ -43,25 +43,16 @@ if TYPE_CHECKING:  # for type checkers and editors, which do not run __getattr__
     from ganlane.transforms import SensorParameters as SensorParameters
     from ganlane.transforms import SensorTransform as SensorTransform
 
-#: Module of each public name.
-_MODULES = {
-    "Driver": "ganlane.build",
-    "EpisodeParameters": "ganlane.env",
-    "HighwayEnv": "ganlane.env",
-    "IdmMobilTraffic": "ganlane.traffic",
-    "IdmTraffic": "ganlane.traffic",
-    "ObservationTransform": "ganlane.transforms",
-    "RewardParameters": "ganlane.transforms",
-    "RewardTransform": "ganlane.transforms",
-    "Road": "ganlane.sim",
-    "SensorParameters": "ganlane.transforms",
-    "SensorTransform": "ganlane.transforms",
-    "Stream": "ganlane.sim",
-    "TrafficModule": "ganlane.traffic",
-    "UserError": "ganlane.errors",
-    "load_agent": "ganlane.api",
-    "make_env": "ganlane.api",
+_NAMES = {
+    "api": "Driver load_agent make_env",
+    "env": "EpisodeParameters HighwayEnv",
+    "errors": "UserError",
+    "sim": "Road Stream",
+    "traffic": "IdmMobilTraffic IdmTraffic TrafficModule",
+    "transforms": "ObservationTransform RewardParameters RewardTransform SensorParameters SensorTransform",
 }
+#: Module of each public name.
+_MODULES = {name: f"ganlane.{module}" for module, names in _NAMES.items() for name in names.split()}
 __all__ = ["__version__", "api", *_MODULES]
 
 

@@ -32,8 +32,9 @@ from torchrl.envs import Transform, TransformedEnv
 
 from ganlane import build
 from ganlane.agents.checkpoint import with_seeds
+from ganlane.arguments import checked_arguments, whole_number
 from ganlane.build import Driver
-from ganlane.compare import compare_configured
+from ganlane.compare import compare
 from ganlane.config.app import Stopped
 from ganlane.config.command_line import ALIASES
 from ganlane.config.env import check_reward
@@ -48,7 +49,7 @@ from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, wri
 from ganlane.evaluation.results import Run, TrainingRun, plain
 from ganlane.files import write_bytes
 from ganlane.options import Option, command_config, option
-from ganlane.parameters.checks import checked_arguments, did_you_mean, whole_number
+from ganlane.parameters.checks import did_you_mean
 from ganlane.runtime import set_threads
 from ganlane.sim.random import Stream
 
@@ -56,8 +57,6 @@ __all__ = ["Driver", "Run", "TrainingRun", "evaluate", "load_agent", "make_env",
 
 #: A driver's name, a loaded driver, or a policy of your own (named by its class).
 Agent: TypeAlias = str | Path | Driver | TensorDictModuleBase
-#: Families of episodes: to train on, to choose on, to report on.
-STREAMS = {stream.name.lower(): stream for stream in Stream}
 
 
 @checked_arguments
@@ -101,7 +100,7 @@ def make_env(
     check_reward(config, rewards)
     checked = RunConfig(seed=int(seed), device=device)
     made = build.make_env(
-        build.make_traffic(option("traffic", traffic), config, _stream(stream)),
+        build.make_traffic(option("traffic", traffic), config, Stream.named(stream)),
         config,
         option("observation", observation),
         rewards,
@@ -137,7 +136,7 @@ def load_agent(
         UserError: no such driver, or its network takes another observation.
     """
     config = option("env", env, overrides)
-    return build.make_driver(str(name), config, _stream(stream), RunConfig(device=device).device)
+    return build.make_driver(str(name), config, Stream.named(stream), RunConfig(device=device).device)
 
 
 @checked_arguments
@@ -180,7 +179,7 @@ def evaluate(
         if folder is not None:  # before hours of driving
             Path(folder).mkdir(parents=True, exist_ok=True)
         drivers = [_driver(agent, name, config) for agent, name in zip(agents, config.agents)]
-        table = compare_configured(drivers, config)
+        table = compare(drivers, config)
     rows = plain(evaluation_rows(table))
     if folder is not None:
         seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
@@ -376,9 +375,3 @@ def _with_traffic(keys: Mapping[str, Any] | None) -> dict[str, Any]:
     if given.get("traffic") is not None:
         given["traffic"] = option("traffic", given["traffic"])
     return given
-
-
-def _stream(name: str) -> Stream:
-    if name not in STREAMS:
-        raise UserError(f"stream={name}: expected one of {', '.join(STREAMS)}; choose one of them.")
-    return STREAMS[name]

@@ -26,8 +26,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road

@@ -13,9 +13,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ganlane.build import Driver, make_env, make_traffic
-from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.traffic import TrafficConfig
 from ganlane.evaluation import (
     crashes_by_scene,
     evaluation_rows,
@@ -29,82 +27,45 @@ from ganlane.evaluation import (
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
 from ganlane.parameters.observation import MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic, TrafficModule
 
 
-def compare(
-    drivers: Sequence[Driver],
-    traffics: Mapping[str, TrafficConfig],
-    env: EnvConfig,
-    reward: RewardParameters | None = None,
-    observation: ObservationConfig | None = None,
-    episodes: int = 100,
-    seed: int = 0,
-    num_envs: int = 512,
-    device: str = "cpu",
-    stream: int = Stream.REPORT,
-    mask: MaskParameters | None = None,
-    quiet: bool = False,
-) -> pl.DataFrame:
-    """Run the episodes 0 to ``episodes - 1`` with each driver on each traffic.
+def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
+    """Run the episodes of ``config`` with each driver on each of its traffics.
 
     Args:
-        drivers: see :func:`ganlane.build.make_driver`; each drives with its own observation.
-        traffics: name to config.
-        env, reward: the same for all.
-        observation: for drivers that name none; its sensors for all.
-        episodes, seed, stream: which episodes.
-        num_envs: episodes side by side, at most.
-        mask: for drivers that name none.
+        drivers: see :func:`ganlane.build.make_driver`; each drives with its own observation and mask, or with those
+            of ``config`` if it names none; the sensors are those of ``config`` for all.
+        config: traffics, episodes and environment.
         quiet: without signs of progress.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
         with ``scene``, the recorded scene of an episode, where one of the traffics replays (null for the others).
     """
-    modules = {name: make_traffic(config, env, stream) for name, config in traffics.items()}
+    env, seed, episodes = config.env, config.seed, config.episodes
+    stream = Stream.named(config.stream)
+    modules = {name: make_traffic(traffic, env, stream) for name, traffic in config.chosen_traffics().items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
-    rows, tables = min(num_envs, episodes), []
+    rows, tables = min(config.num_envs, episodes), []
     made: tuple[tuple[str, ObservationConfig, MaskParameters], EnvBase] | None = None
     disabled = quiet or not sys.stderr.isatty()
-    bar = tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=disabled)
-    with bar:
+    with tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=disabled) as bar:
         for number, (traffic, driver) in enumerate(pairs):
-            own_observation = (observation or ObservationConfig()).read_by(driver.observation)
-            own_mask, policy = driver.behind(mask)
-            make = partial(
-                make_env, modules[traffic], env, own_observation, reward, seed=seed, device=device, mask=own_mask
-            )
-            if made is None or made[0] != (traffic, own_observation, own_mask):
+            observation = config.observation.read_by(driver.observation)
+            mask, policy = driver.behind(config.mask)
+            parts = (modules[traffic], env, observation, config.reward)
+            make = partial(make_env, *parts, seed=seed, device=config.device, mask=mask)
+            if made is None or made[0] != (traffic, observation, mask):
                 # Drivers with the same observation and mask share an environment, so that it is compiled once.
-                made = (traffic, own_observation, own_mask), make(rows)
+                made = (traffic, observation, mask), make(rows)
             smaller = None if env.compile else make
-            title, before = f"{driver.name} on {traffic}", number * episodes
-            on_progress = None if quiet else _reporter(bar, title, before)
+            on_progress = None if quiet else _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
             table = run_episodes(made[1], policy, range(episodes), seed, on_progress, smaller)
             named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             tables.append(_with_scenes(named, modules[traffic], seed))
     return pl.concat(tables, how="diagonal")
-
-
-def compare_configured(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
-    """:func:`compare` with the traffics, episodes and environment of ``config``."""
-    return compare(
-        drivers,
-        config.chosen_traffics(),
-        config.env,
-        config.reward,
-        config.observation,
-        config.episodes,
-        config.seed,
-        config.num_envs,
-        config.device,
-        Stream[config.stream.upper()],
-        config.mask,
-        quiet,
-    )
 
 
 def _reporter(bar: tqdm, title: str, before: int) -> Callable[[int, int], None]:

@@ -16,19 +16,19 @@ from __future__ import annotations
 import importlib
 import os
 import platform
-import re
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
-from ganlane.runtime import check_process
+from ganlane.runtime import check_process, find_compiler
 
 NEEDED_IS_MISSING = 1
 USER_ERROR = 2
@@ -118,7 +118,7 @@ def guarded(subject: str, look: Callable[[], Finding], fix: str = _FIX_FIRST) ->
 def examine() -> dict[str, list[Finding]]:
     """Title of a section to its findings; loads every shipped checkpoint, so it takes seconds."""
     return {
-        "software": [python(), *map(required, REQUIRED)],
+        "software": [python(), *(guarded(text, partial(required, text)) for text in REQUIRED)],
         "machine": machine(),
         "files": [
             guarded("configuration", _configuration, _REINSTALL),
@@ -127,7 +127,7 @@ def examine() -> dict[str, list[Finding]]:
             guarded("cache", cache),
             outputs(),
         ],
-        "extras (not needed)": [extra(name) for name in EXTRAS],
+        "extras (not needed)": [guarded(f"extra {name}", partial(extra, name)) for name in EXTRAS],
     }
 
 
@@ -151,42 +151,16 @@ def report(sections: Mapping[str, Sequence[Finding]]) -> str:
     return "\n\n".join([*blocks, conclusion])
 
 
-class Requirement(NamedTuple):
-    """A distribution and the versions that will do."""
+def installed(text: str) -> tuple[str, str | None, bool]:
+    """Name of a requirement's distribution, its installed version if there is one, and whether that will do."""
+    from packaging.requirements import Requirement  # Hydra's and torch's own
 
-    name: str
-    ranges: tuple[tuple[str, str], ...]
-
-    @classmethod
-    def parsed(cls, text: str) -> Requirement:
-        """``torch>=2.11,<2.14`` taken apart."""
-        name = re.match(r"[\w.-]+", text)
-        if name is None:
-            raise ValueError(text)
-        return cls(name[0], tuple(re.findall(r"(>=|<)([\d.]+)", text)))
-
-    def allows(self, version: str) -> bool:
-        """Whether ``version`` is in all ranges."""
-        found = _release(version)
-        return all(
-            found >= _release(limit) if sign == ">=" else found < _release(limit) for sign, limit in self.ranges
-        )
-
-    def installed(self) -> str | None:
-        """The installed version; None where the distribution is not installed."""
-        try:
-            return metadata.version(self.name)
-        except metadata.PackageNotFoundError:
-            return None
-
-
-def _release(version: str) -> tuple[int, ...]:
-    """The release as numbers, without what follows: (2, 13) for ``2.13.0+cpu``; zeros at the end do not count."""
-    found = re.match(r"\d+(\.\d+)*", version)
-    release = [int(part) for part in found[0].split(".")] if found else []
-    while release and release[-1] == 0:
-        release.pop()
-    return tuple(release)
+    requirement = Requirement(text)
+    try:
+        version = metadata.version(requirement.name)
+    except metadata.PackageNotFoundError:
+        return requirement.name, None, False
+    return requirement.name, version, requirement.specifier.contains(version, prereleases=True)
 
 
 def _install(*requirements: str) -> str:
@@ -205,11 +179,10 @@ def python() -> Finding:
 
 def required(text: str) -> Finding:
     """Whether a requirement is installed in a version that will do, and can be imported."""
-    requirement = Requirement.parsed(text)
-    name, version = requirement.name, requirement.installed()
+    name, version, fits = installed(text)
     if version is None:
         return Finding(name, State.MISSING, "not installed", _install(text))
-    if not requirement.allows(version):
+    if not fits:
         return Finding(name, State.MISSING, f"{version}, needed {text.removeprefix(name)}", _install(text))
 
     def look() -> Finding:
@@ -222,14 +195,12 @@ def required(text: str) -> Finding:
 def extra(name: str) -> Finding:
     """Whether everything of an extra is installed; nothing of it is imported."""
     purpose, texts = EXTRAS[name]
-    parts = {text: Requirement.parsed(text) for text in texts}
-    versions = {text: part.installed() for text, part in parts.items()}
-    lacking = [text for text, version in versions.items() if version is None or not parts[text].allows(version)]
+    parts = {text: installed(text) for text in texts}
+    lacking = [text for text, (_, _, fits) in parts.items() if not fits]
     if lacking:
-        without = ", ".join(parts[text].name for text in lacking)
+        without = ", ".join(parts[text][0] for text in lacking)
         return Finding(f"extra {name}", State.ABSENT, f"{purpose}: {without} not installed", _install(*lacking))
-    found = ", ".join(f"{part.name} {versions[text]}" for text, part in parts.items())
-    return Finding(f"extra {name}", State.OK, found)
+    return Finding(f"extra {name}", State.OK, ", ".join(f"{part} {version}" for part, version, _ in parts.values()))
 
 
 def machine() -> list[Finding]:
@@ -262,13 +233,9 @@ def _devices() -> Finding:
 
 def _compiler() -> Finding:
     """The C++ compiler that only ``env.compile=true`` needs; ``CXX`` names another one."""
-    from ganlane.runtime import COMPILERS
-
-    named = os.environ.get("CXX")
-    looked_for = (named,) if named else COMPILERS
-    path = next(filter(None, map(shutil.which, looked_for)), None)
+    path, looked = find_compiler()
     if path is None:
-        found = f"none (looked for {', '.join(looked_for)}); env.compile=true needs one"
+        found = f"none (looked for {looked}); env.compile=true needs one"
         fix = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
         return Finding("C++ compiler", State.ABSENT, found, fix)
     return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")

@@ -10,8 +10,8 @@ Writes results.json and episodes.parquet (one row per episode) into its run fold
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from ganlane.config.app import run_command
@@ -21,19 +21,18 @@ from ganlane.config.evaluate import EvaluateConfig
 def evaluate(config: EvaluateConfig, folder: Path) -> str:
     """Run, print and keep the table."""
     from ganlane.build import make_drivers
-    from ganlane.compare import compare_configured, publish
+    from ganlane.compare import compare, publish
     from ganlane.runtime import set_threads
 
     set_threads(config.threads)
     drivers = make_drivers(config.agents, config.env, config.device)
-    table = compare_configured(drivers, config)
+    table = compare(drivers, config)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
     return publish(table, folder, asdict(config), seeds)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("evaluate", evaluate, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "evaluate", evaluate)
 
 
 if __name__ == "__main__":

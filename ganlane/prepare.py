@@ -15,11 +15,13 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ganlane.config.app import run_command
 from ganlane.config.recordings import PrepareConfig
+from ganlane.runtime import peak_resident_bytes
 
 if TYPE_CHECKING:
     from ganlane.data import Preparation, SceneSummary
@@ -57,7 +59,8 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     sheet = save_figure(draw_recordings(prepared.statistics), folder / "report.png")
     write_bytes(folder / "report.md", long_report(prepared, str(source), sheet.name).encode())
     print(f"{short_report(prepared)}\nscenes: {out}\nreport: {folder / 'report.md'}")
-    cost = {"wall_s": time.perf_counter() - begun, "peak_memory_mb": _peak_memory_mb()}
+    peak = peak_resident_bytes()
+    cost = {"wall_s": time.perf_counter() - begun, "peak_memory_mb": None if peak is None else peak / 2**20}
     numbers = {"format": config.data.format, "source": str(source), "out": str(out), **prepared.to_dict(), **cost}
     return f"results: {write_results(folder, numbers, asdict(config), {})}"
 
@@ -65,16 +68,6 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
 def _show(scene: SceneSummary) -> None:
     """Prints a line per recording while the others are still read."""
     print(f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km", file=sys.stderr, flush=True)
-
-
-def _peak_memory_mb() -> float | None:
-    """Largest resident memory of this process so far; None where the system does not tell (Windows)."""
-    try:
-        import resource
-    except ImportError:
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def short_report(prepared: Preparation) -> str:
@@ -179,9 +172,8 @@ def _distribution_table(prepared: Preparation) -> str:
     return _table(head, rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("prepare", prepare, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "prepare", prepare)
 
 
 if __name__ == "__main__":

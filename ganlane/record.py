@@ -14,17 +14,18 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any
 
 from ganlane.config.app import run_command
+from ganlane.config.evaluate import RecordConfig
 from ganlane.config.folders import cleared_after_mistakes
-from ganlane.config.record import RecordConfig
 from ganlane.config.schemas import SCHEMAS
 from ganlane.errors import UserError
 
@@ -55,7 +56,7 @@ def record(config: RecordConfig, folder: Path) -> str:
     from ganlane.sim.random import Stream
 
     set_threads(config.threads)
-    driver = make_driver(config.driver, config.env, Stream[config.stream.upper()], config.device)
+    driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
     mask, policy = driver.behind(config.mask)
     seen = config.observation.read_by(driver.observation)
     options = {"env": config.env, "observation": seen, "reward": config.reward, "mask": mask, "stream": config.stream}
@@ -63,7 +64,8 @@ def record(config: RecordConfig, folder: Path) -> str:
     rows = TensorRows(config.traffic, count, {**options, "device": config.device})
     spec = deepcopy(gymnasium.spec(ENV_ID))
     spec.kwargs, spec.max_episode_steps = plain({"traffic": config.traffic, **options}), rows.episode.most_decisions()
-    spec.kwargs["traffic"]["name"], env = config.traffic.label(), _env_name(config)
+    env = next(name for name, kind in SCHEMAS["env"].items() if kind is type(config.env))
+    spec.kwargs["traffic"]["name"] = config.traffic.label()
     spec.kwargs["env"]["name"] = env
     name, root = config.dataset_name(), Path(config.out or folder).absolute()
     about = {"dataset_id": name, "algorithm_name": driver.name, "minari_version": minari.__version__}
@@ -76,10 +78,6 @@ def record(config: RecordConfig, folder: Path) -> str:
     write_results(folder, {"dataset": name, "root": str(root), **found}, asdict(config), seeds)
     print(", ".join(f"{key.replace('_', ' ')} {value}" for key, value in found.items()))
     return f"dataset: minari.load_dataset({name!r}) with MINARI_DATASETS_PATH={root}"
-
-
-def _env_name(config: RecordConfig) -> str:
-    return next(name for name, kind in SCHEMAS["env"].items() if kind is type(config.env))
 
 
 @contextmanager
@@ -175,9 +173,8 @@ def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[
     return {"episodes": written, "decisions": decisions, "mean_return": round(returns / count, 2), "ends": dict(ends)}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("record", record, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "record", record)
 
 
 if __name__ == "__main__":

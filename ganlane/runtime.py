@@ -30,10 +30,16 @@ KEPT_BYTES = 2**28
 _STATUS = Path("/proc/self/status")
 
 
-def has_compiler() -> bool:
-    """Whether torch would find a C++ compiler: the one that ``CXX`` names, or one of :data:`COMPILERS`."""
+def find_compiler() -> tuple[str | None, str]:
+    """Path of the C++ compiler that torch would find, and the names looked for: ``CXX``'s, or :data:`COMPILERS`."""
     named = os.environ.get("CXX")
-    return any(shutil.which(name) for name in ((named,) if named else COMPILERS))
+    names = (named,) if named else COMPILERS
+    return next(filter(None, map(shutil.which, names)), None), f"CXX={named}" if named else ", ".join(names)
+
+
+def has_compiler() -> bool:
+    """Whether torch would find a C++ compiler."""
+    return find_compiler()[0] is not None
 
 
 def can_compile() -> bool:
@@ -46,9 +52,8 @@ def can_compile() -> bool:
 
 def check_compiler() -> None:
     """Raise :class:`UserError` where torch would find no C++ compiler."""
-    if not has_compiler():
-        named = os.environ.get("CXX")
-        looked = f"CXX={named}" if named else ", ".join(COMPILERS)
+    path, looked = find_compiler()
+    if path is None:
         raise UserError(
             f"compile=true needs a C++ compiler, and there is none (looked for {looked}); install one "
             "(Debian: apt install g++) or set compile=false."

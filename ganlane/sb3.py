@@ -25,10 +25,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from ganlane import keys
+from ganlane.arguments import seed_number
 from ganlane.build import Driver
 from ganlane.errors import UserError
 from ganlane.gym.vector import HighwayVectorGym
-from ganlane.parameters.checks import seed_number
 
 try:
     from stable_baselines3.common.base_class import BaseAlgorithm

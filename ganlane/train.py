@@ -14,8 +14,8 @@ Writes agent.safetensors, metrics.csv, config.yaml, results.json and episodes.pa
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 from ganlane.config.app import Stopped, run_command
@@ -55,25 +55,14 @@ def train(config: TrainConfig, folder: Path) -> str:
             raise Stopped(result.stopped_by)
         lengths[phase.name] = {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
     trained = replace(make_driver(str(folder / AGENT_FILE), config.env, device=config.device), name=TRAINED)
-    table = compare(
-        [trained, *others],
-        config.evaluation_traffic(),
-        config.env,
-        config.reward,
-        config.observation,
-        config.evaluation.episodes,
-        config.seed,
-        config.evaluation.num_envs,
-        config.device,
-    )
+    table = compare([trained, *others], config.final_evaluation())
     seeds = {"training": config.seed, "stream": "report", "episodes": [0, config.evaluation.episodes - 1]}
     numbers = {**lengths["train"], "phases": lengths, "agent": str(folder / AGENT_FILE)}
     return publish(table, folder, asdict(config), seeds, numbers)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("train", train, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "train", train)
 
 
 if __name__ == "__main__":

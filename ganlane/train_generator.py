@@ -16,8 +16,8 @@ the preset is also fitted with one part changed at a time. resume=FOLDER continu
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,9 +100,8 @@ def _recordings(data: DataConfig) -> tuple[Path, pl.DataFrame]:
         return source, read_recordings(data.format, source, data.parameters(), progress)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("train_generator", train_generator, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "train_generator", train_generator)
 
 
 if __name__ == "__main__":

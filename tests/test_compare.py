@@ -10,6 +10,7 @@ import pytest
 from ganlane.build import make_driver
 from ganlane.compare import compare, publish, recorded_crashes
 from ganlane.config.env import EnvConfig
+from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.evaluation import crashes_by_scene
@@ -31,7 +32,8 @@ def table(recordings):
     env = EnvConfig(goal_m=60.0)
     traffics = {"idm": IdmTrafficConfig(), "replay": ReplayTrafficConfig(path=str(recordings))}
     drivers = [make_driver(name, env) for name in ("keep_lane", "random_legal")]
-    return compare(drivers, traffics, env, episodes=EPISODES, seed=5, num_envs=4)
+    asked = {"traffics": list(traffics), "traffic_options": traffics, "episodes": EPISODES, "num_envs": 4}
+    return compare(drivers, EvaluateConfig(env=env, seed=5, **asked))
 
 
 def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, recordings):

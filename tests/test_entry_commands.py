@@ -29,19 +29,11 @@ def empty_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_names_options_keys_and_examples(name, capsys):
-    assert main([name, "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert f"ganlane {name} " in shown
-    assert "seed: 0" in shown
-    assert "exit status" in shown
-
-
-@pytest.mark.parametrize("name", COMMANDS)
 def test_help_fits_on_a_page_and_the_rest_is_behind_a_flag(name, capsys):
     assert main([name, "--help"]) == 0
     short = capsys.readouterr().out
     assert short.count("\n") < 80
+    assert all(part in short for part in (f"ganlane {name} ", "seed: 0", "exit status"))
     assert f"ganlane {name} --help-all" in short
     assert main([name, "--help-all"]) == 0
     assert capsys.readouterr().out == help_text(name) + "\n"
@@ -60,10 +52,9 @@ def test_usage_lists_every_command(capsys):
     assert all(name in shown for name in COMMANDS)
 
 
-@pytest.mark.parametrize("flags", [[], ["--resolve"]], ids=["as_is", "resolved"])
 @pytest.mark.parametrize("name", COMMANDS)
-def test_cfg_shows_the_config_and_leaves_nothing_behind(name, flags, empty_folder, capsys):
-    assert main([name, "--cfg", "job", *flags]) == 0
+def test_cfg_shows_the_config_and_leaves_nothing_behind(name, empty_folder, capsys):
+    assert main([name, "--cfg", "job", "--resolve"]) == 0
     shown = capsys.readouterr()
     assert "seed: 0" in shown.out
     assert shown.err == ""
@@ -98,12 +89,11 @@ def test_help_does_not_wait_for_torch(tmp_path):
     assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
 
 
-def test_module_and_console_script_do_the_same(tmp_path):
+def test_a_whole_command_names_its_results(tmp_path):
     tiny = ["agents=[keep_lane]", "traffics=[idm]", "episodes=1", "env.goal_m=20"]
-    for start in (["-m", "ganlane.evaluate"], ["-m", "ganlane", "evaluate"]):
-        done = command(*start, *tiny, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.splitlines()[-1].startswith(f"results: {tmp_path}")
+    done = command("-m", "ganlane", "evaluate", *tiny, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].startswith(f"results: {tmp_path}")
 
 
 def test_a_mistake_ends_the_process_with_status_2(tmp_path):

@@ -1,4 +1,4 @@
-"""What ``ganlane`` itself prints goes to a reader who leaves, or to a full disk: one status, no traceback."""
+"""What ganlane prints goes to a reader who leaves, or to a full disk: one status, no traceback."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-#: What no command with keys stands behind; the doctor's own report is printed as its help is.
-LINES = [["--help"], ["--version"], ["doctor", "--help"]]
+#: ``ganlane`` itself, a command without keys, and one with keys, which names itself.
+LINES = [["--help"], ["doctor", "--help"], ["train", "--help"]]
 
 
 def started(arguments, **options):
@@ -26,9 +26,9 @@ def started(arguments, **options):
 def test_a_full_disk_ends_it_with_one_sentence(arguments):
     with open("/dev/full", "w") as full, started(arguments, stdout=full) as process:
         _, err = process.communicate(timeout=120)
-    assert err == (
-        "ganlane: a file or standard output: No space left on device; make room there, or write to another disk.\n"
-    )
+    name = "ganlane train" if "train" in arguments else "ganlane"
+    told = "a file or standard output: No space left on device; make room there, or write to another disk.\n"
+    assert err == f"{name}: {told}"
     assert process.returncode == 2
 
 

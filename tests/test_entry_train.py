@@ -158,9 +158,10 @@ def test_a_mistake_leaves_one_sentence_and_no_file(arguments, part, capsys, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("traffic", ["idm", "idm_mobil", "gan", "gan_calibrated"])
-@pytest.mark.parametrize("init", ["none", "idm_ckpt"])
-def test_every_traffic_runs_with_every_start(traffic, init, capsys):
+@pytest.mark.parametrize(
+    ("traffic", "init"), [("idm", "idm_ckpt"), ("idm_mobil", "none"), ("gan", "idm_ckpt"), ("gan_calibrated", "none")]
+)
+def test_every_traffic_and_every_start_runs(traffic, init, capsys):
     budget = ["total_decisions=64", "collector.num_envs=16", "env.goal_m=40", "agent.warmup=256", "log_every=64"]
     final = ["evaluation.agents=[keep_lane]", "evaluation.episodes=1", "agent.capacity=1000"]
     assert main([f"traffic={traffic}", f"init={init}", *budget, *final]) == 0

@@ -31,7 +31,7 @@ SHORT = {
     "torchrl_ppo.py": ["2048", "2", "60", "16"],
     "cleanrl_style.py": ["2048"],
     "sb3_dqn.py": ["300", "4", "200"],
-    "sb3_ppo.py": ["4096", "safe", "4", "200", "16"],
+    "sb3_ppo.py": ["4096", "safe", "MaskablePPO", "4", "200", "16"],
 }
 #: What an example needs beside ganlane.
 NEEDS = {"sb3_dqn.py": "stable_baselines3", "sb3_ppo.py": "sb3_contrib"}

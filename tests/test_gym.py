@@ -1,16 +1,12 @@
-"""The highway through gymnasium: one environment, a batch, pictures, and what other libraries expect of them."""
+"""The highway through gymnasium: one environment, a batch, and what gymnasium expects of them."""
 
 from __future__ import annotations
 
 import copy
-import importlib.util
-import itertools
 import pickle
-import re
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -18,24 +14,11 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
+from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until_the_end
 
 import ganlane
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
-from ganlane.gym.rendering import FilmWindow
-
-ID = "ganlane/Highway-v0"
-KEEP, LEFT, RIGHT = 0, 1, 2
-ROOT = Path(__file__).resolve().parents[1]
-MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
-
-
-def make(**options):
-    return gymnasium.make(ID, **{"traffic": "idm", "goal_m": 60.0, **options})
-
-
-def make_vec(rows, **options):
-    return gymnasium.make_vec(ID, num_envs=rows, **{"traffic": "idm", "goal_m": 60.0, **options})
 
 
 @pytest.mark.parametrize("name", sorted(ENV_IDS.keys() - {ID}))
@@ -187,14 +170,6 @@ def test_the_facade_gives_what_the_torchrl_environment_gives():
         np.testing.assert_array_equal(terminated, stepped["next", "terminated"][:, 0].numpy())
 
 
-def until_the_end(env):
-    for _ in range(100):
-        found = env.step(KEEP)
-        if found[2] or found[3]:
-            return found
-    raise AssertionError("it never ended")
-
-
 def test_the_goal_terminates_and_a_time_out_truncates():
     for options, is_goal in (({"goal_m": 30.0}, True), ({"goal_m": 5000.0, "timeout_s": 3.0}, False)):
         env = make(**options)
@@ -244,184 +219,10 @@ def test_rows_can_be_sent_on_by_hand_and_the_others_stay():
     np.testing.assert_array_equal(info["episode_number"], [4, 4, 0])
 
 
-def test_a_users_transform_pays_what_it_says():
-    from torchrl.envs import RewardScaling
-
-    alone, doubled = make(), make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
-    rewards = []
-    for env in (alone, doubled):
-        env.reset(seed=0)
-        rewards.append(env.step(KEEP)[1])
-    assert rewards[1] == pytest.approx(2.0 * rewards[0])
-
-
-def test_episode_statistics_are_recorded_for_one_and_for_many():
-    env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
-    env.reset(seed=0)
-    paid = 0.0
-    while True:
-        _, reward, terminated, truncated, info = env.step(KEEP)
-        paid += reward
-        if terminated or truncated:
-            break
-    assert info["episode"]["r"] == pytest.approx(paid)
-    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_vec(2, goal_m=30.0))
-    envs.reset(seed=0)
-    while "episode" not in info or "_episode" not in info:
-        *_, info = envs.step(np.zeros(2, int))
-    assert info["episode"]["l"][info["_episode"]].min() > 0
-
-
-def test_gymnasiums_own_vectorisation_works_too():
-    envs = make_vec(2, vectorization_mode="sync")
-    observation, info = envs.reset(seed=4)
-    assert info["seed"].tolist() == [4, 5]
-    np.testing.assert_array_equal(observation[1], make().reset(seed=5)[0])
-    assert envs.step(np.zeros(2, int))[0].shape == (2, 29)
-
-
-@pytest.mark.skipif(not MASKS_MAY_BE_ABSENT, reason="DictInfoToList needs gymnasium 1.2.2 or newer")
-def test_infos_of_a_batch_can_be_had_row_by_row():
-    envs = gymnasium.wrappers.vector.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))
-    envs.reset(seed=0)
-    *_, infos = envs.step(np.array([KEEP, LEFT]))
-    assert "final_info" not in infos[0]
-    assert infos[1]["final_info"]["out_of_road"]
-    assert infos[0]["reward_terms"].keys() == infos[1]["reward_terms"].keys()
-
-
-def test_frames_show_the_road_and_change_as_the_ego_drives():
-    env = make(render_mode="rgb_array")
-    env.reset(seed=0)
-    first = env.render()
-    assert first.shape == (320, 1280, 3)
-    assert first.dtype == np.uint8
-    np.testing.assert_array_equal(first, env.render())
-    env.step(KEEP)
-    assert not np.array_equal(first, env.render())
-    envs = make_vec(2, render_mode="rgb_array")
-    envs.reset(seed=0)
-    pictures = envs.render()
-    assert [picture.shape for picture in pictures] == [(320, 1280, 3)] * 2
-    assert not np.array_equal(*pictures)
-
-
-def test_a_long_episode_keeps_no_more_frames_than_its_trails():
-    env = make(render_mode="rgb_array", goal_m=5000.0)
-    env.reset(seed=0)
-    for _ in range(8):
-        env.step(KEEP)
-    recorder = env.unwrapped._view._recorder
-    assert len(recorder.frames) == len(recorder.time_s) == 31 + 10
-    assert recorder.time_s[-1] == pytest.approx(8.0)
-    assert env.render().shape == (320, 1280, 3)
-
-
-def test_a_list_of_frames_has_ten_for_every_second_of_driving():
-    env = make(render_mode="rgb_array_list", goal_m=300.0)
-    assert env.metadata["render_fps"] == 10
-    env.reset(seed=0)
-    assert len(env.render()) == 1
-    assert env.render() == []
-    env.step(KEEP)
-    env.step(KEEP)
-    frames = env.render()
-    assert len(frames) == 20
-    assert all(not np.array_equal(one, other) for one, other in itertools.pairwise(frames))
-
-
-@pytest.mark.parametrize("smooth", [True, False])
-def test_videos_are_recorded_decision_by_decision_or_ten_times_a_second(tmp_path, smooth):
-    moviepy = pytest.importorskip("moviepy", reason="moviepy, which gymnasium's RecordVideo needs, is not installed")
-    video = gymnasium.wrappers.RecordVideo(make(render_mode="rgb_array", goal_m=30.0), str(tmp_path / "films"))
-    if smooth:
-        video.unwrapped.set_record_video_wrapper(video)
-    video.reset(seed=0)
-    *_, info = until_the_end(video)
-    video.close()
-    (film,) = (tmp_path / "films").glob("*.mp4")
-    with moviepy.VideoFileClip(str(film)) as clip:
-        assert clip.fps == (10 if smooth else 1)
-        assert clip.n_frames == (round(info["time_s"] * 10) if smooth else info["decisions"]) + 1
-
-
-class Screen:
-    """A window that remembers what it was shown."""
-
-    def __init__(self, title):
-        self.shown, self.waited, self.closed = [], 0.0, False
-
-    def show(self, picture):
-        self.shown.append(picture)
-
-    def wait(self, seconds):
-        self.waited += seconds
-
-    def close(self):
-        self.closed = True
-
-
-def test_a_window_shows_every_physics_step(monkeypatch):
-    monkeypatch.setattr("ganlane.gym.rendering.FilmWindow", Screen)
-    monkeypatch.setattr("ganlane.gym.single.has_display", lambda: True)
-    env = make(render_mode="human")
-    assert env.unwrapped.metadata["render_modes"] == ["human", "rgb_array", "rgb_array_list"]
-    env.reset(seed=0)
-    window = env.unwrapped._view.window
-    assert len(window.shown) == 1
-    env.step(KEEP)
-    assert len(window.shown) == 11
-    assert 0.0 < window.waited <= 1.1
-    assert env.render() is None
-    env.close()
-    assert window.closed
-
-
-@pytest.fixture
-def dummy_display(monkeypatch):
-    """pygame with SDL's driver that shows nothing."""
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    return pytest.importorskip("pygame", reason="pygame is not installed")
-
-
-def test_the_window_shows_the_picture_until_it_is_closed(dummy_display):
-    pygame = dummy_display
-    window, picture = FilmWindow("test"), np.zeros((40, 60, 3), np.uint8)
-    picture[10, 20] = (1, 2, 3)
-    window.show(picture)
-    assert pygame.display.get_surface().get_size() == (60, 40)
-    assert pygame.display.get_surface().get_at((20, 10))[:3] == (1, 2, 3)
-    pygame.event.post(pygame.event.Event(pygame.QUIT))
-    window.show(picture)
-    assert not pygame.display.get_init()
-    window.show(picture)
-    window.close()
-
-
-def test_gymnasiums_own_check_opens_the_window_too(dummy_display):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(ID, decision_period_s=0.1, render_mode="human")
-        check_env(env.unwrapped)
-    env.close()
-    assert "human" in env.metadata["render_modes"]
-
-
-def test_without_a_display_the_window_is_refused_in_a_sentence(monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(UserError, match=r"render_mode=human: needs pygame .* and a display"):
-        make(render_mode="human")
-    assert make().unwrapped.metadata["render_modes"] == ["rgb_array", "rgb_array_list"]
-
-
 @pytest.mark.parametrize(
     ("options", "told"),
     [
         ({"traffic": "gann"}, "traffic=gann: no such option .did you mean 'gan'.."),
-        ({"observation": "pixels"}, "observation=pixels: no such option"),
-        ({"lanes": 0}, "env.lanes=0: expected a number from 1 to 20"),
         ({"lanes": "many"}, "env.lanes=many: expected a whole number"),
         ({"lane": 4}, "env.lane: no such key .did you mean 'lanes'.."),
         ({"reward": {"crash": 1.0}}, "reward.crash: no such key"),
@@ -456,69 +257,6 @@ def test_wrong_calls_are_told_in_a_sentence():
     refused(envs.render, "made without render_mode")
     refused(lambda: envs.reset(options={"reset_mask": np.array([1, 0])}), r"a boolean array of shape \(2,\)")
     refused(lambda: envs.reset(seed=[1, 2, 3]), "expected one seed and one episode, or 2 of each")
-
-
-def blocks(page):
-    """The Python in a page of the documentation."""
-    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.S)
-
-
-def test_the_code_in_the_docs_runs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    films = importlib.util.find_spec("moviepy") is not None
-    names = {"np": np}
-    exec("\n".join(block for block in blocks("gymnasium.md") if films or "RecordVideo" not in block), names)
-    assert names["following"].shape == (64, 29)
-
-
-def test_the_docs_list_every_info():
-    page = (ROOT / "docs" / "gymnasium.md").read_text()
-    table = re.search(r"\| key \| what \|\n(.*?)\n\n", page, re.S).group(1)
-    listed = {name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
-    _, info = make().reset(seed=0)
-    assert listed == set(info)
-    assert set(re.search(r"`speed, (.*?)` \|", table).group(1).split(", ")) | {"speed"} == set(info["reward_terms"])
-
-
-def test_stable_baselines3_trains_on_it_unchanged():
-    baselines = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
-    env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
-    check = pytest.importorskip("stable_baselines3.common.env_checker").check_env
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check(env.unwrapped)
-    model = baselines.DQN("MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]})
-    before = [weight.clone() for weight in model.q_net.parameters()]
-    model.learn(200)
-    assert model.num_timesteps == 200
-    assert len(model.ep_info_buffer) > 0
-    assert any(not torch.equal(old, new) for old, new in zip(before, model.q_net.parameters()))
-
-
-def test_tianshou_trains_on_it_unchanged():
-    pytest.importorskip("tianshou", minversion="2.0", reason="tianshou is not installed")
-    from tianshou.algorithm.modelfree.dqn import DQN, DiscreteQLearningPolicy
-    from tianshou.algorithm.optim import AdamOptimizerFactory
-    from tianshou.data import Collector, VectorReplayBuffer
-    from tianshou.env import DummyVectorEnv
-    from tianshou.trainer import OffPolicyTrainerParams
-    from tianshou.utils.net.common import Net
-
-    envs = DummyVectorEnv([lambda: gymnasium.make(ID, goal_m=100.0) for _ in range(2)])
-    net = Net(state_shape=envs.observation_space[0].shape, action_shape=3, hidden_sizes=[16])
-    policy = DiscreteQLearningPolicy(model=net, action_space=envs.action_space[0], eps_training=0.5)
-    before = [weight.detach().clone() for weight in net.parameters()]
-    algorithm = DQN(policy=policy, optim=AdamOptimizerFactory(lr=1e-3), target_update_freq=50)
-    collector = Collector(algorithm, envs, VectorReplayBuffer(1000, 2))
-    collector.reset()
-    parameters = OffPolicyTrainerParams(
-        training_collector=collector, max_epochs=1, epoch_num_steps=200, collection_step_num_env_steps=20,
-        batch_size=32, update_step_num_gradient_steps_per_sample=0.1, show_progress=False, verbose=False,
-    )  # fmt: skip
-    found = algorithm.run_training(parameters)
-    assert found.train_step == 200
-    assert found.train_episode >= 10
-    assert any(not torch.equal(old, new) for old, new in zip(before, net.parameters()))
 
 
 def test_the_safe_mask_is_in_the_info_and_behind_maskable_ppos_method():

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from reference.gym_env import KEEP, LEFT, make_vec
 
-import ganlane  # noqa: F401 - registers the environments
 from ganlane.errors import UserError
-
-KEEP, LEFT = 0, 1
-
-
-def make_vec(rows, **options):
-    return gymnasium.make_vec("ganlane/Highway-v0", num_envs=rows, **{"traffic": "idm", "goal_m": 60.0, **options})
 
 
 def returns_by_episode(mode, kernel):

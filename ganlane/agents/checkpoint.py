@@ -17,7 +17,7 @@ from ganlane.agents.policy import GreedyPolicy
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError, as_typed
 from ganlane.files import CHECKPOINTS, load_weights, save_weights
-from ganlane.parameters.removed import without_removed
+from ganlane.parameters.agent import without_removed
 
 #: Agents that come with the package; others are given by their path.
 SHIPPED = ("agent_general", "agent_idm", "agent_gan")

@@ -24,8 +24,7 @@ from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
 from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
 from ganlane.agents.update_graph import UpdateGraph, can_graph
 from ganlane.errors import ParameterError, UserError
-from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.removed import without_removed
+from ganlane.parameters.agent import RainbowConfig, without_removed
 
 
 class Rainbow:

@@ -23,8 +23,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.env.decision import run_decision
 from ganlane.env.native_step import after_decision, native_decision
-from ganlane.parameters.observation import ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import ObservationConfig, RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Vehicles
 

@@ -13,8 +13,7 @@ from ganlane import keys
 from ganlane.bench.measure import Case, Group, Row, Runner, Suite, best_rows, speed_table
 from ganlane.bench.systems import EnvironmentRunner, Scenario
 from ganlane.evaluation.table import Table
-from ganlane.parameters.observation import ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import ObservationConfig, RewardParameters
 
 SYSTEM = "ganlane traffic"
 _HEADINGS = (

@@ -155,7 +155,7 @@ def _hydra(command: str, task: Task, arguments: list[str]) -> None:
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
-    register()
+    register(command)
     mistakes: list[Exception] = []
     here = os.getpid()
 

@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated, TypeAlias
 
-from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import COLUMNS, NAMES, has_cuda
+from ganlane.config.env import EnvConfig, Vehicles, check_reward
+from ganlane.config.run import Columns, Names, has_cuda
 from ganlane.config.traffic import TrafficConfig, all_traffics, chosen_traffics
 from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.checks import Rule, between, check, every, one_of
-from ganlane.parameters.observation import ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.checks import DIFFERENT, Record, Rule, Seed, between, one_of
+from ganlane.parameters.observation import ObservationConfig, RewardParameters
 
-SUITES = ("sim", "traffic", "train")
 MODES = ("eager", "compiled", "native")
 DEVICES = ("cpu", "cuda")
 _QUICK_BATCH = 64
 _QUICK_STORED = 1000
 
-
-def _different(rule: Rule) -> Rule:
-    """A list of different entries, not empty, of which every one obeys ``rule``."""
-    entries = every(rule)
-    return Rule(
-        lambda values: entries.holds(values) and NAMES.holds(values), f"{entries.expected}, all of them different"
-    )
+Batch: TypeAlias = Annotated[int, between(1, 2**20)]
+Batches: TypeAlias = Annotated[list[Batch], DIFFERENT]
+_PAIR = Rule(lambda pair: len(pair) == 2 and pair[0] < pair[1], "two batch sizes, the smaller one first")
 
 
 @dataclass
-class BenchConfig:
+class BenchConfig(Record):
     """What to measure, how often, and where to write it down.
 
     Attributes:
@@ -59,28 +54,28 @@ class BenchConfig:
         columns: of printed tables; auto: as many as the terminal has room for; all.
     """
 
-    suite: str = "sim"
+    suite: Annotated[str, one_of(("sim", "traffic", "train"))] = "sim"
     quick: bool = False
-    batches: list[int] = field(default_factory=lambda: [1, 16, 64, 256, 1024, 4096, 16384])
-    modes: list[str] = field(default_factory=lambda: list(MODES))
-    threads: list[int] = field(default_factory=lambda: [1, 2])
-    devices: list[str] | None = None
-    vehicle_counts: list[int] = field(default_factory=lambda: [9, 15, 30, 60])
-    scaling_batch: int = 1024
-    linear_from: int = 1024
-    memory_batches: list[int] = field(default_factory=lambda: [1024, 4096])
-    traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
-    traffic_batches: list[int] = field(default_factory=lambda: [512, 2048])
-    train_traffics: list[str] = field(default_factory=lambda: ["idm_mobil", "gan"])
-    train_batches: list[int] = field(default_factory=lambda: [256, 512, 1024])
+    batches: Batches = field(default_factory=lambda: [1, 16, 64, 256, 1024, 4096, 16384])
+    modes: Annotated[list[Annotated[str, one_of(MODES)]], DIFFERENT] = field(default_factory=lambda: list(MODES))
+    threads: Annotated[list[Annotated[int, between(1, 1024)]], DIFFERENT] = field(default_factory=lambda: [1, 2])
+    devices: Annotated[list[Annotated[str, one_of(DEVICES)]], DIFFERENT] | None = None
+    vehicle_counts: Annotated[list[Vehicles], DIFFERENT] = field(default_factory=lambda: [9, 15, 30, 60])
+    scaling_batch: Batch = 1024
+    linear_from: Batch = 1024
+    memory_batches: Annotated[list[Batch], _PAIR] = field(default_factory=lambda: [1024, 4096])
+    traffics: Names = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
+    traffic_batches: Batches = field(default_factory=lambda: [512, 2048])
+    train_traffics: Names = field(default_factory=lambda: ["idm_mobil", "gan"])
+    train_batches: Batches = field(default_factory=lambda: [256, 512, 1024])
     train_stored: int = 1_000_000
-    repetitions: int = 5
-    seconds: float = 0.5
+    repetitions: Annotated[int, between(1, 1000)] = 5
+    seconds: Annotated[float, between(0.001, 600)] = 0.5
     peers: bool = True
     memory: bool = True
     report: str | None = None
-    seed: int = 0
-    columns: str = "auto"
+    seed: Seed = 0
+    columns: Columns = "auto"
     env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     observation: ObservationConfig = field(default_factory=ObservationConfig)
@@ -88,31 +83,15 @@ class BenchConfig:
     agent: RainbowConfig = field(default_factory=RainbowConfig)
 
     def __post_init__(self) -> None:
-        sizes = between(1, 2**20)
-        check(
-            self,
-            suite=one_of(SUITES),
-            columns=one_of(COLUMNS),
-            batches=_different(sizes),
-            modes=_different(one_of(MODES)),
-            threads=_different(between(1, 1024)),
-            vehicle_counts=_different(between(2, 1000)),
-            scaling_batch=sizes,
-            linear_from=sizes,
-            traffics=NAMES,
-            traffic_batches=_different(sizes),
-            train_traffics=NAMES,
-            train_batches=_different(sizes),
-            repetitions=between(1, 1000),
-            seconds=between(0.001, 600),
-            seed=between(0, 2**53),
-            memory_batches=Rule(
-                lambda pair: len(pair) == 2 and all(map(sizes.holds, pair)) and pair[0] < pair[1],
-                "two batch sizes, the smaller one first",
-            ),
-        )
-        self._check_devices()
-        self._check_stored()
+        super().__post_init__()
+        if "cuda" in (self.devices or ()) and not has_cuda():
+            raise UserError("devices: torch sees no CUDA device here; leave cuda out or install torch for CUDA.")
+        least, most = self.agent.batch_size, self.agent.capacity
+        if not least <= self.train_stored <= most:
+            raise UserError(
+                f"train_stored={self.train_stored}: expected at least agent.batch_size={least} and at most "
+                f"agent.capacity={most} transitions."
+            )
         self.chosen_traffics()
         self.chosen_train_traffics()
         check_reward(self.env, self.reward)
@@ -124,21 +103,6 @@ class BenchConfig:
     def chosen_train_traffics(self) -> dict[str, TrafficConfig]:
         """Those of ``suite=train``, by name."""
         return chosen_traffics("train_traffics", self.train_traffics, all_traffics(), own=False)
-
-    def _check_stored(self) -> None:
-        least, most = self.agent.batch_size, self.agent.capacity
-        if not least <= self.train_stored <= most:
-            raise UserError(
-                f"train_stored={self.train_stored}: expected at least agent.batch_size={least} and at most "
-                f"agent.capacity={most} transitions."
-            )
-
-    def _check_devices(self) -> None:
-        if self.devices is None:
-            return
-        check(self, devices=_different(one_of(DEVICES)))
-        if "cuda" in self.devices and not has_cuda():
-            raise UserError("devices: torch sees no CUDA device here; leave cuda out or install torch for CUDA.")
 
     def chosen_devices(self) -> tuple[str, ...]:
         """Those asked for; by default the CPU, and a GPU where there is one."""

@@ -243,7 +243,7 @@ def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Che
     Raises:
         UserError: an unknown key or option, a value of the wrong type or out of range.
     """
-    register()
+    register(command)
     try:
         parse(overrides)
         runs = single_runs(overrides, multirun)

@@ -85,7 +85,7 @@ def _completed(command: str, rest: str) -> list[str]:
     from ganlane.config.command_line import VERSION_BASE
     from ganlane.config.schemas import SUFFIX, register
 
-    register()
+    register(command)
     with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
         plugin = BashCompletion(GlobalHydra.instance().config_loader())
         found = plugin._query(config_name=command, line=rest.lstrip())

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import above, assign, between, check, one_of, part_of
+from ganlane.parameters.checks import Positive, Share, assign, between, one_of, part_of
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.parameters.episode import KERNELS, EpisodeParameters, SpawnParameters
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import RewardParameters
 
 if TYPE_CHECKING:
     from ganlane.sim.scenes import Scenes
+
+Vehicles: TypeAlias = Annotated[int, between(2, 1000)]
 
 
 @dataclass(frozen=True)
@@ -35,25 +37,19 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         mobil: how the others change lanes, Table IV.
     """
 
-    vehicles: int = 9
-    lanes: int = 3
-    lane_width_m: float = 4.0
+    vehicles: Vehicles = 9
+    lanes: Annotated[int, between(1, 20)] = 3
+    lane_width_m: Positive = 4.0
     recycle: bool = False
-    recycle_share: float = 1.0
+    recycle_share: Share = 1.0
     compile: bool = False
-    kernel: str = "auto"
+    kernel: Annotated[str, one_of(KERNELS)] = "auto"
     ego: EgoParameters = field(default_factory=EgoParameters)
     idm: IdmParameters = field(default_factory=IdmParameters)
     mobil: MobilParameters = field(default_factory=MobilParameters)
 
     def __post_init__(self) -> None:
-        check(self, vehicles=between(2, 1000), lanes=between(1, 20), lane_width_m=above(0))
-        check(self, recycle_share=between(0, 1), kernel=one_of(KERNELS))
-        SpawnParameters.__post_init__(self)
-        EpisodeParameters.__post_init__(self)
-        self._check_together()
-
-    def _check_together(self) -> None:
+        super().__post_init__()
         for name in ("width_m", "truck_width_m") if self.truck_share > 0 else ("width_m",):
             width = getattr(self, name)
             if self.lane_width_m <= width:
@@ -109,10 +105,10 @@ class DenseEnvConfig(EnvConfig):
         metres_per_vehicle: spread_m is at least this times vehicles, m; Table II has 200 m for 9.
     """
 
-    vehicles: int = 30
-    metres_per_vehicle: float = 22.3
+    vehicles: Vehicles = 30
+    metres_per_vehicle: Positive = 22.3
 
     def __post_init__(self) -> None:
-        check(self, metres_per_vehicle=above(0), vehicles=between(2, 1000))
+        self.check_ranges("metres_per_vehicle", "vehicles")
         assign(self, spread_m=max(self.spread_m, self.metres_per_vehicle * self.vehicles))
         super().__post_init__()

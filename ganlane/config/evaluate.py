@@ -1,22 +1,30 @@
-"""Root of ``ganlane evaluate``."""
+"""Roots of the commands that put drivers through episodes: ``ganlane evaluate``, ``reproduce`` and ``record``."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import EPISODES, NAMES, GeneratorFile, RunConfig
-from ganlane.config.traffic import TrafficConfig, all_traffics, chosen_traffics
-from ganlane.parameters.checks import between, check, one_of
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.config.run import DrivingConfig, Environments, Episodes, Names
+from ganlane.config.traffic import TRAFFICS, TrafficConfig, all_traffics, chosen_traffics
+from ganlane.parameters.checks import DIFFERENT, Rule, Seed, Text, between, one_of
 
-#: Families of episodes that can be driven for a table: to choose on, to report on.
-STREAMS = ("report", "select")
+_COUNTS = Rule(
+    lambda counts: isinstance(counts, dict) and all(type(n) is int and n >= 2 for n in counts.values()),
+    "names of traffics with whole numbers of at least 2",
+)
+_WITH_MOBIL = Rule(
+    lambda names: "mobil" in names and len(names) > 1, "mobil and others, since every lead is one over mobil"
+)
+_DATASET = Rule(
+    lambda name: re.fullmatch(r"(\w[\w-]*/)*\w[\w-]*-v\d+", name, re.ASCII) is not None,
+    "a name such as highway/mobil-v0, its parts of letters, digits, - and _",
+)
 
 
 @dataclass
-class EvaluateConfig(RunConfig):
+class EvaluateConfig(DrivingConfig):
     """Agents x traffics, the same episodes for all of them.
 
     Attributes:
@@ -27,29 +35,88 @@ class EvaluateConfig(RunConfig):
         episodes: the episodes 0 to episodes - 1 of the seed and stream.
         num_envs: episodes driven side by side, at most.
         stream: select: the episodes kept for choosing among recipes, never for a reported figure.
-        generator: weights of generated traffic.
         traffic_options: the traffics' keys.
     """
 
-    agents: list[str] = field(default_factory=lambda: ["mobil", "keep_lane", "random_legal", "agent_idm"])
-    traffics: list[str] = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
-    episodes: int = 100
-    num_envs: int = 512
-    stream: str = "report"
-    env: EnvConfig = field(default_factory=EnvConfig)
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskParameters = field(default_factory=MaskParameters)
-    reward: RewardParameters = field(default_factory=RewardParameters)
-    generator: GeneratorFile = field(default_factory=GeneratorFile)
+    agents: Names = field(default_factory=lambda: ["mobil", "keep_lane", "random_legal", "agent_idm"])
+    traffics: Names = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
+    episodes: Episodes = 100
+    num_envs: Environments = 512
+    stream: Annotated[str, one_of(("report", "select"))] = "report"
     traffic_options: dict[str, TrafficConfig] = field(default_factory=all_traffics)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, agents=NAMES, traffics=NAMES, episodes=EPISODES, num_envs=between(1, 65536))
-        check(self, stream=one_of(STREAMS))
-        check_reward(self.env, self.reward)
         self.chosen_traffics()
 
     def chosen_traffics(self) -> dict[str, TrafficConfig]:
         """The traffics asked for, by name: options of the group, or import paths of a user's own."""
         return chosen_traffics("traffics", self.traffics, self.traffic_options)
+
+
+def _paper_agents() -> list[str]:
+    trained = ("agent_idm@all", "agent_gan@all", "agent_general")
+    behind = [f"{agent}+{mask}" for agent in trained for mask in ("none", "legal", "safe")]
+    return ["random_legal", "keep_lane", "mobil", "mobil_egoistic", *behind]
+
+
+@dataclass
+class ReproduceConfig(EvaluateConfig):
+    """Every driver on every traffic, on the same episodes: tables and figures in one folder.
+
+    Attributes:
+        source: shipped: the agents that ship; scratch: train the paper's agents first, seed by seed (hours). May be
+            given as from=.
+        agents: as of ganlane evaluate; agent_idm@all: every training of its recipe.
+        traffics: options of the group traffic; what is not installed or not at hand is left out, with the reason.
+        fewer: traffics on which driving is slow, with fewer episodes; the smaller number counts.
+        workers: processes that drive.
+        cells: folder of what was driven; a pair of driver and traffic that is there is not driven again.
+        runs: folders of training runs for the learning curves, each with the folder pretrain of its first phase.
+        training_seeds: of source=scratch.
+        trained: of source=scratch: folder of the trainings; those in it go on where they stopped.
+    """
+
+    source: Annotated[str, one_of(("shipped", "scratch"))] = "shipped"
+    agents: Annotated[Names, _WITH_MOBIL] = field(default_factory=_paper_agents)
+    traffics: Names = field(default_factory=lambda: [name for name in TRAFFICS if name != "mixed"])
+    episodes: Annotated[int, between(2, 10_000)] = 1000
+    fewer: Annotated[dict[str, int], _COUNTS] = field(
+        default_factory=lambda: {"gan": 150, "gan_calibrated": 100, "replay": 200, "sumo": 8, "highway_env": 3}
+    )
+    workers: Annotated[int, between(1, 64)] = 2
+    cells: str = "outputs/cells"
+    runs: list[str] = field(default_factory=list)
+    training_seeds: Annotated[list[Seed], DIFFERENT] = field(default_factory=lambda: [0, 1, 2, 3, 4])
+    trained: str = "outputs/scratch"
+
+    def episodes_on(self, traffic: str) -> int:
+        """How many episodes are driven on a traffic."""
+        return min(self.episodes, self.fewer.get(traffic, self.episodes))
+
+
+@dataclass
+class RecordConfig(DrivingConfig):
+    """A driver's episodes as an offline dataset.
+
+    Attributes:
+        driver: agent=NAME says the same: a name, path or import path as in ganlane evaluate.
+        episodes: the episodes 0 to episodes - 1 of the seed and stream.
+        num_envs: episodes driven side by side, at most.
+        stream: train, select or report (the episodes of ganlane evaluate).
+        out: folder of the datasets, Minari's MINARI_DATASETS_PATH; null: the run folder.
+        dataset: the dataset's name; null: ganlane/TRAFFIC/DRIVER-v0.
+    """
+
+    driver: str = "mobil"
+    episodes: Episodes = 100
+    num_envs: Environments = 64
+    stream: Annotated[str, one_of(("train", "select", "report"))] = "train"
+    out: Text | None = None
+    dataset: Annotated[str, _DATASET] | None = None
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+
+    def dataset_name(self) -> str:
+        """The dataset's name, made from traffic and driver where none is given."""
+        parts = (re.sub(r"[^A-Za-z0-9_]+", "_", part).strip("_") for part in (self.traffic.label(), self.driver))
+        return self.dataset or f"ganlane/{'/'.join(parts)}-v0"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -66,15 +66,10 @@ def _one_line(error: BaseException | str) -> str:
     return re.sub(r"\s+", " ", str(error)).strip().rstrip(".")
 
 
-def option_names(options: Iterable[str] | None) -> list[str]:
-    """Names that a user may choose: schemas are not among them."""
-    return sorted(name for name in options or () if not name.endswith("_schema"))
-
-
 def _missing_option(error: MissingConfigException) -> str:
     """``group=name`` without such an option."""
     group, _, name = (error.missing_cfg_file or "").rpartition("/")
-    known = option_names(error.options)
+    known = sorted(option for option in error.options or () if not option.endswith("_schema"))
     if not known:
         return f"{_one_line(error)}; {_HELP}."
     return f"{group}={name}: no such option{did_you_mean(name, known)}; choose one of {', '.join(known)}."

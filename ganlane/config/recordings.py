@@ -1,15 +1,32 @@
-"""Roots of ``ganlane prepare`` and ``ganlane train_generator``."""
+"""Roots of the commands that read recordings: ``ganlane prepare``, ``train_generator`` and ``realism``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
-from ganlane.config.run import RunConfig
+from ganlane.config.env import EnvConfig
+from ganlane.config.run import GeneratorFile, RunConfig
+from ganlane.config.traffic import REACTING, TrafficConfig, chosen_traffics
 from ganlane.errors import UserError
-from ganlane.parameters.checks import at_least, check, optional
+from ganlane.parameters.checks import CountOrZero, NotNegative, at_least, between, one_of
 from ganlane.parameters.data import DataConfig
 from ganlane.parameters.generator import FitConfig
+
+#: Names of the card's own references.
+_REFERENCES = ("random", "constant_velocity")
+#: Traffics that cannot have a card, and why.
+_WITHOUT_CARD = {
+    "replay": "it is the recordings themselves; choose a traffic that drives",
+    "mixed": "a card is of one traffic; make one of each of its parts",
+    **dict.fromkeys(
+        ("sumo", "highway_env"),
+        "a foreign simulator drives around an ego only, and a card has none; choose one of our own",
+    ),
+}
+_QUICK_KM = 5.0
+_QUICK_S = 30.0
 
 
 @dataclass
@@ -25,11 +42,10 @@ class PrepareConfig(RunConfig):
 
     data: DataConfig = field(default_factory=DataConfig)
     out: str | None = None
-    scene_s: float | None = None
+    scene_s: Annotated[float, at_least(1)] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, scene_s=optional(at_least(1)))
         if self.device != "cpu":
             raise UserError(f"device={self.device}: recordings are prepared on the CPU; use device=cpu.")
         if self.data.format != "scenes" and self.data.path is None:
@@ -48,16 +64,105 @@ class TrainGeneratorConfig(RunConfig):
 
     data: DataConfig = field(default_factory=DataConfig)
     generator: FitConfig = field(default_factory=FitConfig)
-    folds: int = 0
+    folds: CountOrZero = 0
     ablations: bool = False
     resume: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, folds=at_least(0))
         if self.folds == 1:
             raise UserError("folds=1: one fold leaves nothing to fit to; use 2 or more, or 0 for none.")
         if self.resume is not None and not Path(self.resume).is_dir():
             raise UserError(f"resume={self.resume}: no such folder; give the folder of an earlier run.")
         if self.device != "cpu":
             raise UserError(f"device={self.device}: generators are fitted on the CPU, in minutes; use device=cpu.")
+
+
+@dataclass
+class RealismConfig(RunConfig):
+    """A traffic, what it is compared with, the recordings, and how much is driven.
+
+    Attributes:
+        against: further traffics from the same starts: options of the group traffic, or the import path of a model of
+            your own.
+        scenes: starts: held_out (data.held_out) or all, those that the generator was fitted to too.
+        repeats: times that every scene is driven, with other random numbers.
+        desired_above_mps: mean excess of desired speeds over the speed at entry, m/s; null: fitted per traffic.
+        long_vehicles: long runs without an ego, with so many vehicles each.
+        vehicle_km: at least so many in every long run; 0 leaves them out.
+        long_s: no episode of a long run lasts longer, s.
+        long_against: true: long runs of the traffics of against, too.
+        i80: whether the I-80 files in the folder of the scenes are used; null: if they are there.
+        resamples: of the bootstrap over scenes.
+        quick: true: a check that it runs, in seconds.
+        publish: true (maintainers): write the histograms that ship from these recordings.
+        report: write the tables into this document, between the markers of this card.
+        figures: write the figures into this folder too, as realism_NAME.png.
+        generator: weights of generated traffic.
+        fold_weights: generators of k folds: every scene is driven by the one that was fitted without it.
+        traffic_options: the keys of the traffics of against.
+    """
+
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    against: list[str] = field(default_factory=lambda: ["idm_mobil"])
+    scenes: Annotated[str, one_of(("held_out", "all"))] = "held_out"
+    repeats: Annotated[int, between(1, 1000)] = 4
+    desired_above_mps: NotNegative | None = None
+    long_vehicles: list[Annotated[int, between(1, 1000)]] = field(default_factory=lambda: [9, 30])
+    vehicle_km: NotNegative = 3000.0
+    long_s: Annotated[float, between(10, 3600)] = 600.0
+    long_against: bool = False
+    i80: bool | None = None
+    resamples: Annotated[int, between(100, 100_000)] = 2000
+    quick: bool = False
+    publish: bool = False
+    report: str | None = None
+    figures: str | None = None
+    env: EnvConfig = field(default_factory=EnvConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    generator: GeneratorFile = field(default_factory=GeneratorFile)
+    fold_weights: list[str] = field(default_factory=list)
+    traffic_options: dict[str, TrafficConfig] = field(
+        default_factory=lambda: {name: kind() for name, kind in REACTING.items()}
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.device != "cpu":
+            raise UserError(f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu.")
+        if self.traffic.label() in _WITHOUT_CARD:
+            raise UserError(f"traffic={self.traffic.label()}: {_WITHOUT_CARD[self.traffic.label()]}.")
+        if self.data.format != "scenes":
+            raise UserError(
+                f"data={self.data.format}: the card reads scenes; run ganlane prepare data={self.data.format} first, "
+                "and give data=scenes data.path=FOLDER with what it wrote."
+            )
+        if self.publish and self.scenes != "all":
+            raise UserError("publish=true: the file that ships is made from all recorded scenes; give scenes=all.")
+        self.rivals()
+
+    def card(self) -> str:
+        """The card's name in a document: whose it is, and from where everybody starts."""
+        return f"{self.traffic.label()} {'folds' if self.fold_weights else self.scenes}"
+
+    def rivals(self) -> dict[str, TrafficConfig]:
+        """The traffics to compare with, by name; the traffic itself is left out."""
+        names = [name for name in self.against if name != self.traffic.label()]
+        for name in [*names, self.traffic.label()]:
+            if name in _REFERENCES:
+                raise UserError(f"against={name}: every card holds it anyway; leave it out.")
+        return chosen_traffics("against", names, self.traffic_options)
+
+    def shortened(self) -> RealismConfig:
+        """With ``quick``, a check that it runs: one repeat, nothing fitted, few vehicle-km, I-80 if asked for."""
+        if not self.quick:
+            return self
+        return replace(
+            self,
+            repeats=1,
+            desired_above_mps=4.5 if self.desired_above_mps is None else self.desired_above_mps,
+            vehicle_km=min(self.vehicle_km, _QUICK_KM),
+            long_s=min(self.long_s, _QUICK_S),
+            i80=bool(self.i80),
+            resamples=min(self.resamples, 200),
+        )

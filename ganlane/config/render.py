@@ -5,14 +5,23 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import GeneratorFile, RunConfig
+from ganlane.config.run import DrivingConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError, UserError
-from ganlane.parameters.checks import Rule, above, at_least, between, check, every, optional, text
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.checks import (
+    DIFFERENT,
+    Count,
+    NotNegative,
+    Positive,
+    Record,
+    Seed,
+    Text,
+    at_least,
+    between,
+    one_of,
+)
 
 #: Films of one episode; pages and tables of any number of episodes.
 FILMS = ("gif", "mp4", "png")
@@ -25,7 +34,7 @@ GIF_S = 30.0
 
 
 @dataclass
-class FilmConfig:
+class FilmConfig(Record):
     """``film``: which part of the episode, how fast, how large.
 
     Attributes:
@@ -43,39 +52,27 @@ class FilmConfig:
         max_bytes: gif: size and frame rate are lowered until it fits; html: the rate of samples.
     """
 
-    fps: float = 20.0
-    speedup: float = 1.0
-    start_s: float = 0.0
-    end_s: float | None = None
-    width: int = 1280
-    height: int = 320
-    road_m: float = 160.0
-    trail_s: float = 3.0
+    fps: Annotated[float, between(1, 120)] = 20.0
+    speedup: Positive = 1.0
+    start_s: NotNegative = 0.0
+    end_s: Positive | None = None
+    width: Annotated[int, between(600, 7680)] = 1280
+    height: Annotated[int, between(160, 4320)] = 320
+    road_m: Positive = 160.0
+    trail_s: NotNegative = 3.0
     speeds: bool = True
     leader_line: bool = False
-    scale: float = 1.0
-    max_bytes: int | None = None
+    scale: Annotated[float, between(0.05, 4)] = 1.0
+    max_bytes: Annotated[int, at_least(10_000)] | None = None
 
     def __post_init__(self) -> None:
-        check(
-            self,
-            fps=between(1, 120),
-            speedup=above(0),
-            start_s=at_least(0),
-            end_s=optional(above(0)),
-            width=between(600, 7680),
-            height=between(160, 4320),
-            road_m=above(0),
-            trail_s=at_least(0),
-            scale=between(0.05, 4),
-            max_bytes=optional(at_least(10_000)),
-        )
+        super().__post_init__()
         if self.end_s is not None and self.end_s <= self.start_s:
             raise ParameterError(f"{{end_s}}={self.end_s:g}: expected more than {{start_s}}={self.start_s:g}.")
 
 
 @dataclass
-class CurvesConfig:
+class CurvesConfig(Record):
     """``curves``: how the figures of training runs are drawn.
 
     Attributes:
@@ -83,15 +80,12 @@ class CurvesConfig:
         smooth: rows that a running mean takes in.
     """
 
-    columns: list[str] | None = None
-    smooth: int = 1
-
-    def __post_init__(self) -> None:
-        check(self, columns=optional(every(text())), smooth=at_least(1))
+    columns: list[Text] | None = None
+    smooth: Count = 1
 
 
 @dataclass
-class RenderConfig(RunConfig):
+class RenderConfig(DrivingConfig):
     """Episodes of agents on one traffic, as a film, page or table; or the learning curves of runs.
 
     Attributes:
@@ -103,34 +97,23 @@ class RenderConfig(RunConfig):
         format: gif, mp4 (needs the extra 'video'), png (a strip of four frames), html (a player), csv or parquet
             (trajectories); null: the ending of out, else gif.
         out: file to write; null: into the run folder.
-        generator: weights of generated traffic.
         film: how a film looks.
         curves: how learning curves look.
     """
 
     driver: str = "agent_general"
-    episode: int = 0
-    agents: list[str] | None = None
-    episodes: list[int] | None = None
-    run: list[str] | None = None
-    format: str | None = None
+    episode: Seed = 0
+    agents: Annotated[list[str], DIFFERENT] | None = None
+    episodes: Annotated[list[Seed], DIFFERENT] | None = None
+    run: list[Text] | None = None
+    format: Annotated[str, one_of(FORMATS)] | None = None
     out: str | None = None
-    env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskParameters = field(default_factory=MaskParameters)
-    reward: RewardParameters = field(default_factory=RewardParameters)
-    generator: GeneratorFile = field(default_factory=GeneratorFile)
     film: FilmConfig = field(default_factory=FilmConfig)
     curves: CurvesConfig = field(default_factory=CurvesConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        number = between(0, 2**53)
-        check(self, episode=number, format=_FORMAT, run=optional(every(text())))
-        check(self, agents=optional(_DIFFERENT), episodes=optional(_DIFFERENT))
-        check(self, episodes=optional(every(number)))
-        check_reward(self.env, self.reward)
         if self.out is not None:
             _check_out(Path(self.out))
         self._check_kind()
@@ -176,10 +159,6 @@ class RenderConfig(RunConfig):
             )
         if count > MOST_EPISODES:
             raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
-
-
-_FORMAT = Rule(lambda value: value is None or value in FORMATS, f"one of {', '.join(FORMATS)}")
-_DIFFERENT = Rule(lambda all: len(all) > 0 and len(set(all)) == len(all), "a list of different entries, not empty")
 
 
 def _check_suffix(out: str | None, kind: str) -> None:

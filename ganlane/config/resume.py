@@ -15,7 +15,7 @@ from ganlane.config.folders import CONFIG, OVERRIDES
 from ganlane.config.targets import is_import_path
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError, as_typed
-from ganlane.parameters.removed import without_removed_overrides
+from ganlane.parameters.agent import without_removed_overrides
 
 _RUNS = Path("outputs")
 #: Where a run keeps its checkpoint, below its folder.

@@ -1,22 +1,27 @@
-"""What the commands share: seed, threads, device, and the file of the generated traffic."""
+"""What the commands share: seed, threads, device, and what everybody drives with."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated, TypeAlias
 
+from ganlane.config.env import EnvConfig, check_reward
 from ganlane.errors import UserError
-from ganlane.parameters.checks import Rule, at_least, between, check, one_of
+from ganlane.parameters.checks import DIFFERENT, CountOrZero, Record, Seed, between, one_of
+from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
-#: A list of names without repetitions.
-NAMES = Rule(lambda names: len(names) > 0 and len(set(names)) == len(names), "a list of different names, not empty")
+#: Environments driven side by side.
+Environments: TypeAlias = Annotated[int, between(1, 65536)]
 #: A number of episodes; their results stay in memory.
-EPISODES = between(1, 10_000_000)
+Episodes: TypeAlias = Annotated[int, between(1, 10_000_000)]
+#: Names without repetitions.
+Names: TypeAlias = Annotated[list[str], DIFFERENT]
 #: Of printed tables.
-COLUMNS = ("auto", "all")
+Columns: TypeAlias = Annotated[str, one_of(("auto", "all"))]
 
 
 @dataclass
-class RunConfig:
+class RunConfig(Record):
     """What every command has.
 
     Attributes:
@@ -26,14 +31,13 @@ class RunConfig:
         columns: of printed tables; auto: as many as the terminal has room for; all.
     """
 
-    seed: int = 0
-    threads: int = 0
-    device: str = "cpu"
-    columns: str = "auto"
+    seed: Seed = 0
+    threads: CountOrZero = 0
+    device: Annotated[str, one_of(("cpu", "cuda"))] = "cpu"
+    columns: Columns = "auto"
 
     def __post_init__(self) -> None:
-        check(self, seed=between(0, 2**53), threads=at_least(0), device=one_of(("cpu", "cuda")))
-        check(self, columns=one_of(COLUMNS))
+        super().__post_init__()
         if self.device == "cuda" and not has_cuda():
             raise UserError("device=cuda: torch sees no CUDA device here; use device=cpu or install torch for CUDA.")
 
@@ -54,3 +58,22 @@ class GeneratorFile:
     """
 
     path: str | None = None
+
+
+@dataclass
+class DrivingConfig(RunConfig):
+    """What every command has in which somebody drives.
+
+    Attributes:
+        generator: weights of generated traffic.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    mask: MaskParameters = field(default_factory=MaskParameters)
+    reward: RewardParameters = field(default_factory=RewardParameters)
+    generator: GeneratorFile = field(default_factory=GeneratorFile)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_reward(self.env, self.reward)

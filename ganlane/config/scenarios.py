@@ -7,12 +7,12 @@ from a file (:mod:`ganlane.sim.scene_files`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from ganlane.config.env import EnvConfig
 from ganlane.config.targets import call_with
 from ganlane.errors import ParameterError, as_typed
-from ganlane.parameters.checks import above, assign, at_least, between, check, lists_to_tuples, optional, text
+from ganlane.parameters.checks import NotNegative, Positive, Record, Text, assign, between
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 
@@ -24,7 +24,7 @@ TABLE_II_KEYS = tuple(field.name for field in fields(SpawnParameters) if field.n
 
 
 @dataclass(frozen=True)
-class SceneOptions:
+class SceneOptions(Record):
     """``env.scene``: how much the scene varies from episode to episode.
 
     Attributes:
@@ -32,11 +32,8 @@ class SceneOptions:
         jitter_mps: and speeds, m/s; standing vehicles remain standing.
     """
 
-    jitter_m: float = 0.0
-    jitter_mps: float = 0.0
-
-    def __post_init__(self) -> None:
-        check(self, jitter_m=at_least(0), jitter_mps=at_least(0))
+    jitter_m: NotNegative = 0.0
+    jitter_mps: NotNegative = 0.0
 
 
 @dataclass(frozen=True)
@@ -57,28 +54,20 @@ class SceneEnvConfig(EnvConfig):
     scene: SceneOptions = field(default_factory=SceneOptions)
 
     def __post_init__(self) -> None:
-        lists_to_tuples(self)
-        self._refuse_table_ii()
-        check(self, lane_width_m=above(0), lanes=between(1, 20), ego_desired_speed_mps=above(0))
-        self._count_vehicles()
-        super().__post_init__()
-
-    def _refuse_table_ii(self) -> None:
-        """A key that would be silently without effect is a mistake."""
+        self.check_ranges(*TABLE_II_KEYS, "lane_width_m", "lanes", "ego_desired_speed_mps")
         for name in TABLE_II_KEYS:
             if getattr(self, name) != getattr(SpawnParameters, name):
                 raise ParameterError(
                     f"{{{name}}}={as_typed(getattr(self, name))}: has no effect on a scene set by hand; "
                     "leave it out, or take env=highway."
                 )
-
-    def _count_vehicles(self) -> None:
         there = self.fixed_scene().vehicles
         if self.vehicles not in (0, there):
             raise ParameterError(
                 f"{{vehicles}}={self.vehicles}: the scene has {there}, the ego included; leave this key out."
             )
         assign(self, vehicles=there)
+        super().__post_init__()
 
     def _check_start(self) -> None:
         scene = self.fixed_scene()
@@ -137,15 +126,11 @@ class CutInOptions(SceneOptions):
         cutter_speed_mps: of the vehicle that cuts in, and its desired speed, m/s.
     """
 
-    jitter_m: float = 1.0
-    jitter_mps: float = 0.5
-    gap_m: float = 20.0
-    speed_mps: float = 20.0
-    cutter_speed_mps: float = 17.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, gap_m=above(0), speed_mps=above(0), cutter_speed_mps=above(0))
+    jitter_m: NotNegative = 1.0
+    jitter_mps: NotNegative = 0.5
+    gap_m: Positive = 20.0
+    speed_mps: Positive = 20.0
+    cutter_speed_mps: Positive = 17.0
 
 
 @dataclass(frozen=True)
@@ -171,15 +156,11 @@ class StalledCarOptions(SceneOptions):
         spacing_m: centre to centre, of those in the next lane, m.
     """
 
-    jitter_m: float = 1.0
-    jitter_mps: float = 0.5
-    distance_m: float = 200.0
-    speed_mps: float = 20.0
-    spacing_m: float = 120.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, distance_m=above(0), speed_mps=above(0), spacing_m=above(0))
+    jitter_m: NotNegative = 1.0
+    jitter_mps: NotNegative = 0.5
+    distance_m: Positive = 200.0
+    speed_mps: Positive = 20.0
+    spacing_m: Positive = 120.0
 
 
 @dataclass(frozen=True)
@@ -205,17 +186,12 @@ class BlockedLaneOptions(SceneOptions):
         spacing_m: centre to centre, of those in the other lanes, m; from 100 on MOBIL finds a gap.
     """
 
-    jitter_m: float = 0.5
-    jitter_mps: float = 0.5
-    distance_m: float = 250.0
-    standing: int = 3
-    speed_mps: float = 15.0
-    spacing_m: float = 60.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive = dict.fromkeys(("distance_m", "speed_mps", "spacing_m"), above(0))
-        check(self, standing=between(1, 100), **positive)
+    jitter_m: NotNegative = 0.5
+    jitter_mps: NotNegative = 0.5
+    distance_m: Positive = 250.0
+    standing: Annotated[int, between(1, 100)] = 3
+    speed_mps: Positive = 15.0
+    spacing_m: Positive = 60.0
 
 
 @dataclass(frozen=True)
@@ -243,15 +219,11 @@ class StopAndGoOptions(SceneOptions):
         speed_mps: of those that flow, m/s.
     """
 
-    jitter_m: float = 0.5
-    jitter_mps: float = 0.5
-    waves: int = 2
-    per_wave: int = 5
-    speed_mps: float = 10.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, waves=between(1, 50), per_wave=between(2, 50), speed_mps=above(0))
+    jitter_m: NotNegative = 0.5
+    jitter_mps: NotNegative = 0.5
+    waves: Annotated[int, between(1, 50)] = 2
+    per_wave: Annotated[int, between(2, 50)] = 5
+    speed_mps: Positive = 10.0
 
 
 @dataclass(frozen=True)
@@ -277,11 +249,7 @@ class FileSceneOptions(SceneOptions):
         path: the file; its first vehicle is the ego.
     """
 
-    path: str | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, path=optional(text()))
+    path: Text | None = None
 
 
 @dataclass(frozen=True)
@@ -295,15 +263,14 @@ class FileSceneEnvConfig(SceneEnvConfig):
         ego_desired_speed_mps: 0: as the file says.
     """
 
-    lanes: int = 0
-    lane_width_m: float = 0.0
-    ego_desired_speed_mps: float = 0.0
+    lanes: Annotated[int, between(0, 20)] = 0
+    lane_width_m: NotNegative = 0.0
+    ego_desired_speed_mps: NotNegative = 0.0
     timeout_s: float = 300.0
     scene: FileSceneOptions = field(default_factory=FileSceneOptions)
 
     def __post_init__(self) -> None:
-        numbers = dict.fromkeys(("lane_width_m", "ego_desired_speed_mps"), at_least(0))
-        check(self, lanes=between(0, 20), **numbers)
+        self.check_ranges("lanes", "lane_width_m", "ego_desired_speed_mps")
         scene = self._read()
         assign(
             self,

@@ -14,12 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
-from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.realism import RealismConfig
-from ganlane.config.record import RecordConfig
-from ganlane.config.recordings import PrepareConfig, TrainGeneratorConfig
+from ganlane.config.evaluate import EvaluateConfig, RecordConfig, ReproduceConfig
+from ganlane.config.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
 from ganlane.config.render import RenderConfig
-from ganlane.config.reproduce import ReproduceConfig
 from ganlane.config.scenarios import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
@@ -43,8 +40,7 @@ from ganlane.files import conf_folder
 from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.data import DataConfig, HighdDataConfig, NgsimDataConfig
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 #: Group (empty at the root) to schema name to dataclass.
 SCHEMAS: dict[str, dict[str, Any]] = {
@@ -87,14 +83,14 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 SUFFIX = "_schema"
 
 
-def register() -> None:
-    """Fill the ConfigStore; again does no harm."""
+def register(command: str) -> None:
+    """Put the schemas of all options and that of a command into the ConfigStore; again does no harm."""
     store = ConfigStore.instance()
     for group, options in SCHEMAS.items():
         kept = store.repo.get(group, {}) if group else store.repo
         for name, schema in options.items():
-            # Storing one takes OmegaConf milliseconds, and a command comes here twice.
-            if f"{name}{SUFFIX}.yaml" not in kept:
+            # Storing one takes OmegaConf milliseconds, that of a command up to 80; and a command comes here twice.
+            if f"{name}{SUFFIX}.yaml" not in kept and (group or name == command):
                 store.store(group=group or None, name=name + SUFFIX, node=node_of(schema), provider="ganlane")
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
 

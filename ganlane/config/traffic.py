@@ -14,11 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 from ganlane.config.targets import is_import_path
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import Rule, assign, between, check, did_you_mean, part_of
+from ganlane.parameters.checks import Record, Rule, Share, assign, did_you_mean, part_of
 from ganlane.parameters.traffic import (
     CalibratedGanParameters,
     DriverFaults,
@@ -28,10 +28,7 @@ from ganlane.parameters.traffic import (
     SumoParameters,
 )
 
-_IMPORT_PATH = Rule(
-    is_import_path,
-    "an import path such as my.module.MyTraffic",
-)
+ImportPath: TypeAlias = Annotated[str, Rule(is_import_path, "an import path such as my.module.MyTraffic")]
 #: A larger sum would be a period of more episodes than anybody drives side by side.
 _MOST = 1000
 _SHARES = Rule(
@@ -48,7 +45,7 @@ SHARES = {"idm_mobil": 1, "gan": 1}
 
 
 @dataclass(frozen=True)
-class TrafficConfig:
+class TrafficConfig(Record):
     """What every traffic option has.
 
     Attributes:
@@ -57,14 +54,9 @@ class TrafficConfig:
         blind_share: share of the episodes, 0 to 1, in which the others do not see the ego at all.
     """
 
-    _target_: str = "ganlane.traffic.IdmTraffic"
+    _target_: ImportPath = "ganlane.traffic.IdmTraffic"
     parameters: dict[str, Any] = field(default_factory=dict)
-    blind_share: float = 0.0
-
-    def __post_init__(self) -> None:
-        check(self, _target_=_IMPORT_PATH, blind_share=between(0, 1))
-        # Then the checks of the parameters that an option inherits.
-        getattr(super(), "__post_init__", lambda: None)()
+    blind_share: Share = 0.0
 
     def label(self) -> str:
         """Name in tables: the option's, or the target's of a model of your own."""
@@ -198,15 +190,14 @@ class MixedTrafficConfig(TrafficConfig):
     """
 
     _target_: str = "ganlane.traffic.MixedTraffic"
-    shares: Any = None
+    shares: Annotated[Any, _SHARES] = None
     options: dict[str, TrafficConfig] = field(
         default_factory=lambda: {name: kind() for name, kind in REACTING.items()}
     )
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         assign(self, shares=dict(SHARES) if self.shares is None else self.shares)
-        check(self, shares=_SHARES)
+        super().__post_init__()
         self.parts()
 
     def parts(self) -> dict[str, TrafficConfig]:

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated, TypeAlias
 
-from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import EPISODES, NAMES, GeneratorFile, RunConfig
+from ganlane.config.evaluate import EvaluateConfig
+from ganlane.config.run import DrivingConfig, Environments, Episodes, Names
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.checks import at_least, between, check, one_of, optional, text
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Record, Text, between, one_of
 
-COMPILE = ("auto", "always", "never")
+Workers: TypeAlias = Annotated[int, between(1, 1024)]
 #: Compiling takes one to two minutes, which a training of so many decisions gets back.
 WORTH_COMPILING = 300_000
-#: Whose support of returns: that of the run's own ``agent``, or that of the trained agent.
-SUPPORTS = ("run", "trained")
 
 
 @dataclass
-class InitConfig:
+class InitConfig(Record):
     """``init=idm_ckpt``: start from a trained agent.
 
     Attributes:
@@ -31,11 +28,11 @@ class InitConfig:
     """
 
     path: str | None = "agent_idm"
-    support: str = "run"
+    support: Annotated[str, one_of(("run", "trained"))] = "run"
     optimizer: bool = False
 
     def __post_init__(self) -> None:
-        check(self, support=one_of(SUPPORTS))
+        super().__post_init__()
         asked = "{optimizer}=true" if self.optimizer else "{support}=trained"
         if self.path is None and (self.optimizer or self.support == "trained"):
             raise ParameterError(
@@ -58,17 +55,14 @@ class NoInitConfig(InitConfig):
 
 
 @dataclass
-class CollectorConfig:
+class CollectorConfig(Record):
     """``collector=single``: one process steps all environments side by side.
 
     Attributes:
         num_envs: environments of the process, 1 to 65536; a step of the loop has a decision of each.
     """
 
-    num_envs: int = 512
-
-    def __post_init__(self) -> None:
-        check(self, num_envs=between(1, 65536))
+    num_envs: Environments = 512
 
     @property
     def environments(self) -> int:
@@ -85,11 +79,10 @@ class OverlapCollectorConfig(CollectorConfig):
         workers: processes, with one thread each.
     """
 
-    workers: int = 2
+    workers: Workers = 2
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, workers=between(1, 1024))
         if self.num_envs % self.workers:
             raise ParameterError(
                 f"{{num_envs}}={self.num_envs}: cannot be shared out evenly between {{workers}}={self.workers}; "
@@ -107,18 +100,19 @@ class MultiCollectorConfig(CollectorConfig):
         weights_every: decisions, over all workers, between two updates of the workers' weights.
     """
 
-    num_envs: int = 64
-    workers: int = 2
-    weights_every: int = 1024
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, workers=between(1, 1024), weights_every=at_least(1))
+    num_envs: Environments = 64
+    workers: Workers = 2
+    weights_every: Count = 1024
 
     @property
     def environments(self) -> int:
         """Decisions per step of the loop, over all workers."""
         return self.workers * self.num_envs
+
+    @property
+    def steps(self) -> int:
+        """Steps of a worker with the same weights, at least one."""
+        return max(1, self.weights_every // self.environments)
 
 
 @dataclass
@@ -129,15 +123,11 @@ class RayCollectorConfig(MultiCollectorConfig):
         address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own here.
     """
 
-    address: str | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(self, address=optional(text()))
+    address: Text | None = None
 
 
 @dataclass
-class LoggerConfig:
+class LoggerConfig(Record):
     """``logger=...``: where the figures of a training run go in addition to ``metrics.csv``.
 
     Attributes:
@@ -146,16 +136,13 @@ class LoggerConfig:
         project: of Weights & Biases.
     """
 
-    kind: str = "csv"
+    kind: Annotated[str, one_of(("csv", "tensorboard", "wandb"))] = "csv"
     progress: bool = True
-    project: str = "ganlane"
-
-    def __post_init__(self) -> None:
-        check(self, kind=one_of(("csv", "tensorboard", "wandb")), project=text())
+    project: Text = "ganlane"
 
 
 @dataclass
-class PretrainConfig:
+class PretrainConfig(Record):
     """``pretrain``: a first phase on other traffic, whose agent the main phase starts from.
 
     Attributes:
@@ -163,11 +150,11 @@ class PretrainConfig:
         traffic: traffic@pretrain.traffic=idm_mobil.
     """
 
-    total_decisions: int = 0
+    total_decisions: CountOrZero = 0
     traffic: TrafficConfig | None = None
 
     def __post_init__(self) -> None:
-        check(self, total_decisions=at_least(0))
+        super().__post_init__()
         if self.total_decisions > 0 and self.traffic is None:
             raise ParameterError(
                 f"{{total_decisions}}={self.total_decisions}: on which traffic? give for instance "
@@ -176,7 +163,7 @@ class PretrainConfig:
 
 
 @dataclass
-class FinalEvaluationConfig:
+class FinalEvaluationConfig(Record):
     """``evaluation``: the trained agent and others on the same episodes, when training is over.
 
     Attributes:
@@ -186,17 +173,14 @@ class FinalEvaluationConfig:
         num_envs: episodes driven side by side, at most.
     """
 
-    agents: list[str] = field(default_factory=lambda: ["mobil", "agent_idm", "random_legal"])
+    agents: Names = field(default_factory=lambda: ["mobil", "agent_idm", "random_legal"])
     traffic: TrafficConfig | None = None
-    episodes: int = 500
-    num_envs: int = 512
-
-    def __post_init__(self) -> None:
-        check(self, agents=NAMES, episodes=EPISODES, num_envs=between(1, 65536))
+    episodes: Episodes = 500
+    num_envs: Environments = 512
 
 
 @dataclass
-class TrainConfig(RunConfig):
+class TrainConfig(DrivingConfig):
     """Inputs of a training run.
 
     Attributes:
@@ -210,44 +194,25 @@ class TrainConfig(RunConfig):
         checkpoint_every_s: seconds between two resume checkpoints.
         checkpoint_replay: with the replay buffer: needed for a resumed run to be exact.
         resume: PATH of a run's folder or checkpoint to go on with, or auto (the newest unfinished run).
-        generator: weights of generated traffic.
         pretrain: a first phase on other traffic.
         evaluation: when training is over.
     """
 
-    total_decisions: int = 600_000
-    compile: str = "auto"
-    log_every: int = 10_000
-    evaluate_every: int = 0
-    selection_episodes: int = 64
-    checkpoint_every_s: float = 20.0
+    total_decisions: Count = 600_000
+    compile: Annotated[str, one_of(("auto", "always", "never"))] = "auto"
+    log_every: Count = 10_000
+    evaluate_every: CountOrZero = 0
+    selection_episodes: Episodes = 64
+    checkpoint_every_s: NotNegative = 20.0
     checkpoint_replay: bool = True
     resume: str | None = None
-    env: EnvConfig = field(default_factory=EnvConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
     init: InitConfig = field(default_factory=InitConfig)
     agent: RainbowConfig = field(default_factory=RainbowConfig)
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    mask: MaskParameters = field(default_factory=MaskParameters)
-    reward: RewardParameters = field(default_factory=RewardParameters)
     collector: CollectorConfig = field(default_factory=CollectorConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
-    generator: GeneratorFile = field(default_factory=GeneratorFile)
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
     evaluation: FinalEvaluationConfig = field(default_factory=FinalEvaluationConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check(
-            self,
-            total_decisions=at_least(1),
-            compile=one_of(COMPILE),
-            log_every=at_least(1),
-            evaluate_every=at_least(0),
-            selection_episodes=EPISODES,
-            checkpoint_every_s=at_least(0),
-        )
-        check_reward(self.env, self.reward)
 
     def compiled(self) -> TrainConfig:
         """The same with ``env.compile`` as ``compile`` says."""
@@ -261,9 +226,16 @@ class TrainConfig(RunConfig):
     def all_traffic(self) -> list[TrafficConfig]:
         """Every traffic that this run drives in."""
         first = [] if self.pretrain.traffic is None else [self.pretrain.traffic]
-        return [*first, self.traffic, *self.evaluation_traffic().values()]
+        return [*first, self.traffic, self.evaluation.traffic or self.traffic]
 
-    def evaluation_traffic(self) -> dict[str, TrafficConfig]:
-        """The traffic of the final evaluation by its name: training's, unless another one was chosen."""
-        chosen = self.evaluation.traffic or self.traffic
-        return {chosen.label(): chosen}
+    def final_evaluation(self) -> EvaluateConfig:
+        """Config of the comparison when training is over, on training's traffic unless another one was chosen."""
+        traffic = self.evaluation.traffic or self.traffic
+        shared = {name: getattr(self, name) for name in ("seed", "device", "env", "observation", "reward")}
+        return EvaluateConfig(
+            **shared,
+            traffics=[traffic.label()],
+            traffic_options={traffic.label(): traffic},
+            episodes=self.evaluation.episodes,
+            num_envs=self.evaluation.num_envs,
+        )

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ganlane.arguments import whole_number
 from ganlane.errors import UserError
 from ganlane.keys import ACTIONS
-from ganlane.parameters.checks import whole_number
 from ganlane.runtime import check_default_device
 
 #: The most rows and vehicles; the configuration's bounds lie within.

@@ -11,13 +11,13 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ganlane import keys
+from ganlane.arguments import checked_arguments, seed_number
 from ganlane.env.checks import ActionCheck, check_counter, check_sizes, usable_device
 from ganlane.env.decision import Recorder, known_false, run_decision
 from ganlane.env.native_step import NATIVE_TAKEN, after_decision, make_kernel, native_decision, say_once
 from ganlane.env.physics import Physics, Rules, Substep, outcome
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
-from ganlane.parameters.checks import checked_arguments, seed_number
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters

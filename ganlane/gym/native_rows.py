@@ -37,8 +37,8 @@ def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeR
         reward, mask = option("reward", own.get("reward", "paper")), option("mask", own.get("mask", "none"))
         check_reward(env, reward)
         device = RunConfig(device=own.get("device", "cpu")).device
-        stream = Stream[str(own.get("stream", "train")).upper()]
-    except (UserError, KeyError):
+        stream = Stream.named(str(own.get("stream", "train")))
+    except UserError:
         return None  # the other way says what is wrong
     ruled = chosen._target_ in _TRAFFICS and not chosen.blind_share and not chosen.parameters
     seen = observation.form in NATIVE_FORMS and observation.sensors is None

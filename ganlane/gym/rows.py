@@ -106,12 +106,22 @@ def observation_space(size: int, largest: float) -> Box:
     return Box(low, high, dtype=np.float32)
 
 
-def with_limit(spec: EnvSpec | None, episode: EpisodeParameters) -> EnvSpec | None:
-    """A spec whose ``max_episode_steps`` says when the environment's own time limit ends an episode."""
-    limited = copy.copy(spec)
-    if limited is not None:
-        limited.max_episode_steps = episode.most_decisions()
-    return limited
+class OnRows:
+    """An environment on top of :class:`Rows`, with a ``spec`` that has its own time limit."""
+
+    _rows: Rows
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How gymnasium made it; ``max_episode_steps`` follows from ``timeout_s``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = copy.copy(spec)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self._rows.episode.most_decisions()
 
 
 def copied(info: dict[str, Any]) -> dict[str, Any]:

@@ -7,24 +7,23 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
 
+from ganlane.arguments import checked_arguments, seed_number, whole_number
 from ganlane.errors import UserError
 from ganlane.gym import has_display
 from ganlane.gym.rows import (
     ACTIONS,
     SEEDS,
     Floats,
+    OnRows,
     actions_of,
     array_of,
     known_options,
     make_rows,
     row_of,
-    with_limit,
 )
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.options import Option, option
-from ganlane.parameters.checks import checked_arguments, seed_number, whole_number
 
 if TYPE_CHECKING:
     from gymnasium.wrappers import RecordVideo
@@ -34,7 +33,7 @@ RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
 FPS = round(1.0 / PHYSICS_STEP_S)
 
 
-class HighwayGym(gymnasium.Env[Floats, Any]):
+class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
     """``gymnasium.make("ganlane/Highway-v0", ...)``.
 
     Args:
@@ -54,8 +53,6 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": FPS}  # noqa: RUF012 - gymnasium's own form
-
-    _spec: EnvSpec | None = None
 
     @checked_arguments
     def __init__(
@@ -141,15 +138,6 @@ class HighwayGym(gymnasium.Env[Floats, Any]):
         By itself it gets one picture per decision. The name is HighwayEnv's.
         """
         self._video, wrapper.frames_per_sec = wrapper, FPS
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How gymnasium made it."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_limit(spec, self._rows.episode)
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
         """Which actions are allowed now, bool [3]; named as sb3-contrib's MaskablePPO asks for it."""

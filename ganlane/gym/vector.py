@@ -7,17 +7,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from ganlane.arguments import checked_arguments, seed_number
 from ganlane.errors import UserError
 from ganlane.gym.rows import (
     ACTIONS,
     SEEDS,
     Flags,
     Floats,
+    OnRows,
     actions_of,
     array_of,
     copied,
@@ -25,13 +26,11 @@ from ganlane.gym.rows import (
     known_options,
     make_rows,
     row_mask,
-    with_limit,
 )
 from ganlane.options import Option, option
-from ganlane.parameters.checks import checked_arguments, seed_number
 
 
-class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):
+class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):
     """``gymnasium.make_vec("ganlane/Highway-v0", num_envs=64, ...)``.
 
     Args:
@@ -56,8 +55,6 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012
-
-    _spec: EnvSpec | None = None
 
     @checked_arguments
     def __init__(
@@ -167,15 +164,6 @@ class HighwayVectorGym(VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]
             final |= {"final_info": copied(self._rows.info()), "_final_info": ended}
             self._restart(ended)
         return self._rows.observation().copy(), reward, terminated, truncated, copied(self._rows.info()) | final
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How gymnasium made it; ``max_episode_steps`` follows from ``timeout_s``."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = with_limit(spec, self._rows.episode)
 
     def action_masks(self) -> Flags:
         """Which actions are allowed now, bool [N, 3]."""

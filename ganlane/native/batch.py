@@ -19,8 +19,7 @@ from ganlane.native.library import load
 from ganlane.native.settings import reward_of, safe_settings, settings_of, spawn_of, view_of
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
-from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, largest_number
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters, largest_number
 
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
 SPEED_RATIO_LIMIT = 4.0

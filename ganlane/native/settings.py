@@ -8,8 +8,7 @@ from typing import Final
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, SteeringParameters
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
-from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
 
 #: The observations that the kernel computes: whether with drift, and with overlap.
 NATIVE_FORMS: Final = {

@@ -1,27 +1,21 @@
-"""Rainbow's hyperparameters and switches."""
+"""Rainbow's hyperparameters and switches, and options that released versions had in addition.
+
+The latter lost the search of the hyperparameters (docs/search.md). Agents, checkpoints and command lines of released
+versions hold them at their defaults; those load as before.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any, Final
 
-from ganlane.errors import ParameterError
-from ganlane.parameters.checks import (
-    Rule,
-    above,
-    at_least,
-    between,
-    check,
-    every,
-    lists_to_tuples,
-    number,
-    optional,
-)
-
-_DISCOUNT = Rule(lambda value: 0.0 < value <= 1.0, "a number above 0, at most 1")
+from ganlane.errors import ParameterError, UserError, as_typed
+from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Number, Positive, PositiveShare, Record, Share
 
 
 @dataclass(frozen=True)
-class RainbowConfig:
+class RainbowConfig(Record):
     """Hyperparameters of Rainbow (Hessel et al. 2018); the values are for one update of 256 per 64 decisions.
 
     Attributes:
@@ -56,60 +50,38 @@ class RainbowConfig:
         epsilon_decisions: decisions in which the one falls to the other.
     """
 
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[Count, ...] = (256, 256)
     noisy: bool = True
     dueling: bool = True
     distributional: bool = True
     double: bool = True
     prioritised: bool = True
-    n_step: int = 3
-    gamma: float = 0.98
-    atoms: int = 101
-    v_min: float = -120.0
-    v_max: float = 100.0
-    noisy_sigma: float = 0.5
-    batch_size: int = 256
-    capacity: int = 1_000_000
-    warmup: int = 10_000
-    decisions_per_update: int = 64
-    target_period: int = 500
-    learning_rate: float = 2.5e-4
-    learning_rate_end: float | None = None
-    learning_rate_decisions: int = 0
-    adam_eps: float | None = None
-    gradient_clip: float = 10.0
-    alpha: float = 0.5
-    beta_start: float = 0.4
-    beta_updates: int = 100_000
+    n_step: Count = 3
+    gamma: PositiveShare = 0.98
+    atoms: Count = 101
+    v_min: Number = -120.0
+    v_max: Number = 100.0
+    noisy_sigma: NotNegative = 0.5
+    batch_size: Count = 256
+    capacity: Count = 1_000_000
+    warmup: Count = 10_000
+    decisions_per_update: Count = 64
+    target_period: Count = 500
+    learning_rate: Positive = 2.5e-4
+    learning_rate_end: Positive | None = None
+    learning_rate_decisions: CountOrZero = 0
+    adam_eps: Positive | None = None
+    gradient_clip: Positive = 10.0
+    alpha: Share = 0.5
+    beta_start: Share = 0.4
+    beta_updates: CountOrZero = 100_000
     kl_priority: bool = True
-    epsilon_start: float = 1.0
-    epsilon: float = 0.04
-    epsilon_decisions: int = 300_000
+    epsilon_start: Share = 1.0
+    epsilon: Share = 0.04
+    epsilon_decisions: CountOrZero = 300_000
 
     def __post_init__(self) -> None:
-        lists_to_tuples(self)
-        counts = ["n_step", "batch_size", "capacity", "warmup", "decisions_per_update", "target_period", "atoms"]
-        shares = ("alpha", "beta_start", "epsilon_start", "epsilon")
-        check(
-            self,
-            hidden=every(at_least(1)),
-            gamma=_DISCOUNT,
-            v_min=number(),
-            v_max=number(),
-            noisy_sigma=at_least(0),
-            learning_rate=above(0),
-            learning_rate_end=optional(above(0)),
-            learning_rate_decisions=at_least(0),
-            adam_eps=optional(above(0)),
-            gradient_clip=above(0),
-            beta_updates=at_least(0),
-            epsilon_decisions=at_least(0),
-            **dict.fromkeys(counts, at_least(1)),
-            **dict.fromkeys(shares, between(0, 1)),
-        )
-        self._check_together()
-
-    def _check_together(self) -> None:
+        super().__post_init__()
         if self.v_min >= self.v_max or (self.distributional and self.atoms < 2):
             raise ParameterError(
                 f"{{v_min}}={self.v_min}, {{v_max}}={self.v_max}, {{atoms}}={self.atoms}: expected v_min below "
@@ -131,3 +103,67 @@ class RainbowConfig:
         if self.learning_rate_end is not None and self.learning_rate_decisions == 0:
             return replace(self, learning_rate_decisions=decisions)
         return self
+
+
+class RemovedOption(UserError):
+    """A stored file or a command line asks for an option that was removed."""
+
+
+#: The last revision that had them.
+LAST_REVISION: Final = "2f3f5feca555"
+#: Options of the agent and their defaults.
+AGENT_OPTIONS: Final[dict[str, Any]] = {
+    "encoder": "none",
+    "encoder_width": 64,
+    "encoder_layers": 2,
+    "decide_when_free": False,
+}
+#: Those that changed what an agent does; the others were details of the encoder.
+_SWITCHES: Final = ("encoder", "decide_when_free")
+OBSERVATIONS: Final = ("fixed_order",)
+_SEARCH: Final = "search/"
+
+
+def without_removed(options: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """``options`` of a saved agent or network, without those that are no more; ``where`` names it in the error.
+
+    Raises:
+        RemovedOption: the agent was trained with one of them.
+    """
+    for name in _SWITCHES:
+        if options.get(name, AGENT_OPTIONS[name]) != AGENT_OPTIONS[name]:
+            raise _removed(where, f"agent.{name}={as_typed(options[name])}")
+    return {name: value for name, value in options.items() if name not in AGENT_OPTIONS}
+
+
+def refuse_removed_observation(form: str) -> None:
+    """Raise :class:`RemovedOption` if ``form`` is an observation that is no more."""
+    if form in OBSERVATIONS:
+        raise _removed(f"observation={form}", "it")
+
+
+def without_removed_overrides(overrides: Iterable[str], where: str) -> list[str]:
+    """The command line of a run without the removed options, where it only repeats their defaults.
+
+    Raises:
+        RemovedOption: it sets one of them to something else, or names an experiment of the search.
+    """
+    kept = []
+    for override in overrides:
+        key, _, value = override.lstrip("+").partition("=")
+        name = key.removeprefix("agent.")
+        if name != key and name in AGENT_OPTIONS:
+            if name in _SWITCHES and value != as_typed(AGENT_OPTIONS[name]):
+                raise _removed(where, override)
+        elif value in OBSERVATIONS or (key == "experiment" and value.startswith(_SEARCH)):
+            raise _removed(where, override)
+        else:
+            kept.append(override)
+    return kept
+
+
+def _removed(where: str, what: str) -> RemovedOption:
+    return RemovedOption(
+        f"{where}: {what} was removed after revision {LAST_REVISION}; check out that revision to use it, or train a "
+        "new agent."
+    )

@@ -1,23 +1,26 @@
-"""Range checks of parameters as rules with names, and help for frozen dataclasses."""
+"""Ranges of parameters: rules that stand in a field's annotation, and the base class that checks them.
+
+::
+
+    @dataclass(frozen=True)
+    class Pedals(Record):
+        gain: Positive = 1.0
+        offset: Annotated[float, between(-1, 1)] = 0.0
+"""
 
 from __future__ import annotations
 
 import difflib
-import inspect
 import math
-import operator
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence, Set
-from dataclasses import MISSING, Field, fields
-from functools import cache, wraps
-from numbers import Real
-from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Final, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from types import UnionType
+from typing import Annotated, Any, Final, NamedTuple, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from ganlane.errors import ParameterError, UserError, as_typed
+from ganlane.errors import ParameterError, as_typed
 
-Record = TypeVar("Record")
-F = TypeVar("F", bound=Callable)
+Part = TypeVar("Part")
 #: Metadata of a field that is set from Python alone: OmegaConf leaves such fields out of a schema.
 NO_KEY: Final[Mapping[str, Any]] = {"omegaconf_ignore": True}
 
@@ -61,33 +64,14 @@ def between(low: float, high: float) -> Rule:
     )
 
 
-def number() -> Rule:
-    """Finite."""
-    return Rule(_finite, "a finite number")
-
-
-def text() -> Rule:
-    """Not empty."""
-    return Rule(lambda value: isinstance(value, str) and value != "", "a text that is not empty")
-
-
 def one_of(names: Iterable[str]) -> Rule:
     """One of ``names``."""
     known = tuple(names)
     return Rule(lambda value: isinstance(value, Hashable) and value in known, f"one of {', '.join(known)}")
 
 
-def speed_range() -> Rule:
-    """Two numbers, the first at least 0 and not above the second."""
-    return Rule(
-        lambda value: len(value) == 2 and all(map(_finite, value)) and 0 <= value[0] <= value[1],
-        "two numbers [low, high], 0 <= low <= high",
-    )
-
-
-def positive_range() -> Rule:
-    """Two numbers above 0, the first not above the second."""
-    return Rule(lambda value: speed_range().holds(value) and value[0] > 0, "two numbers [low, high], 0 < low <= high")
+def _is_range(value: Any) -> bool:
+    return len(value) == 2 and all(map(_finite, value)) and 0 <= value[0] <= value[1]
 
 
 def every(rule: Rule) -> Rule:
@@ -103,18 +87,79 @@ def optional(rule: Rule) -> Rule:
     return Rule(lambda value: value is None or rule.holds(value), f"null or {rule.expected}")
 
 
-def check(record: Any, **rules: Rule) -> None:
-    """Check fields of a dataclass against ``rules``, given by field name.
+#: A list without repetitions.
+DIFFERENT = Rule(lambda all: len(all) > 0 and len(set(all)) == len(all), "a list of different entries, not empty")
+
+Number: TypeAlias = Annotated[float, Rule(_finite, "a finite number")]
+Positive: TypeAlias = Annotated[float, above(0)]
+NotNegative: TypeAlias = Annotated[float, at_least(0)]
+Share: TypeAlias = Annotated[float, between(0, 1)]
+PositiveShare: TypeAlias = Annotated[float, Rule(lambda value: 0 < value <= 1, "a number above 0, at most 1")]
+Count: TypeAlias = Annotated[int, at_least(1)]
+CountOrZero: TypeAlias = Annotated[int, at_least(0)]
+Seed: TypeAlias = Annotated[int, between(0, 2**53)]
+Text: TypeAlias = Annotated[str, Rule(lambda value: value != "", "a text that is not empty")]
+#: Lowest and highest value, from 0 on; or above 0.
+Range: TypeAlias = Annotated[tuple[float, float], Rule(_is_range, "two numbers [low, high], 0 <= low <= high")]
+PositiveRange: TypeAlias = Annotated[
+    tuple[float, float],
+    Rule(lambda value: _is_range(value) and value[0] > 0, "two numbers [low, high], 0 < low <= high"),
+]
+
+
+def rules_of(hint: Any) -> list[Rule]:
+    """The rules in an annotation: of a value, of every entry of a list or tuple, of what is not null."""
+    kind, inner = get_origin(hint), get_args(hint)
+    if kind is Annotated:
+        return [*rules_of(inner[0]), *inner[1:]]
+    if kind in (Union, UnionType):
+        return [optional(rule) for each in inner for rule in rules_of(each)]
+    return [every(rule) for rule in rules_of(inner[0])] if kind in (list, tuple) else []
+
+
+def _is_tuple(hint: Any) -> bool:
+    return get_origin(hint) is tuple or any(map(_is_tuple, get_args(hint)))
+
+
+@cache
+def _checks(kind: Any) -> dict[str, tuple[list[Rule], bool]]:
+    """The fields of a dataclass: their rules, or those of its bases for them, and whether they are tuples."""
+    found: dict[str, tuple[list[Rule], bool]] = {}
+    for base in kind.__mro__[::-1]:
+        hints = get_type_hints(base, include_extras=True) if is_dataclass(base) else {}
+        for name, hint in hints.items():
+            known = found[name][0] if name in found else []
+            found[name] = rules_of(hint) or known, _is_tuple(hint)
+    return {known.name: found[known.name] for known in fields(kind)}
+
+
+class Record:
+    """Base class of dataclasses whose fields are checked when one is made.
+
+    Lists, which YAML and the command line give, become tuples where the field is one. A subclass that gives a field
+    another default keeps its range.
 
     Raises:
         ParameterError: for the first value out of range; names field, value, what was expected, and a valid value.
     """
-    known = {field.name: field for field in fields(record)}
-    for name, rule in rules.items():
-        value = getattr(record, name)
-        if not rule.holds(value):
-            advice = _advice(known[name])
-            raise ParameterError(f"{{{name}}}={as_typed(value)}: expected {rule.expected}{advice}.")
+
+    def __post_init__(self) -> None:
+        self.check_ranges()
+
+    def check_ranges(self, *names: str) -> None:
+        """Check all fields, or those that have to be right before a ``__post_init__`` can go on."""
+        known = {field.name: field for field in fields(self)}  # type: ignore[arg-type]
+        checks = _checks(type(self))  # type: ignore[arg-type]
+        for name in names or checks:
+            value = getattr(self, name)
+            rules, is_tuple = checks[name]
+            if is_tuple and isinstance(value, list):
+                value = tuple(value)
+                assign(self, **{name: value})
+            for rule in rules:
+                if not rule.holds(value):
+                    advice = _advice(known[name])
+                    raise ParameterError(f"{{{name}}}={as_typed(value)}: expected {rule.expected}{advice}.")
 
 
 def _advice(field: Field[Any]) -> str:
@@ -135,109 +180,6 @@ def assign(record: Any, **values: Any) -> None:
         object.__setattr__(record, name, value)
 
 
-def lists_to_tuples(record: Any) -> None:
-    """Turn lists, which YAML and the command line give, into tuples; for a ``__post_init__`` alone."""
-    for field in fields(record):
-        value = getattr(record, field.name)
-        if isinstance(value, list):
-            assign(record, **{field.name: tuple(value)})
-
-
-def part_of(record: Any, kind: type[Record]) -> Record:
+def part_of(record: Any, kind: type[Part]) -> Part:
     """The fields that ``record`` inherits from ``kind``, as a ``kind``."""
     return kind(**{field.name: getattr(record, field.name) for field in fields(kind)})  # type: ignore[arg-type]
-
-
-def whole_number(name: str, value: Any, low: int, high: int) -> int:
-    """``value`` as an int; NumPy's integers are allowed.
-
-    Raises:
-        UserError: it is none, or not from ``low`` to ``high``.
-    """
-    if not _is_whole(value) or not low <= int(value) <= high:
-        most = "2**63 - 1" if high == 2**63 - 1 else f"{high}"
-        raise UserError(
-            f"{name}={_shown(value)}: expected a whole number from {low} to {most}; give for instance {name}={low}."
-        )
-    return int(value)
-
-
-def _is_whole(value: Any) -> bool:
-    """Whether it counts as an int: NumPy's do, truth values and arrays do not."""
-    try:
-        operator.index(value)
-    except TypeError:
-        return False
-    return not isinstance(value, bool)
-
-
-def _shown(value: Any) -> str:
-    """``value`` on one line, cut off where it is long."""
-    return f"{' '.join(repr(value).split()):.80}"
-
-
-def seed_number(seed: Any) -> int:
-    """A seed, checked: the counters of the environment hold 63 bits."""
-    return whole_number("seed", seed, 0, 2**63 - 1)
-
-
-def checked_arguments(function: F) -> F:
-    """``function``, which refuses arguments of other types than its annotations say, before it does anything.
-
-    NumPy's numbers count as Python's; a text holds no zero byte, which no path and no name can; where ``Any`` stands,
-    alone or in a union, everything will do.
-
-    Raises:
-        UserError: for the first such argument.
-    """
-    signature = inspect.signature(function)
-    hints = cache(lambda: get_type_hints(function))  # at the first call, when all modules are imported
-
-    @wraps(function)
-    def checked(*arguments: Any, **named: Any) -> Any:
-        for name, value in signature.bind(*arguments, **named).arguments.items():
-            hint = hints().get(name, Any)
-            if not _fits(value, hint):
-                raise UserError(f"{name}={_shown(value)}: expected {_in_words(hint)}; correct this argument.")
-        return function(*arguments, **named)
-
-    return checked  # type: ignore[return-value]
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of the type that an annotation says."""
-    kind, inner = get_origin(hint) or hint, get_args(hint)
-    if kind in (Union, UnionType):
-        return any(_fits(value, each) for each in inner)
-    if kind is Mapping or kind is dict:
-        return isinstance(value, Mapping) and all(_fits(key, inner[0]) for key in value)
-    if kind is Sequence:  # or an array
-        listed = isinstance(value, Collection) and not isinstance(value, str | bytes | Mapping | Set)
-        return listed and getattr(value, "ndim", 1) > 0 and all(_fits(each, inner[0]) for each in value)
-    if kind is int:
-        return _is_whole(value)
-    if kind is float:
-        return isinstance(value, Real) and not isinstance(value, bool)
-    if kind is bool:
-        return type(value).__name__ in ("bool", "bool_")  # NumPy's, by either name
-    if kind is str:
-        return isinstance(value, str) and "\0" not in value
-    if getattr(kind, "_is_protocol", False):  # scenes of a user's own have what is needed of them
-        return callable(value)
-    return kind is Any or not inspect.isclass(kind) or isinstance(value, kind)
-
-
-_NAMES: Final[Mapping[Any, str]] = {
-    **{int: "a whole number", float: "a number", bool: "True or False", str: "a text", Path: "a path"},
-    **{Mapping: "a mapping of names", dict: "a dictionary", NoneType: "None"},
-}
-
-
-def _in_words(hint: Any) -> str:
-    """A type in words."""
-    kind, inner = get_origin(hint) or hint, get_args(hint)
-    if kind in (Union, UnionType):
-        return " or ".join(_in_words(each) for each in inner if each is not Any)
-    if kind is Sequence:
-        return f"a list (each entry {_in_words(inner[0])})"
-    return _NAMES.get(kind, f"a {getattr(kind, '__name__', kind)}")

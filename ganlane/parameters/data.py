@@ -5,21 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import (
-    NO_KEY,
-    Rule,
-    assign,
-    at_least,
-    check,
-    every,
-    lists_to_tuples,
-    one_of,
-    optional,
-    part_of,
-    text,
-)
+from ganlane.parameters.checks import NO_KEY, Count, Record, Rule, Text, assign, part_of
 
 #: The NGSIM trajectories (doi:10.21949/1504477), as the portal of the US DOT exports them.
 NGSIM_URL = "https://data.transportation.gov/api/views/8ect-6jqj/rows.csv?accessType=DOWNLOAD"
@@ -32,7 +21,7 @@ _ADDRESS = Rule(lambda value: value.startswith(("http://", "https://")), "an add
 
 
 @dataclass(frozen=True)
-class NgsimParameters:
+class NgsimParameters(Record):
     """Which rows of an NGSIM file are read.
 
     Attributes:
@@ -42,17 +31,17 @@ class NgsimParameters:
         block_bytes: bytes read at once.
     """
 
-    locations: tuple[str, ...] = MOTORWAYS
-    lanes: int = 6
-    block_bytes: int = field(default=BLOCK_BYTES, metadata=NO_KEY)
+    locations: tuple[Text, ...] = MOTORWAYS
+    lanes: Count = 6
+    block_bytes: Count = field(default=BLOCK_BYTES, metadata=NO_KEY)
 
     def __post_init__(self) -> None:
-        check(self, locations=every(text()), lanes=at_least(1), block_bytes=at_least(1))
+        super().__post_init__()
         assign(self, locations=tuple(place.lower() for place in self.locations))
 
 
 @dataclass(frozen=True)
-class DataConfig:
+class DataConfig(Record):
     """``data=scenes``: scene CSV, or what ``ganlane prepare`` wrote (:func:`ganlane.data.read_scenes`).
 
     Attributes:
@@ -63,11 +52,12 @@ class DataConfig:
 
     format: str = "scenes"
     path: str | None = None
-    held_out: tuple[str, ...] | None = None
+    held_out: tuple[Text, ...] | None = None
 
     def __post_init__(self) -> None:
-        lists_to_tuples(self)
-        check(self, format=one_of((type(self).format,)), held_out=optional(every(text())))
+        super().__post_init__()
+        if self.format != type(self).format:
+            raise ParameterError(f"{{format}}={self.format}: expected {type(self).format}; choose data=NAME.")
 
     def parameters(self) -> NgsimParameters | None:
         """Further inputs of the reader; None where it takes nothing."""
@@ -94,13 +84,11 @@ class NgsimDataConfig(NgsimParameters, DataConfig):
 
     format: str = "ngsim"
     download: bool = False
-    url: str = NGSIM_URL
-    sha256: str | None = None
+    url: Annotated[str, _ADDRESS] = NGSIM_URL
+    sha256: Annotated[str, _SHA256] | None = None
 
     def __post_init__(self) -> None:
-        DataConfig.__post_init__(self)
-        NgsimParameters.__post_init__(self)
-        check(self, url=_ADDRESS, sha256=optional(_SHA256))
+        super().__post_init__()
         if self.download and self.path is None:
             raise ParameterError("{download}=true: where to is missing; give {path}=FILE, for instance ngsim.csv.")
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Annotated
 
-from ganlane.parameters.checks import above, at_least, below, check, one_of
+from ganlane.parameters.checks import NotNegative, Positive, Record, below, one_of
 
 
 class Visibility(IntEnum):
@@ -26,7 +27,7 @@ VISIBILITIES = tuple(kind.name.lower() for kind in Visibility)
 
 
 @dataclass(frozen=True)
-class IdmParameters:
+class IdmParameters(Record):
     """The Intelligent Driver Model (Treiber et al. 2000) with the paper's Table V.
 
     The acceleration exponent is 4, computed as two squarings: the result of ``torch.pow`` may differ in its last bits
@@ -40,15 +41,11 @@ class IdmParameters:
         max_acceleration: m/s2, above 0.
     """
 
-    min_gap_m: float = 2.0
-    headway_s: float = 1.6
-    comfortable_deceleration: float = 1.7
-    min_acceleration: float = -20.0
-    max_acceleration: float = 0.7
-
-    def __post_init__(self) -> None:
-        positive = dict.fromkeys(("comfortable_deceleration", "max_acceleration"), above(0))
-        check(self, min_gap_m=at_least(0), headway_s=at_least(0), min_acceleration=below(0), **positive)
+    min_gap_m: NotNegative = 2.0
+    headway_s: NotNegative = 1.6
+    comfortable_deceleration: Positive = 1.7
+    min_acceleration: Annotated[float, below(0)] = -20.0
+    max_acceleration: Positive = 0.7
 
     def per_lane(self) -> IdmParameters:
         """The parameters, which broadcast to lanes and pairs."""
@@ -60,7 +57,7 @@ class IdmParameters:
 
 
 @dataclass(frozen=True)
-class MobilParameters:
+class MobilParameters(Record):
     """The lane-changing model MOBIL (Kesting et al. 2007) with the paper's Table IV; all at least 0.
 
     Attributes:
@@ -71,19 +68,15 @@ class MobilParameters:
         exclusive_m: of several vehicles that want to enter one lane within this distance, only the foremost does, m.
     """
 
-    threshold: float = 0.1
-    politeness_rear: float = 0.5
-    politeness_side: float = 1.0
-    safe_deceleration: float = 4.0
-    exclusive_m: float = 60.0
-
-    def __post_init__(self) -> None:
-        names = ("threshold", "politeness_rear", "politeness_side", "exclusive_m")
-        check(self, safe_deceleration=above(0), **dict.fromkeys(names, at_least(0)))
+    threshold: NotNegative = 0.1
+    politeness_rear: NotNegative = 0.5
+    politeness_side: NotNegative = 1.0
+    safe_deceleration: Positive = 4.0
+    exclusive_m: NotNegative = 60.0
 
 
 @dataclass(frozen=True)
-class EgoParameters:
+class EgoParameters(Record):
     """How the ego handles commands and when others see its lane changes.
 
     Attributes:
@@ -94,13 +87,9 @@ class EgoParameters:
     """
 
     abort_lane_change: bool = False
-    visibility: str = "body"
-    soft_crash_ttc_s: float = 1.5
-    soft_crash_gap_m: float = 2.0
-
-    def __post_init__(self) -> None:
-        limits = dict.fromkeys(("soft_crash_ttc_s", "soft_crash_gap_m"), at_least(0))
-        check(self, visibility=one_of(VISIBILITIES), **limits)
+    visibility: Annotated[str, one_of(VISIBILITIES)] = "body"
+    soft_crash_ttc_s: NotNegative = 1.5
+    soft_crash_gap_m: NotNegative = 2.0
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
-from ganlane.errors import ParameterError
+from ganlane.errors import ParameterError, UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.checks import above, between, check, lists_to_tuples, positive_range, speed_range
+from ganlane.parameters.checks import Positive, PositiveRange, Range, Record, Share
 
 #: What drives a decision: the tensor code, the native kernel, or the latter where it can.
 KERNELS = ("torch", "native", "auto")
@@ -20,9 +20,21 @@ class Stream(IntEnum):
     SELECT = 1
     REPORT = 2
 
+    @classmethod
+    def named(cls, name: str) -> Stream:
+        """From its name in lower case.
+
+        Raises:
+            UserError: no such stream.
+        """
+        if name.upper() not in cls.__members__:
+            names = ", ".join(cls.__members__).lower()
+            raise UserError(f"stream={name}: expected one of {names}; choose one of them.")
+        return cls[name.upper()]
+
 
 @dataclass(frozen=True)
-class EpisodeParameters:
+class EpisodeParameters(Record):
     """Decision period of the ego, distance to the goal and time limit; all above 0.
 
     Attributes:
@@ -31,12 +43,12 @@ class EpisodeParameters:
         timeout_s: time at which it is cut off, s, reported as time-out.
     """
 
-    decision_period_s: float = 1.0
-    goal_m: float = 5000.0
-    timeout_s: float = 1000.0
+    decision_period_s: Positive = 1.0
+    goal_m: Positive = 5000.0
+    timeout_s: Positive = 1000.0
 
     def __post_init__(self) -> None:
-        check(self, decision_period_s=above(0), goal_m=above(0), timeout_s=above(0))
+        super().__post_init__()
         if self.substeps() < 1 or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9:
             raise ParameterError(
                 f"{{decision_period_s}}={self.decision_period_s:g} is not a multiple of {PHYSICS_STEP_S:g} s; "
@@ -53,10 +65,10 @@ class EpisodeParameters:
 
 
 @dataclass(frozen=True)
-class SpawnParameters:
+class SpawnParameters(Record):
     """The first scene: Table II, extended by lorries. Distances in m, speeds in m/s, ranges (low, high).
 
-    Sizes are above 0, speeds from 0 on, desired speeds above 0. Whether so many vehicles fit and can brake is
+    Desired speeds are above 0, since IDM divides by them. Whether so many vehicles fit and can brake is
     checked by :func:`ganlane.sim.spawn.check_start`.
 
     Attributes:
@@ -77,33 +89,19 @@ class SpawnParameters:
             92/6/EEC.
     """
 
-    spread_m: float = 200.0
-    min_spacing_m: float = 25.0
-    front_speed_mps: tuple[float, float] = (10.0, 12.0)
-    rear_speed_mps: tuple[float, float] = (15.0, 25.0)
-    ego_speed_mps: tuple[float, float] = (10.0, 15.0)
-    desired_speed_mps: tuple[float, float] = (18.0, 26.0)
-    ego_desired_speed_mps: float = 25.0
-    length_m: float = 4.5
-    width_m: float = 2.5
-    truck_share: float = 0.0
-    truck_length_m: float = 12.0
-    truck_width_m: float = 2.5
-    truck_desired_speed_mps: tuple[float, float] = (22.0, 25.0)
-
-    def __post_init__(self) -> None:
-        lists_to_tuples(self)
-        sizes = ("spread_m", "min_spacing_m", "length_m", "width_m", "truck_length_m", "truck_width_m")
-        speeds = ("front_speed_mps", "rear_speed_mps", "ego_speed_mps")
-        desired = ("desired_speed_mps", "truck_desired_speed_mps")
-        check(
-            self,
-            **dict.fromkeys((*sizes, "ego_desired_speed_mps"), above(0)),
-            truck_share=between(0, 1),
-            **dict.fromkeys(speeds, speed_range()),
-            # IDM divides by the desired speed.
-            **dict.fromkeys(desired, positive_range()),
-        )
+    spread_m: Positive = 200.0
+    min_spacing_m: Positive = 25.0
+    front_speed_mps: Range = (10.0, 12.0)
+    rear_speed_mps: Range = (15.0, 25.0)
+    ego_speed_mps: Range = (10.0, 15.0)
+    desired_speed_mps: PositiveRange = (18.0, 26.0)
+    ego_desired_speed_mps: Positive = 25.0
+    length_m: Positive = 4.5
+    width_m: Positive = 2.5
+    truck_share: Share = 0.0
+    truck_length_m: Positive = 12.0
+    truck_width_m: Positive = 2.5
+    truck_desired_speed_mps: PositiveRange = (22.0, 25.0)
 
     @property
     def longest_m(self) -> float:

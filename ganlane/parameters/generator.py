@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from ganlane.errors import ParameterError
 from ganlane.parameters.checks import (
     NO_KEY,
+    Count,
+    CountOrZero,
+    NotNegative,
+    Positive,
+    Record,
     Rule,
-    above,
     at_least,
     between,
-    check,
-    every,
-    lists_to_tuples,
-    optional,
 )
 
 Preset = Literal["paper", "calibrated"]
@@ -26,7 +26,7 @@ _WASHOUT = Rule(lambda value: value > 0 and not math.isnan(value), "a number abo
 
 
 @dataclass(frozen=True)
-class GeneratorSizes:
+class GeneratorSizes(Record):
     """Widths of the generator; stored with its weights. Three of them are keys of the command line.
 
     Attributes:
@@ -49,18 +49,15 @@ class GeneratorSizes:
     pooled: int = field(default=32, metadata=NO_KEY)
     context: int = field(default=64, metadata=NO_KEY)
     noise: int = field(default=8, metadata=NO_KEY)
-    neighbours: int = 8
+    neighbours: Annotated[int, between(0, 100)] = 8
     extra_inputs: int = field(default=0, metadata=NO_KEY)
     observed: int = field(default=8, metadata=NO_KEY)
-    predicted: int = 8
+    predicted: Annotated[int, between(1, 50)] = 8
     differences: bool = True
-
-    def __post_init__(self) -> None:
-        check(self, predicted=between(1, 50), neighbours=between(0, 100))
 
 
 @dataclass(frozen=True)
-class LossWeights:
+class LossWeights(Record):
     """Weights of the generator's loss terms; a weight of 0 switches a term off.
 
     Attributes:
@@ -70,19 +67,19 @@ class LossWeights:
         adversarial: cross-entropy of the discriminator's logits.
     """
 
-    variety: float = 1.6
-    single: float = 1.0
-    mean: float = 1.0
-    adversarial: float = 0.02
+    variety: NotNegative = 1.6
+    single: NotNegative = 1.0
+    mean: NotNegative = 1.0
+    adversarial: NotNegative = 0.02
 
     def __post_init__(self) -> None:
-        check(self, **dict.fromkeys(("variety", "single", "mean", "adversarial"), at_least(0)))
+        super().__post_init__()
         if self.variety == self.single == self.mean == 0:
             raise ParameterError("{variety}=0: {single} and {mean} are 0, too; give one of them a weight.")
 
 
 @dataclass(frozen=True)
-class LoopConfig:
+class LoopConfig(Record):
     """How long to fit.
 
     Attributes:
@@ -95,22 +92,17 @@ class LoopConfig:
         max_seconds: stop after this long, s; null: never.
     """
 
-    updates: int = 1200
-    evaluate_every: int = 150
-    patience: int = 8
-    learning_rate: float = 4e-3
-    warmup: int = 100
-    largest_gradient: float = 1.0
-    max_seconds: float | None = None
-
-    def __post_init__(self) -> None:
-        counts = dict.fromkeys(("updates", "evaluate_every", "patience"), at_least(1))
-        positive = dict.fromkeys(("learning_rate", "largest_gradient"), above(0))
-        check(self, warmup=at_least(0), max_seconds=optional(above(0)), **counts, **positive)
+    updates: Count = 1200
+    evaluate_every: Count = 150
+    patience: Count = 8
+    learning_rate: Positive = 4e-3
+    warmup: CountOrZero = 100
+    largest_gradient: Positive = 1.0
+    max_seconds: Positive | None = None
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Record):
     """Settings of a fit: those of one preset or the other.
 
     Attributes:
@@ -143,17 +135,13 @@ class PaperConfig(FitConfig):
     sizes: GeneratorSizes = field(default_factory=GeneratorSizes)
     weights: LossWeights = field(default_factory=LossWeights)
     loop: LoopConfig = field(default_factory=LoopConfig)
-    group_size: int = 9
-    stride: int = 1
-    held_out_stride: int = 3
-    samples: int = 6
-    history_noise: float = 0.0
-    batch: int = 48
+    group_size: Count = 9
+    stride: Count = 1
+    held_out_stride: Count = 3
+    samples: Annotated[int, between(1, 100)] = 6
+    history_noise: NotNegative = 0.0
+    batch: Count = 48
     mirror: bool = True
-
-    def __post_init__(self) -> None:
-        counts = ("batch", "group_size", "stride", "held_out_stride")
-        check(self, samples=between(1, 100), history_noise=at_least(0), **dict.fromkeys(counts, at_least(1)))
 
 
 @dataclass(frozen=True)
@@ -179,28 +167,19 @@ class CalibratedConfig(FitConfig):
     preset: ClassVar[Preset] = "calibrated"
     sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS), metadata=NO_KEY)
     loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40))
-    horizons: tuple[int, ...] = (8, 16, 29)
-    shares: tuple[float, ...] = (3.0, 1.0, 1.0)
-    held_out_horizon: int = 29
-    batch: int = 6
-    held_out_stride: int = 3
-    noise_period_s: float = 5.0
+    horizons: tuple[Count, ...] = (8, 16, 29)
+    shares: tuple[NotNegative, ...] = (3.0, 1.0, 1.0)
+    held_out_horizon: Annotated[int, at_least(8)] = 29
+    batch: Count = 6
+    held_out_stride: Count = 3
+    noise_period_s: NotNegative = 5.0
     mirror: bool = True
-    washout_s: float = 3.0
+    washout_s: Annotated[float, _WASHOUT] = 3.0
     further_inputs: bool = True
     traits: bool = True
 
     def __post_init__(self) -> None:
-        lists_to_tuples(self)
-        check(
-            self,
-            horizons=every(at_least(1)),
-            shares=every(at_least(0)),
-            held_out_horizon=at_least(8),
-            noise_period_s=at_least(0),
-            washout_s=_WASHOUT,
-            **dict.fromkeys(("batch", "held_out_stride"), at_least(1)),
-        )
+        super().__post_init__()
         if len(self.shares) != len(self.horizons) or sum(self.shares) <= 0:
             raise ParameterError(
                 f"{{shares}}={list(self.shares)}: give one share of the updates for each of the horizons "

@@ -1,12 +1,25 @@
-"""What the agent perceives, and which actions it may choose."""
+"""What the agent perceives, which actions it may choose, and what it is rewarded for."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
+from ganlane import keys
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import above, assign, at_least, between, check, one_of, part_of
-from ganlane.parameters.removed import refuse_removed_observation
+from ganlane.parameters.agent import refuse_removed_observation
+from ganlane.parameters.checks import (
+    NotNegative,
+    Number,
+    Positive,
+    Record,
+    Share,
+    assign,
+    at_most,
+    below,
+    one_of,
+    part_of,
+)
 
 #: How far a delay may be from a whole number of decisions, in decisions.
 _TOLERANCE = 1e-6
@@ -28,7 +41,7 @@ MASKS = ("none", "legal", "safe")
 
 
 @dataclass(frozen=True)
-class ObservationScale:
+class ObservationScale(Record):
     """What observations are divided by, above 0.
 
     Attributes:
@@ -36,15 +49,12 @@ class ObservationScale:
         speed_mps: the same for relative speeds, m/s; not a cap on driving.
     """
 
-    range_m: float = 200.0
-    speed_mps: float = 30.0
-
-    def __post_init__(self) -> None:
-        check(self, range_m=above(0), speed_mps=above(0))
+    range_m: Positive = 200.0
+    speed_mps: Positive = 30.0
 
 
 @dataclass(frozen=True)
-class SensorParameters:
+class SensorParameters(Record):
     """Errors in what the ego perceives of the other vehicles; all at least 0, all 0: none.
 
     Attributes:
@@ -56,15 +66,11 @@ class SensorParameters:
         delay_s: age of what is perceived, s, a multiple of env.decision_period_s.
     """
 
-    position_noise_m: float = 0.0
-    lateral_noise_m: float = 0.0
-    speed_noise_mps: float = 0.0
-    dropout: float = 0.0
-    delay_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        sizes = ("position_noise_m", "lateral_noise_m", "speed_noise_mps", "delay_s")
-        check(self, dropout=between(0, 1), **dict.fromkeys(sizes, at_least(0)))
+    position_noise_m: NotNegative = 0.0
+    lateral_noise_m: NotNegative = 0.0
+    speed_noise_mps: NotNegative = 0.0
+    dropout: Share = 0.0
+    delay_s: NotNegative = 0.0
 
     def delay_decisions(self, decision_period_s: float) -> int:
         """The delay in decisions.
@@ -90,16 +96,15 @@ class ObservationConfig(ObservationScale):
         sensors: errors in what the ego perceives of the others; None, and all 0: none.
     """
 
-    form: str = "lane_view_overlap"
+    form: Annotated[str, one_of(FORMS)] = "lane_view_overlap"
     sensors: SensorParameters | None = field(default_factory=SensorParameters)
 
     def __post_init__(self) -> None:
+        refuse_removed_observation(self.form)
         super().__post_init__()
         # One way to say that there are no errors, which is also that of older runs.
         if self.sensors == SensorParameters():
             assign(self, sensors=None)
-        refuse_removed_observation(self.form)
-        check(self, form=one_of(FORMS))
 
     def scale(self) -> ObservationScale:
         """The normalisers alone."""
@@ -119,7 +124,7 @@ def largest_number(form: str, longest_m: float = 4.5) -> float:
 
 
 @dataclass(frozen=True)
-class MaskParameters:
+class MaskParameters(Record):
     """Which actions the driver of the ego may choose.
 
     Attributes:
@@ -127,8 +132,39 @@ class MaskParameters:
         safe_deceleration: MOBIL's ``b_safe``, m/s2, above 0; read by ``safe`` alone.
     """
 
-    form: str = "none"
-    safe_deceleration: float = 4.0
+    form: Annotated[str, one_of(MASKS)] = "none"
+    safe_deceleration: Positive = 4.0
 
-    def __post_init__(self) -> None:
-        check(self, form=one_of(MASKS), safe_deceleration=above(0))
+
+@dataclass(frozen=True)
+class RewardParameters(Record):
+    """Section V.C. Speeds in m/s, deceleration in m/s2; the other numbers are rewards.
+
+    Attributes:
+        base_speed_mps: the speed reward is 0 at this speed and 1 at the ego's desired speed, which is higher.
+        low_acceleration: a mean acceleration below this, itself below 0, turns the speed reward against the agent.
+        literal_low_acceleration: whether the speed reward is then negated, as the paper's text has it, which below
+            15 m/s pays for crawling; by default its absolute value is.
+        lane_change: when one starts.
+        out_of_road: a command that would leave the road.
+        hard_crash: a collision.
+        soft_crash: per onset of somebody dangerously close ahead.
+        goal: the goal reached.
+        soft_crash_behind: per onset of a soft crash *behind* (:func:`ganlane.sim.ego.ego_surroundings`), at most 0.
+            The paper has no such term; at 0 it is not there.
+    """
+
+    base_speed_mps: Number = 15.0
+    low_acceleration: Annotated[float, below(0)] = -2.0
+    literal_low_acceleration: bool = False
+    lane_change: Number = -1.0
+    out_of_road: Number = -100.0
+    hard_crash: Number = -100.0
+    soft_crash: Number = -10.0
+    goal: Number = 100.0
+    soft_crash_behind: Annotated[float, at_most(0)] = 0.0
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """The terms in the order in which they are added up."""
+        return keys.REWARD_TERM_NAMES + ((keys.SOFT_CRASH_BEHIND,) if self.soft_crash_behind else ())

@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.checks import (
+    NotNegative,
+    Positive,
+    PositiveRange,
+    PositiveShare,
+    Range,
+    Record,
     Rule,
-    above,
+    Share,
     at_least,
     between,
-    check,
-    lists_to_tuples,
-    optional,
-    positive_range,
-    speed_range,
 )
 
-Range = tuple[float, float]
-_REACTION = Rule(
-    lambda value: speed_range().holds(value) and value[1] <= 3, "two numbers [low, high], 0 <= low <= high <= 3"
-)
+_MOST_3 = Rule(lambda value: value[1] <= 3, "two numbers [low, high], 0 <= low <= high <= 3")
+#: A time that lasts a physics step at least, s.
+Steps = Annotated[float, at_least(PHYSICS_STEP_S)]
 
 
 @dataclass(frozen=True)
-class GanParameters:
+class GanParameters(Record):
     """The paper's generated traffic (:func:`ganlane.traffic.presets.gan_traffic`).
 
     Attributes:
@@ -36,15 +37,12 @@ class GanParameters:
 
     path: str | None = None
     guard: bool = True
-    noise_scale: float = 1.0
-    execute_k: int = 1
-
-    def __post_init__(self) -> None:
-        check(self, noise_scale=at_least(0), execute_k=between(1, 8))
+    noise_scale: NotNegative = 1.0
+    execute_k: Annotated[int, between(1, 8)] = 1
 
 
 @dataclass(frozen=True)
-class CalibratedGanParameters:
+class CalibratedGanParameters(Record):
     """The calibrated generated traffic (:func:`ganlane.traffic.presets.gan_calibrated_traffic`).
 
     The two numbers of the noise were chosen on the scenes that the generator is fitted to: as fitted (1 and 5 s) too
@@ -58,16 +56,13 @@ class CalibratedGanParameters:
     """
 
     path: str | None = None
-    noise_scale: float = 1.4
-    noise_period_s: float = 3.0
-    changes_per_km: float | None = None
-
-    def __post_init__(self) -> None:
-        check(self, noise_scale=at_least(0), noise_period_s=at_least(0), changes_per_km=optional(at_least(0)))
+    noise_scale: NotNegative = 1.4
+    noise_period_s: NotNegative = 3.0
+    changes_per_km: NotNegative | None = None
 
 
 @dataclass(frozen=True)
-class SumoParameters:
+class SumoParameters(Record):
     """What SUMO's drivers have in common (:class:`ganlane.traffic.SumoTraffic`).
 
     Attributes:
@@ -78,25 +73,15 @@ class SumoParameters:
         speed_wander: how far a driver's desired speed strays from its mean, as a share of it.
     """
 
-    truck_share: float = 0.15
-    truck_length_m: float = 12.0
-    lane_change_s: float = 4.0
-    keep_right: float = 1.0
-    speed_wander: float = 0.03
-
-    def __post_init__(self) -> None:
-        check(
-            self,
-            truck_share=between(0, 1),
-            truck_length_m=between(4.5, 25),
-            lane_change_s=at_least(1),
-            keep_right=at_least(0),
-            speed_wander=between(0, 0.2),
-        )
+    truck_share: Share = 0.15
+    truck_length_m: Annotated[float, between(4.5, 25)] = 12.0
+    lane_change_s: Annotated[float, at_least(1)] = 4.0
+    keep_right: NotNegative = 1.0
+    speed_wander: Annotated[float, between(0, 0.2)] = 0.03
 
 
 @dataclass(frozen=True)
-class ReplayParameters:
+class ReplayParameters(Record):
     """Recorded traffic (:class:`ganlane.traffic.ReplayTraffic`).
 
     Attributes:
@@ -105,14 +90,11 @@ class ReplayParameters:
     """
 
     path: str | None = None
-    least_s: float = 4.0
-
-    def __post_init__(self) -> None:
-        check(self, least_s=at_least(PHYSICS_STEP_S))
+    least_s: Steps = 4.0
 
 
 @dataclass(frozen=True)
-class RandomDrivers:
+class RandomDrivers(Record):
     """Ranges (low, high) that every driver's parameters are drawn from, uniformly and independently, per episode.
 
     Attributes:
@@ -134,28 +116,18 @@ class RandomDrivers:
     """
 
     headway_s: Range = (0.8, 2.2)
-    max_acceleration: Range = (0.6, 1.6)
-    comfortable_deceleration: Range = (1.2, 2.5)
-    strongest_braking: Range = (4.0, 9.0)
-    desired_speed: Range = (0.9, 1.1)
+    max_acceleration: PositiveRange = (0.6, 1.6)
+    comfortable_deceleration: PositiveRange = (1.2, 2.5)
+    strongest_braking: PositiveRange = (4.0, 9.0)
+    desired_speed: PositiveRange = (0.9, 1.1)
     politeness: Range = (0.0, 1.0)
-    reaction_s: Range = (0.0, 0.6)
+    reaction_s: Annotated[Range, _MOST_3] = (0.0, 0.6)
     sway_m: Range = (0.0, 0.25)
-    sway_period_s: Range = (8.0, 20.0)
-
-    def __post_init__(self) -> None:
-        lists_to_tuples(self)
-        positive = ("max_acceleration", "comfortable_deceleration", "strongest_braking", "desired_speed")
-        check(
-            self,
-            **dict.fromkeys((*positive, "sway_period_s"), positive_range()),
-            **dict.fromkeys(("headway_s", "politeness", "sway_m"), speed_range()),
-            reaction_s=_REACTION,
-        )
+    sway_period_s: PositiveRange = (8.0, 20.0)
 
 
 @dataclass(frozen=True)
-class BrakingFaults:
+class BrakingFaults(Record):
     """Phantom braking.
 
     Attributes:
@@ -164,16 +136,13 @@ class BrakingFaults:
         lasts_s: how long, s.
     """
 
-    per_hour: float = 6.0
-    deceleration: float = 4.0
-    lasts_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        check(self, per_hour=at_least(0), deceleration=above(0), lasts_s=at_least(PHYSICS_STEP_S))
+    per_hour: NotNegative = 6.0
+    deceleration: Positive = 4.0
+    lasts_s: Steps = 1.0
 
 
 @dataclass(frozen=True)
-class ReactionFaults:
+class ReactionFaults(Record):
     """Late reactions.
 
     Attributes:
@@ -182,17 +151,13 @@ class ReactionFaults:
         lasts_s: how long a lapse lasts, s.
     """
 
-    per_hour: float = 12.0
-    delay_s: float = 0.8
-    lasts_s: float = 5.0
-
-    def __post_init__(self) -> None:
-        steps = dict.fromkeys(("delay_s", "lasts_s"), at_least(PHYSICS_STEP_S))
-        check(self, per_hour=at_least(0), **steps)
+    per_hour: NotNegative = 12.0
+    delay_s: Steps = 0.8
+    lasts_s: Steps = 5.0
 
 
 @dataclass(frozen=True)
-class HesitationFaults:
+class HesitationFaults(Record):
     """Hesitant lane changes.
 
     Attributes:
@@ -200,16 +165,12 @@ class HesitationFaults:
         pace: their lateral speed over the usual one, above 0 to 1.
     """
 
-    share: float = 0.2
-    pace: float = 0.5
-
-    def __post_init__(self) -> None:
-        pace = Rule(lambda value: 0 < value <= 1, "a number above 0, at most 1")
-        check(self, share=between(0, 1), pace=pace)
+    share: Share = 0.2
+    pace: PositiveShare = 0.5
 
 
 @dataclass(frozen=True)
-class AbortFaults:
+class AbortFaults(Record):
     """Aborted lane changes.
 
     Attributes:
@@ -217,15 +178,12 @@ class AbortFaults:
         at: how far the change has come when the driver turns back, 0 to 1; 0.5 is the line between the lanes.
     """
 
-    share: float = 0.1
-    at: float = 0.5
-
-    def __post_init__(self) -> None:
-        check(self, share=between(0, 1), at=between(0, 1))
+    share: Share = 0.1
+    at: Share = 0.5
 
 
 @dataclass(frozen=True)
-class DriverFaults:
+class DriverFaults(Record):
     """How often drivers make which faults; a rate or share of 0 switches one off.
 
     Attributes:

@@ -34,7 +34,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ganlane.config.app import run_command
-from ganlane.config.realism import RealismConfig
+from ganlane.config.recordings import RealismConfig
 
 
 def realism(config: RealismConfig, folder: Path) -> str:

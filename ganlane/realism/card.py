@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from ganlane.build import make_road, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.realism import RealismConfig
+from ganlane.config.recordings import RealismConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ganlane.config.folders import OVERRIDES
-from ganlane.config.realism import RealismConfig
+from ganlane.config.recordings import RealismConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, machine
 from ganlane.evaluation.table import aligned, number, with_interval

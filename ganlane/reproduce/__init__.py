@@ -25,8 +25,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from ganlane.config.app import run_command
+from ganlane.config.evaluate import ReproduceConfig
 from ganlane.config.folders import OVERRIDES
-from ganlane.config.reproduce import ReproduceConfig
 from ganlane.errors import UserError
 
 #: Hours that one training of the paper's schedule took, on one core.

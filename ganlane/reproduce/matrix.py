@@ -17,8 +17,8 @@ import polars as pl
 from tqdm import tqdm
 
 from ganlane.build import Driver, make_driver, make_drivers, make_traffic
-from ganlane.compare import compare_configured
-from ganlane.config.reproduce import ReproduceConfig
+from ganlane.compare import compare
+from ganlane.config.evaluate import ReproduceConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.results import code_version
@@ -140,7 +140,7 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     """Drive one cell and write its file."""
     set_threads(config.threads)
     alone = replace(config, traffics=[cell.traffic], episodes=cell.settings["episodes"])
-    table = compare_configured([make_driver(cell.driver, config.env, device=config.device)], alone, quiet=True)
+    table = compare([make_driver(cell.driver, config.env, device=config.device)], alone, quiet=True)
     origin = json.dumps({"settings": cell.settings, "code": code_version()})
     with atomic_path(cell.path) as part:
         table.write_parquet(part, metadata={_ORIGIN: origin})

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from ganlane.agents import GreedyPolicy, Rainbow
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
-from ganlane.parameters.checks import at_least, check
+from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Record
 from ganlane.training.checkpoint import Checkpointer, TrainingState
 from ganlane.training.collectors import Collector
 from ganlane.training.logs import Log, Logs
@@ -27,7 +27,7 @@ Evaluate = Callable[[GreedyPolicy], Mapping[str, float]]
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class TrainingConfig(Record):
     """Length and schedule of a run. ``*_every`` count decisions over all environments; 0 is never.
 
     A checkpoint is written ``checkpoint_every_s`` seconds after the last one, later if writing takes long: never
@@ -36,17 +36,13 @@ class TrainingConfig:
     kept. ``progress`` shows a bar on a terminal and lines elsewhere.
     """
 
-    total_decisions: int
-    log_every: int = TrainConfig.log_every
-    evaluate_every: int = TrainConfig.evaluate_every
+    total_decisions: Count
+    log_every: Count = TrainConfig.log_every
+    evaluate_every: CountOrZero = TrainConfig.evaluate_every
     best_metric: str = "mean_reward"
-    checkpoint_every_s: float = TrainConfig.checkpoint_every_s
+    checkpoint_every_s: NotNegative = TrainConfig.checkpoint_every_s
     checkpoint_replay: bool = TrainConfig.checkpoint_replay
     progress: bool = True
-
-    def __post_init__(self) -> None:
-        counts = {"total_decisions": at_least(1), "log_every": at_least(1), "evaluate_every": at_least(0)}
-        check(self, **counts, checkpoint_every_s=at_least(0))
 
 
 @dataclass(frozen=True)

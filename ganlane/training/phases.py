@@ -6,7 +6,6 @@ leaves the agent in the folder of the phase.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from contextlib import closing
@@ -37,8 +36,9 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.config.train import MultiCollectorConfig, OverlapCollectorConfig, RayCollectorConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
+from ganlane.evaluation.results import plain
+from ganlane.parameters.agent import RemovedOption, without_removed
 from ganlane.parameters.observation import ObservationConfig
-from ganlane.parameters.removed import RemovedOption, without_removed
 from ganlane.runtime import keep_freed_memory, set_threads
 from ganlane.sim.random import Stream
 from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint
@@ -46,7 +46,7 @@ from ganlane.training.collectors import Collector, SingleCollector
 from ganlane.training.logs import make_logs
 from ganlane.training.loop import Evaluate, TrainingConfig, TrainingResult, train
 from ganlane.training.overlap import OverlapCollector
-from ganlane.training.workers import ClusterCollector, ProcessCollector, WorkerPool
+from ganlane.training.workers import ClusterCollector, ProcessCollector
 from ganlane.transforms import observation_size
 
 #: The trained agent, in the folder of its phase; its presence says that the phase is over.
@@ -149,10 +149,9 @@ def make_collector(config: TrainConfig, phase: Phase) -> Collector:
     make_worker_env = partial(worker_env, config, phase)
     if isinstance(collector, OverlapCollectorConfig):
         return OverlapCollector(make_worker_env, collector.workers, collector.num_envs)
-    pool = WorkerPool(collector.workers, collector.num_envs, collector.weights_every)
     if isinstance(collector, RayCollectorConfig):
-        return ClusterCollector(make_worker_env, pool, collector.address)
-    return ProcessCollector(make_worker_env, pool)
+        return ClusterCollector(make_worker_env, collector)
+    return ProcessCollector(make_worker_env, collector)
 
 
 def training_env(
@@ -369,12 +368,6 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
             "traffic": phase.traffic.description(),
         },
     }
-
-
-def plain(config: Any) -> dict[str, Any]:
-    """A dataclass by its fields' names, as JSON has it: with lists in place of tuples."""
-    values: dict[str, Any] = json.loads(json.dumps(asdict(config)))
-    return values
 
 
 def defaults_of(config: Any) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -24,6 +23,7 @@ from ganlane import keys
 from ganlane.agents import Rainbow
 from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
 from ganlane.agents.policy import ExploringPolicy, LegalActions
+from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig
 from ganlane.errors import UserError
 from ganlane.training.collectors import Collector, pack, unpack
 from ganlane.training.signals import shielded_children
@@ -38,29 +38,6 @@ Factories = Sequence[Callable[[], Any]]
 EPISODES_PER_WORKER = 2**40
 #: State of the simulation, most of a step's bytes: the workers need it, the loop does not.
 INNER = (keys.VEHICLES, keys.TRAFFIC, keys.ROAD, PERCEIVED, SENSORS)
-
-
-@dataclass(frozen=True)
-class WorkerPool:
-    """Who collects: ``workers``, each with ``environments`` of its own.
-
-    ``weights_every`` is the number of decisions, over all environments, that are collected with the same weights;
-    rounded down to whole steps, at least one.
-    """
-
-    workers: int
-    environments: int
-    weights_every: int
-
-    @property
-    def rows(self) -> int:
-        """Environments of all workers."""
-        return self.workers * self.environments
-
-    @property
-    def steps(self) -> int:
-        """Steps that a worker takes with the same weights."""
-        return max(1, self.weights_every // self.rows)
 
 
 class WorkerPolicy(ExploringPolicy):
@@ -91,22 +68,22 @@ def read_by_loop(steps: TensorDictBase) -> TensorDictBase:
 class WorkerCollector(Collector):
     """Steps from TorchRL's collectors, on the CPUs of the workers.
 
-    The workers take ``pool.steps`` steps with the same weights, and wait while the learner works on them. They are
-    started by :meth:`open`, at the latest by the first :meth:`step`. Row ``w * pool.environments + i`` of a step is
+    The workers take ``config.steps`` steps with the same weights, and wait while the learner works on them. They are
+    started by :meth:`open`, at the latest by the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is
     row i of worker w, which starts with episode ``w * 2**40 + i``.
 
     Args:
         make_env: makes the environments of one worker.
-        pool: how many, and how often they get new weights.
+        config: how many, and how often they get new weights.
     """
 
     exact = False
     #: Of ``collector=NAME``, for messages.
     name: str
 
-    def __init__(self, make_env: MakeEnv, pool: WorkerPool) -> None:
-        self.make_env, self.pool, self.environments = make_env, pool, pool.rows
-        self.first_episodes = [worker * EPISODES_PER_WORKER for worker in range(pool.workers)]
+    def __init__(self, make_env: MakeEnv, config: MultiCollectorConfig) -> None:
+        self.make_env, self.config, self.environments = make_env, config, config.environments
+        self.first_episodes = [worker * EPISODES_PER_WORKER for worker in range(config.workers)]
         self.collector: BaseCollector | None = None
         self._batches: Iterator[TensorDictBase] = iter(())
         self._steps: deque[TensorDictBase] = deque()
@@ -125,11 +102,11 @@ class WorkerCollector(Collector):
         if self.collector is not None:
             return
         seed, config, legal = agent.generators["collect"].initial_seed(), agent.network.config, agent.policy.legal
-        environments = [partial(self.make_env, self.pool.environments, first) for first in self.first_episodes]
+        environments = [partial(self.make_env, self.config.num_envs, first) for first in self.first_episodes]
         policies = [partial(make_policy, config, legal, noise_seed(seed, first)) for first in self.first_episodes]
         threads = torch.get_num_threads()
         with self._failures_as_user_errors(), shielded_children():
-            self.collector = self.start(environments, policies, self.pool.rows * self.pool.steps)
+            self.collector = self.start(environments, policies, self.environments * self.config.steps)
         torch.set_num_threads(threads)
         self._batches = iter(self.collector)
 
@@ -153,7 +130,7 @@ class WorkerCollector(Collector):
         """
         assert self.collector is not None
         weights = {name: value.cpu() for name, value in agent.weights().items()}
-        self.collector.map_fn("policy.load", [(weights, agent.policy.epsilon)] * self.pool.workers)
+        self.collector.map_fn("policy.load", [(weights, agent.policy.epsilon)] * self.config.workers)
 
     @contextmanager
     def _failures_as_user_errors(self) -> Iterator[None]:
@@ -177,7 +154,7 @@ class WorkerCollector(Collector):
         last = unpack(state)
         self._last = last
         if keys.EPISODE in last:
-            begun = last.get(keys.EPISODE).reshape(self.pool.workers, -1).amax(1)
+            begun = last.get(keys.EPISODE).reshape(self.config.workers, -1).amax(1)
             self.first_episodes = [int(episode) + 1 for episode in begun.tolist()]
 
     def close(self) -> None:
@@ -242,9 +219,7 @@ class ClusterCollector(WorkerCollector):
 
     Args:
         make_env: makes the environments of one worker; on a cluster, ganlane is installed on its machines.
-        pool: how many, and how often they get new weights.
-        address: of the cluster's head (``HOST:6379``, ``ray://HOST:10001`` or ``auto``); None: a Ray of its own, on
-            this machine.
+        config: how many, and how often they get new weights; and the address of the cluster's head.
 
     Raises:
         UserError: Ray is not installed.
@@ -252,9 +227,9 @@ class ClusterCollector(WorkerCollector):
 
     name = "ray"
 
-    def __init__(self, make_env: MakeEnv, pool: WorkerPool, address: str | None = None) -> None:
-        super().__init__(make_env, pool)
-        self.address = address
+    def __init__(self, make_env: MakeEnv, config: RayCollectorConfig) -> None:
+        super().__init__(make_env, config)
+        self.address = config.address
         try:
             import ray  # noqa: F401
         except ImportError as error:
@@ -266,7 +241,7 @@ class ClusterCollector(WorkerCollector):
 
         connection: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
         if self.address is None:
-            connection |= {"address": "local", "num_cpus": self.pool.workers, "include_dashboard": False}
+            connection |= {"address": "local", "num_cpus": self.config.workers, "include_dashboard": False}
         else:
             check_reachable(self.address)
             connection["address"] = self.address

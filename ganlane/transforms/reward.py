@@ -10,7 +10,7 @@ from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import RewardParameters
 
 SECTION_V_C = RewardParameters()
 

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from ganlane.agents import RainbowConfig, agent_file, checkpoint, load_agent, read_agent, save_agent, warm_start
 from ganlane.agents.checkpoint import load_moments
 from ganlane.errors import UserError
-from ganlane.parameters.removed import AGENT_OPTIONS, LAST_REVISION
+from ganlane.parameters.agent import AGENT_OPTIONS, LAST_REVISION
 
 
 @pytest.fixture

@@ -30,8 +30,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig, TrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
-from ganlane.parameters.observation import ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import ObservationConfig, RewardParameters
 
 SHORT = {"repetitions": 2, "seconds": 0.001}
 

@@ -25,8 +25,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.observation import ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import ObservationConfig, RewardParameters
 
 SCENARIO = Scenario(EnvConfig(), IdmMobilTrafficConfig(), ObservationConfig(), RewardParameters())
 RAINBOW = RainbowConfig(hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64)

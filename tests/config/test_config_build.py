@@ -12,7 +12,7 @@ from torchrl.envs.utils import check_env_specs
 from ganlane.agents.drivers import DRIVERS, MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.realism import RealismConfig
+from ganlane.config.recordings import RealismConfig
 from ganlane.config.traffic import HighwayEnvTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, SumoTrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters.driving import IdmParameters, MobilParameters

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,8 +11,6 @@ import pytest
 from ganlane.config.app import run_command
 from ganlane.config.messages import ADVICE, is_users_matter, sentence
 from ganlane.files import write_bytes
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -108,29 +104,3 @@ def test_every_refusal_has_a_sentence(number):
     told = sentence(OSError(number, os.strerror(number), "a.txt"))
     assert told == f"a.txt: {os.strerror(number)}; {ADVICE[number]}."
     assert is_users_matter(OSError(number, ""))
-
-
-def started(**options):
-    """``ganlane train --help`` in a process of its own, which needs no torch."""
-    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
-    line = [sys.executable, "-m", "ganlane", "train", "--help"]
-    return subprocess.Popen(line, env=environment, stderr=subprocess.PIPE, text=True, **options)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-def test_a_full_disk_behind_standard_output():
-    with open("/dev/full", "w") as full, started(stdout=full) as process:
-        _, err = process.communicate(timeout=120)
-    assert err.startswith("ganlane train: a file or standard output: No space left on device; make room there")
-    assert err.count("\n") == 1
-    assert process.returncode == 2
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
-def test_a_reader_who_leaves_ends_the_command_in_silence():
-    reading, writing = os.pipe()
-    os.close(reading)
-    with started(stdout=writing) as process:
-        os.close(writing)
-        _, err = process.communicate(timeout=120)
-    assert (process.returncode, err) == (141, "")

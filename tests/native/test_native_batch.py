@@ -14,8 +14,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.native.batch import NativeBatch
 from ganlane.native.library import VARIANTS, best_variant, why_not
 from ganlane.parameters.driving import EgoParameters
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
-from ganlane.parameters.reward import RewardParameters
+from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 pytestmark = pytest.mark.skipif(why_not() is not None, reason="no C++ compiler")
 ROWS = 37

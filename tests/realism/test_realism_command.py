@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from reference.recordings import following_file
 
-from ganlane.config.realism import RealismConfig
+from ganlane.config.recordings import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.files import load_weights, save_weights
 from ganlane.generator import shipped_generator

@@ -43,7 +43,7 @@ def fresh_hydra() -> Iterator[None]:
 def composed(command: str, options: tuple[str, ...] = ()) -> Any:
     """As Hydra composes it with these options of groups, its own part included; read from YAML once."""
     if (command, options) not in CONFIGS:
-        register()
+        register(command)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(ConfigLoaderImpl, "load_configuration", LOAD)
             with fresh_hydra(), initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):

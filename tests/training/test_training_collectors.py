@@ -1,65 +1,42 @@
 """Steps from workers: in the order of time, from episodes of their own, with weights that follow the learner's."""
 
-import functools
 import importlib.util
-import json
-import os
-import signal
-import socket
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from training.toy import ToyRoad
+from training.toy import ROAD, SMALL, ToyRoad, agent, road, steps, toy
 
 from ganlane import keys
 from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.build import make_env, make_traffic
-from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.config.train import MultiCollectorConfig, TrainConfig
+from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.parameters.observation import ObservationConfig
 from ganlane.training import TrainingConfig, train
 from ganlane.training.checkpoint import TrainingState
 from ganlane.training.loop import collect
 from ganlane.training.phases import identity, make_collector, phases_of
-from ganlane.training.signals import shielded_children
 from ganlane.training.workers import (
     EPISODES_PER_WORKER,
     ClusterCollector,
     ProcessCollector,
     WorkerCollector,
-    WorkerPool,
-    check_reachable,
     noise_seed,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
 NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)")
 NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-ROAD = EnvConfig(vehicles=4, goal_m=60.0)
 QUIET = {"auto_register_policy_transforms": False}
-SMALL = {"hidden": (16, 16), "batch_size": 16, "warmup": 32, "capacity": 1000, "decisions_per_update": 8, "atoms": 11}
 
 
-def road(rows, first_episode):
-    return make_env(
-        make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(), num_envs=rows, first_episode=first_episode
-    )
-
-
-def toy(rows, first_episode):
-    return ToyRoad(rows)
-
-
-def agent(size=29, seed=0, **options):
-    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
+def pool(workers, num_envs, weights_every):
+    return MultiCollectorConfig(num_envs, workers, weights_every)
 
 
 class Here:
@@ -98,15 +75,11 @@ class HereCollector(WorkerCollector):
         return None
 
 
-def steps(source, learner, count):
-    return torch.stack([source.step(learner).clone() for _ in range(count)])
-
-
 # --- steps, episodes, weights
 
 
 def test_steps_come_in_the_order_of_time_across_batches():
-    source = HereCollector(road, WorkerPool(2, 3, weights_every=18))
+    source = HereCollector(road, pool(2, 3, 18))
     seen = steps(source, agent(), 10)
     assert seen.batch_size == (10, 6)
     going = ~seen["next", "done"][:-1, :, 0]
@@ -117,7 +90,7 @@ def test_steps_come_in_the_order_of_time_across_batches():
 
 
 def test_no_two_workers_drive_the_same_episode():
-    source = HereCollector(road, WorkerPool(3, 2, weights_every=60))
+    source = HereCollector(road, pool(3, 2, 60))
     episodes = steps(source, agent(), 40)[keys.EPISODE]
     assert torch.equal(episodes[0], torch.tensor([w * EPISODES_PER_WORKER + i for w in range(3) for i in range(2)]))
     driven = [set(episodes[:, row].tolist()) for row in range(6)]
@@ -126,7 +99,7 @@ def test_no_two_workers_drive_the_same_episode():
 
 
 def test_workers_explore_each_in_its_own_way():
-    source = HereCollector(toy, WorkerPool(2, 64, weights_every=1))
+    source = HereCollector(toy, pool(2, 64, 1))
     learner = agent(4, epsilon_start=1.0)
     first, second = source.step(learner)[keys.ACTION].split(64)
     assert not torch.equal(first, second)
@@ -135,7 +108,7 @@ def test_workers_explore_each_in_its_own_way():
 
 
 def test_workers_drive_with_the_weights_of_the_last_handover():
-    source = HereCollector(toy, WorkerPool(2, 4, weights_every=32))
+    source = HereCollector(toy, pool(2, 4, 32))
     learner = agent(4, noisy=False, epsilon_start=0.0, epsilon=0.0)
     source.step(learner)
     with torch.no_grad():
@@ -149,11 +122,11 @@ def test_workers_drive_with_the_weights_of_the_last_handover():
 
 @pytest.mark.parametrize(("every", "expected"), [(1, 1), (8, 1), (23, 2), (800, 100)])
 def test_weights_are_handed_over_every_so_many_decisions_in_whole_steps(every, expected):
-    assert WorkerPool(2, 4, every).steps == expected
+    assert pool(2, 4, every).steps == expected
 
 
 def test_the_share_of_random_actions_travels_with_the_weights():
-    source = HereCollector(toy, WorkerPool(1, 4, weights_every=4))
+    source = HereCollector(toy, pool(1, 4, 4))
     run = TrainingState(source, agent(4, epsilon_start=1.0, epsilon=0.0, epsilon_decisions=8))
     for _ in range(3):
         collect(run)
@@ -166,7 +139,7 @@ def test_the_share_of_random_actions_travels_with_the_weights():
 def test_a_run_with_workers_learns_what_a_run_without_does(tmp_path):
     learner = agent(4, **{"gamma": 0.8, "v_min": -10.0, "v_max": 10.0, "learning_rate": 3e-3})
     config = TrainingConfig(6000, log_every=1000, progress=False)
-    source = HereCollector(toy, WorkerPool(2, 8, weights_every=64))
+    source = HereCollector(toy, pool(2, 8, 64))
     result = train(source, learner, config, tmp_path)
     assert result.decisions == 6000
     assert result.updates == pytest.approx((6000 - 32) / 8, abs=8)
@@ -177,10 +150,10 @@ def test_a_run_with_workers_learns_what_a_run_without_does(tmp_path):
 
 def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(tmp_path, capsys):
     config = TrainingConfig(400, log_every=200, progress=False)
-    source = HereCollector(road, WorkerPool(2, 4, weights_every=80))
+    source = HereCollector(road, pool(2, 4, 80))
     first = train(source, agent(), config, tmp_path)
     begun = source._last[keys.EPISODE].reshape(2, 4)
-    resumed, again = agent(), HereCollector(road, WorkerPool(2, 4, weights_every=80))
+    resumed, again = agent(), HereCollector(road, pool(2, 4, 80))
     result = train(again, resumed, TrainingConfig(480, progress=False), tmp_path, resume=first.checkpoint)
     assert "the workers begin the next ones; not bit-exact" in capsys.readouterr().err
     assert again.first_episodes == [int(last) + 1 for last in begun.amax(1)]
@@ -189,8 +162,8 @@ def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(
 
 
 def test_another_number_of_workers_is_refused_on_resume(tmp_path):
-    first = train(HereCollector(toy, WorkerPool(2, 4, 8)), agent(4), TrainingConfig(80, progress=False), tmp_path)
-    for other in (HereCollector(toy, WorkerPool(3, 4, 8)), ToyRoad(4)):
+    first = train(HereCollector(toy, pool(2, 4, 8)), agent(4), TrainingConfig(80, progress=False), tmp_path)
+    for other in (HereCollector(toy, pool(3, 4, 8)), ToyRoad(4)):
         with pytest.raises(UserError, match=r"shape \[8\], this run has"):
             train(other, agent(4), TrainingConfig(160, progress=False), tmp_path, resume=first.checkpoint)
 
@@ -204,7 +177,7 @@ def test_a_phase_collects_as_the_option_says(monkeypatch):
     (phase,) = phases_of(config, Path("nowhere"))
     source = make_collector(config, phase)
     assert isinstance(source, ProcessCollector)
-    assert source.pool == WorkerPool(5, 3, 60)
+    assert source.config is collector
     assert collector.environments == source.environments == 15
     assert source.make_env(2, 70).reset()[keys.EPISODE].tolist() == [70, 71]
     assert identity(config, phase)["collector"] == {"num_envs": 3, "workers": 5, "weights_every": 60}
@@ -213,184 +186,7 @@ def test_a_phase_collects_as_the_option_says(monkeypatch):
 def test_a_missing_ray_is_named_with_the_command_that_mends_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"pip install 'ganlane\[ray\]'"):
-        ClusterCollector(toy, WorkerPool(1, 1, 1))
-
-
-# --- signals
-
-
-def test_children_of_a_run_are_spared_its_signals():
-    with shielded_children():
-        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            child.send_signal(number)
-        time.sleep(0.5)
-        assert child.poll() is None
-    finally:
-        child.kill()
-        child.wait()
-
-
-def test_a_signal_that_comes_while_children_start_is_not_lost_nor_its_handler():
-    seen = []
-    before = signal.signal(signal.SIGTERM, lambda number, frame: seen.append(number))
-    try:
-        with shielded_children():
-            os.kill(os.getpid(), signal.SIGTERM)
-        with shielded_children():
-            signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))  # as ray.init does
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert seen == [signal.SIGTERM, signal.SIGTERM]
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-# --- processes
-
-
-def alive(number):
-    try:
-        os.kill(number, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-def test_a_dead_worker_ends_the_run_in_one_sentence_and_takes_the_others_along():
-    source, learner = ProcessCollector(road, WorkerPool(2, 2, weights_every=8)), agent()
-    threads = torch.get_num_threads()
-    try:
-        seen = steps(source, learner, 4)
-        assert torch.equal(seen[keys.EPISODE][0], torch.tensor([0, 1, 2**40, 2**40 + 1]))
-        going = ~seen["next", "done"][:-1, :, 0]
-        assert torch.equal(seen["next", keys.OBSERVATION][:-1][going], seen[keys.OBSERVATION][1:][going])
-        numbers = [process.pid for process in source.collector.procs]
-        os.kill(numbers[1], signal.SIGKILL)
-        with pytest.raises(UserError, match=r"^collector=multi: .*died.* go on from the last checkpoint") as error:
-            steps(source, learner, 3)
-        assert "\n" not in str(error.value)
-    finally:
-        source.close()
-    assert not any(map(alive, numbers))
-    assert torch.get_num_threads() == threads
-
-
-@pytest.fixture
-def carried_along():
-    """Ray's workers cannot import this module: what they need of it travels with them."""
-    from ray import cloudpickle
-
-    module = sys.modules[__name__]
-    cloudpickle.register_pickle_by_value(module)
-    yield
-    cloudpickle.unregister_pickle_by_value(module)
-
-
-@NO_RAY
-@pytest.mark.slow
-def test_two_ray_workers_collect_and_a_dead_one_is_told_in_one_sentence(carried_along):
-    source, learner = ClusterCollector(road, WorkerPool(2, 2, weights_every=8)), agent()
-    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    try:
-        seen = steps(source, learner, 6)
-        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
-        assert torch.equal(seen[keys.EPISODE][0], torch.tensor([0, 1, 2**40, 2**40 + 1]))
-        going = ~seen["next", "done"][:-1, :, 0]
-        assert torch.equal(seen["next", keys.OBSERVATION][:-1][going], seen[keys.OBSERVATION][1:][going])
-        assert len({policy.initial_seed() for policy in source.collector.get_distant_attr("policy.generator")}) == 2
-        import ray
-
-        ray.kill(source.collector.remote_collectors[0])
-        with pytest.raises(UserError, match=r"^collector=ray: a worker died"):
-            steps(source, learner, 4)
-    finally:
-        source.close()
-    assert not ray.is_initialized()
-
-
-def test_nobody_at_an_address_is_found_out_at_once():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        check_reachable(f"127.0.0.1:{port}")
-        check_reachable(f"ray://127.0.0.1:{port}")
-    for address in (f"127.0.0.1:{port}", "ray://127.0.0.1:1", "127.0.0.1:99999"):
-        with pytest.raises(ConnectionError):
-            check_reachable(address)
-    check_reachable("auto")
-
-
-@NO_RAY
-@pytest.mark.slow
-def test_an_address_without_a_cluster_is_named(carried_along):
-    source = ClusterCollector(road, WorkerPool(1, 1, 1), address="127.0.0.1:1")
-    with pytest.raises(UserError, match=r"no Ray cluster answers at collector.address=127.0.0.1:1"):
-        source.step(agent())
-    source.close()
-
-
-COMMAND = [
-    *("traffic=idm", "init=none", "env.goal_m=40", "collector=multi", "collector.num_envs=8"),
-    *("collector.weights_every=32", "log_every=64", "agent.hidden=[16,16]", "agent.batch_size=32"),
-    *("agent.warmup=64", "agent.capacity=1000", "evaluation.agents=[keep_lane]", "evaluation.episodes=2"),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_to_the_whole_group_saves_and_leaves_no_process(number, tmp_path):
-    run = functools.partial(subprocess.Popen, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "ganlane.train", *COMMAND, "total_decisions=1000000000"]
-    process = run(command, env=environment)
-    while not any(len(path.read_text().splitlines()) > 1 for path in tmp_path.rglob("metrics.csv")):
-        assert process.poll() is None
-        time.sleep(0.1)
-    os.killpg(process.pid, number)
-    message = process.communicate(timeout=120)[1]
-    assert process.returncode == 128 + number
-    assert "go on with: ganlane train resume=" in message
-    assert "Traceback" not in message
-    assert gone(process.pid)
-
-
-@pytest.mark.slow
-def test_a_run_that_lost_a_worker_is_resumed_to_its_end(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    options = {"cwd": tmp_path, "stderr": subprocess.PIPE, "text": True, "env": environment}
-    start = [sys.executable, "-m", "ganlane.train"]
-    process = subprocess.Popen([*start, *COMMAND, "total_decisions=4000", "hydra.run.dir=run"], **options)
-    figures = tmp_path / "run" / "metrics.csv"
-    while not figures.is_file() or len(figures.read_text().splitlines()) < 3:
-        assert process.poll() is None
-        time.sleep(0.02)
-    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
-    message = process.communicate(timeout=120)[1]
-    assert process.returncode == 2
-    assert "died" in message
-    assert "Traceback" not in message
-    again = subprocess.run([*start, "resume=run"], **options)
-    assert again.returncode == 0, again.stderr
-    assert [int(line.split(",")[0]) for line in figures.read_text().splitlines()[1:]][-1] == 3968
-    assert json.loads((tmp_path / "run" / "results.json").read_text())["decisions"] == 4000
-
-
-def workers_of(parent: int) -> list[int]:
-    """Process ids of a run's workers: children that run a function of multiprocessing, not its resource tracker."""
-    found = subprocess.check_output(["ps", "-o", "pid=,args=", "--ppid", str(parent)], text=True)
-    return [int(line.split()[0]) for line in found.splitlines() if "spawn_main" in line]
-
-
-def gone(group: int, within_s: float = 20.0) -> bool:
-    """Whether a process group is empty soon; who has ended counts until the system has taken note of it."""
-    end = time.monotonic() + within_s
-    while time.monotonic() < end:
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.1)
-    return False
+        ClusterCollector(toy, RayCollectorConfig())
 
 
 # --- device=cuda

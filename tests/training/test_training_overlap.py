@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from training.test_training_collectors import ROAD, SMALL, gone, road
 from training.test_training_loop import agent, same, settings, train
-from training.toy import ToyRoad
+from training.toy import ROAD, SMALL, ToyRoad, gone, road, toy
 
 from ganlane import keys
 from ganlane.agents import Rainbow, RainbowConfig
@@ -25,10 +24,6 @@ from ganlane.training.checkpoint import load_checkpoint
 from ganlane.training.collectors import SingleCollector
 from ganlane.training.overlap import OverlapCollector, work
 from ganlane.training.phases import identity, make_collector, phases_of
-
-
-def toy(rows, first_episode):
-    return ToyRoad(rows)
 
 
 class Thread(threading.Thread):

@@ -1,11 +1,5 @@
 """Phases: what a run starts from and takes over, what it may go on from, and what its agent is told of it."""
 
-import os
-import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +7,6 @@ import entry_tiny
 import pytest
 import torch
 
-import ganlane
 from ganlane.agents import read_agent, save_agent
 from ganlane.build import make_driver
 from ganlane.config.command_line import check
@@ -21,9 +14,8 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.train import InitConfig, NoInitConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
+from ganlane.parameters.agent import LAST_REVISION, without_removed_overrides
 from ganlane.parameters.observation import MaskParameters
-from ganlane.parameters.removed import LAST_REVISION, without_removed_overrides
-from ganlane.runtime import COMPILERS
 from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
 from ganlane.training.phases import (
     AGENT_FILE,
@@ -160,36 +152,21 @@ def test_another_observation_is_refused_from_a_checkpoint_too(trained, tmp_path)
         start(tmp_path, trained, "observation.range_m=100")
 
 
-def damaged(damage, good: Path, path: Path):
-    """A last.pt that is none."""
-    state = load_checkpoint(good)
-    if damage == "text":
-        path.write_text("hello")
-    elif damage == "truncated":
-        path.write_bytes(good.read_bytes()[:1000])
-    elif damage == "another kind":
-        torch.save({"kind": "notes"}, path)
-    elif damage == "no state":
-        save_checkpoint(path, None)
-    elif damage == "no agent":
-        save_checkpoint(path, {**state, "agent": None})
-    elif damage == "unknown option":
-        save_checkpoint(path, {**state, "agent": {**state["agent"], "config": {"wheels": 4}}})
-    elif damage == "no observation":
-        save_checkpoint(path, {**state, "identity": {}})
-    else:
-        save_checkpoint(path, {**state, "agent": {**state["agent"], "network": {"head.weight": 3}}})
-
-
-DAMAGES = ["text", "truncated", "another kind", "no state", "no agent", "unknown option", "no observation", "numbers"]
+#: A checkpoint that can be read, and what of it is no training run's.
+DAMAGES = {
+    "no state": lambda state: None,
+    "no agent": lambda state: {**state, "agent": None},
+    "unknown option": lambda state: {**state, "agent": {**state["agent"], "config": {"wheels": 4}}},
+    "no observation": lambda state: {**state, "identity": {}},
+    "numbers": lambda state: {**state, "agent": {**state["agent"], "network": {"head.weight": 3}}},
+}
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_checkpoint_is_refused_in_one_sentence(damage, trained, tmp_path):
-    path = tmp_path / "last.pt"
-    damaged(damage, trained / LAST, path)
+def test_a_checkpoint_without_an_agent_is_refused_in_one_sentence(damage, trained, tmp_path):
+    save_checkpoint(tmp_path / "last.pt", DAMAGES[damage](load_checkpoint(trained / LAST)))
     with pytest.raises(UserError, match=r"^init\.path=.*last\.pt: not a .*checkpoint .*; give "):
-        read_start(str(path))
+        read_start(str(tmp_path / "last.pt"))
 
 
 def test_weights_that_are_not_those_of_the_network_are_refused(trained, tmp_path):
@@ -217,11 +194,6 @@ def test_a_shipped_name_means_the_shipped_agent_beside_a_folder_of_that_name(tmp
 def test_who_starts_afresh_has_nothing_to_take_over(kind, given):
     with pytest.raises(UserError, match=r"of which agent\? give init=idm_ckpt"):
         kind(**given)
-
-
-def test_another_word_for_the_support_is_refused():
-    with pytest.raises(UserError, match=r"support=mine: expected one of run, trained"):
-        InitConfig(support="mine")
 
 
 # --- experiments, lengths, learning rates
@@ -345,62 +317,3 @@ def test_a_checkpoint_with_a_removed_option_names_the_revision_that_had_it(train
     save_checkpoint(path, state)
     with pytest.raises(UserError, match=f"fixed_order: it was removed after revision {LAST_REVISION}"):
         read_start(str(path))
-
-
-# --- env.compile=true: a run that is stopped goes on, in a process of its own, to the weights of one in a piece
-
-#: A phase alone, without the evaluation that a command makes at its end: that would compile as much again.
-SCRIPT = """
-import sys
-from pathlib import Path
-from ganlane.config.command_line import check
-from ganlane.training.phases import phases_of, run_phase
-
-if __name__ == "__main__":
-    folder, resume, *told = sys.argv[1:]
-    config = check("train", told).config
-    run_phase(config, phases_of(config, Path(folder))[0], resume or None)
-"""
-#: Decisions that nobody waits for.
-TOO_LONG = 64_000
-
-
-def begin(folder: Path, total: int, resume: Path | str = "") -> subprocess.Popen:
-    """A training run in ``folder``, under way; what the compiler leaves is shared by the runs beside it."""
-    own = {
-        "PYTHONPATH": str(Path(ganlane.__file__).parents[1]),
-        "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"),
-    }
-    command = [
-        sys.executable,
-        "-c",
-        SCRIPT,
-        str(folder),
-        str(resume),
-        *TINY,
-        "env.compile=true",
-        f"total_decisions={total}",
-    ]
-    return subprocess.Popen(command, env={**os.environ, **own, "OMP_NUM_THREADS": "1"})
-
-
-def stop_after_a_row(run: subprocess.Popen, metrics: Path) -> None:
-    """SIGTERM in the middle: in the loop, some steps after the first figures."""
-    while run.poll() is None and not (metrics.is_file() and len(metrics.read_text().splitlines()) > 1):
-        time.sleep(0.1)
-    run.send_signal(signal.SIGTERM)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not any(map(shutil.which, COMPILERS)), reason="no C++ compiler")
-def test_a_compiled_run_stopped_and_resumed_ends_with_the_same_bits(tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    first = begin(parts, TOO_LONG)
-    stop_after_a_row(first, parts / "metrics.csv")
-    assert first.wait() == 0
-    reached = load_checkpoint(parts / LAST)["counters"]["decisions"]
-    assert 160 <= reached < TOO_LONG
-    assert not (parts / AGENT_FILE).exists()
-    assert begin(parts, reached + 480, resume=parts / LAST).wait() == 0
-    assert begin(whole, reached + 480).wait() == 0
-    assert same_agent(parts, whole)

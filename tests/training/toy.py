@@ -1,13 +1,23 @@
-"""A toy road: keep off the lane that the observation warns of. Its whole state travels in the TensorDict."""
+"""Small environments and agents for tests of the training loop; a toy road whose whole state is in the TensorDict."""
+
+import os
+import time
 
 import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ganlane.agents import Rainbow, RainbowConfig
+from ganlane.build import make_env, make_traffic
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.parameters.observation import ObservationConfig
 from ganlane.sim.random import draw_keys, episode_key, to_uniform
 
 ACTIONS, LIMIT = 3, 8
+ROAD = EnvConfig(vehicles=4, goal_m=60.0)
+SMALL = {"hidden": (16, 16), "batch_size": 16, "warmup": 32, "capacity": 1000, "decisions_per_update": 8, "atoms": 11}
 
 
 class ToyRoad(EnvBase):
@@ -91,3 +101,33 @@ class ToyRoad(EnvBase):
 
     def _set_seed(self, seed):
         self.seed_number = seed
+
+
+def road(rows, first_episode):
+    return make_env(
+        make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(), num_envs=rows, first_episode=first_episode
+    )
+
+
+def toy(rows, first_episode):
+    return ToyRoad(rows)
+
+
+def agent(size=29, seed=0, **options):
+    return Rainbow(RainbowConfig(**{**SMALL, **options}), size, seed=seed)
+
+
+def steps(source, learner, count):
+    return torch.stack([source.step(learner).clone() for _ in range(count)])
+
+
+def gone(group: int, within_s: float = 20.0) -> bool:
+    """Whether a process group is empty soon; who has ended counts until the system has taken note of it."""
+    end = time.monotonic() + within_s
+    while time.monotonic() < end:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.1)
+    return False

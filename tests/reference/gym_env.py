@@ -1,0 +1,29 @@
+"""The highway through gymnasium, small and fast, for tests of its interface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium
+
+import ganlane  # noqa: F401 - registers the environments
+
+ID = "ganlane/Highway-v0"
+KEEP, LEFT, RIGHT = 0, 1, 2
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def make(**options):
+    return gymnasium.make(ID, **{"traffic": "idm", "goal_m": 60.0, **options})
+
+
+def make_vec(rows, **options):
+    return gymnasium.make_vec(ID, num_envs=rows, **{"traffic": "idm", "goal_m": 60.0, **options})
+
+
+def until_the_end(env):
+    for _ in range(100):
+        found = env.step(KEEP)
+        if found[2] or found[3]:
+            return found
+    raise AssertionError("it never ended")

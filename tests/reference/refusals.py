@@ -1,0 +1,30 @@
+"""How a command refuses what is broken: status 2 and one sentence, without a traceback, and nothing left behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ganlane.__main__ import main
+
+
+def everything_below(folder: Path) -> dict[str, int]:
+    """Every file and folder with its size."""
+    return {str(path.relative_to(folder)): path.stat().st_size for path in folder.rglob("*")}
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The sentence with which a command line is refused, after all that it must not do was looked for."""
+    before = everything_below(Path.cwd())
+    status = main(arguments)
+    out, err = capsys.readouterr()
+    assert status == 2, (arguments, out, err)
+    assert is_one_sentence(err, arguments[0]), err
+    assert everything_below(Path.cwd()) == before
+    return err
+
+
+def is_one_sentence(err: str, command: str) -> bool:
+    """One line that names the command and ends in a full stop; no traceback."""
+    return err.startswith(f"ganlane {command}: ") and err.endswith(".\n") and err.count("\n") == 1

@@ -1,0 +1,124 @@
+"""What other libraries, and the documents, do with the gymnasium environments."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from reference.gym_env import ID, KEEP, LEFT, ROOT, make, make_vec
+
+MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
+
+
+def test_a_users_transform_pays_what_it_says():
+    from torchrl.envs import RewardScaling
+
+    alone, doubled = make(), make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
+    rewards = []
+    for env in (alone, doubled):
+        env.reset(seed=0)
+        rewards.append(env.step(KEEP)[1])
+    assert rewards[1] == pytest.approx(2.0 * rewards[0])
+
+
+def test_episode_statistics_are_recorded_for_one_and_for_many():
+    env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
+    env.reset(seed=0)
+    paid = 0.0
+    while True:
+        _, reward, terminated, truncated, info = env.step(KEEP)
+        paid += reward
+        if terminated or truncated:
+            break
+    assert info["episode"]["r"] == pytest.approx(paid)
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_vec(2, goal_m=30.0))
+    envs.reset(seed=0)
+    while "episode" not in info or "_episode" not in info:
+        *_, info = envs.step(np.zeros(2, int))
+    assert info["episode"]["l"][info["_episode"]].min() > 0
+
+
+def test_gymnasiums_own_vectorisation_works_too():
+    envs = make_vec(2, vectorization_mode="sync")
+    observation, info = envs.reset(seed=4)
+    assert info["seed"].tolist() == [4, 5]
+    np.testing.assert_array_equal(observation[1], make().reset(seed=5)[0])
+    assert envs.step(np.zeros(2, int))[0].shape == (2, 29)
+
+
+@pytest.mark.skipif(not MASKS_MAY_BE_ABSENT, reason="DictInfoToList needs gymnasium 1.2.2 or newer")
+def test_infos_of_a_batch_can_be_had_row_by_row():
+    envs = gymnasium.wrappers.vector.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))
+    envs.reset(seed=0)
+    *_, infos = envs.step(np.array([KEEP, LEFT]))
+    assert "final_info" not in infos[0]
+    assert infos[1]["final_info"]["out_of_road"]
+    assert infos[0]["reward_terms"].keys() == infos[1]["reward_terms"].keys()
+
+
+def blocks(page):
+    """The Python in a page of the documentation."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.S)
+
+
+def test_the_code_in_the_docs_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    films = importlib.util.find_spec("moviepy") is not None
+    names = {"np": np}
+    exec("\n".join(block for block in blocks("gymnasium.md") if films or "RecordVideo" not in block), names)
+    assert names["following"].shape == (64, 29)
+
+
+def test_the_docs_list_every_info():
+    page = (ROOT / "docs" / "gymnasium.md").read_text()
+    table = re.search(r"\| key \| what \|\n(.*?)\n\n", page, re.S).group(1)
+    listed = {name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+    _, info = make().reset(seed=0)
+    assert listed == set(info)
+    assert set(re.search(r"`speed, (.*?)` \|", table).group(1).split(", ")) | {"speed"} == set(info["reward_terms"])
+
+
+def test_stable_baselines3_trains_on_it_unchanged():
+    baselines = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
+    check = pytest.importorskip("stable_baselines3.common.env_checker").check_env
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check(env.unwrapped)
+    model = baselines.DQN("MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]})
+    before = [weight.clone() for weight in model.q_net.parameters()]
+    model.learn(200)
+    assert model.num_timesteps == 200
+    assert len(model.ep_info_buffer) > 0
+    assert any(not torch.equal(old, new) for old, new in zip(before, model.q_net.parameters()))
+
+
+def test_tianshou_trains_on_it_unchanged():
+    pytest.importorskip("tianshou", minversion="2.0", reason="tianshou is not installed")
+    from tianshou.algorithm.modelfree.dqn import DQN, DiscreteQLearningPolicy
+    from tianshou.algorithm.optim import AdamOptimizerFactory
+    from tianshou.data import Collector, VectorReplayBuffer
+    from tianshou.env import DummyVectorEnv
+    from tianshou.trainer import OffPolicyTrainerParams
+    from tianshou.utils.net.common import Net
+
+    envs = DummyVectorEnv([lambda: gymnasium.make(ID, goal_m=100.0) for _ in range(2)])
+    net = Net(state_shape=envs.observation_space[0].shape, action_shape=3, hidden_sizes=[16])
+    policy = DiscreteQLearningPolicy(model=net, action_space=envs.action_space[0], eps_training=0.5)
+    before = [weight.detach().clone() for weight in net.parameters()]
+    algorithm = DQN(policy=policy, optim=AdamOptimizerFactory(lr=1e-3), target_update_freq=50)
+    collector = Collector(algorithm, envs, VectorReplayBuffer(1000, 2))
+    collector.reset()
+    parameters = OffPolicyTrainerParams(
+        training_collector=collector, max_epochs=1, epoch_num_steps=200, collection_step_num_env_steps=20,
+        batch_size=32, update_step_num_gradient_steps_per_sample=0.1, show_progress=False, verbose=False,
+    )  # fmt: skip
+    found = algorithm.run_training(parameters)
+    assert found.train_step == 200
+    assert found.train_episode >= 10
+    assert any(not torch.equal(old, new) for old, new in zip(before, net.parameters()))

@@ -7,6 +7,8 @@
 Bare physics of ``idm_mobil`` on 3 lanes: no observation, no reward, no resets; the ego keeps its lane. Printed is the
 median over the repeats. ``--kernel-only`` leaves the tensor code out, ``--variants`` compares instruction sets.
 
+``--pairs`` adds the tensor code without sorting (:mod:`ganlane.sim.neighbours`).
+
 ``--environment``: everything, through TorchRL: observation (``lane_view``), reward and automatic resets, in episodes
 of 1 km (about 45 decisions), so that about every 45th row is reset in each decision.
 ``--goal-m 5000`` makes them the paper's.
@@ -15,9 +17,11 @@ of 1 km (about 45 decisions), so that about every 45th row is reset in each deci
 from __future__ import annotations
 
 import argparse
+import math
 import statistics
 import time
 from collections.abc import Callable
+from unittest import mock
 
 import torch
 from tensordict import TensorDictBase
@@ -31,6 +35,7 @@ from ganlane.native.decision import EgoState, Kernel, Outcome
 from ganlane.native.library import VARIANTS, best_variant
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.parameters.observation import ObservationConfig
+from ganlane.sim import neighbours
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
@@ -59,7 +64,9 @@ def scene(rows: int, vehicles: int, lanes: int) -> tuple[HighwayEnv, TensorDictB
     return env, td
 
 
-def contenders(env: HighwayEnv, td: TensorDictBase, variants: list[str], tensor: bool) -> dict[str, Callable]:
+def contenders(
+    env: HighwayEnv, td: TensorDictBase, variants: list[str], tensor: bool, pairs: bool
+) -> dict[str, Callable]:
     """Name to a decision of all rows from the same state."""
     rows = td.batch_size[0]
     ego = EgoState(*(td[keys.EGO, name] for name in EgoState._fields))
@@ -71,6 +78,13 @@ def contenders(env: HighwayEnv, td: TensorDictBase, variants: list[str], tensor:
         made[variant] = lambda kernel=kernel: kernel.decide(td[keys.ACTION], vehicles, steering, ego, step, out=out)
     if tensor:
         made["torch"] = lambda: env._step(td)
+
+    def by_pairs() -> None:
+        with mock.patch.object(neighbours, "SORTS_FROM", math.inf):
+            env._step(td)
+
+    if pairs:
+        made["by pairs"] = by_pairs
     return made
 
 
@@ -104,6 +118,7 @@ def main() -> None:
     parser.add_argument("--environment", action="store_true")
     parser.add_argument("--goal-m", type=float, default=1000.0)
     parser.add_argument("--kernel-only", action="store_true")
+    parser.add_argument("--pairs", action="store_true")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=[best_variant()])
     wanted = parser.parse_args()
     torch.set_num_threads(wanted.threads)
@@ -117,7 +132,7 @@ def main() -> None:
                     )
                 else:
                     env, td = scene(rows, vehicles, wanted.lanes)
-                    decisions = contenders(env, td, wanted.variants, not wanted.kernel_only)
+                    decisions = contenders(env, td, wanted.variants, not wanted.kernel_only, wanted.pairs)
                 rates: dict[str, list[float]] = {name: [] for name in decisions}
                 for _ in range(wanted.repeats):
                     for name, decide in decisions.items():

@@ -158,8 +158,7 @@ def test_lane_changes_are_drawn_as_the_share_that_lasts_longer():
 
 @pytest.mark.parametrize(("ending", "begins"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_the_ending_chooses_the_format_and_the_same_figure_gives_the_same_file(runs, tmp_path, ending, begins):
-    one = draw_runs(runs, ["loss"])
-    first, again = (save_figure(one, tmp_path / f"{name}.{ending}") for name in ("first", "again"))
+    first, again = (save_figure(draw_runs(runs, ["loss"]), tmp_path / f"{name}.{ending}") for name in ("a", "b"))
     assert first.read_bytes().startswith(begins)
     assert first.read_bytes() == again.read_bytes()
 

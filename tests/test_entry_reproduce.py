@@ -44,7 +44,7 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
     assert main([*SHORT, *SMALL, "fewer={gan: 2}", f"runs=[{runs}]", "from=shipped"]) == 0
     out, folder = capsys.readouterr().out, Path("out")
     assert "Table VI: crashes" in out
-    assert len(cells_driven) == len(set(cells_driven)) == 8
+    assert len(cells_driven) == len(set(cells_driven)) == 2 * (3 + 4)  # agent_idm has four trainings
 
     page = (folder / "report.html").read_text()
     for said in ("19", "-22.33", "114.82", "3 on idm, 2 on gan", "agent_idm", "<svg"):
@@ -89,7 +89,7 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
     ("arguments", "said"),
     [
         (["agents=[random_legal]", "traffics=[idm]"], "expected mobil and others"),
-        (["agents=[mobil,agent_idm@77]", "traffics=[idm]"], "no such training"),
+        (["agents=[mobil,agent_idm@77]", "traffics=[idm]"], "no training with seed 77"),
         (["fewer={gan: 0}"], "whole numbers of at least 2"),
         (["runs=[nowhere]"], "no such file"),
         (["from=elsewhere"], "shipped, scratch"),

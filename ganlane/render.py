@@ -4,6 +4,7 @@
     ganlane render agent=agent_idm traffic=gan format=mp4 out=film.mp4
     ganlane render 'agents=[mobil,agent_idm]' traffic=gan episode=3 out=player.html
     ganlane render agent=mobil traffic=gan_calibrated 'episodes=[0,1,2]' out=simulated.parquet
+    ganlane render crashes=docs/reproduce/crashes.json 'traffics=[gan]' out=crashes.html
     ganlane render run=outputs/train/FIRST,outputs/train/SECOND out=curves.png      (or .svg, .pdf)
 
 The episodes are those of ``ganlane evaluate`` with the same seed.
@@ -18,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ganlane.config.app import run_command
-from ganlane.config.render import FILMS, RenderConfig
+from ganlane.config.render import FILMS, MOST_EPISODES, RenderConfig
+from ganlane.errors import UserError
 
 if TYPE_CHECKING:
     from ganlane.view import Trajectory
@@ -32,7 +34,10 @@ def render(config: RenderConfig, folder: Path) -> str:
     from ganlane.view import write_player, write_tracks
 
     set_threads(config.threads)
-    episodes = [_record(config, agent, episode) for agent, episode in config.pairs()]
+    if config.crashes is not None:
+        episodes = _crashes(config, config.crashes)
+    else:
+        episodes = [_record(config, agent, episode) for agent, episode in config.pairs()]
     kind, film = config.kind, config.film
     out = Path(config.out) if config.out is not None else folder / _name(config)
     if kind in FILMS:
@@ -57,9 +62,46 @@ def _record(config: RenderConfig, agent: str, number: int) -> Trajectory:
     env = make_env(traffic, config.env, seen, config.reward, device=config.device, mask=mask)
     end_s = config.end_s if config.end_s is not None else float("inf")
     episode = record_episode(env, policy, config.seed, number, driver.name, label, end_s)
-    which = f"{driver.name} on {label}, seed {config.seed}, episode {number}"
-    print(f"{which}: {episode.outcome or 'cut off'} after {episode.time_s[-1]:.1f} s")
+    print(_sentence(episode))
     return episode
+
+
+def _sentence(episode: Trajectory) -> str:
+    label = episode.label
+    which = f"{label.agent} on {label.traffic}, seed {label.seed}, episode {label.episode}"
+    return f"{which}: {episode.outcome or 'cut off'} after {episode.time_s[-1]:.1f} s"
+
+
+def _crashes(config: RenderConfig, path: str) -> list[Trajectory]:
+    """Drive the chosen episodes of a list of crashes again, with their actions.
+
+    Raises:
+        UserError: no such list, or none of its episodes is chosen.
+    """
+    from ganlane.crashes import read_crashes
+    from ganlane.evaluation.rollouts import ScriptedPolicy
+    from ganlane.view import record_episode
+
+    listed, episodes = read_crashes(path), []
+    chosen = [
+        each
+        for each in listed.crashes
+        if each.driver in (config.agents or [each.driver])
+        and each.episode in (config.episodes or [each.episode])
+        and each.traffic in (config.traffics or [each.traffic])
+    ]
+    if not chosen:
+        drivers = ", ".join(dict.fromkeys(each.driver for each in listed.crashes)) or "none at all"
+        raise UserError(f"crashes={path}: none of these agents, episodes and traffics; it lists {drivers}.")
+    if len(chosen) > MOST_EPISODES:
+        print(f"the first {MOST_EPISODES} of {len(chosen)} crashes; agents, traffics and episodes choose others")
+    end_s = config.end_s if config.end_s is not None else float("inf")
+    for each in chosen[:MOST_EPISODES]:
+        env, policy = listed.make_env(each.traffic, reward=config.reward), ScriptedPolicy(each.steps())
+        episodes.append(record_episode(env, policy, each.seed, each.episode, each.driver, each.traffic, end_s))
+        changed = f" (listed: {each.end})" if episodes[-1].outcome not in (each.end, "") else ""
+        print(f"{_sentence(episodes[-1])}{changed}")
+    return episodes
 
 
 def _film(config: RenderConfig, episode: Trajectory, out: Path) -> str:
@@ -85,6 +127,8 @@ def _curves(config: RenderConfig, runs: Sequence[str], folder: Path) -> str:
 
 def _name(config: RenderConfig) -> str:
     """The file's name where none is given: agents, traffic, seed, episodes."""
+    if config.crashes is not None:
+        return f"crashes.{config.kind}"
     agents = dict.fromkeys(Path(agent).stem for agent, _ in config.pairs())
     numbers = dict.fromkeys(str(number) for _, number in config.pairs())
     parts = [*agents, config.traffic.label(), str(config.seed), *numbers]

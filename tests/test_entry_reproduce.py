@@ -56,6 +56,8 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
     for name in ("table_vi", "table_vii", "comparisons"):
         assert len((folder / f"{name}.csv").read_text().splitlines()) > 2
 
+    assert json.loads((folder / "crashes.json").read_text())["crashes"] == []  # nobody but random_legal had time to
+
     results = json.loads((folder / "results.json").read_text())
     assert results["command"].startswith("ganlane reproduce episodes=3")
     assert results["seeds"]["episodes"] == {"idm": 3, "gan": 2}

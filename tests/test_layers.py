@@ -26,7 +26,7 @@ ORDER = [
     {"config"},
     {"build"},
     {"training"},
-    {"compare", "fit_report"},
+    {"compare", "crashes", "fit_report"},
     {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
     {"options"},
     # The typed calls run the commands' own functions.

@@ -72,6 +72,7 @@ class ReproduceConfig(EvaluateConfig):
         fewer: traffics on which driving is slow, with fewer episodes; the smaller number counts.
         workers: processes that drive.
         cells: folder of what was driven; a pair of driver and traffic that is there is not driven again.
+        crashes: so many per driver and traffic, the earliest, are listed in crashes.json with their actions.
         runs: folders of training runs for the learning curves, each with the folder pretrain of its first phase.
         training_seeds: of source=scratch.
         trained: of source=scratch: folder of the trainings; those in it go on where they stopped.
@@ -86,6 +87,7 @@ class ReproduceConfig(EvaluateConfig):
     )
     workers: Annotated[int, between(1, 64)] = 2
     cells: str = "outputs/cells"
+    crashes: Annotated[int, between(0, 100)] = 3
     runs: list[str] = field(default_factory=list)
     training_seeds: Annotated[list[Seed], DIFFERENT] = field(default_factory=lambda: [0, 1, 2, 3, 4])
     trained: str = "outputs/scratch"

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from ganlane.config.run import DrivingConfig
+from ganlane.config.run import DrivingConfig, Names
 from ganlane.config.traffic import TrafficConfig
-from ganlane.errors import ParameterError, UserError
+from ganlane.errors import ParameterError, UserError, as_typed
 from ganlane.parameters.checks import (
     DIFFERENT,
     Count,
@@ -94,6 +94,9 @@ class RenderConfig(DrivingConfig):
         agents: html, csv, parquet: several instead of driver, for instance agents=[mobil,agent_idm].
         episodes: html, csv, parquet: several instead of episode, for instance episodes=[0,1,2].
         run: instead of an episode: learning curves of runs, run=FOLDER or run=FOLDER,FOLDER.
+        crashes: instead of an episode: the crashes.json of ganlane reproduce, whose episodes are driven again with
+            their actions; agents, episodes and traffics choose among them.
+        traffics: of crashes: on these traffics alone.
         format: gif, mp4 (needs the extra 'video'), png (a strip of four frames), html (a player), csv or parquet
             (trajectories); null: the ending of out, else gif.
         out: file to write; null: into the run folder.
@@ -106,6 +109,8 @@ class RenderConfig(DrivingConfig):
     agents: Annotated[list[str], DIFFERENT] | None = None
     episodes: Annotated[list[Seed], DIFFERENT] | None = None
     run: list[Text] | None = None
+    crashes: Text | None = None
+    traffics: Names | None = None
     format: Annotated[str, one_of(FORMATS)] | None = None
     out: str | None = None
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
@@ -120,9 +125,10 @@ class RenderConfig(DrivingConfig):
 
     @property
     def kind(self) -> str:
-        """The format that is asked for: ``format``, or the ending of ``out``, or png for ``run``, else gif."""
+        """``format``, or the ending of ``out``, or else png for ``run``, html for ``crashes``, gif."""
         ending = Path(self.out).suffix.removeprefix(".").lower() if self.out is not None else ""
-        return self.format or ending or ("gif" if self.run is None else "png")
+        default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
+        return self.format or ending or default
 
     @property
     def end_s(self) -> float | None:
@@ -152,6 +158,11 @@ class RenderConfig(DrivingConfig):
             )
         if self.kind == "mp4":
             require_video()
+        if self.crashes is not None:
+            self._check_crashes()
+            return
+        if self.traffics is not None:
+            raise UserError(f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give traffic=NAME.")
         count = len(self.pairs())
         if self.kind in FILMS and count > 1:
             raise UserError(
@@ -159,6 +170,13 @@ class RenderConfig(DrivingConfig):
             )
         if count > MOST_EPISODES:
             raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
+
+    def _check_crashes(self) -> None:
+        """Crashes are several episodes, and nothing else beside them."""
+        if self.run is not None:
+            raise UserError("crashes and run: either crashes or learning curves are drawn; leave one of them out.")
+        if self.kind in FILMS:
+            raise UserError(f"format={self.kind}: shows one episode; crashes are html, csv or parquet.")
 
 
 def _check_suffix(out: str | None, kind: str) -> None:

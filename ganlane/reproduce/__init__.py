@@ -5,8 +5,9 @@
     ganlane reproduce 'runs=[outputs/train/SEED_0,outputs/train/SEED_1]'
     ganlane reproduce from=scratch
 
-Writes results.json, report.html, figures (PNG, SVG) and a CSV behind each into its run folder. What was driven stays
-in ``cells``: a command that was stopped goes on where it was, and one with other drivers drives those alone.
+Writes results.json, report.html, crashes.json (for ``ganlane render crashes=FILE``), figures (PNG, SVG) and a CSV
+behind each into its run folder. What was driven stays in ``cells``: a command that was stopped goes on where it was,
+and one with other drivers drives those alone.
 
 The modules: :mod:`~ganlane.reproduce.matrix` drives, :mod:`~ganlane.reproduce.numbers` computes,
 :mod:`~ganlane.reproduce.report` writes.
@@ -22,6 +23,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 from omegaconf import OmegaConf
 
 from ganlane.config.app import run_command
@@ -100,8 +102,20 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "seed": config.seed,
         "episodes": {name: config.episodes_on(name) for name in traffics},
     }
+    _list_crashes(episodes, config, folder)
     results = write_results(folder, record, asdict(config), seeds)
     return f"report: {page}; results: {results}"
+
+
+def _list_crashes(episodes: pl.DataFrame, config: ReproduceConfig, folder: Path) -> None:
+    """Write the earliest crashes of every driver but the controls, as ``crashes.json``."""
+    from ganlane.crashes import find_crashes, write_crashes
+
+    if config.crashes:
+        compared = episodes.filter(~pl.col("agent").is_in(["random", "random_legal", "keep_lane"]))
+        listed, others = find_crashes(compared, config, config.crashes)
+        write_crashes(folder / "crashes.json", listed)
+        print(f"crashes.json: {len(listed.crashes)} crashes; {others} ended otherwise when driven again, not listed")
 
 
 def command_line(folder: Path) -> str:

@@ -1,0 +1,166 @@
+"""Crashes are listed with their actions, and come back when they are driven again."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from ganlane.config.env import EnvConfig
+from ganlane.config.evaluate import EvaluateConfig
+from ganlane.crashes import Crash, CrashList, find_crashes, read_crashes, write_crashes
+from ganlane.errors import UserError
+from ganlane.render import main
+
+SHIPPED = Path(__file__).parents[1] / "docs" / "reproduce" / "crashes.json"
+
+
+@pytest.fixture(scope="module")
+def shipped() -> CrashList:
+    return read_crashes(SHIPPED)
+
+
+def ends(listed: CrashList) -> list[tuple[str, str, int, str]]:
+    return [
+        (each.driver, each.traffic, each.episode, rollout.end)
+        for each, rollout in zip(listed.crashes, listed.drive_again())
+    ]
+
+
+def by_length(listed: CrashList) -> list[Crash]:
+    """The earliest crash first."""
+    return sorted(listed.crashes, key=lambda each: len(each.actions))
+
+
+def as_listed(listed: CrashList) -> list[tuple[str, str, int, str]]:
+    return [(each.driver, each.traffic, each.episode, each.end) for each in listed.crashes]
+
+
+def test_the_earliest_crashes_of_the_shipped_agents_happen_again(shipped):
+    early = {each.traffic: each for each in by_length(shipped)[::-1] if len(each.actions) < 20}
+    assert early.keys() >= {"idm_mobil", "idm_faults", "gan", "gan_calibrated"}
+    chosen = replace(shipped, crashes=list(early.values()))
+    assert ends(chosen) == as_listed(chosen)
+
+
+@pytest.mark.slow
+def test_every_crash_of_the_shipped_agents_happens_again(shipped):
+    assert ends(shipped) == as_listed(shipped)
+
+
+def test_the_list_holds_failures_of_the_published_evaluation(shipped):
+    failures = json.loads((SHIPPED.parent / "results.json").read_text())["failures"]
+    known = {(f["driver"], f["traffic"], number, end) for f in failures for end in _ENDS for number in f[end]}
+    assert set(as_listed(shipped)) <= known
+    drivers = {each.driver.partition("+")[0] for each in shipped.crashes}
+    assert drivers >= {f"agent_{recipe}@{seed}" for recipe in ("idm", "gan") for seed in range(4)}
+    assert SHIPPED.stat().st_size < 200_000
+
+
+_ENDS = ("hard_crash", "out_of_road")
+
+
+def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
+    config = EvaluateConfig(agents=["random"], traffics=["idm"], env=EnvConfig(goal_m=60.0))
+    asked = {"agent": "random", "traffic": "idm", "episode": [2, 3, 7], "decisions": [9, 1, 5]}
+    rows = pl.DataFrame({**asked, "reason": ["out_of_road", "out_of_road", "hard_crash"]})
+    listed, others = find_crashes(rows, config, 3)
+    assert [each.episode for each in listed.crashes] == [2, 3]
+    assert others == 1
+    assert [each.episode for each in find_crashes(rows, config, 1)[0].crashes] == [3]  # the earliest
+    write_crashes(tmp_path / "crashes.json", listed)
+    read = read_crashes(tmp_path / "crashes.json")
+    assert read.crashes == listed.crashes
+    assert (read.env, read.stream) == (listed.env, "report")
+    assert ends(read) == as_listed(listed)
+
+
+def _code(content):
+    content["traffics"]["gan"]["_target_"] = "os.getcwd"
+
+
+def _placeholder(content):
+    content["crashes"][0]["driver"] = "${oc.env:HOME}"
+
+
+def _unknown_traffic(content):
+    content["crashes"][0]["traffic"] = "mixed"
+
+
+def _bad_action(content):
+    content["crashes"][0]["actions"] = "0123"
+
+
+def _bad_road(content):
+    content["env"]["lanes"] = 0
+
+
+def _no_number(content):
+    content["crashes"][0]["episode"] = 1.5
+
+
+def _foreign(content):
+    content.clear()
+
+
+@pytest.mark.parametrize(
+    "spoil", [_code, _placeholder, _unknown_traffic, _bad_action, _bad_road, _no_number, _foreign]
+)
+def test_a_broken_or_foreign_list_is_refused_in_one_sentence(spoil, small_list, tmp_path):
+    content = json.loads(small_list.read_text())
+    spoil(content)
+    small_list.write_text(json.dumps(content))
+    with pytest.raises(UserError, match="not a list of crashes") as refused:
+        read_crashes(small_list)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"\xff\xfe", b"[" * 100_000, b'{"kind": 3}'])
+def test_what_is_no_json_of_ours_is_refused(content, tmp_path):
+    (tmp_path / "crashes.json").write_bytes(content)
+    with pytest.raises(UserError, match="not a list of crashes"):
+        read_crashes(tmp_path / "crashes.json")
+    with pytest.raises(UserError, match="cannot be read"):
+        read_crashes(tmp_path / "nowhere.json")
+
+
+@pytest.fixture
+def small_list(shipped, tmp_path, monkeypatch) -> Path:
+    """Two early crashes on traffic of two kinds."""
+    monkeypatch.chdir(tmp_path)
+    chosen = [
+        next(each for each in by_length(shipped) if each.traffic == traffic) for traffic in ("idm_faults", "gan")
+    ]
+    write_crashes("crashes.json", replace(shipped, crashes=chosen))
+    return Path("crashes.json")
+
+
+def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
+    crashes = read_crashes(small_list).crashes
+    assert main([f"crashes={small_list}", "out=player.html"]) == 0
+    out = capsys.readouterr().out
+    assert "listed:" not in out  # each ended as listed
+    page = Path("player.html").read_text()
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])["episodes"]
+    shown = [(each["agent"], each["traffic"], each["seed"], each["episode"], each["outcome"]) for each in data]
+    assert shown == [(each.driver, each.traffic, each.seed, each.episode, each.end) for each in crashes]
+
+
+@pytest.mark.usefixtures("hydra_from_memory")
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("crashes=nowhere.json", "nowhere.json: cannot be read"),
+        ("crashes=crashes.json agents=[nobody]", "none of these agents"),
+        ("crashes=crashes.json format=gif", "crashes are html, csv or parquet"),
+        ("crashes=crashes.json run=RUN", "leave one of them out"),
+        ("traffics=[idm]", "goes with crashes=FILE"),
+    ],
+)
+def test_a_mistake_is_one_sentence(line, said, small_list, capsys):
+    assert main(line.split()) == 2
+    assert said in capsys.readouterr().err

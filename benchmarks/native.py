@@ -78,12 +78,12 @@ def contenders(
         made[variant] = lambda kernel=kernel: kernel.decide(td[keys.ACTION], vehicles, steering, ego, step, out=out)
     if tensor:
         made["torch"] = lambda: env._step(td)
-
-    def by_pairs() -> None:
-        with mock.patch.object(neighbours, "SORTS_FROM", math.inf):
-            env._step(td)
-
     if pairs:
+
+        def by_pairs() -> None:
+            with mock.patch.object(neighbours, "SORTS_FROM", math.inf):
+                env._step(td)
+
         made["by pairs"] = by_pairs
     return made
 

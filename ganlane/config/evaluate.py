@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any
 
 from ganlane.config.run import DrivingConfig, Environments, Episodes, Names
 from ganlane.config.traffic import TRAFFICS, TrafficConfig, all_traffics, chosen_traffics
 from ganlane.parameters.checks import DIFFERENT, Rule, Seed, Text, between, one_of
 
+#: Episodes of ``ganlane reproduce`` on traffics on which driving is slow.
+FEWER = {"gan": 150, "gan_calibrated": 100, "replay": 200, "sumo": 8, "highway_env": 3}
 _COUNTS = Rule(
-    lambda counts: isinstance(counts, dict) and all(type(n) is int and n >= 2 for n in counts.values()),
+    lambda counts: (
+        counts is None or (isinstance(counts, dict) and all(type(n) is int and n >= 2 for n in counts.values()))
+    ),
     "names of traffics with whole numbers of at least 2",
 )
 _WITH_MOBIL = Rule(
@@ -69,7 +73,8 @@ class ReproduceConfig(EvaluateConfig):
             given as from=.
         agents: as of ganlane evaluate; agent_idm@all: every training of its recipe.
         traffics: options of the group traffic; what is not installed or not at hand is left out, with the reason.
-        fewer: traffics on which driving is slow, with fewer episodes; the smaller number counts.
+        fewer: number of episodes on slow traffics, where it is smaller than episodes; it changes or adds to
+            {gan: 150, gan_calibrated: 100, replay: 200, sumo: 8, highway_env: 3}.
         workers: processes that drive.
         cells: folder of what was driven; a pair of driver and traffic that is there is not driven again.
         crashes: so many per driver and traffic, the earliest, are listed in crashes.json with their actions.
@@ -82,9 +87,8 @@ class ReproduceConfig(EvaluateConfig):
     agents: Annotated[Names, _WITH_MOBIL] = field(default_factory=_paper_agents)
     traffics: Names = field(default_factory=lambda: [name for name in TRAFFICS if name != "mixed"])
     episodes: Annotated[int, between(2, 10_000)] = 1000
-    fewer: Annotated[dict[str, int], _COUNTS] = field(
-        default_factory=lambda: {"gan": 150, "gan_calibrated": 100, "replay": 200, "sumo": 8, "highway_env": 3}
-    )
+    # Of a free type: Hydra would refuse names that a typed default does not have.
+    fewer: Annotated[Any, _COUNTS] = None
     workers: Annotated[int, between(1, 64)] = 2
     cells: str = "outputs/cells"
     crashes: Annotated[int, between(0, 100)] = 3
@@ -94,7 +98,8 @@ class ReproduceConfig(EvaluateConfig):
 
     def episodes_on(self, traffic: str) -> int:
         """How many episodes are driven on a traffic."""
-        return min(self.episodes, self.fewer.get(traffic, self.episodes))
+        fewer = {**FEWER, **(self.fewer or {})}
+        return min(self.episodes, fewer.get(traffic, self.episodes))
 
 
 @dataclass

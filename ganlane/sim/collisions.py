@@ -59,16 +59,15 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     v = vehicles
     dx = road.distance_ahead(v.x[:, :1], v.x[:, 1:])
     both = v.valid[:, 1:] & v.valid[:, :1]
-    if not reads_are_cheap(dx):
-        return _ego_hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
-    # Boxes overlap only within the sum of their half diagonals, each at most half of length plus width.
-    row, column = (dx.abs() < v.length.amax() + v.width.amax()).nonzero().unbind(1)
-    if len(row) == 0:
-        return torch.zeros_like(both)
-    if dx.numel() < FEW:
-        return _ego_hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
-    ego, near = (Vehicles(*(field[row, which] for field in v)) for which in (0, column + 1))
-    return torch.zeros_like(both).index_put((row, column), _ego_hits(dx[row, column], ego, near)) & both
+    if reads_are_cheap(dx):
+        # Boxes overlap only within the sum of their half diagonals, each at most half of length plus width.
+        row, column = (dx.abs() < v.length.amax() + v.width.amax()).nonzero().unbind(1)
+        if len(row) == 0:
+            return torch.zeros_like(both)
+        if dx.numel() >= FEW:
+            ego, near = (Vehicles(*(field[row, which] for field in v)) for which in (0, column + 1))
+            return torch.zeros_like(both).index_put((row, column), _ego_hits(dx[row, column], ego, near)) & both
+    return _ego_hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
 
 
 def _ego_hits(dx: Tensor, ego: Vehicles, others: Vehicles) -> Tensor:

@@ -38,7 +38,10 @@ PAIRS = (
     ("agent_idm", "mobil"),
     ("agent_gan+safe", "agent_idm+safe"),
     ("agent_general", "mobil"),
+    ("agent_general", "mobil_egoistic"),
     ("agent_general", "agent_gan"),
+    ("agent_general", "agent_idm+safe"),
+    ("agent_general", "agent_gan+safe"),
 )
 
 

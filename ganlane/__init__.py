@@ -18,11 +18,12 @@ them are ``keys`` (every TensorDict key), ``errors``, ``files`` and ``runtime``.
 from __future__ import annotations
 
 import importlib
+import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 from ganlane._version import __version__
-from ganlane.gym import register_envs
-from ganlane.runtime import check_process
+from ganlane.runtime import check_process, register_envs
 
 if TYPE_CHECKING:  # for type checkers and editors, which do not run __getattr__
     from ganlane import api as api
@@ -74,4 +75,11 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-register_envs()
+def _starts_a_command() -> bool:
+    """Whether ``ganlane ...`` or ``python -m ganlane...`` imports this; the latter is called -m until it is found."""
+    return os.path.splitext(os.path.basename(sys.argv[0]))[0] in ("-m", "ganlane") if sys.argv else False
+
+
+# A command registers them once its keys are checked: gymnasium's import takes 0.2 of the 0.7 s of a mistyped key.
+if not _starts_a_command():
+    register_envs()

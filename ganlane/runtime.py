@@ -1,4 +1,4 @@
-"""How the process runs: compiled functions, kept memory, threads.
+"""How the process runs: compiled functions, kept memory, threads; gymnasium's registry.
 
 Torch is imported inside the functions: the command line reads this module before it needs torch.
 """
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from ganlane.errors import UserError
 
@@ -28,6 +28,32 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 #: Bytes; blocks up to this size come from the heap, and as much free memory is kept at its end.
 KEPT_BYTES = 2**28
 _STATUS = Path("/proc/self/status")
+ENV_ID: Final = "ganlane/Highway-v0"
+#: Id to the arguments that differ; reference scores are in docs/gymnasium.md. The registered specs have no
+#: ``max_episode_steps``: gymnasium would cut all episodes there, whatever ``timeout_s`` and ``decision_period_s``
+#: are. That of an environment that has been made has the limit that is true for it.
+ENV_IDS: Final[dict[str, dict[str, str]]] = {
+    ENV_ID: {},
+    "ganlane/HighwayDense-v0": {"env": "dense"},
+    "ganlane/HighwayGAN-v0": {"traffic": "gan"},
+    "ganlane/HighwayGANCalibrated-v0": {"traffic": "gan_calibrated"},
+}
+
+
+def register_envs() -> None:
+    """Register the environments with gymnasium, once; without gymnasium nothing happens."""
+    try:
+        import gymnasium
+    except ModuleNotFoundError:  # the rest of the package works; 'ganlane doctor' says what is missing
+        return
+    for name, arguments in ENV_IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point="ganlane.gym.single:HighwayGym",
+                vector_entry_point="ganlane.gym.vector:HighwayVectorGym",
+                kwargs=arguments,
+            )
 
 
 def find_compiler() -> tuple[str | None, str]:

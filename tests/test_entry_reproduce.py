@@ -65,7 +65,8 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
         ("agent_idm+none", "idm", 2),
         ("agent_gan+none", "gan", 2),
     }
-    assert {"comparisons", "failures", "left_out", "cells", "machine", "code", "config"} <= results.keys()
+    assert all(seconds > 0.0 for seconds in results["seconds"].values())
+    assert {"comparisons", "failures", "left_out", "seconds", "cells", "machine", "code", "config"} <= results.keys()
 
 
 def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_driven, capsys):

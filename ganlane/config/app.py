@@ -33,7 +33,7 @@ from ganlane.config.resume import refuse_stored_imports, with_resumed
 from ganlane.config.schemas import register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.runtime import check_process, keep_freed_memory, open_closed_streams
+from ganlane.runtime import check_process, keep_freed_memory, open_closed_streams, register_envs
 
 #: What a command does with its config in its run folder; it returns a line to print last, or None.
 Task = Callable[[Any, Path], str | None]
@@ -142,6 +142,7 @@ def _show_sweep(folder: Path, columns: str) -> None:
 
 def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) -> None:
     """The task in its folder, in which its configuration is written down first."""
+    register_envs()  # for a driver or traffic of the user's own; ganlane/__init__.py leaves it to commands
     with held(folder):
         write_down(composed, asked, folder)
         with numbered_refusals():

@@ -10,8 +10,16 @@ from ganlane.config.run import DrivingConfig, Environments, Episodes, Names
 from ganlane.config.traffic import TRAFFICS, TrafficConfig, all_traffics, chosen_traffics
 from ganlane.parameters.checks import DIFFERENT, Rule, Seed, Text, between, one_of
 
-#: Episodes of ``ganlane reproduce`` on traffics on which driving is slow.
-FEWER = {"gan": 150, "gan_calibrated": 100, "replay": 200, "sumo": 8, "highway_env": 3}
+#: Episodes of ``ganlane reproduce`` on traffics on which driving is slow, so that all of it takes half an hour.
+FEWER = {
+    "idm_faults": 300,
+    "idm_random": 300,
+    "gan": 100,
+    "gan_calibrated": 60,
+    "replay": 100,
+    "sumo": 8,
+    "highway_env": 3,
+}
 _COUNTS = Rule(
     lambda counts: (
         counts is None or (isinstance(counts, dict) and all(type(n) is int and n >= 2 for n in counts.values()))
@@ -59,9 +67,8 @@ class EvaluateConfig(DrivingConfig):
 
 
 def _paper_agents() -> list[str]:
-    trained = ("agent_idm@all", "agent_gan@all", "agent_general")
-    behind = [f"{agent}+{mask}" for agent in trained for mask in ("none", "legal", "safe")]
-    return ["random_legal", "keep_lane", "mobil", "mobil_egoistic", *behind]
+    behind = [f"{agent}@all+{mask}" for agent in ("agent_idm", "agent_gan") for mask in ("none", "legal", "safe")]
+    return ["random_legal", "keep_lane", "mobil", "mobil_egoistic", *behind, "agent_general@all+safe"]
 
 
 @dataclass
@@ -74,7 +81,7 @@ class ReproduceConfig(EvaluateConfig):
         agents: as of ganlane evaluate; agent_idm@all: every training of its recipe.
         traffics: options of the group traffic; what is not installed or not at hand is left out, with the reason.
         fewer: number of episodes on slow traffics, where it is smaller than episodes; it changes or adds to
-            {gan: 150, gan_calibrated: 100, replay: 200, sumo: 8, highway_env: 3}.
+            {idm_faults: 300, idm_random: 300, gan: 100, gan_calibrated: 60, replay: 100, sumo: 8, highway_env: 3}.
         workers: processes that drive.
         cells: folder of what was driven; a pair of driver and traffic that is there is not driven again.
         crashes: so many per driver and traffic, the earliest, are listed in crashes.json with their actions.

@@ -20,34 +20,10 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from typing import Final
 
-ENV_ID: Final = "ganlane/Highway-v0"
-#: Id to the arguments that differ; reference scores are in docs/gymnasium.md. The registered specs have no
-#: ``max_episode_steps``: gymnasium would cut all episodes there, whatever ``timeout_s`` and ``decision_period_s``
-#: are. That of an environment that has been made has the limit that is true for it.
-ENV_IDS: Final[dict[str, dict[str, str]]] = {
-    ENV_ID: {},
-    "ganlane/HighwayDense-v0": {"env": "dense"},
-    "ganlane/HighwayGAN-v0": {"traffic": "gan"},
-    "ganlane/HighwayGANCalibrated-v0": {"traffic": "gan_calibrated"},
-}
+from ganlane.runtime import ENV_ID, ENV_IDS
 
-
-def register_envs() -> None:
-    """Register the environments with gymnasium, once; without gymnasium nothing happens."""
-    try:
-        import gymnasium
-    except ModuleNotFoundError:  # the rest of the package works; 'ganlane doctor' says what is missing
-        return
-    for name, arguments in ENV_IDS.items():
-        if name not in gymnasium.registry:
-            gymnasium.register(
-                name,
-                entry_point="ganlane.gym.single:HighwayGym",
-                vector_entry_point="ganlane.gym.vector:HighwayVectorGym",
-                kwargs=arguments,
-            )
+__all__ = ["ENV_ID", "ENV_IDS", "has_display"]
 
 
 def has_display() -> bool:

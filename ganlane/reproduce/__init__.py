@@ -40,7 +40,10 @@ PAIRS = (
     ("agent_idm", "mobil"),
     ("agent_gan+safe", "agent_idm+safe"),
     ("agent_general", "mobil"),
+    ("agent_general", "mobil_egoistic"),
     ("agent_general", "agent_gan"),
+    ("agent_general", "agent_idm+safe"),
+    ("agent_general", "agent_gan+safe"),
 )
 
 
@@ -60,7 +63,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         print(f"left out, {name}: {reason}", file=sys.stderr)
     cells = cells_of(config, traffics)
     drive(cells, config)
-    episodes, revisions = read_cells(cells)
+    episodes, revisions, seconds = read_cells(cells)
     by_recipe = numbers.by_recipe(episodes)
     rows, compared = numbers.rows(by_recipe), numbers.comparisons(by_recipe, _pairs(by_recipe))
     tables = {
@@ -84,6 +87,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         f"Episodes of seed {config.seed}, the same for all drivers: {counts}. Intervals are 95 %: over trainings, "
         "where there are several of a recipe, and over episodes.",
         *(f"Left out, {name}: {reason}" for name, reason in missing.items()),
+        f"Driving took {sum(seconds.values()) / 60:.1f} minutes of one process.",
         machine_sentence([config.threads or 1]),
     ]
     page = report.write_report(folder, tables, figures, intro)
@@ -95,6 +99,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "comparisons": compared,
         "failures": numbers.failures(episodes, config.seed),
         "left_out": missing,
+        "seconds": seconds,
         "cells": {"revisions": revisions, "files": {f"{c.driver} on {c.traffic}": c.path.name for c in cells}},
     }
     seeds = {

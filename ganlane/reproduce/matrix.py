@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import signal
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -139,27 +140,33 @@ def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
 def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     """Drive one cell and write its file."""
     set_threads(config.threads)
+    begun = time.monotonic()
     alone = replace(config, traffics=[cell.traffic], episodes=cell.settings["episodes"])
     table = compare([make_driver(cell.driver, config.env, device=config.device)], alone, quiet=True)
-    origin = json.dumps({"settings": cell.settings, "code": code_version()})
+    seconds = round(time.monotonic() - begun, 1)
+    origin = json.dumps({"settings": cell.settings, "code": code_version(), "seconds": seconds})
     with atomic_path(cell.path) as part:
         table.write_parquet(part, metadata={_ORIGIN: origin})
 
 
-def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str]]:
-    """All episodes, one below the other, and the revisions of the code that drove them.
+def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str, float]]:
+    """All episodes, one below the other, the revisions of the code that drove them, and how long it took.
+
+    Returns:
+        The third: by traffic, s, all drivers together; a file that does not say it counts as 0.
 
     Raises:
         UserError: a file that is none of ours; it is named.
     """
-    tables, revisions = [], set()
+    tables, revisions, seconds = [], set(), dict.fromkeys((cell.traffic for cell in cells), 0.0)
     for cell in cells:
         try:
             origin = json.loads(pl.read_parquet_metadata(cell.path)[_ORIGIN])
             tables.append(pl.read_parquet(cell.path))
             revisions.add(str(origin["code"]["revision"] or origin["code"]["version"]))
+            seconds[cell.traffic] += float(origin.get("seconds", 0.0))
         except (OSError, KeyError, ValueError, pl.exceptions.PolarsError) as error:
             raise UserError(
                 f"{cell.path}: not the episodes of a cell ({error}); remove it and start again."
             ) from error
-    return pl.concat(tables, how="diagonal"), sorted(revisions)
+    return pl.concat(tables, how="diagonal"), sorted(revisions), seconds

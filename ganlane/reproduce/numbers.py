@@ -68,8 +68,8 @@ def rows(cells: Cells) -> list[Row]:
         ``hard_crash_share`` (exact interval of all episodes, as if they were independent); ``crashes``,
         ``departures`` and ``failures`` (both) ``_per_1000_km``; ``mean_speed_mps, lane_changes_per_km,
         soft_crash_behind_per_episode``; ``at_fault_share`` of the hard crashes (None without any); and ``each``, mean
-        reward and failures of every training. A key with ``_ci`` holds the 95 % interval of its namesake over
-        trainings and episodes.
+        reward, lead over MOBIL and failures of every training. A key with ``_ci`` holds the 95 % interval of its
+        namesake over trainings and episodes.
     """
     return [_row(recipe, traffic, trainings, cells) for (recipe, traffic), trainings in cells.items()]
 
@@ -102,10 +102,10 @@ def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells
     row["soft_crash_behind_per_episode"] = together["soft_crash_behind"].mean()
     row["at_fault_share"] = crashes["at_fault"].mean() if "at_fault" in crashes.columns else None
     row["each"] = []
-    for name, frame in trainings.items():
-        reward = entries("mean_reward", over_trainings(frame["reward"].to_numpy()[None]))
+    for (name, frame), own in zip(trainings.items(), rewards[:, None]):
         counts = {end: frame.filter(_ended([end])).height for end in FAILURES}
-        row["each"].append({"driver": name, **reward, **counts})
+        lead = entries("minus_mobil", None if above is None else difference(own, above))
+        row["each"].append({"driver": name, **entries("mean_reward", over_trainings(own)), **lead, **counts})
     return row
 
 

@@ -160,6 +160,14 @@ def test_a_mistake_is_reported_without_torch(line):
     assert loaded(f"from ganlane.__main__ import main; main({line.split()})", "torch", "ganlane.sim") == "[]\n"
 
 
+@pytest.mark.parametrize("started", ["-m", "/bin/ganlane"])
+def test_a_mistake_is_reported_without_gymnasium(started):
+    """Whose import would take a third of the time; whoever imports the package has its environments at once."""
+    mistake = "from ganlane.__main__ import main; main(['train', 'env.lane=3'])"
+    assert loaded(f"sys.argv[0] = {started!r}; {mistake}", "gymnasium") == "[]\n"
+    assert loaded("import ganlane", "gymnasium") == "['gymnasium']\n"
+
+
 class Trap:
     """Writes a file when it is unpickled."""
 

@@ -1,0 +1,248 @@
+"""The tables of README and docs that the matrix gives, and a check of the numbers printed around them.
+
+    python -m benchmarks.printed                                   # print what is not as the results say
+    python -m benchmarks.printed outputs/reproduce/RUN/results.json --write
+
+Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes them again from
+``docs/reproduce/results.json``; it also looks up every figure with an interval, such as ``14.0 [3.2, 25.6]``, in the
+sections of :data:`CHECKED`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.script import make_parser, run_script
+from ganlane.errors import UserError
+from ganlane.evaluation.table import Table
+from ganlane.files import split_at_markers, write_between_markers
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "reproduce" / "results.json"
+#: Driver of the matrix to its name in a document, and the traffics that it was trained on.
+DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
+    "agent_general+safe": ("agent_general", frozenset({"idm", "idm_mobil", "idm_random", "gan"})),
+    "agent_idm+none": ("Agent_IDM", frozenset({"idm_mobil"})),
+    "agent_gan+none": ("Agent_GAN", frozenset({"idm_mobil", "gan"})),
+    "agent_idm+safe": ("Agent_IDM behind `safe`", frozenset({"idm_mobil"})),
+    "agent_gan+safe": ("Agent_GAN behind `safe`", frozenset({"idm_mobil", "gan"})),
+    "mobil_egoistic": ("egoistic MOBIL", frozenset()),
+    "keep_lane": ("keeping the lane", frozenset()),
+    "random_legal": ("random legal", frozenset()),
+}
+#: Differences of the page on the paper's claim: first, second, and what the line is called.
+CLAIMS = (
+    ("agent_idm+none", "mobil", "Agent_IDM over MOBIL"),
+    ("agent_gan+none", "mobil", "Agent_GAN over MOBIL"),
+    ("agent_gan+none", "agent_idm+none", "Agent_GAN over Agent_IDM"),
+    ("agent_gan+safe", "agent_idm+safe", "the same, both behind `safe`"),
+    ("agent_general+safe", "agent_idm+safe", "agent_general over Agent_IDM behind `safe`"),
+    ("agent_general+safe", "agent_gan+safe", "agent_general over Agent_GAN behind `safe`"),
+)
+#: Sections whose figures are looked up: document, and the heading of the section (None: all of it).
+CHECKED = (
+    ("README.md", "## Results"),
+    ("docs/results.md", "## The matrix"),
+    ("docs/results.md", "## The paper's claims"),
+    ("docs/carry_over.md", "## agent_general over trainings"),
+)
+_INTERVAL = re.compile(r"([-+]?\d+(?:\.\d+)?) \[(-?\d+(?:\.\d+)?), (-?\d+(?:\.\d+)?)\]")
+
+Results = Mapping[str, Any]
+Row = Mapping[str, Any]
+
+
+def _at(results: Results, driver: str, traffic: str) -> Row:
+    return next(row for row in results["rows"] if (row["driver"], row["traffic"]) == (driver, traffic))
+
+
+def _traffics(results: Results) -> list[str]:
+    return list(results["seeds"]["episodes"])
+
+
+def _with_interval(value: float, interval: Sequence[float] | None, sign: str = "+") -> str:
+    text = f"{value:{sign}.1f}"
+    return text if interval is None else f"{text} [{interval[0]:.1f}, {interval[1]:.1f}]"
+
+
+def _lead(row: Row, trained: frozenset[str]) -> str:
+    """Lead over MOBIL; italics: a learning driver's on traffic that it was not trained on."""
+    text = _with_interval(row["minus_mobil"], row["minus_mobil_ci"])
+    return f"*{text}*" if trained and row["traffic"] not in trained else text
+
+
+def _drivers(results: Results, among: Sequence[str]) -> list[str]:
+    there = {row["driver"] for row in results["rows"]}
+    return [driver for driver in among if driver in there]
+
+
+def _by_traffic(results: Results, drivers: Sequence[str], cell: Callable[[str, str], str], first: str) -> str:
+    traffics = _traffics(results)
+    lines = [[DRIVERS[driver][0], *(cell(driver, traffic) for traffic in traffics)] for driver in drivers]
+    return Table("", [first, *(f"`{traffic}`" for traffic in traffics)], lines).markdown(heading=False)
+
+
+def leads(results: Results) -> str:
+    """Drivers by traffics: paired lead over MOBIL."""
+    drivers = _drivers(results, [name for name in DRIVERS if name != "random_legal"])
+    table = _by_traffic(results, drivers, lambda d, t: _lead(_at(results, d, t), DRIVERS[d][1]), "lead over MOBIL")
+    means = ", ".join(f"{_at(results, 'mobil', t)['mean_reward']:.1f} on `{t}`" for t in _traffics(results))
+    return f"{table}\n\nMOBIL's own mean reward: {means}."
+
+
+def failures(results: Results) -> str:
+    """Drivers by traffics: crashes and departures in all episodes of all trainings."""
+
+    def cell(driver: str, traffic: str) -> str:
+        row = _at(results, driver, traffic)
+        return f"{row['hard_crash']}, {row['out_of_road']} of {row['trainings'] * row['episodes']}"
+
+    names = {**DRIVERS, "mobil": ("MOBIL", frozenset[str]())}
+    traffics = _traffics(results)
+    lines = [
+        [names[driver][0], *(cell(driver, traffic) for traffic in traffics)]
+        for driver in _drivers(results, ["mobil", *DRIVERS])
+    ]
+    headings = ["hard crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
+    return Table("", headings, lines).markdown(heading=False)
+
+
+def claims(results: Results) -> str:
+    """Pairs of :data:`CLAIMS` by traffics."""
+    found = {(row["driver"], row["over"], row["traffic"]): row for row in results["comparisons"]}
+    traffics = _traffics(results)
+    lines = []
+    for first, second, name in CLAIMS:
+        rows = [found[first, second, traffic] for traffic in traffics if (first, second, traffic) in found]
+        if rows:
+            lines.append([name, *(_with_interval(row["lead"], row["lead_ci"]) for row in rows)])
+    return Table("", ["lead", *(f"`{traffic}`" for traffic in traffics)], lines).markdown(heading=False)
+
+
+def trainings(results: Results) -> str:
+    """agent_general training by training: lead over MOBIL, and failures."""
+    traffics = _traffics(results)
+    lines = []
+    for place, each in enumerate(_at(results, "agent_general+safe", traffics[0])["each"]):
+        rows = [_at(results, "agent_general+safe", traffic)["each"][place] for traffic in traffics]
+        cells = [
+            f"{_with_interval(row['minus_mobil'], row['minus_mobil_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
+            for row in rows
+        ]
+        lines.append([f"`{each['driver'].removesuffix('+safe')}`", *cells])
+    headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
+    return Table("", headings, lines).markdown(heading=False)
+
+
+def readme(results: Results) -> str:
+    """README's table: lead over MOBIL and hard crashes per 1000 episodes."""
+
+    def cell(driver: str, traffic: str) -> str:
+        row, mobil = _at(results, driver, traffic), _at(results, "mobil", traffic)
+        per_1000 = [1000 * each["hard_crash"] / (each["trainings"] * each["episodes"]) for each in (row, mobil)]
+        return f"{_lead(row, DRIVERS[driver][1])}, {per_1000[0]:.0f} ({per_1000[1]:.0f})"
+
+    drivers = _drivers(results, ["agent_general+safe", "agent_idm+none", "agent_gan+none", "mobil_egoistic"])
+    return _by_traffic(results, drivers, cell, "driver")
+
+
+#: Document and name of the markers to the table between them.
+SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
+    ("README.md", "readme"): readme,
+    ("docs/results.md", "leads"): leads,
+    ("docs/results.md", "failures"): failures,
+    ("docs/results.md", "claims"): claims,
+    ("docs/carry_over.md", "trainings"): trainings,
+}
+
+
+def markers(name: str) -> tuple[str, str]:
+    """The lines around a table."""
+    return f"<!-- matrix {name}: begin -->", f"<!-- matrix {name}: end -->"
+
+
+def section(text: str, heading: str) -> str:
+    """The part of a document from a heading to the next one of its level.
+
+    Raises:
+        UserError: there is no such heading.
+    """
+    level = heading.split()[0]
+    found = re.search(rf"^{re.escape(heading)}$(.*?)(?=^{level} |\Z)", text, re.MULTILINE | re.DOTALL)
+    if found is None:
+        raise UserError(f"{heading}: no such section; expected it in the document.")
+    return found[1]
+
+
+def _values(node: Any) -> Iterator[tuple[float, float, float]]:
+    """Every value of the results with its interval."""
+    if isinstance(node, list):
+        for each in node:
+            yield from _values(each)
+    elif isinstance(node, dict):
+        for key, value in node.items():
+            interval = node.get(f"{key}_ci")
+            if interval and value is not None:
+                yield (value, *interval)
+            yield from _values(value)
+
+
+def unsourced(text: str, results: Results) -> list[str]:
+    """Figures with an interval in ``text`` that the results do not have, rounded as they are printed.
+
+    A lead may be told the other way round: ``12 [10, 14]`` below as ``-12 [-14, -10]``.
+    """
+    values = list(_values([results["rows"], results["comparisons"]]))
+    values += [(-value, -high, -low) for value, low, high in values]
+    wrong = []
+    for found in _INTERVAL.finditer(text):
+        digits = len(found[1].partition(".")[2])
+        printed = tuple(float(x) for x in found.groups())
+        if not any(tuple(float(f"{x:.{digits}f}") for x in value) == printed for value in values):
+            wrong.append(found[0])
+    return wrong
+
+
+def differences(results: Results, root: Path = ROOT) -> list[str]:
+    """What in the documents is not as the results say, one line each."""
+    found = []
+    for (document, name), table in SECTIONS.items():
+        before, after = split_at_markers(root / document, *markers(name))
+        whole = (root / document).read_text(encoding="utf-8")
+        if whole[len(before) : -len(after)].strip() != table(results):
+            found.append(f"{document}: the table {name} differs; run `python -m benchmarks.printed --write`.")
+    for document, heading in CHECKED:
+        text = section((root / document).read_text(encoding="utf-8"), heading)
+        found += [f"{document}, {heading}: {figure} is not in the results." for figure in unsourced(text, results)]
+    return found
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    parser = make_parser(__doc__)
+    parser.add_argument("results", type=Path, nargs="?", default=RESULTS, help="of ganlane reproduce")
+    parser.add_argument("--write", action="store_true", help="put the tables into the documents")
+    return parser.parse_args(arguments)
+
+
+def compare_or_write(options: argparse.Namespace) -> str:
+    """What differs, after writing the tables if that is asked for."""
+    results = json.loads(options.results.read_text(encoding="utf-8"))
+    for (document, name), table in SECTIONS.items() if options.write else ():
+        write_between_markers(ROOT / document, *markers(name), f"\n{table(results)}\n")
+    return "\n".join(differences(results)) or "everything printed is as the results say"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare or write; the exit status."""
+    return run_script(compare_or_write, parse(arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -17,6 +17,7 @@ from ganlane.config.evaluate import EvaluateConfig
 from ganlane.evaluation import (
     crashes_by_scene,
     evaluation_rows,
+    failed_episodes,
     paired_rows,
     paired_table,
     run_episodes,
@@ -116,8 +117,9 @@ def publish(
 ) -> str:
     """Print the tables of a comparison, write its episodes and ``results.json``; the line that names the latter.
 
-    The record also holds ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table with two drivers or more)
-    and, where a traffic replays recorded scenes, ``crashes_by_scene`` (:func:`recorded_crashes`).
+    The record also holds ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table with two drivers or
+    more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`) and, where a traffic replays recorded scenes,
+    ``crashes_by_scene`` (:func:`recorded_crashes`).
 
     Args:
         table: what :func:`compare` returned.
@@ -129,5 +131,5 @@ def publish(
     show(text_table(rows), *([paired_table(paired)] if paired else []), columns=config.get("columns", "all"))
     write_episodes(folder, table)
     scenes = {"crashes_by_scene": recorded} if recorded else {}
-    record = {"rows": rows, "paired": paired, **scenes, **(numbers or {})}
+    record = {"rows": rows, "paired": paired, **scenes, "failures": failed_episodes(table), **(numbers or {})}
     return f"results: {write_results(folder, record, config, seeds)}"

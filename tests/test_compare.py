@@ -13,7 +13,7 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.traffic import IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.evaluation import crashes_by_scene
+from ganlane.evaluation import crashes_by_scene, failed_episodes
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic
 
@@ -59,6 +59,7 @@ def test_the_record_holds_rows_paired_leads_and_crashes_by_scene(table, tmp_path
         lead = means["keep_lane", row["traffic"]] - means["random_legal", row["traffic"]]
         assert row["lead"] == pytest.approx(lead)
         assert row["lead_ci"][0] <= row["lead"] <= row["lead_ci"][1]
+    assert record["failures"] == failed_episodes(table)
     assert [row["agent"] for row in record["crashes_by_scene"]] == ["keep_lane", "random_legal"]
     for row in record["crashes_by_scene"]:
         own = table.filter(pl.col("traffic") == "replay", pl.col("agent") == row["agent"])

@@ -16,6 +16,7 @@ from ganlane.evaluation.rows import (
     NormalizedScore,
     crashes_by_scene,
     evaluation_rows,
+    failed_episodes,
     normalized_percent,
     paired_rows,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "code_version",
     "crashes_by_scene",
     "evaluation_rows",
+    "failed_episodes",
     "machine",
     "machine_sentence",
     "mean_interval",

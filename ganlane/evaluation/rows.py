@@ -31,6 +31,8 @@ SCALE_TOP, SCALE_BOTTOM = "mobil", "random_legal"
 #: What two drivers' episodes are matched by.
 _EPISODE = ["seed", "episode"]
 _CRASH = "hard_crash"
+#: The ends of an episode that are the driver's failures.
+FAILURES = (_CRASH, "out_of_road")
 
 Row = dict[str, Any]
 
@@ -247,3 +249,13 @@ def crashes_by_scene(
     ratios = [counts @ crashes / (counts @ driven) for counts in resample_counts(len(km), resamples, seed)]
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
     return CrashesByScene(Estimate(value, float(low), float(high)), rows)
+
+
+def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
+    """Every crash and departure: per ``driver, traffic, seed`` the numbers of the episodes that ended so."""
+    failed = episodes.filter(pl.col("reason").is_in(FAILURES))
+    return [
+        {"driver": driver, "traffic": traffic, "seed": seed}
+        | {end: frame.filter(pl.col("reason") == end)["episode"].sort().to_list() for end in FAILURES}
+        for (driver, traffic, seed), frame in failed.group_by("agent", "traffic", "seed", maintain_order=True)
+    ]

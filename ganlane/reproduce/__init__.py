@@ -49,7 +49,7 @@ PAIRS = (
 
 def reproduce(config: ReproduceConfig, folder: Path) -> str:
     """Drive what is missing, then write numbers, tables and figures; the line that names the report."""
-    from ganlane.evaluation import machine_sentence, write_results
+    from ganlane.evaluation import failed_episodes, machine_sentence, write_results
     from ganlane.reproduce import numbers, report
     from ganlane.reproduce.matrix import available, cells_of, drive, read_cells
     from ganlane.runtime import set_threads
@@ -97,7 +97,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "command": command_line(folder),
         "rows": rows,
         "comparisons": compared,
-        "failures": numbers.failures(episodes, config.seed),
+        "failures": failed_episodes(episodes),
         "left_out": missing,
         "seconds": seconds,
         "cells": {"revisions": revisions, "files": {f"{c.driver} on {c.traffic}": c.path.name for c in cells}},

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from ganlane.errors import UserError
-from ganlane.evaluation.rows import SCALE_BOTTOM, SCALE_TOP
+from ganlane.evaluation.rows import FAILURES, SCALE_BOTTOM, SCALE_TOP
 from ganlane.evaluation.statistics import Array, Estimate, clopper_pearson, entries
 from ganlane.evaluation.trainings import (
     difference,
@@ -25,7 +25,6 @@ from ganlane.evaluation.trainings import (
 Row = dict[str, Any]
 #: Recipe and traffic to the episodes of each training, by driver's name.
 Cells = Mapping[tuple[str, str], Mapping[str, pl.DataFrame]]
-FAILURES = ("hard_crash", "out_of_road")
 #: Rates per 1000 km by name: the ends that they count.
 _RATES = {"crashes": FAILURES[:1], "departures": FAILURES[1:], "failures": FAILURES}
 
@@ -142,13 +141,3 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
 def _probability(first: Array, second: Array) -> Estimate | None:
     """None where neither has a second training: it says nothing then."""
     return probability_of_improvement(first, second) if len(first) + len(second) > 2 else None
-
-
-def failures(episodes: pl.DataFrame, seed: int) -> list[Row]:
-    """Every crash and departure: per driver and traffic the ``seed`` and the numbers of its episodes."""
-    found = []
-    failed = episodes.filter(_ended(FAILURES))
-    for (driver, traffic), frame in failed.group_by("agent", "traffic", maintain_order=True):
-        numbers = {end: frame.filter(_ended([end]))["episode"].sort().to_list() for end in FAILURES}
-        found.append({"driver": driver, "traffic": traffic, "seed": seed, **numbers})
-    return found

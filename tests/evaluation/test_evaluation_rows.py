@@ -15,6 +15,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation import (
     crashes_by_scene,
     evaluation_rows,
+    failed_episodes,
     normalized_percent,
     paired_rows,
     paired_table,
@@ -287,3 +288,12 @@ def test_what_does_not_fit_together_is_refused():
         crashes_by_scene(episodes, scenes[:2])
     with pytest.raises(UserError, match="nobody drove"):
         crashes_by_scene(*recorded(("a", 3, 0, 0.0)))
+
+
+def test_every_failure_is_listed_with_its_seed_and_episode():
+    table = episodes("mobil", [0, 0, 0], ["hard_crash", "goal", "out_of_road"], "gan")
+    (found,) = failed_episodes(table)
+    assert found == {
+        **{"driver": "mobil", "traffic": "gan", "seed": table["seed"][0]},
+        **{"hard_crash": [table["episode"][0]], "out_of_road": [table["episode"][2]]},
+    }

@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 
 from ganlane.errors import UserError
-from ganlane.reproduce.numbers import by_recipe, comparisons, failures, recipe_of, rows
+from ganlane.reproduce.numbers import by_recipe, comparisons, recipe_of, rows
 
 KM = 5.0
 
@@ -96,13 +96,6 @@ def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):
     first, second = row["mcnemar"]
     assert (first["only_first"], first["only_second"], first["p_value"]) == (1, 1, 1.0)
     assert (second["only_first"], second["only_second"]) == (0, 1)
-
-
-def test_every_failure_is_listed_with_its_seed_and_episode():
-    table = driven("mobil", [0, 0, 0], ["hard_crash", "goal", "out_of_road"])
-    assert failures(table, 3) == [
-        {"driver": "mobil", "traffic": "gan", "seed": 3, "hard_crash": [0], "out_of_road": [2]}
-    ]
 
 
 def test_two_agents_of_one_name_and_seed_are_not_mixed():

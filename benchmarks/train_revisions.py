@@ -23,7 +23,7 @@ from datetime import date
 from pathlib import Path
 from statistics import median
 
-from benchmarks.script import ReportSection, add_report, make_parser, run_script
+from benchmarks.script import ReportSection, add_report, checkout_of, make_parser, run_script
 from ganlane.errors import UserError
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, count
@@ -132,21 +132,15 @@ def measure(options: argparse.Namespace) -> str:
     """Run everything; the table, in the document too where one is named."""
     section = ReportSection(options.report, BEGIN, END)
     lines = []
-    with tempfile.TemporaryDirectory() as place:
-        old = Path(place) / "revision"
-        git = ["git", "-C", str(HERE), "worktree"]
-        subprocess.run([*git, "add", "--detach", str(old), options.revision], check=True, capture_output=True)
-        try:
-            for group in runs_of(options, old, Path(place)):
-                take_turns(group, options)
-                for run in group:
-                    pairs = list(zip(run.rates, group[0].rates))
-                    times = [median(own[i] / base[i] for own, base in pairs) for i in (0, 1)]
-                    rates = [median(each[i] for each in run.rates) for i in (0, 1)]
-                    figures = [count(rates[0]), f"{times[0]:.2f}", count(rates[1]), f"{times[1]:.2f}"]
-                    lines.append([run.traffic, run.name, str(len(run.cores)), *figures])
-        finally:
-            subprocess.run([*git, "remove", "--force", str(old)], check=True, capture_output=True)
+    with tempfile.TemporaryDirectory() as place, checkout_of(options.revision) as old:
+        for group in runs_of(options, old, Path(place)):
+            take_turns(group, options)
+            for run in group:
+                pairs = list(zip(run.rates, group[0].rates))
+                times = [median(own[i] / base[i] for own, base in pairs) for i in (0, 1)]
+                rates = [median(each[i] for each in run.rates) for i in (0, 1)]
+                figures = [count(rates[0]), f"{times[0]:.2f}", count(rates[1]), f"{times[1]:.2f}"]
+                lines.append([run.traffic, run.name, str(len(run.cores)), *figures])
     headings = ["traffic", "run", "cores", "decisions/s", "times", "decisions/CPU-s", "times"]
     note = (
         f"Medians of {options.turns} turns of {options.rows * ROW} decisions; {options.environments} environments, "

@@ -143,7 +143,7 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     begun = time.monotonic()
     alone = replace(config, traffics=[cell.traffic], episodes=cell.settings["episodes"])
     table = compare([make_driver(cell.driver, config.env, device=config.device)], alone, quiet=True)
-    seconds = round(time.monotonic() - begun, 1)
+    seconds = round(time.monotonic() - begun, 3)
     origin = json.dumps({"settings": cell.settings, "code": code_version(), "seconds": seconds})
     with atomic_path(cell.path) as part:
         table.write_parquet(part, metadata={_ORIGIN: origin})

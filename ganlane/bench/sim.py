@@ -121,11 +121,15 @@ class SimSuite(Suite):
     def _case(
         self, part: str, system: str, mode: str, device: str, threads: int, batch: int, vehicles: int | None = None
     ) -> Case:
-        """With so many ``vehicles`` the first scene grows to keep the density of Table II."""
+        """With so many ``vehicles`` the first scene grows to keep the density of Table II.
+
+        It is then wider than the range of recycling, which would crowd it; in so short a time no ego leaves it.
+        """
         scenario = Scenario.of(self.config)
         if vehicles is not None:
             spread_m = max(scenario.env.spread_m, DenseEnvConfig().metres_per_vehicle * vehicles)
-            scenario = replace(scenario, env=replace(scenario.env, vehicles=vehicles, spread_m=spread_m))
+            env = replace(scenario.env, vehicles=vehicles, spread_m=spread_m, recycle=False)
+            scenario = replace(scenario, env=env)
         place = {"part": part, "device": device, "vehicles": scenario.env.vehicles}
         labels = self.labels(system, scenario.traffic.label(), mode, threads, batch, **place)
         return Case(labels, partial(_START[system], scenario, mode, device, batch))

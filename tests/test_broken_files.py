@@ -320,7 +320,7 @@ WHOLE = (
 )
 
 
-@pytest.mark.parametrize("line", WHOLE)
+@pytest.mark.parametrize("line", [WHOLE[0], *(pytest.param(line, marks=pytest.mark.slow) for line in WHOLE[1:])])
 def test_a_whole_command_ends_with_status_2(line, here):
     if "broken.safetensors" in line:
         Path("broken.safetensors").write_bytes(DAMAGED[AGENT]["pickle"])

@@ -89,6 +89,7 @@ def test_help_does_not_wait_for_torch(tmp_path):
     assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
 
 
+@pytest.mark.slow
 def test_a_whole_command_names_its_results(tmp_path):
     tiny = ["agents=[keep_lane]", "traffics=[idm]", "episodes=1", "env.goal_m=20"]
     done = command("-m", "ganlane", "evaluate", *tiny, cwd=tmp_path)

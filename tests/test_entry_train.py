@@ -124,6 +124,7 @@ def test_a_start_from_another_observation_is_refused(finished, capsys, tmp_path)
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_a_sweep_gives_every_run_a_folder(capsys, tmp_path):
     short = [option for option in TINY if not option.startswith(("traffic=", "total_decisions="))]
     assert main(["-m", *short, "total_decisions=16", "seed=0,1", "traffic=idm,idm_mobil"]) == 0

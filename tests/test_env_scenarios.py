@@ -136,7 +136,7 @@ def test_who_keeps_its_lane_behind_a_stalled_car_runs_out_of_time():
 # Blocked lane
 
 
-@pytest.mark.parametrize("traffic", ["idm", "idm_mobil"])
+@pytest.mark.parametrize("traffic", [pytest.param("idm", marks=pytest.mark.slow), "idm_mobil"])
 def test_polite_mobil_strands_at_the_closed_lane_and_egoistic_mobil_finds_a_gap(traffic):
     """With politeness 1 a gap of 55 m costs the follower more than the ego gains, until it stands and cannot go."""
     polite = drive(SCENARIOS["blocked_lane"], "mobil", traffic, 60)
@@ -177,6 +177,7 @@ def test_the_ego_stops_for_the_wave_and_drives_on_and_the_scene_brakes_gently():
 # Dense traffic
 
 
+@pytest.mark.slow
 def test_the_mobil_ego_gets_through_dense_traffic_and_faster_than_one_that_keeps_its_lane():
     config = DenseEnvConfig()
     mobil, keeping = (drive(config, driver, "idm_mobil", 60) for driver in ("mobil", "keep_lane"))

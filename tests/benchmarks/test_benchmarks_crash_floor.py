@@ -117,7 +117,7 @@ def somebody_comes_through(env, episode, seed):
             return False
 
 
-@pytest.mark.parametrize("by_reward", [False, True])
+@pytest.mark.parametrize("by_reward", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_answer_depends_neither_on_the_rows_nor_on_the_company(by_reward):
     episodes = list(range(12))
     plans = beam_search(crowded(16), episodes, 1, 4, by_reward)

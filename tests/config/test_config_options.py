@@ -147,6 +147,18 @@ def test_paper_experiment_is_two_phases_and_can_be_shortened():
     assert whole.init.path is None
 
 
+@pytest.mark.parametrize(
+    ("control", "first", "second"), [("gan_only", "gan", "gan"), ("idm_long", None, "idm_mobil")]
+)
+def test_a_control_differs_from_the_papers_schedule_in_its_traffic_alone(control, first, second):
+    paper = check("train", ["experiment=paper" if first else "experiment=paper_gan"]).config
+    config = check("train", [f"experiment={control}"]).config
+    assert config.traffic.label() == second
+    assert config.pretrain.traffic is None if first is None else config.pretrain.traffic.label() == first
+    assert dataclasses.replace(config, traffic=paper.traffic, pretrain=paper.pretrain) == paper
+    assert config.pretrain.total_decisions == paper.pretrain.total_decisions
+
+
 def test_a_generator_file_reaches_every_generated_traffic():
     config = check("evaluate", ["generator.path=mine.safetensors"]).config
     assert {config.traffic_options[name].path for name in ("gan", "gan_calibrated")} == {"mine.safetensors"}

@@ -18,6 +18,8 @@ needs_compiler = pytest.mark.skipif(library.why_not() is not None, reason="no C+
 @pytest.fixture(autouse=True)
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / "cache"))
+    # Nothing is driven here: the compiler need not optimise.
+    monkeypatch.setattr(library, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in library.FLAGS))
     library._load.cache_clear()
     yield
     library._load.cache_clear()
@@ -49,6 +51,7 @@ def test_another_source_is_another_library(monkeypatch, tmp_path):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_processes_that_build_at_once_do_not_disturb_each_other():
     script = "from ganlane.native import library; library.load('default'); print('loaded')"
     processes = [

@@ -80,6 +80,7 @@ def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordin
         assert (figures / f"realism_{name}").read_bytes() == (results["folder"] / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recordings, capsys):
     arguments = ["quick=false", "repeats=1", "i80=false", "vehicle_km=0", "resamples=100", "against=[]"]
     held_out = "data.held_out=[synthetic-1]"
@@ -194,6 +195,7 @@ def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(record
     assert run(capsys, "traffic=idm", f"data.path={recordings}", "scenes=all")[0] == 0
 
 
+@pytest.mark.slow
 def test_nothing_is_held_out_of_recordings_that_nothing_was_fitted_to(recordings, capsys):
     # quick=true takes desired speeds as they are, and the shipped generator was fitted to other scenes.
     asked = ["traffic=gan_calibrated", f"data.path={recordings}", "scenes=all", "against=[idm]", "vehicle_km=0"]

@@ -213,6 +213,7 @@ def in_range_by_km(on: bool, cars: int = 9, goal_m: float = 5000.0, rows: int = 
     return [sum(counts) / len(counts) for counts in seen if counts], spy
 
 
+@pytest.mark.slow
 def test_without_recycling_the_ego_loses_its_company_over_5_km():
     alone, _ = in_range_by_km(on=False)
     assert alone[0] > 7.0

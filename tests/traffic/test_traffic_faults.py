@@ -177,7 +177,7 @@ def episodes(rows: int, first: int, decisions: int) -> list:
     return seen
 
 
-@pytest.mark.parametrize(("rows", "first"), [(1, 0), (1, 40), (7, 20)])
+@pytest.mark.parametrize(("rows", "first"), [pytest.param(1, 0, marks=pytest.mark.slow), (1, 40), (7, 20)])
 def test_an_episode_with_faults_is_the_same_bits_at_every_batch_size(rows, first):
     wide, narrow = episodes(64, 0, 20), episodes(rows, first, 20)
     faulty = wide[-1][keys.TRAFFIC]

@@ -72,7 +72,7 @@ def test_each_part_has_its_share_of_every_period_and_nobody_waits_long():
     assert max(after - before for before, after in pairwise(places)) <= 6
 
 
-@pytest.mark.parametrize("rows", [1, 6, 64])
+@pytest.mark.parametrize("rows", [1, 6, pytest.param(64, marks=pytest.mark.slow)])
 def test_an_episode_of_a_mixture_is_the_same_bits_in_every_batch(rows):
     wide, narrow = drive(MixedTraffic(rules(), RULES), 64), drive(MixedTraffic(rules(), RULES), rows, 0)
     for all_rows, some in zip(wide, narrow):

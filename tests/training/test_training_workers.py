@@ -72,6 +72,7 @@ def alive(number):
     return True
 
 
+@pytest.mark.slow
 def test_a_dead_worker_ends_the_run_in_one_sentence_and_takes_the_others_along():
     source, learner = ProcessCollector(road, MultiCollectorConfig(2, 2, 8)), agent()
     threads = torch.get_num_threads()

@@ -44,6 +44,11 @@ def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
     return {**shared, **{name: metadata.get("training", {}).get(name) for name in ("phase", "traffic")}}
 
 
+def of_no_machine(start: str | None) -> str | None:
+    """What a training started from, without the folders of the machine: ``RUN/pretrain/agent.safetensors``."""
+    return "/".join(Path(start).parts[-3:]) if start and Path(start).is_absolute() else start
+
+
 def collect(folders: Sequence[Path]) -> dict[int, Agent]:
     """The agents by seed.
 
@@ -68,6 +73,7 @@ def collect(folders: Sequence[Path]) -> dict[int, Agent]:
         differing = [name for name, value in recipes[str(path)].items() if value != reference[name]]
         if differing:
             raise UserError(f"{path}: another recipe than {first} ({', '.join(differing)}); give runs of one recipe.")
+        agent[2]["training"]["init"] = of_no_machine(metadata["training"].get("init"))
         found[seed] = agent
     return dict(sorted(found.items()))
 

@@ -5,7 +5,7 @@
 
 Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes them again from
 ``docs/reproduce/results.json``; it also looks up every figure with an interval, such as ``14.0 [3.2, 25.6]``, in the
-sections of :data:`CHECKED`.
+sections of :data:`CHECKED`. Other roads come from ``docs/reproduce/roads/results.json`` (``benchmarks.roads``).
 """
 
 from __future__ import annotations
@@ -25,11 +25,13 @@ from ganlane.files import split_at_markers, write_between_markers
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
+ROADS = ROOT / "docs" / "reproduce" / "roads" / "results.json"
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
     "agent_general+safe": ("agent_general", frozenset({"idm", "idm_mobil", "idm_random", "gan"})),
     "agent_idm+none": ("Agent_IDM", frozenset({"idm_mobil"})),
     "agent_gan+none": ("Agent_GAN", frozenset({"idm_mobil", "gan"})),
+    "agent_idm_long+none": ("Agent_IDM, 3 M longer", frozenset({"idm_mobil"})),
     "agent_idm+safe": ("Agent_IDM behind `safe`", frozenset({"idm_mobil"})),
     "agent_gan+safe": ("Agent_GAN behind `safe`", frozenset({"idm_mobil", "gan"})),
     "mobil_egoistic": ("egoistic MOBIL", frozenset()),
@@ -42,6 +44,8 @@ CLAIMS = (
     ("agent_gan+none", "mobil", "Agent_GAN over MOBIL"),
     ("agent_gan+none", "agent_idm+none", "Agent_GAN over Agent_IDM"),
     ("agent_gan+safe", "agent_idm+safe", "the same, both behind `safe`"),
+    ("agent_idm_long+none", "agent_idm+none", "Agent_IDM 3 M longer over Agent_IDM"),
+    ("agent_gan+none", "agent_idm_long+none", "Agent_GAN over Agent_IDM 3 M longer"),
     ("agent_general+safe", "agent_idm+safe", "agent_general over Agent_IDM behind `safe`"),
     ("agent_general+safe", "agent_gan+safe", "agent_general over Agent_GAN behind `safe`"),
 )
@@ -50,6 +54,7 @@ CHECKED = (
     ("README.md", "## Results"),
     ("docs/results.md", "## The matrix"),
     ("docs/results.md", "## The paper's claims"),
+    ("docs/results.md", "## Other roads"),
     ("docs/carry_over.md", "## agent_general over trainings"),
 )
 _INTERVAL = re.compile(r"([-+]?\d+(?:\.\d+)?) \[(-?\d+(?:\.\d+)?), (-?\d+(?:\.\d+)?)\]")
@@ -152,12 +157,30 @@ def readme(results: Results) -> str:
     return _by_traffic(results, drivers, cell, "driver")
 
 
+def roads(results: Results) -> str:
+    """Drivers by roads, traffic by traffic: lead over MOBIL, and failures."""
+    rows = results["roads"]["rows"]
+    places = list(dict.fromkeys((row["vehicles"], row["lanes"]) for row in rows))
+    found = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
+    lines = []
+    for driver, traffic in dict.fromkeys((row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"):
+        each = [found[(driver, traffic, *place)] for place in places]
+        cells = [
+            f"{_with_interval(row['minus_mobil'], row['minus_mobil_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
+            for row in each
+        ]
+        lines.append([f"{DRIVERS[driver][0]}, `{traffic}`", *cells])
+    headings = ["lead; crashes, departures", *(f"{vehicles} on {lanes}" for vehicles, lanes in places)]
+    return Table("", headings, lines).markdown(heading=False)
+
+
 #: Document and name of the markers to the table between them.
 SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("README.md", "readme"): readme,
     ("docs/results.md", "leads"): leads,
     ("docs/results.md", "failures"): failures,
     ("docs/results.md", "claims"): claims,
+    ("docs/results.md", "roads"): roads,
     ("docs/carry_over.md", "trainings"): trainings,
 }
 
@@ -198,7 +221,7 @@ def unsourced(text: str, results: Results) -> list[str]:
 
     A lead may be told the other way round: ``12 [10, 14]`` below as ``-12 [-14, -10]``.
     """
-    values = list(_values([results["rows"], results["comparisons"]]))
+    values = list(_values([results["rows"], results["comparisons"], results["roads"]["rows"]]))
     values += [(-value, -high, -low) for value, low, high in values]
     wrong = []
     for found in _INTERVAL.finditer(text):
@@ -231,9 +254,15 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+def load(path: Path = RESULTS) -> Results:
+    """The results of the matrix, with those of the other roads as ``roads``."""
+    matrix, on_roads = (json.loads(each.read_text(encoding="utf-8")) for each in (path, ROADS))
+    return {**matrix, "roads": on_roads}
+
+
 def compare_or_write(options: argparse.Namespace) -> str:
     """What differs, after writing the tables if that is asked for."""
-    results = json.loads(options.results.read_text(encoding="utf-8"))
+    results = load(options.results)
     for (document, name), table in SECTIONS.items() if options.write else ():
         write_between_markers(ROOT / document, *markers(name), f"\n{table(results)}\n")
     return "\n".join(differences(results)) or "everything printed is as the results say"

@@ -38,6 +38,8 @@ PAIRS = (
     ("agent_gan", "mobil"),
     ("agent_gan", "agent_idm"),
     ("agent_idm", "mobil"),
+    ("agent_gan", "agent_idm_long"),
+    ("agent_idm_long", "agent_idm"),
     ("agent_gan+safe", "agent_idm+safe"),
     ("agent_general", "mobil"),
     ("agent_general", "mobil_egoistic"),

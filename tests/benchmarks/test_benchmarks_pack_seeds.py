@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -16,6 +18,7 @@ from ganlane.errors import UserError
 from ganlane.transforms import observation_size
 
 VEHICLES = 9
+START = str(Path.home() / "outputs" / "paper_1" / "pretrain" / "agent.safetensors")
 RECIPE = {
     "observation": "lane_view_overlap",
     "observation_scale": {"range_m": 200.0, "speed_mps": 30.0},
@@ -27,7 +30,7 @@ def run(folder, seed, hidden=(8, 8), **more):
     """The folder of a finished training with ``seed``."""
     size = observation_size("lane_view_overlap", VEHICLES)
     config = RainbowConfig(hidden=hidden, batch_size=8, warmup=8, capacity=100)
-    metadata = {**RECIPE, "training": {"seed": seed, "phase": "train", "traffic": {}}, **more}
+    metadata = {**RECIPE, "training": {"seed": seed, "phase": "train", "traffic": {}, "init": START}, **more}
     save_agent(folder / "agent.safetensors", Rainbow(config, size, seed=seed), metadata)
     return folder
 
@@ -52,6 +55,7 @@ def test_each_seed_drives_as_it_did_alone(packed, tmp_path):
         ours, metadata = load_agent(f"agent_idm@{seed}")
         assert torch.equal(ours(data.clone())["action"], alone(data.clone())["action"])
         assert metadata["training"]["seed"] == seed
+        assert metadata["training"]["init"] == "paper_1/pretrain/agent.safetensors"
 
 
 def test_what_a_greedy_agent_computes_with_is_kept_to_the_last_bit(packed, tmp_path):

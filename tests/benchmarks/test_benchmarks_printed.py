@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 
 import pytest
@@ -13,7 +12,7 @@ from ganlane.errors import UserError
 
 @pytest.fixture(scope="module")
 def results():
-    return json.loads(printed.RESULTS.read_text(encoding="utf-8"))
+    return printed.load()
 
 
 @pytest.fixture

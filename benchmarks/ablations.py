@@ -1,11 +1,12 @@
-"""What each part of the agent is worth: trained again without it, several seeds each, and compared on the same episodes.
+"""What each part of the agent is worth: trained again without it, with several seeds, and compared.
 
     python -m benchmarks.ablations                        # trains what is missing: about four hours on one core
     python -m benchmarks.ablations --only nothing dqn --seeds 0 1
 
 Everything is trained as ``experiment=ablation`` with the options of :data:`ABLATIONS`, seed after seed, and its last
-policy is compared behind the mask of its training, or behind none. Trainings that are finished are not done again, nor are
-cells that were driven. ``python -m benchmarks.printed --write`` makes the table of the document.
+policy is compared on the same episodes behind the mask of its training, or behind none. Trainings that are finished
+are not done again, nor are cells that were driven. ``python -m benchmarks.printed --write`` makes the document's
+table.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -113,11 +113,15 @@ def _typed(value: str) -> str:
 
 
 def _unknown_key(key: str, error: OmegaConfBaseException) -> str:
-    parent, _, name = key.rpartition(".")
-    if parent.endswith(".parameters"):
+    if key.rpartition(".")[0].endswith(".parameters"):
         return f"{key}: to be added with +; write +{key}=VALUE."
     known = sorted(map(str, error.parent_node.keys())) if OmegaConf.is_dict(error.parent_node) else []
-    known = [other for other in known if other != "hydra"]
+    return unknown_key(key, [other for other in known if other != "hydra"])
+
+
+def unknown_key(key: str, known: Sequence[str]) -> str:
+    """``key`` is not among the ``known`` ones of its parent."""
+    parent, _, name = key.rpartition(".")
     where = f"{parent} has" if parent else "known are"
     listed = f"; {where} {', '.join(known)}" if known else f"; {_HELP}"
     return f"{key}: no such key{did_you_mean(name, known)}{listed}."

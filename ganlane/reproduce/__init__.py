@@ -21,15 +21,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import polars as pl
 from omegaconf import OmegaConf
 
 from ganlane.config.app import run_command
 from ganlane.config.evaluate import ReproduceConfig
 from ganlane.config.folders import OVERRIDES
 from ganlane.errors import UserError
+
+if TYPE_CHECKING:
+    import polars as pl
 
 #: Hours that one training of the paper's schedule took, on one core.
 HOURS_PER_SEED = 1.1
@@ -119,7 +121,7 @@ def _list_crashes(episodes: pl.DataFrame, config: ReproduceConfig, folder: Path)
     from ganlane.crashes import find_crashes, write_crashes
 
     if config.crashes:
-        compared = episodes.filter(~pl.col("agent").is_in(["random", "random_legal", "keep_lane"]))
+        compared = episodes.filter(~episodes["agent"].is_in(["random", "random_legal", "keep_lane"]))
         listed, others = find_crashes(compared, config, config.crashes)
         write_crashes(folder / "crashes.json", listed)
         print(f"crashes.json: {len(listed.crashes)} crashes; {others} ended otherwise when driven again, not listed")

@@ -15,7 +15,7 @@ from reference.hydra_memory import composed, own_part
 
 from ganlane.__main__ import COMMANDS, main
 from ganlane.config.app import Stopped
-from ganlane.config.command_line import as_meant, check, parse
+from ganlane.config.command_line import as_meant, check, parse, refuse_unknown_keys
 from ganlane.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -72,9 +72,17 @@ def test_every_whole_number_may_have_an_exponent_and_every_list_may_lack_bracket
     assert lists == []
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_key_that_there_is_passes_the_check_before_composing(command):
+    refuse_unknown_keys(command, parse([f"{key}=1" for c, key, _ in KEYS if c == command]))
+
+
 #: Command line to a part of its sentence.
 MISTAKES = {
     "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
+    "train trafic=gan": "trafic: no such key (did you mean 'traffic'?); known are agent",
+    "train agent.gama=0.9": "agent.gama: no such key (did you mean 'gamma'?); agent has adam_eps",
+    "train pretrain.traffic.guard=false": "below a key that is null",
     "train traffic=ganny": "traffic=ganny: no such option (did you mean 'gan'?)",
     "train env=[a,b]": "choose one of blocked_lane",
     "train env.idm=3": "env.idm.NAME=VALUE",

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import ganlane
+from ganlane.agents.checkpoint import SHIPPED
 from ganlane.files import PACKAGE, conf_folder
 from ganlane.native import library
 
@@ -46,13 +47,27 @@ def test_a_conf_folder_of_somebody_else_is_not_ours(tmp_path, monkeypatch):
     assert conf_folder() == inside.parent
 
 
-def test_the_wheel_holds_configuration_weights_and_kernel(tmp_path, monkeypatch):
-    monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})  # the others take seconds
+def files_of_wheel(folder, monkeypatch):
+    """Names in a wheel, built here with one variant of the kernel: the others take seconds."""
+    monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
     wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling is not installed; CI builds the wheel")
-    (artifact,) = wheel.WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    (artifact,) = wheel.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
     assert Path(artifact).name.startswith(f"ganlane-{ganlane.__version__}-")
     with zipfile.ZipFile(artifact) as packed:
-        names = set(packed.namelist())
+        return set(packed.namelist()), Path(artifact).stat().st_size
+
+
+def test_a_light_wheel_leaves_the_further_trainings_out_and_is_below_5_mb(tmp_path, monkeypatch):
+    monkeypatch.setenv("GANLANE_LIGHT_WHEEL", "1")
+    names, size = files_of_wheel(tmp_path, monkeypatch)
+    weights = {path.name for path in (PACKAGE / "checkpoints").glob("*.safetensors")}
+    inside = {name.rpartition("/")[2] for name in names if name.endswith(".safetensors")}
+    assert weights - inside == {f"seeds_of_{agent}.safetensors" for agent in SHIPPED}
+    assert size < 5e6
+
+
+def test_the_wheel_holds_configuration_weights_and_kernel(tmp_path, monkeypatch):
+    names, _ = files_of_wheel(tmp_path, monkeypatch)
     assert {f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")} <= names
     for kind in ("safetensors", "json"):
         shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob(f"*.{kind}")}

@@ -65,7 +65,9 @@ def with_seeds(name: str) -> list[str]:
         return [name]
     shipped = recipe in SHIPPED
     packed = _seeds_file(recipe) if shipped else Path(recipe)
-    seeds = [] if shipped and not packed.is_file() else sorted(_read_several(packed)[1])
+    if shipped and not packed.is_file():
+        raise UserError(f"{name}: only the training {recipe}@0 is installed; give that, or install from a clone.")
+    seeds = sorted(_read_several(packed)[1])
     return [f"{recipe}@{seed}{mask}" for seed in ([0, *seeds] if shipped else seeds)]
 
 

@@ -188,23 +188,25 @@ def _refuse_new_keys(override: Override) -> None:
 def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:
     """Tell of a mistyped key at once: registering and composing take 0.3 s.
 
-    Keys of parts that have several options are left to composing.
+    Keys that one option of a group has and another has not are left to composing.
 
     Raises:
         UserError: an unknown key.
     """
+    options = [kind for schemas in SCHEMAS.values() for kind in schemas.values()]
     for override in overrides:
         key = override.key_or_group
         if override.type != OverrideType.CHANGE or of_hydra(override) or (conf_folder() / key).is_dir():
             continue
         kind, path = SCHEMAS[""].get(command), key.split(".")
         for depth, name in enumerate(path, 1):
-            if not is_dataclass(kind) or type.__subclasses__(kind):  # type: ignore[arg-type]
+            kinds: list[Any] = [kind, *(type.__subclasses__(kind) if depth > 1 and isinstance(kind, type) else ())]
+            known = {field.name for each in kinds if is_dataclass(each) for field in fields(each)}
+            if not known or (len(kinds) > 1 and kind not in options):
                 break
-            known = sorted(field.name for field in fields(kind))
             if name not in known:
-                raise UserError(unknown_key(".".join(path[:depth]), known))
-            hint = get_type_hints(kind)[name]
+                raise UserError(unknown_key(".".join(path[:depth]), sorted(known)))
+            hint = get_type_hints(kind).get(name)
             kind = next(filter(is_dataclass, get_args(hint)), hint)
 
 

@@ -72,7 +72,8 @@ def test_what_a_greedy_agent_computes_with_is_kept_to_the_last_bit(packed, tmp_p
 def test_names_of_seeds_stand_for_their_agents(packed):
     assert with_seeds("agent_idm@all") == ["agent_idm@0", "agent_idm@1", "agent_idm@2"]
     assert with_seeds("agent_idm@all+safe")[1] == "agent_idm@1+safe"
-    assert with_seeds("agent_gan@all") == ["agent_gan@0"]
+    with pytest.raises(UserError, match="only the training agent_gan@0 is installed"):
+        with_seeds("agent_gan@all")
     assert with_seeds(f"{packed}@all") == [f"{packed}@1", f"{packed}@2"]
     assert with_seeds("mobil") == ["mobil"]
     assert agent_file("agent_idm@0") == agent_file("agent_idm") != agent_file("agent_idm@1") == packed

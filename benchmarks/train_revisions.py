@@ -1,7 +1,7 @@
 """``ganlane train`` of this checkout and of an older revision, in turns: decisions per second with learning.
 
     python -m benchmarks.train_revisions --revision 82e9c00
-    python -m benchmarks.train_revisions --revision 82e9c00 --cores 0 1 --collectors single overlap
+    python -m benchmarks.train_revisions --environments 1024 --cores 0 1 --collectors single single:2 overlap
 
 Every case is a real run of the command, logs included and checkpoints not, with the agent of ``agent=rainbow``. All
 are started at once and stopped (SIGSTOP) except for the one whose turn it is, so that a change of the machine's speed
@@ -31,7 +31,7 @@ from ganlane.evaluation.table import Table, count
 BEGIN, END = "<!-- begin train revisions -->", "<!-- end train revisions -->"
 HERE = Path(__file__).resolve().parents[1]
 OPTIONS = (
-    *("init=none", "agent=rainbow", "observation=lane_view", "env.compile=true", "seed=0", "threads=1"),
+    *("init=none", "agent=rainbow", "observation=lane_view", "env.compile=true", "seed=0"),
     *("total_decisions=1000000000", "checkpoint_every_s=1000000000", "logger.progress=false"),
 )
 #: Decisions between two rows of metrics.csv, by which progress is seen.
@@ -49,17 +49,19 @@ class Run:
     options: list[str]
     cores: list[int]
     folder: Path
+    threads: int = 1
     rates: list[tuple[float, float]] = field(default_factory=list)
 
     def start(self) -> None:
         """The command, in a process group of its own."""
-        command = ["-m", "ganlane.train", f"traffic={self.traffic}", *OPTIONS, f"log_every={ROW}", *self.options]
+        own = [f"traffic={self.traffic}", f"threads={self.threads}", f"log_every={ROW}", *self.options]
+        command = ["-m", "ganlane.train", *OPTIONS, *own]
         self.folder.mkdir(parents=True)
         with (self.folder / "messages.txt").open("w") as messages:
             self.process = subprocess.Popen(
                 [sys.executable, *command, f"hydra.run.dir={self.folder}"],
                 cwd=self.folder,
-                env={**os.environ, "PYTHONPATH": str(self.source), "OMP_NUM_THREADS": "1"},
+                env={**os.environ, "PYTHONPATH": str(self.source), "OMP_NUM_THREADS": str(self.threads)},
                 stdout=messages,
                 stderr=messages,
                 preexec_fn=lambda: os.sched_setaffinity(0, self.cores),
@@ -120,10 +122,12 @@ def runs_of(options: argparse.Namespace, old: Path, folder: Path) -> list[list[R
         where = folder / traffic
         of_old = Run(options.revision, traffic, old, everywhere[:1], first, where / "old")
         group = [of_old]
-        for collector in options.collectors:
-            cores = first if collector == "single" else options.cores
+        for name in options.collectors:
+            collector, _, threads = name.partition(":")
+            cores = first if name == "single" else options.cores
             own = [f"collector={collector}", "mask=none", *everywhere]
-            group.append(Run(f"collector={collector}", traffic, HERE, own, cores, where / collector))
+            title = f"collector={collector}" + (f" threads={threads}" if threads else "")
+            group.append(Run(title, traffic, HERE, own, cores, where / name, int(threads or 1)))
         found.append(group)
     return found
 
@@ -175,7 +179,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__)
     parser.add_argument("--revision", default="82e9c00")
     parser.add_argument("--traffics", nargs="+", default=["idm_mobil", "gan"])
-    parser.add_argument("--collectors", nargs="+", default=["single"])
+    parser.add_argument("--collectors", nargs="+", default=["single"], help="NAME, or NAME:THREADS")
     parser.add_argument("--cores", type=int, nargs="+", default=[0], help="the first one for what needs only one")
     parser.add_argument("--environments", type=int, default=512)
     parser.add_argument("--turns", type=int, default=5)

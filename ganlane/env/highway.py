@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from ganlane import keys
 from ganlane.arguments import checked_arguments, seed_number, whole_number
 from ganlane.env.checks import ActionCheck, check_counter, usable_device
-from ganlane.env.native_step import NATIVE_TAKEN, after_decision, make_kernel, native_decision, say_once
+from ganlane.env.native_step import NATIVE_TAKEN, as_state, make_kernel, make_scenes, native_decision, say_once
 from ganlane.env.physics import Physics, Recorder, Rules, known_false, outcome, run_decision
 from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
 from ganlane.errors import UserError
@@ -120,6 +120,7 @@ class HighwayEnv(EnvBase):
         #: The native kernel; None: the tensor code drives.
         self.kernel = make_kernel(kernel, traffic, self.rules, self.vehicles, self.device, dtype)
         self._kernel_must = kernel == "native"
+        self._native_scenes = make_scenes(self.kernel, self.scenes, self.stream)
         self._check_action = ActionCheck(self.batch_size[0], self.device)
         self._make_specs()
 
@@ -198,7 +199,11 @@ class HighwayEnv(EnvBase):
     ) -> TensorDictBase:
         """All rows at the start of their episodes; EnvBase keeps the rows that are not to be reset."""
         seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
-        rows = self._rows_to_draw(tensordict)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if self._native_scenes is not None:
+            drawn = None if mask is None else mask.reshape(-1)
+            return as_state(seed, episode, *self._native_scenes.start(seed, episode, drawn))
+        rows = self._rows_to_draw(mask)
         if rows is None:
             return self._start(seed, episode)
         # The other rows keep what they have: here they repeat one of those drawn, which is quicker than their own.
@@ -207,9 +212,8 @@ class HighwayEnv(EnvBase):
         started = self._start(seed[rows], episode[rows])[place]
         return started.set(keys.SEED, seed).set(keys.EPISODE, episode)
 
-    def _rows_to_draw(self, tensordict: TensorDictBase | None) -> Tensor | None:
+    def _rows_to_draw(self, mask: Tensor | None) -> Tensor | None:
         """The rows to be reset, where to draw them alone saves time; None: draw all."""
-        mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
             return None
         rows = mask.reshape(-1).nonzero()[:, 0]
@@ -279,7 +283,8 @@ class HighwayEnv(EnvBase):
         except ValueError:
             self._check_action.values(action)  # says which
             raise
-        return after_decision(tensordict, *decided)
+        after = as_state(tensordict.get(keys.SEED), tensordict.get(keys.EPISODE), *decided)
+        return after.set(keys.REWARD, torch.zeros_like(decided[0].distance)[:, None])  # which a transform writes
 
     def _recycling_rows(self, key: Tensor) -> Tensor:
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""

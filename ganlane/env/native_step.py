@@ -15,7 +15,10 @@ from ganlane.env.state import pack
 from ganlane.errors import UserError
 from ganlane.native.decision import EgoState, Kernel, Outcome
 from ganlane.native.library import why_not
+from ganlane.native.scenes import NativeScenes
 from ganlane.parameters.episode import KERNELS
+from ganlane.sim.scenes import Scenes
+from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
@@ -84,8 +87,13 @@ def native_decision(
     return out, out.moved(vehicles)
 
 
-def after_decision(state: TensorDictBase, out: Outcome, vehicles: Vehicles) -> TensorDictBase:
-    """The state after the decision from ``state`` (:mod:`ganlane.env.state`); reward 0, which a transform writes."""
+def make_scenes(kernel: Kernel | None, scenes: Scenes, stream: int) -> NativeScenes | None:
+    """What draws the first states for ``kernel``; None: the tensor code does."""
+    return NativeScenes(scenes, stream) if kernel is not None and type(scenes) is RandomScenes else None
+
+
+def as_state(seed: Tensor, episode: Tensor, out: Outcome, vehicles: Vehicles) -> TensorDictBase:
+    """The state (:mod:`ganlane.env.state`) of the episodes (``seed``, ``episode``) [N], without a reward."""
     ego = {
         "steering": out.ego_steering,
         "mean_acceleration": out.mean_acceleration,
@@ -102,7 +110,6 @@ def after_decision(state: TensorDictBase, out: Outcome, vehicles: Vehicles) -> T
     events = {name: getattr(out, name) for name in ("goal", "hard_crash", "out_of_road", "timeout")}
     events["scene_end"] = torch.zeros_like(out.timeout)  # of recorded scenes, which the kernel does not drive
     events |= {keys.SOFT_CRASH: out.soft_crash, keys.SOFT_CRASH_BEHIND: out.soft_crash_behind}
-    rest = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.STEP: out.step}
-    rest |= {keys.REWARD: torch.zeros_like(out.distance)[:, None]}
+    rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: out.step}
     rest |= {"terminated": out.terminated, "truncated": out.truncated, "done": out.done}
     return pack(vehicles, ego, memory, events, rest)

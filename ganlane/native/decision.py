@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -65,10 +66,10 @@ class Outcome(NamedTuple):
     truncated: Tensor
 
     @classmethod
-    def empty(cls, rows: int, vehicles: int) -> Outcome:
-        """Room for the outcome of ``rows`` environments."""
+    def empty(cls, rows: int, vehicles: int, make: Callable[..., Tensor] = torch.empty) -> Outcome:
+        """Room for the outcome of ``rows`` environments; ``make=torch.zeros``: filled with zeros."""
         shapes = {"vehicle": (rows, vehicles), "row": (rows,), "column": (rows, 1)}
-        return cls(*(torch.empty(shapes[shape], dtype=dtype) for shape, dtype in OUTCOME.values()))
+        return cls(*(make(shapes[shape], dtype=dtype) for shape, dtype in OUTCOME.values()))
 
     def moved(self, before: Vehicles) -> Vehicles:
         """The vehicles after the decision; what does not change within one is that of ``before``."""

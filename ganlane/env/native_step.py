@@ -8,11 +8,13 @@ from functools import lru_cache
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from ganlane import keys
 from ganlane.env.physics import Rules
 from ganlane.env.state import pack
 from ganlane.errors import UserError
+from ganlane.native.calls import torch_on_one_thread
 from ganlane.native.decision import EgoState, Kernel, Outcome
 from ganlane.native.library import why_not
 from ganlane.native.scenes import NativeScenes
@@ -24,6 +26,15 @@ from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 
 NATIVE_TAKEN = "env.kernel=auto: the native kernel"
+
+
+class KernelEnv(TransformedEnv):
+    """A TransformedEnv around a :class:`~ganlane.env.HighwayEnv` that the kernel drives."""
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        """As TorchRL's, with the threads where they pay."""
+        with torch_on_one_thread():
+            return super().step_and_maybe_reset(tensordict)
 
 
 @lru_cache(maxsize=8)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 from typing import Any
 
@@ -24,9 +26,36 @@ def addresses(arrays: Sequence[Any], count: int) -> ctypes.Array[ctypes.c_void_p
     )
 
 
+#: Threads of the kernel while torch has but one (:func:`torch_on_one_thread`); None: as many as torch.
+_threads: ContextVar[int | None] = ContextVar("threads of the kernel", default=None)
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """Inside, torch computes on one thread, and the kernel on as many as torch had.
+
+    Around the kernel torch works on small tensors, which it is slow to share out: a step of 4096 environments through
+    TorchRL took 6.8 ms on one core, 7.3 with two threads of both, and 5.2 with two of the kernel alone.
+    """
+    torch = sys.modules["torch"]
+    before = int(torch.get_num_threads())
+    if before == 1:
+        yield
+        return
+    token = _threads.set(before)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _threads.reset(token)
+
+
 def threads_allowed() -> int:
     """As many threads as torch may use; where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores."""
-    torch = sys.modules.get("torch")
+    own, torch = _threads.get(), sys.modules.get("torch")
+    if own is not None:
+        return own
     if torch is not None:
         return int(torch.get_num_threads())
     named = os.environ.get("OMP_NUM_THREADS", "")

@@ -13,8 +13,8 @@ from ganlane.parameters.checks import DIFFERENT, Rule, Seed, Text, between, one_
 #: Episodes of ``ganlane reproduce`` on traffics on which driving is slow, so that all of it takes half an hour.
 FEWER = {
     "idm_faults": 500,
-    "idm_random": 500,
-    "gan": 150,
+    "idm_random": 400,
+    "gan": 120,
     "gan_calibrated": 100,
     "replay": 100,
     "sumo": 8,
@@ -81,7 +81,7 @@ class ReproduceConfig(EvaluateConfig):
         agents: as of ganlane evaluate; agent_idm@all: every training of its recipe.
         traffics: options of the group traffic; what is not installed or not at hand is left out, with the reason.
         fewer: number of episodes on slow traffics, where it is smaller than episodes; it changes or adds to
-            {idm_faults: 500, idm_random: 500, gan: 150, gan_calibrated: 100, replay: 100, sumo: 8, highway_env: 3}.
+            {idm_faults: 500, idm_random: 400, gan: 120, gan_calibrated: 100, replay: 100, sumo: 8, highway_env: 3}.
         workers: processes that drive.
         cells: folder of what was driven; a pair of driver and traffic that is there is not driven again.
         crashes: so many per driver and traffic, the earliest, are listed in crashes.json with their actions.

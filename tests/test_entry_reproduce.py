@@ -53,6 +53,7 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
     assert not any(f'{attribute}="http' in page for attribute in ("src", "href"))
     for name in ("matrix", "figure_4"):
         assert all((folder / f"{name}.{kind}").stat().st_size > 0 for kind in ("png", "svg", "csv"))
+    assert all((folder / f"figure_3.{kind}").stat().st_size > 0 for kind in ("png", "svg", "csv"))
     for name in ("table_vi", "table_vii", "comparisons"):
         assert len((folder / f"{name}.csv").read_text().splitlines()) > 2
 
@@ -84,8 +85,9 @@ def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_dr
 def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys):
     monkeypatch.setenv("GANLANE_DATA", "nowhere")
     assert main([*SHORT, "agents=[random_legal,mobil]", "traffics=[idm,replay]"]) == 0
-    assert "left out, replay:" in capsys.readouterr().err
-    assert "replay" in json.loads(Path("out/results.json").read_text())["left_out"]
+    said = capsys.readouterr().err
+    assert all(f"left out, {what}:" in said for what in ("replay", "figure 2", "figure 3"))
+    assert {"replay", "figure 2", "figure 3"} == json.loads(Path("out/results.json").read_text())["left_out"].keys()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ behind each into its run folder. What was driven stays in ``cells``: a command t
 and one with other drivers drives those alone.
 
 The modules: :mod:`~ganlane.reproduce.matrix` drives, :mod:`~ganlane.reproduce.numbers` computes,
-:mod:`~ganlane.reproduce.report` writes.
+:mod:`~ganlane.reproduce.figures` draws the paper's Figures 2 and 3, :mod:`~ganlane.reproduce.report` writes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,7 @@ PAIRS = (
 def reproduce(config: ReproduceConfig, folder: Path) -> str:
     """Drive what is missing, then write numbers, tables and figures; the line that names the report."""
     from ganlane.evaluation import failed_episodes, machine_sentence, write_results
+    from ganlane.reproduce import figures as papers
     from ganlane.reproduce import numbers, report
     from ganlane.reproduce.matrix import available, cells_of, drive, read_cells
     from ganlane.runtime import set_threads
@@ -63,8 +64,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         config = trained_from_scratch(config)
     report.read_transfers(config.runs, [])  # a folder that cannot be read shows before hours of driving
     traffics, missing = available(config)
-    for name, reason in missing.items():
-        print(f"left out, {name}: {reason}", file=sys.stderr)
+    _say_left_out(missing)
     cells = cells_of(config, traffics)
     drive(cells, config)
     episodes, revisions, seconds = read_cells(cells)
@@ -76,7 +76,12 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "comparisons": report.comparison_table(compared),
         "matrix": report.matrix_table(rows),
     }
-    figures = {"matrix": report.draw_matrix(rows)}
+    drawn = papers.draw_all(config, traffics)
+    _say_left_out(drawn.missing)
+    missing |= drawn.missing
+    figures = {"matrix": report.draw_matrix(rows), **drawn.figures}
+    for name, frame in drawn.numbers.items():
+        report.write_csv(folder / f"{name}.csv", frame.to_dicts())
     transfer = report.read_transfers(config.runs, rows)
     if transfer is not None:
         figures["figure_4"] = report.draw_transfer(transfer)
@@ -114,6 +119,11 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     _list_crashes(episodes, config, folder)
     results = write_results(folder, record, asdict(config), seeds)
     return f"report: {page}; results: {results}"
+
+
+def _say_left_out(missing: Mapping[str, str]) -> None:
+    for name, reason in missing.items():
+        print(f"left out, {name}: {reason}", file=sys.stderr)
 
 
 def _list_crashes(episodes: pl.DataFrame, config: ReproduceConfig, folder: Path) -> None:

@@ -1,0 +1,213 @@
+"""The paper's Figures 2 and 3: what the trajectory generator predicts, and an episode among generated drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.transforms import Affine2D
+
+from ganlane.build import Driver, make_drivers, make_env, make_traffic
+from ganlane.config.evaluate import ReproduceConfig
+from ganlane.config.traffic import TrafficConfig
+from ganlane.data import FRAME_S, default_scenes, read_scenes
+from ganlane.errors import UserError
+from ganlane.generator import load_generator, shipped_generator
+from ganlane.generator.forecasts import paper_forecasts
+from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, scene_tracks
+from ganlane.generator.windows import Windows, cut_windows, group_windows
+from ganlane.sim.random import Stream
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
+from ganlane.view.record import EpisodeLabel, Trajectory, record_episode
+
+#: Panels of Figure 2 by what the vehicle does, and samples drawn in each.
+PANELS = {"starts a lane change": 3, "completes a lane change": 3, "goes steady": 2}
+SAMPLES = 8
+#: Frames of every recording from one window to the next.
+_STRIDE = 5
+#: Least way of a vehicle in the 1.6 s of a window, m.
+LEAST_M = 8.0
+#: Figure 3: frames over each other, s from the first to the last, s of the episode to choose from, m around the ego.
+FRAMES, SHOWN_S, LONGEST_S, AROUND_M = 4, 3.0, 30.0, (-70.0, 130.0)
+EGO, OTHER = COLOURS[1], COLOURS[0]
+Positions = npt.NDArray[np.float64]
+
+
+class Drawn(NamedTuple):
+    """Figures by name, the numbers behind them, and why others are left out."""
+
+    figures: dict[str, Figure]
+    numbers: dict[str, pl.DataFrame]
+    missing: dict[str, str]
+
+
+def draw_all(config: ReproduceConfig, traffics: Mapping[str, TrafficConfig]) -> Drawn:
+    """``figure_2``, where the recordings are at hand, and ``figure_3``, where ``gan`` is among the traffics."""
+    drawn = Drawn({}, {}, {})
+    try:
+        drawn.numbers["figure_2"] = forecasts_to_draw()
+        drawn.figures["figure_2"] = draw_forecasts(drawn.numbers["figure_2"])
+    except UserError as error:
+        drawn.missing["figure 2"] = str(error)
+    if "gan" in traffics:
+        drivers = make_drivers(config.agents, config.env, config.device)
+        learnt = [driver for driver in drivers if "agent_gan" in driver.name]
+        episode = drive_beginning([*learnt, drivers[-1]][0], traffics["gan"], config)
+        drawn.numbers["figure_3"] = busiest(episode)
+        drawn.figures["figure_3"] = draw_episode(episode.label, drawn.numbers["figure_3"])
+    else:
+        drawn.missing["figure 3"] = "the traffic gan is not among the traffics"
+    return drawn
+
+
+def interesting(windows: Windows) -> list[tuple[str, int]]:
+    """Kind and row of the windows to draw, :data:`PANELS`, no vehicle twice, none that hardly moves.
+
+    A vehicle starts a lane change where it moves across in the future and has not before, completes one the other way
+    round, and goes steady where it moves across least of all.
+    """
+    along, across = windows.positions[:, :, 0], windows.positions[:, :, 1]
+    before = np.abs(across[:, PRESENT] - across[:, 0])
+    after = np.abs(across[:, -1] - across[:, PRESENT])
+    moves = along[:, -1] - along[:, 0] > LEAST_M
+    scores = {
+        "starts a lane change": after - 2.0 * before,
+        "completes a lane change": before - 2.0 * after,
+        "goes steady": -before - after,
+    }
+    chosen, seen = [], set[tuple[int, int]]()
+    for kind, count in PANELS.items():
+        found = 0
+        for row in np.argsort(-scores[kind], kind="stable"):
+            vehicle = int(windows.scene[row]), int(windows.vehicle[row])
+            if found < count and moves[row] and vehicle not in seen:
+                seen.add(vehicle)
+                chosen.append((kind, int(row)))
+                found += 1
+    return chosen
+
+
+def forecasts_to_draw() -> pl.DataFrame:
+    """Vehicles of the recordings that the shipped generator was not fitted to, observed, recorded and predicted.
+
+    Returns:
+        Columns ``panel``, ``kind`` (of :data:`PANELS`), ``path`` (``observed``, ``recorded``, ``mean`` with z = 0,
+        ``sample 1`` to :data:`SAMPLES`), ``time_s``, ``ahead_m`` and ``left_m``, all relative to the present.
+
+    Raises:
+        UserError: the recordings are not at hand.
+    """
+    generator, metadata = load_generator(shipped_generator("paper"), "paper")
+    held_out = set(metadata["data"]["held_out"])
+    scenes = [scene for scene in scene_tracks(read_scenes(default_scenes())) if scene.name in held_out]
+    windows = cut_windows(scenes, _STRIDE)
+    groups = group_windows(windows)
+    predicted: dict[str, Positions] = {}
+    for seed in range(SAMPLES):
+        drawn = paper_forecasts(generator, windows, groups, seed, samples=1)
+        predicted |= {"mean": drawn["mean"], f"sample {seed + 1}": drawn["single"]}
+    parts = []
+    for panel, (kind, row) in enumerate(interesting(windows)):
+        observed = windows.positions[row, :OBSERVED_POSITIONS] - windows.positions[row, PRESENT]
+        later = {"recorded": windows.future, **predicted}
+        paths = {name: np.concatenate([np.zeros((1, 2)), each[row]]) for name, each in later.items()}
+        for name, path in {**paths, "observed": observed}.items():
+            time_s = (np.arange(len(path)) - (PRESENT if name == "observed" else 0)) * FRAME_S
+            columns = {"time_s": time_s, "ahead_m": path[:, 0], "left_m": path[:, 1]}
+            parts.append(pl.DataFrame(columns).select(pl.lit(panel).alias("panel"), pl.lit(kind).alias("kind"),
+                                                      pl.lit(name).alias("path"), pl.all()))  # fmt: skip
+    return pl.concat(parts)
+
+
+@rc_context(STYLE)
+def draw_forecasts(paths: pl.DataFrame) -> Figure:
+    """Figure 2: the vehicles of :func:`forecasts_to_draw`, 0.8 s observed, then 0.8 s recorded and predicted."""
+    panels = paths.partition_by("panel", maintain_order=True)
+    figure, grid = panel_grid(len(panels), 2.5, 1.7)
+    colours = {"observed": FAINT, "recorded": INK, "predicted, z = 0": COLOURS[1], "predicted": COLOURS[4]}
+    styles: dict[str, dict[str, Any]] = {
+        **{f"sample {number + 1}": {"color": colours["predicted"], "lw": 0.8} for number in range(SAMPLES)},
+        "mean": {"color": colours["predicted, z = 0"], "lw": 1.6},
+        **{name: {"color": colours[name], "marker": ".", "ms": 3} for name in ("observed", "recorded")},
+    }
+    for axes, panel in zip(grid, panels):
+        axes.set(title=panel["kind"][0], xlabel="m ahead", ylabel="m to the left")
+        for name, style in styles.items():  # what is drawn last lies above
+            path = panel.filter(pl.col("path") == name)
+            axes.plot(path["ahead_m"], path["left_m"], **style)
+        low, high = axes.get_ylim()
+        reach = max(0.8, (high - low) / 2.0)
+        axes.set_ylim((low + high) / 2.0 - reach, (low + high) / 2.0 + reach)
+    add_legend(figure, colours)
+    return figure
+
+
+def drive_beginning(driver: Driver, traffic: TrafficConfig, config: ReproduceConfig) -> Trajectory:
+    """Episode 0, at most :data:`LONGEST_S` of it."""
+    seen = config.observation.read_by(driver.observation)
+    mask, policy = driver.behind(config.mask)
+    made = make_traffic(traffic, config.env, Stream[config.stream.upper()])
+    env = make_env(made, config.env, seen, config.reward, device=config.device, mask=mask)
+    return record_episode(env, policy, config.seed, 0, driver.name, traffic.label(), LONGEST_S)
+
+
+def busiest(episode: Trajectory) -> pl.DataFrame:
+    """The :data:`SHOWN_S` seconds of an episode in which the others near the ego move across most.
+
+    Returns:
+        Columns ``time_s``, ``vehicle`` (0: the ego), ``x_m`` (from where the ego is at first), ``y_m``,
+        ``heading_rad``, ``length_m`` and ``width_m``; a vehicle that is placed elsewhere meanwhile is left out.
+    """
+    shown = min(round(SHOWN_S / episode.frame_s), len(episode) - 1)
+    ahead = episode.x - episode.x[:, :1]
+    near = episode.valid & (ahead > AROUND_M[0]) & (ahead < AROUND_M[1] / 2.0)
+    near[:, 0] = False
+    across = np.abs(episode.y[shown:] - episode.y[: len(episode) - shown])
+    first = int(np.argmax((across * near[: len(across)]).sum(axis=1)))
+    part, origin = slice(first, first + shown + 1), episode.x[first, 0]
+    stays = episode.valid[part].all(axis=0) & ~episode.jumped()[first + 1 : first + shown + 1].any(axis=0)
+    numbers = {
+        "x_m": episode.x - origin, "y_m": episode.y, "heading_rad": episode.heading,
+        "length_m": episode.length, "width_m": episode.width,
+    }  # fmt: skip
+    return pl.concat(
+        pl.DataFrame(
+            {"time_s": episode.time_s[part], **{name: each[part, vehicle] for name, each in numbers.items()}}
+        ).insert_column(1, pl.lit(int(vehicle)).alias("vehicle"))
+        for vehicle in np.flatnonzero(stays)
+    )
+
+
+@rc_context(STYLE)
+def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
+    """Figure 3: :data:`FRAMES` frames of :func:`busiest` over each other, older ones fainter, and everybody's way."""
+    figure = Figure(figsize=(9.0, 1.9))
+    axes = figure.subplots()
+    width_m, times = label.lane_width_m, tracks["time_s"].unique().sort().to_numpy()
+    axes.set(xlim=AROUND_M, xlabel="m", yticks=[], aspect="equal")
+    axes.set_ylim(-0.75 * width_m, (label.lanes - 0.25) * width_m)
+    axes.set_title(f"{label.agent} on {label.traffic}, {times[0]:.1f} to {times[-1]:.1f} s")
+    for line in range(label.lanes + 1):
+        edge = line in (0, label.lanes)
+        axes.axhline((line - 0.5) * width_m, color=INK if edge else FAINT, ls="-" if edge else (0, (8, 8)))
+    frames = np.linspace(0, len(times) - 1, FRAMES).round().astype(int)
+    for track in tracks.partition_by("vehicle", maintain_order=True):
+        colour = EGO if track["vehicle"][0] == 0 else OTHER
+        axes.plot(track["x_m"], track["y_m"], color=colour, lw=0.8)
+        for place, frame in enumerate(frames):
+            _draw_body(axes, track.row(int(frame), named=True), color=colour, alpha=(place + 1.0) / FRAMES)
+    add_legend(figure, {"ego": EGO, "others": OTHER})
+    return figure
+
+
+def _draw_body(axes: Axes, at: dict[str, float], **style: Any) -> None:
+    length, width = at["length_m"], at["width_m"]
+    turned = Affine2D().rotate(at["heading_rad"]).translate(at["x_m"], at["y_m"]) + axes.transData
+    axes.add_patch(Rectangle((-length / 2.0, -width / 2.0), length, width, lw=0, transform=turned, **style))

@@ -10,11 +10,13 @@ import torch
 from reference.worlds import environment, leaves
 from torchrl.envs.utils import check_env_specs
 
+import ganlane
 from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.env import native_step
 from ganlane.errors import UserError
+from ganlane.native.calls import ROWS_PER_THREAD, threads_allowed, torch_on_one_thread
 from ganlane.native.library import why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.parameters.driving import EgoParameters, IdmParameters
@@ -74,6 +76,27 @@ def test_a_rollout_is_the_same_bit_for_bit_in_another_batch():
             td = env.step(td)["next"].exclude("reward")
         states.append(td[:5])
     assert (states[0] == states[1]).all()
+
+
+def test_two_threads_are_the_kernels_alone_and_change_no_bit():
+    """Around the kernel torch computes on one thread, and has both again afterwards."""
+    driven, seen, before = [], [], torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            env = ganlane.make_env(traffic="idm_mobil", num_envs=2 * ROWS_PER_THREAD)
+            state = env.reset()
+            for step in range(3):
+                actions = (torch.arange(2 * ROWS_PER_THREAD) + step) % 3
+                stepped, state = env.step_and_maybe_reset(state.set("action", actions))
+            driven.append(stepped)
+            with torch_on_one_thread():
+                seen.append((torch.get_num_threads(), threads_allowed()))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [(1, 1), (1, 2)]
+    assert (driven[0] == driven[1]).all()
 
 
 def test_what_goes_into_a_step_stays_as_it_is():

@@ -4,7 +4,7 @@ Runs when a wheel is built (``pip install .`` builds one), with the compiler tha
 g++, clang++ or, where there is none, Clang from the package ``ziglang``, which is then fetched for the build. Without
 any of them the wheel has no kernel, and the tensor code drives. An editable install builds at first use.
 
-``GANLANE_LIGHT_WHEEL=1`` leaves the further trainings of the shipped agents (``agent_idm@1``) out: 13 MB of 17.
+``GANLANE_LIGHT_WHEEL=1`` leaves the further trainings of the shipped agents (``agent_idm@1``) out: 12 MB of 17.
 """
 
 from __future__ import annotations

@@ -61,10 +61,10 @@ ABLATIONS: Mapping[str, tuple[str, ...]] = {
 BEHIND = {"legal": "legal", "safe": "safe"}
 SEEDS = (0, 1, 2)
 OPTIONS = (
-    "traffics=[idm_mobil,idm,idm_faults,gan_calibrated]",
+    "traffics=[idm_mobil,idm,idm_faults,idm_random]",
     "episodes=500",
-    "fewer={gan_calibrated:100}",
-    "workers=1",
+    "fewer={idm_faults:500,idm_random:500}",
+    "workers=2",
 )
 
 
@@ -123,13 +123,15 @@ def measure(options: argparse.Namespace) -> str:
     if unknown:
         raise UserError(f"--only {unknown[0]}: no such ablation; there are {', '.join(ABLATIONS)}.")
     record, config = compared(train_all(options), options.options)
-    record = {"command": shlex.join(["python", "-m", "benchmarks.ablations", *options.options]), **record}
+    record = {"command": shlex.join(["python", "-m", "benchmarks.ablations", *options.given]), **record}
     options.out.mkdir(parents=True, exist_ok=True)
     seeds = {
         "trainings": list(options.seeds),
         "stream": config.stream,
         "seed": config.seed,
-        "episodes": {name: config.episodes_on(name) for name in config.chosen_traffics()},
+        "episodes": {
+            name: config.episodes_on(name) for name in dict.fromkeys(row["traffic"] for row in record["rows"])
+        },
     }
     return f"results: {write_results(options.out, record, asdict(config), seeds)}"
 
@@ -145,7 +147,8 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--runs", type=Path, default=RUNS, help=f"folder of the trainings ({RUNS})")
     parser.add_argument("--out", type=Path, default=OUT, help=f"folder of results.json ({OUT})")
-    return parser.parse_intermixed_args(arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    return argparse.Namespace(**vars(parser.parse_intermixed_args(given)), given=given)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

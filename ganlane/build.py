@@ -24,7 +24,6 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.targets import call_with, import_target, is_import_path
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.native_step import KernelEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters
@@ -126,8 +125,7 @@ def make_env(
         sensors = [] if errors is None else [SensorTransform(errors, traffic.stream, env.decision_period_s)]
     except ParameterError as error:
         raise error.below("observation.sensors") from error
-    whole = TransformedEnv if base.kernel is None else KernelEnv
-    return whole(base, Compose(*sensors, *transforms, RewardTransform(env.decision_period_s, reward)))
+    return TransformedEnv(base, Compose(*sensors, *transforms, RewardTransform(env.decision_period_s, reward)))
 
 
 @dataclass(frozen=True)

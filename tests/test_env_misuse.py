@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 import ganlane
+import ganlane.gym
 from ganlane import keys
 from ganlane.build import make_traffic
 from ganlane.config.env import EnvConfig

@@ -16,7 +16,7 @@ from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.env import native_step
 from ganlane.errors import UserError
-from ganlane.native.calls import ROWS_PER_THREAD, threads_allowed, torch_on_one_thread
+from ganlane.native.calls import ROWS_PER_THREAD, threads_allowed
 from ganlane.native.library import why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.parameters.driving import EgoParameters, IdmParameters
@@ -88,15 +88,23 @@ def test_two_threads_are_the_kernels_alone_and_change_no_bit():
             state = env.reset()
             for step in range(3):
                 actions = (torch.arange(2 * ROWS_PER_THREAD) + step) % 3
-                stepped, state = env.step_and_maybe_reset(state.set("action", actions))
+                with native_step.threads_for(env):
+                    stepped, state = env.step_and_maybe_reset(state.set("action", actions))
+                    seen.append((torch.get_num_threads(), threads_allowed()))
             driven.append(stepped)
-            with torch_on_one_thread():
-                seen.append((torch.get_num_threads(), threads_allowed()))
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
-    assert seen == [(1, 1), (1, 2)]
+    assert seen == [(1, 1)] * 3 + [(1, 2)] * 3
     assert (driven[0] == driven[1]).all()
+
+
+@pytest.mark.parametrize("wrong", [torch.tensor([7.0, 8.0]), torch.tensor([[7], [8]])])
+def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
+    env = native(2)
+    state = env.reset().set("_reset", torch.tensor([[True], [False]]))
+    with pytest.raises(UserError, match=r"next_episode is \[.*; give next_episode as int64 of shape \[2\]"):
+        env.reset(state, next_episode=wrong)
 
 
 def test_what_goes_into_a_step_stays_as_it_is():

@@ -66,7 +66,9 @@ def with_seeds(name: str) -> list[str]:
     shipped = recipe in SHIPPED
     packed = _seeds_file(recipe) if shipped else Path(recipe)
     if shipped and not packed.is_file():
-        raise UserError(f"{name}: only the training {recipe}@0 is installed; give that, or install from a clone.")
+        raise UserError(
+            f"{name}: only the training {recipe}@0 is installed (a light wheel); give that, or install from a clone."
+        )
     seeds = sorted(_read_several(packed)[1])
     return [f"{recipe}@{seed}{mask}" for seed in ([0, *seeds] if shipped else seeds)]
 

@@ -198,16 +198,23 @@ def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:
         key = override.key_or_group
         if override.type != OverrideType.CHANGE or of_hydra(override) or (conf_folder() / key).is_dir():
             continue
-        kind, path = SCHEMAS[""].get(command), key.split(".")
+        kind, path = SCHEMAS[""][command], key.split(".")
         for depth, name in enumerate(path, 1):
-            kinds: list[Any] = [kind, *(type.__subclasses__(kind) if depth > 1 and isinstance(kind, type) else ())]
-            known = {field.name for each in kinds if is_dataclass(each) for field in fields(each)}
+            kinds = [kind] if depth == 1 else _with_subclasses(kind)
+            known = {field.name for each in kinds for field in fields(each)} if is_dataclass(kind) else set()
             if not known or (len(kinds) > 1 and kind not in options):
                 break
             if name not in known:
-                raise UserError(unknown_key(".".join(path[:depth]), sorted(known)))
+                of = "its options have" if len(kinds) > 1 else None
+                raise UserError(unknown_key(".".join(path[:depth]), sorted(known), of))
             hint = get_type_hints(kind).get(name)
             kind = next(filter(is_dataclass, get_args(hint)), hint)
+
+
+def _with_subclasses(kind: Any) -> list[Any]:
+    """A class and all that are derived from it."""
+    below: list[Any] = type.__subclasses__(kind) if isinstance(kind, type) else []
+    return [kind, *(each for child in below for each in _with_subclasses(child))]
 
 
 def without_repetitions(overrides: Sequence[str]) -> list[str]:
@@ -283,9 +290,10 @@ def _check_one(command: str, overrides: Sequence[str]) -> Checked:
     try:
         composed = compose(command, overrides=with_shares_replaced(overrides), return_hydra_config=True)
     except AssertionError as error:  # OmegaConf's own check
-        dotted = ", ".join(key for key, _, _ in (each.partition("=") for each in overrides) if "." in key)
+        below = [key for key in (each.partition("=")[0] for each in overrides) if "." in key]
+        nested = ", ".join(key for key in below if not key.startswith("hydra."))
         raise UserError(
-            f"{dotted}: one of them lies below a key that is null; choose an option of that group, too."
+            f"{nested}: a key below one that is null; choose an option first, as in traffic@pretrain.traffic=gan."
         ) from error
     with open_dict(composed):
         composed.hydra.job.num = 0

@@ -119,10 +119,10 @@ def _unknown_key(key: str, error: OmegaConfBaseException) -> str:
     return unknown_key(key, [other for other in known if other != "hydra"])
 
 
-def unknown_key(key: str, known: Sequence[str]) -> str:
-    """``key`` is not among the ``known`` ones of its parent."""
+def unknown_key(key: str, known: Sequence[str], of: str | None = None) -> str:
+    """``key`` is not among the ``known`` ones of its parent, or ``of`` what the sentence says."""
     parent, _, name = key.rpartition(".")
-    where = f"{parent} has" if parent else "known are"
+    where = of or (f"{parent} has" if parent else "known are")
     listed = f"; {where} {', '.join(known)}" if known else f"; {_HELP}"
     return f"{key}: no such key{did_you_mean(name, known)}{listed}."
 

@@ -17,9 +17,8 @@ def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
     """``counter`` [N] int64 of a reset; :class:`UserError` if it is none, or of another shape or type."""
     if counter is None or counter.shape != (rows,) or counter.dtype != torch.int64:
         found = "missing" if counter is None else f"{list(counter.shape)} in {counter.dtype}"
-        raise UserError(
-            f"reset(): {name} is {found}; give 'seed' and 'episode' as int64 of shape [{rows}], or neither."
-        )
+        given = "next_episode" if name == "next_episode" else "'seed' and 'episode'"
+        raise UserError(f"reset(): {name} is {found}; give {given} as int64 of shape [{rows}], or leave it out.")
     return counter
 
 

@@ -192,7 +192,8 @@ class HighwayEnv(EnvBase):
             return seed, self.first_episode + torch.arange(n, device=self.device)
         if mask is None:
             return seed, last
-        return seed, torch.where(mask.reshape(n), last + n if next_episode is None else next_episode, last)
+        following = last + n if next_episode is None else check_counter("next_episode", next_episode, n)
+        return seed, torch.where(mask.reshape(n), following, last)
 
     def _reset(
         self, tensordict: TensorDictBase | None, next_episode: Tensor | None = None, **kwargs: object

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.env.physics import Rules
@@ -28,13 +30,12 @@ from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 NATIVE_TAKEN = "env.kernel=auto: the native kernel"
 
 
-class KernelEnv(TransformedEnv):
-    """A TransformedEnv around a :class:`~ganlane.env.HighwayEnv` that the kernel drives."""
-
-    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """As TorchRL's, with the threads where they pay."""
-        with torch_on_one_thread():
-            return super().step_and_maybe_reset(tensordict)
+def threads_for(env: EnvBase) -> AbstractContextManager[None]:
+    """:func:`~ganlane.native.calls.torch_on_one_thread` for steps of an ``env`` that the kernel drives."""
+    base: Any = env
+    while hasattr(base, "base_env"):
+        base = base.base_env
+    return nullcontext() if getattr(base, "kernel", None) is None else torch_on_one_thread()
 
 
 @lru_cache(maxsize=8)

@@ -159,8 +159,10 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
         UserError: a training did not end well; its own sentence stands above.
     """
     from ganlane.agents import read_agent
-    from ganlane.agents.checkpoint import save_agents
+    from ganlane.agents.checkpoint import save_agents, with_seeds
 
+    for name in config.agents:
+        with_seeds(name)  # a training that is not installed shows before hours of training
     folders = {seed: Path(config.trained) / f"seed_{seed}" for seed in config.training_seeds}
     open_ones = {seed: path for seed, path in folders.items() if not (path / "results.json").is_file()}
     hours = HOURS_PER_SEED * len(open_ones)

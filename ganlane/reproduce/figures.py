@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 
-from ganlane.build import Driver, make_drivers, make_env, make_traffic
+from ganlane.agents.checkpoint import with_seeds
+from ganlane.build import Driver, make_driver, make_env, make_traffic
 from ganlane.config.evaluate import ReproduceConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.data import FRAME_S, default_scenes, read_scenes
@@ -32,7 +33,7 @@ PANELS = {"starts a lane change": 3, "completes a lane change": 3, "goes steady"
 SAMPLES = 8
 #: Frames of every recording from one window to the next.
 _STRIDE = 5
-#: Least way of a vehicle in the 1.6 s of a window, m.
+#: Shortest distance that a vehicle drives in the 1.6 s of a window, m.
 LEAST_M = 8.0
 #: Figure 3: frames over each other, s from the first to the last, s of the episode to choose from, m around the ego.
 FRAMES, SHOWN_S, LONGEST_S, AROUND_M = 4, 3.0, 30.0, (-70.0, 130.0)
@@ -57,9 +58,10 @@ def draw_all(config: ReproduceConfig, traffics: Mapping[str, TrafficConfig]) -> 
     except UserError as error:
         drawn.missing["figure 2"] = str(error)
     if "gan" in traffics:
-        drivers = make_drivers(config.agents, config.env, config.device)
-        learnt = [driver for driver in drivers if "agent_gan" in driver.name]
-        episode = drive_beginning([*learnt, drivers[-1]][0], traffics["gan"], config)
+        learnt = [name for name in config.agents if "agent_gan" in name]
+        name = with_seeds([*learnt, config.agents[-1]][0])[0]
+        driver = make_driver(name, config.env, device=config.device)
+        episode = drive_beginning(driver, traffics["gan"], config)
         drawn.numbers["figure_3"] = busiest(episode)
         drawn.figures["figure_3"] = draw_episode(episode.label, drawn.numbers["figure_3"])
     else:
@@ -107,6 +109,8 @@ def forecasts_to_draw() -> pl.DataFrame:
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
     held_out = set(metadata["data"]["held_out"])
     scenes = [scene for scene in scene_tracks(read_scenes(default_scenes())) if scene.name in held_out]
+    if not scenes:
+        raise UserError(f"the recordings have none of the scenes {', '.join(sorted(held_out))}, kept from the fit.")
     windows = cut_windows(scenes, _STRIDE)
     groups = group_windows(windows)
     predicted: dict[str, Positions] = {}
@@ -187,7 +191,7 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
 
 @rc_context(STYLE)
 def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
-    """Figure 3: :data:`FRAMES` frames of :func:`busiest` over each other, older ones fainter, and everybody's way."""
+    """Figure 3: :data:`FRAMES` frames of :func:`busiest` over each other, older ones fainter, and the paths."""
     figure = Figure(figsize=(9.0, 1.9))
     axes = figure.subplots()
     width_m, times = label.lane_width_m, tracks["time_s"].unique().sort().to_numpy()

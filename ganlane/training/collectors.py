@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.agents import Rainbow
+from ganlane.env.native_step import threads_for
 
 
 class Collector(ABC):
@@ -67,11 +68,14 @@ class SingleCollector(Collector):
 
     def __init__(self, env: EnvBase) -> None:
         self.env, self.environments = env, env.batch_size.numel()
-        self.env_state: TensorDictBase = env.reset()
+        with threads_for(env):
+            self.env_state: TensorDictBase = env.reset()
 
     def step(self, agent: Rainbow) -> TensorDictBase:
         """One decision; environments that ended start afresh in ``env_state``, not in the step."""
-        step, self.env_state = self.env.step_and_maybe_reset(agent.policy(self.env_state))
+        decided = agent.policy(self.env_state)
+        with threads_for(self.env):
+            step, self.env_state = self.env.step_and_maybe_reset(decided)
         return step
 
     def state_dict(self, exact: bool) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.agents import Rainbow
+from ganlane.env.native_step import threads_for
 from ganlane.errors import UserError
 from ganlane.training.collectors import Collector, SingleCollector, pack, unpack
 from ganlane.training.signals import shielded_children
@@ -194,7 +195,8 @@ def send(pipe: Connection, message: Any) -> None:
 def drive(source: SingleCollector, action: npt.NDArray[np.int64]) -> TensorDict:
     """One decision: what ``seen`` after it, with new episodes where one ended, and ``after`` it before any reset."""
     given = source.env_state.set(keys.ACTION, torch.from_numpy(action))
-    step, source.env_state = source.env.step_and_maybe_reset(given)
+    with threads_for(source.env):
+        step, source.env_state = source.env.step_and_maybe_reset(given)
     after = step.get("next").exclude(*INNER)
     return TensorDict({"seen": visible(source.env_state), "after": after}, step.batch_size)
 

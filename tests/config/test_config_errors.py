@@ -6,6 +6,7 @@ import pickle
 import signal
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from reference.hydra_memory import composed, own_part
 from ganlane.__main__ import COMMANDS, main
 from ganlane.config.app import Stopped
 from ganlane.config.command_line import as_meant, check, parse, refuse_unknown_keys
+from ganlane.config.schemas import SCHEMAS
 from ganlane.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,12 +79,21 @@ def test_a_key_that_there_is_passes_the_check_before_composing(command):
     refuse_unknown_keys(command, parse([f"{key}=1" for c, key, _ in KEYS if c == command]))
 
 
+@pytest.mark.parametrize("group", ["env", "collector", "init", "data", "generator", "agent", "traffic"])
+def test_a_key_that_any_option_of_a_group_has_passes_it_too(group):
+    command = {"data": "train_generator", "generator": "train_generator"}.get(group, "train")
+    of_options = {each.name for kind in SCHEMAS[group].values() for each in fields(kind)}
+    assert of_options
+    refuse_unknown_keys(command, parse([f"{group}.{name}=1" for name in of_options]))
+
+
 #: Command line to a part of its sentence.
 MISTAKES = {
     "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
     "train trafic=gan": "trafic: no such key (did you mean 'traffic'?); known are agent",
     "train agent.gama=0.9": "agent.gama: no such key (did you mean 'gamma'?); agent has adam_eps",
-    "train pretrain.traffic.guard=false": "below a key that is null",
+    "train collector.wrkers=2": "collector.wrkers: no such key (did you mean 'workers'?); its options have",
+    "train pretrain.traffic.guard=false": "pretrain.traffic.guard: a key below one that is null",
     "train traffic=ganny": "traffic=ganny: no such option (did you mean 'gan'?)",
     "train env=[a,b]": "choose one of blocked_lane",
     "train env.idm=3": "env.idm.NAME=VALUE",

@@ -61,9 +61,8 @@ ABLATIONS: Mapping[str, tuple[str, ...]] = {
 BEHIND = {"legal": "legal", "safe": "safe"}
 SEEDS = (0, 1, 2)
 OPTIONS = (
-    "traffics=[idm_mobil,idm,idm_faults,idm_random]",
+    "traffics=[idm_mobil,idm,idm_faults]",
     "episodes=500",
-    "fewer={idm_faults:500,idm_random:500}",
     "workers=2",
 )
 

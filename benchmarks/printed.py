@@ -4,8 +4,8 @@
     python -m benchmarks.printed outputs/reproduce/RUN/results.json --write
 
 Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes them again from
-``docs/reproduce/results.json``; it also looks up every figure with an interval, such as ``14.0 [3.2, 25.6]``, in the
-sections of :data:`CHECKED`. Other roads come from ``docs/reproduce/roads/results.json`` (``benchmarks.roads``).
+``docs/reproduce/results.json`` and from those of :data:`FURTHER`; it also looks up every figure with an interval,
+such as ``14.0 [3.2, 25.6]``, in the sections of :data:`CHECKED`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from ganlane.files import split_at_markers, write_between_markers
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
-ROADS = ROOT / "docs" / "reproduce" / "roads" / "results.json"
+#: Folders below it with results of ``benchmarks.roads``, ``ganlane reproduce`` on the traffics that are not the
+#: project's own, and ``benchmarks.ablations``.
+FURTHER = ("roads", "elsewhere", "ablations")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
     "agent_general+safe": ("agent_general", frozenset({"idm", "idm_mobil", "idm_random", "gan"})),
@@ -55,6 +57,8 @@ CHECKED = (
     ("docs/results.md", "## The matrix"),
     ("docs/results.md", "## The paper's claims"),
     ("docs/results.md", "## Other roads"),
+    ("docs/results.md", "## Recordings, other simulators, individual drivers"),
+    ("docs/search.md", "## What each part is worth"),
     ("docs/carry_over.md", "## agent_general over trainings"),
 )
 _INTERVAL = re.compile(r"([-+]?\d+(?:\.\d+)?) \[(-?\d+(?:\.\d+)?), (-?\d+(?:\.\d+)?)\]")
@@ -80,6 +84,14 @@ def _lead(row: Row, trained: frozenset[str]) -> str:
     """Lead over MOBIL; italics: a learning driver's on traffic that it was not trained on."""
     text = _with_interval(row["minus_mobil"], row["minus_mobil_ci"])
     return f"*{text}*" if trained and row["traffic"] not in trained else text
+
+
+def _lead_and_failures(row: Row, lead: str = "minus_mobil") -> str:
+    return f"{_with_interval(row[lead], row[f'{lead}_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
+
+
+def _mean_and_failures(row: Row) -> str:
+    return f"({row['mean_reward']:.1f}); {row['hard_crash']}, {row['out_of_road']}"
 
 
 def _drivers(results: Results, among: Sequence[str]) -> list[str]:
@@ -136,10 +148,7 @@ def trainings(results: Results) -> str:
     lines = []
     for place, each in enumerate(_at(results, "agent_general+safe", traffics[0])["each"]):
         rows = [_at(results, "agent_general+safe", traffic)["each"][place] for traffic in traffics]
-        cells = [
-            f"{_with_interval(row['minus_mobil'], row['minus_mobil_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
-            for row in rows
-        ]
+        cells = map(_lead_and_failures, rows)
         lines.append([f"`{each['driver'].removesuffix('+safe')}`", *cells])
     headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
     return Table("", headings, lines).markdown(heading=False)
@@ -164,13 +173,42 @@ def roads(results: Results) -> str:
     found = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
     lines = []
     for driver, traffic in dict.fromkeys((row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"):
-        each = [found[(driver, traffic, *place)] for place in places]
-        cells = [
-            f"{_with_interval(row['minus_mobil'], row['minus_mobil_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
-            for row in each
-        ]
+        cells = [_lead_and_failures(found[(driver, traffic, *place)]) for place in places]
         lines.append([f"{DRIVERS[driver][0]}, `{traffic}`", *cells])
     headings = ["lead; crashes, departures", *(f"{vehicles} on {lanes}" for vehicles, lanes in places)]
+    return Table("", headings, lines).markdown(heading=False)
+
+
+def elsewhere(results: Results) -> str:
+    """Drivers by traffics that are not the project's own: lead over MOBIL, and failures."""
+    own = results["elsewhere"]
+
+    def cell(driver: str, traffic: str) -> str:
+        row = _at(own, driver, traffic)
+        return _mean_and_failures(row) if driver == "mobil" else _lead_and_failures(row)
+
+    names = {"mobil": "MOBIL (its mean reward)", **{driver: name for driver, (name, _) in DRIVERS.items()}}
+    there, traffics = {row["driver"] for row in own["rows"]}, _traffics(own)
+    lines = [[names[driver], *(cell(driver, traffic) for traffic in traffics)] for driver in names if driver in there]
+    episodes = ["episodes of each training", *(str(own["seeds"]["episodes"][traffic]) for traffic in traffics)]
+    headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
+    return Table("", headings, [episodes, *lines]).markdown(heading=False)
+
+
+def ablations(results: Results) -> str:
+    """Trainings with one thing changed by traffics: lead over the one without a change, and failures."""
+    own = results["ablations"]
+    leads = {(row["driver"], row["traffic"]): row for row in own["comparisons"]}
+    lines = []
+    for name, changed in own["changed"].items():
+        cells = []
+        for traffic in _traffics(own):
+            row = _at(own, name, traffic)
+            cells.append(
+                _lead_and_failures({**row, **leads[name, traffic]}, "lead") if changed else _mean_and_failures(row)
+            )
+        lines.append([f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)", *cells])
+    headings = ["changed: lead; crashes, departures", *(f"`{traffic}`" for traffic in _traffics(own))]
     return Table("", headings, lines).markdown(heading=False)
 
 
@@ -181,6 +219,8 @@ SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("docs/results.md", "failures"): failures,
     ("docs/results.md", "claims"): claims,
     ("docs/results.md", "roads"): roads,
+    ("docs/results.md", "elsewhere"): elsewhere,
+    ("docs/search.md", "ablations"): ablations,
     ("docs/carry_over.md", "trainings"): trainings,
 }
 
@@ -221,7 +261,8 @@ def unsourced(text: str, results: Results) -> list[str]:
 
     A lead may be told the other way round: ``12 [10, 14]`` below as ``-12 [-14, -10]``.
     """
-    values = list(_values([results["rows"], results["comparisons"], results["roads"]["rows"]]))
+    sources = [results, *(results[name] for name in FURTHER)]
+    values = list(_values([[each["rows"], each.get("comparisons", [])] for each in sources]))
     values += [(-value, -high, -low) for value, low, high in values]
     wrong = []
     for found in _INTERVAL.finditer(text):
@@ -255,9 +296,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def load(path: Path = RESULTS) -> Results:
-    """The results of the matrix, with those of the other roads as ``roads``."""
-    matrix, on_roads = (json.loads(each.read_text(encoding="utf-8")) for each in (path, ROADS))
-    return {**matrix, "roads": on_roads}
+    """The results of the matrix, with those of :data:`FURTHER` by name."""
+    further = {name: RESULTS.parent / name / RESULTS.name for name in FURTHER}
+    matrix, *others = (json.loads(each.read_text(encoding="utf-8")) for each in (path, *further.values()))
+    return {**matrix, **dict(zip(further, others))}
 
 
 def compare_or_write(options: argparse.Namespace) -> str:

@@ -70,16 +70,33 @@ def _makes(target: Any, base: type) -> bool:
     return inspect.isclass(target) and issubclass(target, base)
 
 
+def signature_of(target: Callable[..., Any]) -> inspect.Signature:
+    """What ``target`` takes when it is called; a class: what its own constructor takes.
+
+    For a class with an ``__init__`` Python below 3.11.4 tells what a base's ``__new__`` takes, which for modules of
+    TensorDict is anything.
+    """
+    if not inspect.isclass(target):
+        return inspect.signature(target)
+    for each in target.__mro__[:-1]:
+        for name in ("__init__", "__new__"):
+            if name in vars(each):
+                taken = inspect.signature(getattr(each, name))
+                return taken.replace(parameters=list(taken.parameters.values())[1:])
+    return inspect.Signature()
+
+
 def call_with(target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str) -> Any:
     """``target(...)`` with all of ``own`` and those of ``offered`` that its signature names.
 
     Raises:
         UserError: ``own`` holds what the target does not take, or something that it needs is not there.
     """
-    parameters = inspect.signature(target).parameters
+    signature = signature_of(target)
+    parameters = signature.parameters
     arguments = {**{name: value for name, value in offered.items() if name in parameters}, **own}
     try:
-        inspect.signature(target).bind(**arguments)
+        signature.bind(**arguments)
     except TypeError as error:
         takes = ", ".join(parameters) or "nothing"
         raise UserError(

@@ -311,7 +311,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
 
 def _function(command: str) -> Callable[[Any, Path], str]:
     """The command itself: it takes its config and run folder, and returns the line that names its result."""
-    return getattr(importlib.import_module(f"ganlane.{command}"), command)
+    return getattr(importlib.import_module(f"ganlane.commands.{command}"), command)
 
 
 def _run_in(

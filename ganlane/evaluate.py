@@ -7,32 +7,13 @@
 Writes results.json and episodes.parquet (one row per episode) into its run folder.
 """
 
-from __future__ import annotations
-
 import sys
-from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 
-from ganlane.config.app import run_command
-from ganlane.config.evaluate import EvaluateConfig
-
-
-def evaluate(config: EvaluateConfig, folder: Path) -> str:
-    """Run, print and keep the table."""
-    from ganlane.build import make_drivers
-    from ganlane.compare import compare, publish
-    from ganlane.runtime import set_threads
-
-    set_threads(config.threads)
-    drivers = make_drivers(config.agents, config.env, config.device)
-    table = compare(drivers, config)
-    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
-    return publish(table, folder, asdict(config), seeds)
-
+from ganlane.config.app import imported, run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "evaluate", evaluate)
+main = partial(run_command, "evaluate", imported("ganlane.commands.evaluate:evaluate"))
 
 
 if __name__ == "__main__":

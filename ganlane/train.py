@@ -11,58 +11,13 @@ Ctrl-C (or SIGTERM) saves and ends; resume continues from there, and after a kil
 Writes agent.safetensors, metrics.csv, config.yaml, results.json and episodes.parquet into its run folder.
 """
 
-from __future__ import annotations
-
 import sys
-from dataclasses import asdict, replace
 from functools import partial
-from pathlib import Path
 
-from ganlane.config.app import Stopped, run_command
-from ganlane.config.folders import earned
-from ganlane.config.train import TrainConfig
-from ganlane.errors import UserError
-
-#: Name of the agent of this run in the table.
-TRAINED = "trained"
-
-
-def train(config: TrainConfig, folder: Path) -> str:
-    """Run the phases, then evaluate what came out."""
-    if config.resume is None and earned(folder):
-        raise UserError(f"{folder}: a run is there already; go on with resume={folder}, or give another folder.")
-    from ganlane.build import make_driver, make_drivers, make_traffic
-    from ganlane.compare import compare, publish
-    from ganlane.runtime import set_threads
-    from ganlane.training.checkpoint import LAST
-    from ganlane.training.phases import AGENT_FILE, length_if_finished, phases_of, run_phase
-
-    set_threads(config.threads)
-    for traffic in config.all_traffic():  # a mistake in any of them shows before hours of training, not after
-        make_traffic(traffic, config.env)
-    others = make_drivers(config.evaluation.agents, config.env, config.device)
-    lengths: dict[str, dict[str, float]] = {}
-    for phase in phases_of(config, folder):
-        finished = length_if_finished(config, phase)
-        if finished is not None:
-            lengths[phase.name] = finished
-            continue
-        last = phase.folder / LAST
-        resume = last if config.resume is not None and last.is_file() else None
-        result = run_phase(config.compiled(), phase, resume)
-        if result.stopped_by is not None:
-            print(f"saved; go on with: ganlane train resume={folder}", file=sys.stderr)
-            raise Stopped(result.stopped_by)
-        lengths[phase.name] = {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
-    trained = replace(make_driver(str(folder / AGENT_FILE), config.env, device=config.device), name=TRAINED)
-    table = compare([trained, *others], config.final_evaluation())
-    seeds = {"training": config.seed, "stream": "report", "episodes": [0, config.evaluation.episodes - 1]}
-    numbers = {**lengths["train"], "phases": lengths, "agent": str(folder / AGENT_FILE)}
-    return publish(table, folder, asdict(config), seeds, numbers)
-
+from ganlane.config.app import imported, run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "train", train)
+main = partial(run_command, "train", imported("ganlane.commands.train:train"))
 
 
 if __name__ == "__main__":

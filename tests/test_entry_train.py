@@ -180,7 +180,7 @@ def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monk
     def broken(*arguments, **options):
         raise PermissionError(13, "Permission denied", "results.json")
 
-    monkeypatch.setattr("ganlane.compare.compare", broken)
+    monkeypatch.setattr("ganlane.commands.train.compare", broken)
     assert main(TINY) == 2
     assert any(tmp_path.rglob("agent.safetensors"))
     assert any(tmp_path.rglob("last.pt"))

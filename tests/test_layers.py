@@ -27,12 +27,14 @@ ORDER = [
     {"build"},
     {"training"},
     {"compare", "crashes", "fit_report"},
-    {"train", "evaluate", "render", "train_generator", "prepare", "realism", "bench", "reproduce", "doctor"},
+    {"realism", "bench", "reproduce", "doctor"},
     {"options"},
     # The typed calls run the commands' own functions.
     {"api"},
     {"gym"},
-    {"sb3", "record"},
+    {"sb3"},
+    {"commands"},
+    {"train", "evaluate", "render", "record", "train_generator", "prepare"},
     {"__main__"},
 ]
 LEVEL = {part: level for level, parts in enumerate(ORDER) for part in parts}

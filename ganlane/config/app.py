@@ -6,6 +6,7 @@ stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the 
 
 from __future__ import annotations
 
+import importlib
 import os
 import select
 import signal
@@ -14,6 +15,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
 
 from ganlane.config.command_line import (
     VERSION_BASE,
@@ -37,6 +41,16 @@ from ganlane.runtime import check_process, keep_freed_memory, open_closed_stream
 
 #: What a command does with its config in its run folder; it returns a line to print last, or None.
 Task = Callable[[Any, Path], str | None]
+
+
+def imported(path: str) -> Task:
+    """The function ``module:name``, imported when it is called.
+
+    A command's module needs torch, which takes seconds to import: a mistake on the command line is reported before.
+    """
+    module, _, name = path.partition(":")
+    return lambda config, folder: getattr(importlib.import_module(module), name)(config, folder)
+
 
 USER_ERROR = 2
 #: 128 and the number of SIGPIPE, which Windows does not have.
@@ -153,9 +167,6 @@ def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) 
 
 def _hydra(command: str, task: Task, arguments: list[str]) -> None:
     """Let Hydra show the configuration, or sweep; errors come out as they are."""
-    import hydra
-    from hydra.core.hydra_config import HydraConfig
-
     register(command)
     mistakes: list[Exception] = []
     here = os.getpid()

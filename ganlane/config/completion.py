@@ -11,6 +11,12 @@ import re
 import sys
 from collections.abc import Collection, Sequence
 
+from hydra import initialize_config_dir
+from hydra._internal.core_plugins.bash_completion import BashCompletion
+from hydra.core.global_hydra import GlobalHydra
+
+from ganlane.config.command_line import VERSION_BASE
+from ganlane.config.schemas import SUFFIX, register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 
@@ -19,8 +25,6 @@ ACTIONS = ("install", "uninstall", "query")
 PROGRAM = "ganlane"
 #: Any command will do where only the script of the shell is wanted.
 _ANY = "train"
-#: Ending of the names of schemas (``ganlane.config.schemas``, which takes long to import).
-_SUFFIX = "_schema"
 #: What Hydra leaves out: zsh needs its layer for bash's completion, and bash keeps pointing at the removed function.
 _BEFORE = {
     ("install", "zsh"): "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }\n"
@@ -78,13 +82,6 @@ def candidates(line: str, commands: Collection[str]) -> list[str]:
 
 def _completed(command: str, rest: str) -> list[str]:
     """Hydra's answer for one command, without the names of schemas."""
-    from hydra import initialize_config_dir
-    from hydra._internal.core_plugins.bash_completion import BashCompletion
-    from hydra.core.global_hydra import GlobalHydra
-
-    from ganlane.config.command_line import VERSION_BASE
-    from ganlane.config.schemas import SUFFIX, register
-
     register(command)
     with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
         plugin = BashCompletion(GlobalHydra.instance().config_loader())
@@ -94,11 +91,6 @@ def _completed(command: str, rest: str) -> list[str]:
 
 def _script(action: str, shell: str) -> None:
     """Print what the shell is to evaluate."""
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-
-    from ganlane.config.command_line import VERSION_BASE
-
     print(_BEFORE.get((action, shell), ""))
     before = sys.argv
     # Hydra takes the program's name from there; python -m ganlane has the path of a module.

@@ -27,36 +27,9 @@ The modules, from the bottom up:
 - :mod:`~ganlane.realism.output`: tables, documents and figures.
 """
 
-from __future__ import annotations
+from functools import partial
 
-from collections.abc import Sequence
-from dataclasses import asdict
-from pathlib import Path
+from ganlane.config.app import imported, run_command
 
-from ganlane.config.app import run_command
-from ganlane.config.recordings import RealismConfig
-
-
-def realism(config: RealismConfig, folder: Path) -> str:
-    """Make a card: drive, measure, print and save; the line that names its results."""
-    from ganlane.evaluation import write_results
-    from ganlane.realism.card import drive_card, scenes_path
-    from ganlane.realism.output import card_text, check_targets, draw, publish, show
-    from ganlane.runtime import set_threads
-
-    config = config.shortened()
-    set_threads(config.threads)
-    path = scenes_path(config)
-    check_targets(config, path)
-    card = drive_card(config, path)
-    drawn, numbers = draw(card, folder), card.numbers()
-    if config.publish:
-        publish(card.starts)
-    show(config, folder, card_text(numbers, card.long_runs), numbers, drawn)
-    seeds = {"stream": "report", "seed": config.seed}
-    return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit status."""
-    return run_command("realism", realism, arguments)
+#: Entry point; takes the arguments of the command line, and returns the exit status.
+main = partial(run_command, "realism", imported("ganlane.commands.realism:realism"))

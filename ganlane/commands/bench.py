@@ -1,0 +1,57 @@
+"""Run a suite of benchmarks, print its tables and write them into a document."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import asdict
+from datetime import date
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from ganlane.bench.measure import Suite, measure
+from ganlane.bench.sim import SimSuite
+from ganlane.bench.traffic import TrafficSuite
+from ganlane.bench.train import TrainSuite
+from ganlane.config.bench import BenchConfig
+from ganlane.config.folders import OVERRIDES
+from ganlane.evaluation import machine_sentence, write_results
+from ganlane.evaluation.table import show
+from ganlane.files import split_at_markers, write_between_markers
+
+_SUITES: tuple[type[Suite], ...] = (SimSuite, TrafficSuite, TrainSuite)
+
+
+def bench(config: BenchConfig, folder: Path) -> str:
+    """Measure, print and save; the line that names the results."""
+    config = config.shortened()
+    markers = f"<!-- begin bench {config.suite} -->", f"<!-- end bench {config.suite} -->"
+    if config.report is not None:
+        split_at_markers(Path(config.report), *markers)
+    suite = {each.name: each for each in _SUITES}[config.suite](config)
+    for note in suite.notes:
+        print(note, file=sys.stderr, flush=True)
+    numbers = measure(suite, config.repetitions, config.seconds)
+    tables = [table for table in suite.tables(numbers["rows"], numbers) if table.lines]
+    show(*(table.text() for table in tables), columns=config.columns)
+    print()
+    for note in suite.notes:
+        print(note)
+    path = write_results(folder, numbers, asdict(config), {"seed": config.seed})
+    if config.report is not None:
+        parts = [
+            f"Written by the command on {date.today().isoformat()}:\n\n    {command_line(folder)}",
+            f"Taken on: {machine_sentence(config.threads)}",
+            *[table.markdown() for table in tables],
+            *(["\n".join(f"- {note}" for note in suite.notes)] if suite.notes else []),
+        ]
+        write_between_markers(Path(config.report), *markers, "\n" + "\n\n".join(parts) + "\n")
+    return f"results: {path}"
+
+
+def command_line(folder: Path) -> str:
+    """How the run in ``folder`` was started, without the paths in it."""
+    overrides = [str(override) for override in OmegaConf.load(folder / OVERRIDES)]
+    kept = [override for override in overrides if not override.startswith(("report=", "hydra."))]
+    return shlex.join(["python", "-m", "ganlane.bench", *kept])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -82,7 +83,8 @@ def test_a_dataset_that_is_there_is_kept(here, capsys):
 
 
 def test_without_minari_the_extra_is_named(here, capsys, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "minari.dataset.minari_storage", None)
+    monkeypatch.setitem(sys.modules, "minari.dataset.minari_storage", None)
+    monkeypatch.delitem(sys.modules, "ganlane.commands.record", raising=False)
     assert record() == 2
     assert "needs the extra 'minari'; run `pip install" in capsys.readouterr().err
     assert list(here.iterdir()) == []

@@ -120,7 +120,8 @@ def test_a_training_from_scratch_that_fails_is_named_after_the_hours_were(monkey
         returncode = 2
 
     asked = []
-    monkeypatch.setattr("ganlane.reproduce.subprocess.run", lambda command, **_: asked.append(command) or Failed)
+    run = "ganlane.commands.reproduce.subprocess.run"
+    monkeypatch.setattr(run, lambda command, **_: asked.append(command) or Failed)
     assert main([*SHORT, *SMALL, "from=scratch", "training_seeds=[4,5]"]) == 2
     error = capsys.readouterr().err
     assert "2 trainings, one after the other: about 2.2 hours on one core." in error

@@ -19,14 +19,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import gymnasium
 import numpy as np
 import torch
 
 import ganlane
-import ganlane.train
+import ganlane.commands.train
 from benchmarks.torture.damage import traceback_of
 from benchmarks.torture.tally import Tally, forked
 from ganlane.env import HighwayEnv
@@ -130,7 +130,8 @@ def _calls() -> Iterator[tuple[str, Callable[[], Any]]]:
     def train(**given: Any) -> Any:
         quick = {"total_decisions": 16, "num_envs": 4, "evaluation": {"episodes": 1}, "traffic": "idm", **given}
         # The checks, and what a command does around it: the training itself takes seconds.
-        with patch.object(ganlane.train, "train", lambda config, folder: (_ for _ in ()).throw(UserError("stopped"))):
+        stopped = Mock(side_effect=UserError("stopped"))
+        with patch.object(ganlane.commands.train, "train", stopped):
             return ganlane.api.train(**quick)
 
     def evaluate(**given: Any) -> Any:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import torch
 
-import ganlane.compare
+import ganlane.commands.train
 import ganlane.generator.checkpoint
 import ganlane.traffic.presets
 import ganlane.training.phases
@@ -205,7 +205,7 @@ def dies_in_evaluation(after_s: float, number: int = signal.SIGKILL) -> Callable
     """Makes a child get a signal ``after_s`` seconds after its final evaluation has begun."""
 
     def prepare() -> None:
-        compare = ganlane.compare.compare
+        compare = ganlane.commands.train.compare
 
         def watched(*arguments: object, **options: object) -> object:
             parent = os.getpid()
@@ -215,6 +215,6 @@ def dies_in_evaluation(after_s: float, number: int = signal.SIGKILL) -> Callable
                 os._exit(0)
             return compare(*arguments, **options)
 
-        ganlane.compare.compare = watched
+        ganlane.commands.train.compare = watched
 
     return prepare

@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 from reference.recordings import ngsim_rows, portal_csv, traffic, write_highd
 
+from ganlane.commands.prepare import long_report, short_report
 from ganlane.data import (
     PooledStatistics,
     Scene,
@@ -25,7 +26,6 @@ from ganlane.data.prepare import whole_folder
 from ganlane.data.scenes import cut_into_scenes
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
-from ganlane.prepare import long_report, short_report
 
 TOO_LONG = "s" * 300
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from ganlane.agents import read_agent
@@ -20,9 +21,11 @@ from ganlane.config.folders import OVERRIDES
 from ganlane.crashes import find_crashes, write_crashes
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results
+from ganlane.evaluation.table import Table
 from ganlane.reproduce import figures as papers
 from ganlane.reproduce import numbers, report
 from ganlane.reproduce.matrix import available, cells_of, drive, read_cells
+from ganlane.reproduce.numbers import Row
 from ganlane.runtime import set_threads
 
 #: Hours that one training of the paper's schedule took, on one core.
@@ -50,33 +53,15 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         config = trained_from_scratch(config)
     report.read_transfers(config.runs, [])  # a folder that cannot be read shows before hours of driving
     traffics, missing = available(config)
-    _say_left_out(missing)
+    _print_left_out(missing)
     cells = cells_of(config, traffics)
     drive(cells, config)
     episodes, revisions, seconds = read_cells(cells)
     by_recipe = numbers.by_recipe(episodes)
     rows, compared = numbers.rows(by_recipe), numbers.comparisons(by_recipe, _pairs(by_recipe))
-    tables = {
-        "table_vi": report.table_vi(rows),
-        "table_vii": report.table_vii(rows),
-        "comparisons": report.comparison_table(compared),
-        "matrix": report.matrix_table(rows),
-    }
-    drawn = papers.draw_all(config, traffics)
-    _say_left_out(drawn.missing)
-    missing |= drawn.missing
-    figures = {"matrix": report.draw_matrix(rows), **drawn.figures}
-    for name, frame in drawn.numbers.items():
-        report.write_csv(folder / f"{name}.csv", frame.to_dicts())
-    transfer = report.read_transfers(config.runs, rows)
-    if transfer is not None:
-        figures["figure_4"] = report.draw_transfer(transfer)
-        curves = [{"run": name, **row} for name, frame in transfer.runs.items() for row in frame.to_dicts()]
-        report.write_csv(folder / "figure_4.csv", curves)
-    for name in ("table_vi", "table_vii"):
-        report.write_csv(folder / f"{name}.csv", tables[name])
-    report.write_csv(folder / "matrix.csv", rows)
-    report.write_csv(folder / "comparisons.csv", compared)
+    tables = _tables(rows, compared, folder)
+    figures, not_drawn = _figures(config, traffics, rows, folder)
+    missing |= not_drawn
     counts = ", ".join(f"{config.episodes_on(name)} on {name}" for name in traffics)
     intro = [
         f"Episodes of seed {config.seed}, the same for all drivers: {counts}. Intervals are 95 %: over trainings, "
@@ -88,6 +73,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     page = report.write_report(folder, tables, figures, intro)
     for table in tables.values():
         print(table.text(), end="\n\n")
+    _list_crashes(episodes, config, folder)
     record = {
         "command": command_line(folder),
         "rows": rows,
@@ -97,17 +83,43 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "seconds": seconds,
         "cells": {"revisions": revisions, "files": {f"{c.driver} on {c.traffic}": c.path.name for c in cells}},
     }
-    seeds = {
-        "stream": config.stream,
-        "seed": config.seed,
-        "episodes": {name: config.episodes_on(name) for name in traffics},
+    driven = {name: config.episodes_on(name) for name in traffics}
+    seeds = {"stream": config.stream, "seed": config.seed, "episodes": driven}
+    return f"report: {page}; results: {write_results(folder, record, asdict(config), seeds)}"
+
+
+def _tables(rows: list[Row], compared: list[Row], folder: Path) -> dict[str, Table]:
+    """The tables of the report by name; the rows behind them as CSV files in ``folder``."""
+    tables = {
+        "table_vi": report.table_vi(rows),
+        "table_vii": report.table_vii(rows),
+        "comparisons": report.comparison_table(compared),
+        "matrix": report.matrix_table(rows),
     }
-    _list_crashes(episodes, config, folder)
-    results = write_results(folder, record, asdict(config), seeds)
-    return f"report: {page}; results: {results}"
+    files: dict[str, Any] = {**tables, "comparisons": compared, "matrix": rows}
+    for name, lines in files.items():
+        report.write_csv(folder / f"{name}.csv", lines)
+    return tables
 
 
-def _say_left_out(missing: Mapping[str, str]) -> None:
+def _figures(
+    config: ReproduceConfig, traffics: Mapping[str, Any], rows: list[Row], folder: Path
+) -> tuple[dict[str, Figure], dict[str, str]]:
+    """The figures of the report by name, and why others are missing; the numbers behind each as a CSV file."""
+    drawn = papers.draw_all(config, traffics)
+    _print_left_out(drawn.missing)
+    figures = {"matrix": report.draw_matrix(rows), **drawn.figures}
+    for name, frame in drawn.numbers.items():
+        report.write_csv(folder / f"{name}.csv", frame.to_dicts())
+    transfer = report.read_transfers(config.runs, rows)
+    if transfer is not None:
+        figures["figure_4"] = report.draw_transfer(transfer)
+        curves = [{"run": name, **row} for name, frame in transfer.runs.items() for row in frame.to_dicts()]
+        report.write_csv(folder / "figure_4.csv", curves)
+    return figures, drawn.missing
+
+
+def _print_left_out(missing: Mapping[str, str]) -> None:
     for name, reason in missing.items():
         print(f"left out, {name}: {reason}", file=sys.stderr)
 

@@ -1,4 +1,4 @@
-"""The state of a run, from which everything else of it follows, and the checkpoint that resumes it."""
+"""The complete state of a training run, and the checkpoint that resumes it."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from ganlane.training.stats import EpisodeStats
 
 KIND = "ganlane training checkpoint"
 VERSION = 2
-#: Names in the checkpoints of version 0.1, and today's.
+#: Names in checkpoints of version 0.1, and their present names.
 RENAMED = {"carrier": "env_state", "meter": "stats", "owed": "pending_decisions"}
-#: Key of an identity for the defaults of its options.
+#: Key of an identity that holds the defaults of its options.
 DEFAULTS = "defaults"
-#: Parts of an identity that may change when a run is resumed, bit-exact only if they do not: how it is computed.
+#: Parts of an identity that may change when a run is resumed; the run is bit-exact only if they do not.
 COMPUTED_BY = ("env.compile",)
-#: A checkpoint that took t seconds to write is followed by the next after 50 t at the earliest: 2 % of the time.
+#: After a checkpoint that took t seconds to write, the next comes after 50 t at the earliest: 2 % of the time.
 PATIENCE = 50.0
-#: Parts of a checkpoint whose numbers are always finite.
+#: Parts of a checkpoint in which every number must be finite.
 FINITE = ("network", "target", "optimizer", "replay", "window", "stats")
 
 
 class TrainingState:
     """State of a run of ``agent`` in ``env``, batch [N].
 
-    ``pending_decisions`` are not yet paid for by an update; ``best`` is the best evaluation so far, ``evaluated_at``
-    the decisions at the last one. ``identity`` is plain data that a resumed run must share: environment, traffic,
-    reward, seed; under :data:`DEFAULTS`, which is not saved, the defaults of its options by dotted name, for the
-    options that an older run does not name.
+    ``pending_decisions`` counts decisions whose updates are still due; ``best`` is the best evaluation so far,
+    ``evaluated_at`` the decisions at the last one. ``identity`` is plain data that a resumed run must share:
+    environment, traffic, reward, seed. Its entry :data:`DEFAULTS`, which is not saved, holds the defaults of options
+    by dotted name, for options that did not exist when an older run was started.
     """
 
     def __init__(self, env: EnvBase | Collector, agent: Rainbow, identity: Mapping[str, Any] | None = None) -> None:
@@ -56,7 +56,7 @@ class TrainingState:
 
     @property
     def wall_s(self) -> float:
-        """Seconds of training, earlier stretches included."""
+        """Seconds of training, including those before the run was resumed."""
         return self._before_s + time.monotonic() - self._started_s
 
     def passed(self, every: int) -> bool:
@@ -66,8 +66,8 @@ class TrainingState:
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Tensors and plain data.
 
-        Without the replay buffer it is small, and of the environments only the episodes are kept: a resumed run
-        starts the next ones, and is not bit-exact. So it is with a collector that cannot be resumed exactly.
+        Without the replay buffer the state is small and holds only the episode numbers of the environments: a
+        resumed run starts the next episodes and is not bit-exact. The same holds for collectors that are not exact.
         """
         exact = with_replay and self.collector.exact
         return {
@@ -85,13 +85,13 @@ class TrainingState:
         }
 
     def restore(self, path: str | Path) -> str | None:
-        """Go on from the checkpoint of a run with as many environments and the same agent.
+        """Load the checkpoint of a run with as many environments and the same agent.
 
         Returns:
-            None where the rest of the run is the one it would have been, else what it has to do without.
+            None if the run continues bit for bit, else what could not be restored.
 
         Raises:
-            UserError: unreadable, or of another run.
+            UserError: the checkpoint is unreadable, or of another run.
         """
         state = load_checkpoint(path, self.agent.device)
         parts = {"agent", "window", "env_state", "stats", "counters", "identity"}
@@ -104,7 +104,7 @@ class TrainingState:
             missing = self._take_over(state, path)
         except UserError:
             raise
-        except Exception as error:  # what a part can be instead of what it was has no end
+        except Exception as error:  # damaged parts can fail in any way
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(
                 f"resume={path}: a part of the run is damaged in it ({reason}); give another checkpoint."
@@ -112,7 +112,7 @@ class TrainingState:
         return missing
 
     def _take_over(self, state: Mapping[str, Any], path: str | Path) -> str | None:
-        """Everything from ``state``; see :meth:`restore`."""
+        """Restore everything from ``state``; see :meth:`restore`."""
         exact = state["window"] is not None
         fresh, shape = self.collector.state_dict(exact), state["env_state"]["batch_size"]
         if isinstance(shape, list) and shape != fresh["batch_size"]:
@@ -134,12 +134,12 @@ class TrainingState:
         return None if exact else "the episodes that were under way: the workers begin the next ones"
 
     def _refuse_another_run(self, path: str | Path, saved: Mapping[str, Any]) -> None:
-        """Raise :class:`UserError` where the run with identity ``saved`` is not this one."""
-        theirs, ours = (flat({**self.defaults, **flat(one)}) for one in (saved, self.identity))
-        for name in (*ours, *theirs):
-            if name not in COMPUTED_BY and theirs.get(name) != ours.get(name):
+        """Raise :class:`UserError` unless ``saved`` is the identity of this run."""
+        before, now = (flat({**self.defaults, **flat(each)}) for each in (saved, self.identity))
+        for name in (*now, *before):
+            if name not in COMPUTED_BY and before.get(name) != now.get(name):
                 raise UserError(
-                    f"resume={path}: {name}={ours.get(name)}, but the run was started with {theirs.get(name)}; "
+                    f"resume={path}: {name}={now.get(name)}, but the run was started with {before.get(name)}; "
                     "go on with that, or start a new run."
                 )
 
@@ -150,9 +150,9 @@ class Checkpointer:
     Args:
         state: to be saved.
         folder: of the run.
-        every_s: seconds between two checkpoints, at least.
-        with_replay: whether they hold the replay buffer.
-        metadata: goes into the agent's files; what is known of the training is added under ``training``.
+        every_s: least seconds between two checkpoints.
+        with_replay: save the replay buffer too.
+        metadata: for the agent's files; the progress of the training is added under ``training``.
     """
 
     def __init__(
@@ -163,11 +163,11 @@ class Checkpointer:
         self.saved_s, self.pause_s = time.monotonic(), every_s
 
     def due(self) -> bool:
-        """Whether it is time for the next checkpoint."""
+        """Whether the next checkpoint is due."""
         return time.monotonic() - self.saved_s > self.pause_s
 
     def save(self) -> None:
-        """Write the checkpoint and the present weights."""
+        """Write the checkpoint and the current weights."""
         begun = time.monotonic()
         save_checkpoint(self.path, self.state.state_dict(self.with_replay))
         self.save_weights("last", {})
@@ -177,8 +177,8 @@ class Checkpointer:
     def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
         """Write the online network as ``NAME.safetensors``, with ``figures`` in its metadata."""
         state = self.state
-        known = {"decisions": state.decisions, "updates": state.agent.updates, "wall_s": state.wall_s}
-        training = {**self.metadata.get("training", {}), **known, **figures}
+        progress = {"decisions": state.decisions, "updates": state.agent.updates, "wall_s": state.wall_s}
+        training = {**self.metadata.get("training", {}), **progress, **figures}
         save_agent(self.path.with_name(f"{name}.safetensors"), state.agent, {**self.metadata, "training": training})
 
 
@@ -190,18 +190,18 @@ def save_checkpoint(path: str | Path, state: Any) -> None:
 
 
 def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: str = "resume") -> Any:
-    """Read what :func:`save_checkpoint` wrote, under today's names; never executes code.
+    """Read a file of :func:`save_checkpoint`, with present names; never executes code.
 
-    A file of a version that wrote no checksum is read, too (:func:`note_without_checksum`).
+    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`).
 
     Args:
         path: of the file.
         device: for its tensors.
-        key: of the command line that gave ``path``.
+        key: the configuration key of ``path``, for error messages.
 
     Raises:
-        UserError: absent, damaged in any byte, with weights that are not finite, or no training checkpoint of this
-            version.
+        UserError: the file is absent, damaged in any byte, holds weights that are not finite, or is no training
+            checkpoint of this version.
     """
     path, given = Path(path), f"{key}={path}"
     if not path.is_file():
@@ -211,7 +211,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
         whole = not empty and has_checksum(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), given)
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # foreign bytes can make the unpickler fail in any way
+    except Exception as error:  # arbitrary bytes can make the unpickler fail in any way
         raise UserError(
             f"{given}: not a readable checkpoint (truncated, or not written by ganlane); give another one."
         ) from error
@@ -219,7 +219,7 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
         raise UserError(f"{given}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
     if not whole and "sealed" in content:
         raise UserError(f"{given}: damaged, the checksum that was written with it is missing; give another one.")
-    state = _renamed(content.get("state"))  # whether a run can go on from it, the run knows
+    state = _renamed(content.get("state"))  # :meth:`TrainingState.restore` checks the parts
     if isinstance(state, dict) and "counters" in state:
         state["counters"] = _renamed(state["counters"])
     agent = state.get("agent") if isinstance(state, dict) else None
@@ -246,7 +246,7 @@ def _renamed(names: Any) -> Any:
 
 
 def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested plain data as dotted names; tuples as lists, which is how they come back from a file."""
+    """Nested plain data by dotted name; tuples become lists, as when read from a file."""
     names: dict[str, Any] = {}
     for name, value in nested.items():
         if isinstance(value, Mapping) and value:

@@ -1,8 +1,8 @@
-"""Where the steps come from: one decision of all environments at a time, in the order of time.
+"""Collectors: each step is one decision of all environments, in order of time.
 
-The loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the environments in this process;
-in :mod:`ganlane.training.overlap` worker processes do, while the loop learns. Runs with these two can be resumed to
-the same bits. The collectors of :mod:`ganlane.training.workers` are TorchRL's, in worker processes.
+The training loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the environments in this
+process; with :mod:`ganlane.training.overlap` worker processes step them while the loop updates. Runs with these two
+resume bit for bit. The collectors of :mod:`ganlane.training.workers` wrap TorchRL's, in worker processes.
 """
 
 from __future__ import annotations
@@ -23,45 +23,45 @@ class Collector(ABC):
 
     #: N, over all processes.
     environments: int
-    #: Whether a resumed run is the one it would have been, bit for bit.
+    #: Whether a run resumes bit for bit.
     exact: bool
-    #: Whether the loop learns between :meth:`begin` and :meth:`step`, and not after them.
+    #: Whether the loop makes its updates between :meth:`begin` and :meth:`step` rather than after both.
     overlaps: bool = False
 
-    def open(self, agent: Rainbow) -> None:  # noqa: B027 (nothing to do unless there are workers)
-        """Start what collecting needs; :meth:`step` does it otherwise.
+    def open(self, agent: Rainbow) -> None:  # noqa: B027 (optional)
+        """Start workers, if any; otherwise the first :meth:`step` does.
 
         Raises:
-            UserError: it cannot be started.
+            UserError: they cannot be started.
         """
 
-    def begin(self, agent: Rainbow) -> None:  # noqa: B027 (for those that overlap)
-        """Set out on the next step with the agent's present weights, and come back before it is made."""
+    def begin(self, agent: Rainbow) -> None:  # noqa: B027 (optional)
+        """Start the next step with the agent's current weights and return without waiting for it."""
 
     @abstractmethod
     def step(self, agent: Rainbow) -> TensorDictBase:
         """One decision of every environment, batch [N], on the agent's device.
 
-        Row i of a step continues row i of the last one; ``next`` is what followed before any reset.
+        Row i of a step continues row i of the last one; ``next`` is the outcome before any reset.
         """
 
     @abstractmethod
     def state_dict(self, exact: bool) -> dict[str, Any]:
-        """Tensors and plain data to go on from: ``exact``, or with the episodes after the present ones."""
+        """Tensors and plain data to continue from: bit for bit if ``exact``, else with the next episodes."""
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Go on from :meth:`state_dict`, made with environments of the same shape."""
+        """Continue from :meth:`state_dict` of environments of the same shape."""
 
     def close(self) -> None:  # noqa: B027
-        """End what was started for collecting; again does no harm."""
+        """Stop all workers; may be called again."""
 
 
 class SingleCollector(Collector):
     """``collector=single``: steps ``env``, batch [N], in this process.
 
-    ``env_state`` is the TensorDict that takes the environments' state from step to step. TorchRL's own ``Collector``
-    would keep it to itself; here it is saved, and a resumed run is exact.
+    ``env_state`` is the TensorDict with the environments' state. TorchRL's ``Collector`` does not expose it; here it
+    is saved, so that a resumed run is exact.
     """
 
     exact = True
@@ -72,18 +72,18 @@ class SingleCollector(Collector):
             self.env_state: TensorDictBase = env.reset()
 
     def step(self, agent: Rainbow) -> TensorDictBase:
-        """One decision; environments that ended start afresh in ``env_state``, not in the step."""
+        """One decision; ended environments are reset in ``env_state``, not in the returned step."""
         decided = agent.policy(self.env_state)
         with threads_for(self.env):
             step, self.env_state = self.env.step_and_maybe_reset(decided)
         return step
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
-        """The state of the environments, or of it the episodes alone."""
+        """The state of the environments; unless ``exact``, only their episode numbers."""
         return pack(self.env_state if exact else self.env_state.select(keys.SEED, keys.EPISODE, strict=False))
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Take over the state, or begin the episodes after those of ``state``, the first ones if it has none."""
+        """Restore the state; unless ``exact``, begin the episodes after those of ``state``, if it has any."""
         saved = unpack(state)
         if exact:
             self.env_state = saved
@@ -94,7 +94,7 @@ class SingleCollector(Collector):
 
 
 def pack(tensordict: TensorDictBase) -> dict[str, Any]:
-    """A TensorDict as plain data, nested batch sizes included."""
+    """A TensorDict as plain data, with its (nested) batch sizes."""
     leaves = {key: pack(value) if isinstance(value, TensorDictBase) else value for key, value in tensordict.items()}
     return {"batch_size": list(tensordict.batch_size), "items": leaves}
 

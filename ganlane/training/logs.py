@@ -1,4 +1,4 @@
-"""Where the figures of a run go: CSV files and the progress always, TensorBoard or Weights & Biases if asked for."""
+"""Logs of a training run: CSV files and progress; optionally TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from ganlane.config.train import LoggerConfig
 from ganlane.errors import UserError
 from ganlane.files import atomic_path
 
-#: Columns of ``metrics.csv``; an action's share follows for each action.
+#: Columns of ``metrics.csv``; the share of each action follows.
 COLUMNS = (
     *("decisions", "updates", "wall_s", "decisions_per_s", "episodes"),
     *("mean_return", "mean_discounted_return", "mean_return_to_go", "mean_value"),
     *("goal_rate", "crash_rate", "out_of_road_rate", "timeout_rate", "lane_changes_per_km"),
     *("loss", "mean_q", "clamped_fraction", "priority", "gradient_norm", "sigma", "epsilon"),
 )
-#: Figures shown with the rate, and their format.
+#: Figures of the progress, and their formats.
 SHOWN = {
     "mean_return": "return {:.1f}",
     "crash_rate": "crashes {:.1%}",
     "out_of_road_rate": "off the road {:.1%}",
     "goal_rate": "goals {:.1%}",
 }
-#: The bar: the rate is that of the last seconds, the time left follows from it.
+#: Format of the bar; rate and remaining time are those of the last seconds.
 BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} decisions, {rate_noinv_fmt}, {remaining} left{postfix}"
 
 
 class Log(Protocol):
-    """Takes rows of figures, one per logging interval."""
+    """Receives a row of figures per logging interval."""
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Keep one row; it holds ``decisions``."""
+        """Write one row; it holds ``decisions``."""
 
     def close(self) -> None:
-        """Finish."""
+        """Close the log."""
 
 
 class Logs:
@@ -50,9 +50,9 @@ class Logs:
     Args:
         folder: of the run.
         actions: A, for the columns of their shares.
-        decisions: where the run starts (a resumed one).
-        total: decisions of the whole run, for the progress; None shows no progress.
-        further: more logs for the rows of ``metrics.csv`` and of the evaluations.
+        decisions: already made (in a resumed run).
+        total: decisions of the whole run, for the progress; None: no progress is shown.
+        further: further logs of the rows of ``metrics.csv`` and of the evaluations.
     """
 
     def __init__(
@@ -65,12 +65,12 @@ class Logs:
         self.further = list(further)
         self.of_metrics: list[Log] = [metrics, *([] if self.progress is None else [self.progress]), *further]
         before = read_rows(self.evaluation_file)
-        if before:  # of a resumed run; rows beyond its checkpoint go
+        if before:  # a resumed run: remove rows beyond its checkpoint
             CsvLog(self.evaluation_file, list(before[0]), decisions).close()
         self._last, self._last_s = decisions, monotonic()
 
     def write(self, row: Mapping[str, float]) -> None:
-        """A row of metrics; the rate since the last one is added."""
+        """Write a row of metrics, with the decisions per second since the last one."""
         now = monotonic()
         rate = (row["decisions"] - self._last) / max(now - self._last_s, 1e-9)
         self._last, self._last_s = int(row["decisions"]), now
@@ -78,7 +78,7 @@ class Logs:
             log.write({**row, "decisions_per_s": rate})
 
     def write_evaluation(self, row: Mapping[str, float]) -> None:
-        """A row of evaluation figures, in place of one that a run made here before it was stopped and resumed."""
+        """Write a row of evaluation figures, replacing one at the same decisions from before the run was resumed."""
         evaluation = CsvLog(self.evaluation_file, list(row), int(row["decisions"]) - 1)
         evaluation.write(row)
         evaluation.close()
@@ -91,23 +91,23 @@ class Logs:
             self.progress.advance(decisions)
 
     def say(self, text: str) -> None:
-        """A line to the user, above the bar if there is one."""
+        """Print a line, above the bar if there is one."""
         tqdm.write(text, file=sys.stderr)
 
     def close(self) -> None:
-        """Close all of them."""
+        """Close all logs."""
         for log in self.of_metrics:
             log.close()
 
 
 class CsvLog:
-    """A CSV file with fixed columns, one line per row, complete after every row.
+    """A CSV file with fixed columns, flushed after every row.
 
     Args:
-        path: the file; if it exists, its whole rows up to ``decisions`` are kept: a resumed run continues where the
-            checkpoint was made, not where the interrupted run had got to.
-        columns: in this order; a row's other entries are dropped, missing ones left empty.
-        decisions: where the run starts.
+        path: the file; if it exists, its complete rows up to ``decisions`` are kept: a resumed run continues at its
+            checkpoint, not where it was interrupted.
+        columns: in this order; other entries of a row are dropped, missing ones left empty.
+        decisions: already made.
     """
 
     def __init__(self, path: str | Path, columns: Sequence[str], decisions: int = 0) -> None:
@@ -133,19 +133,19 @@ class CsvLog:
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV file that :class:`CsvLog` wrote; none if it is absent.
+    """Rows of a CSV file of :class:`CsvLog`; none if it is absent.
 
-    A row that a full disk or a kill has torn is left out: its last figure may have lost digits.
+    A row cut off by a full disk or a kill is left out, since its last figure may lack digits.
 
     Raises:
-        UserError: it holds something else than numbers.
+        UserError: an entry is not a number.
     """
     if not path.is_file():
         return []
     try:
         with path.open(newline="", encoding="utf-8") as file:
             whole = [line for line in file if line.endswith("\n")]
-        # DictReader gives what a short row lacks as None, and what a long one has too much under None.
+        # DictReader gives missing entries of a short row as None, and surplus ones of a long row under the key None.
         rows = [row for row in csv.DictReader(whole) if None not in row and None not in row.values()]
         if whole and "decisions" not in next(csv.reader(whole)):
             raise ValueError("it has no column 'decisions'")
@@ -163,14 +163,14 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 class Progress:
-    """Shows decisions per second, time left, mean return and ends of the episodes: a bar, or a line per row.
+    """Shows decisions per second, remaining time, mean return and ends of episodes: a bar, or a line per row.
 
-    Figures that a row lacks, since no episode ended in its interval, are shown as they were last.
+    Figures that a row lacks, because no episode ended in its interval, keep their last value.
 
     Args:
         total: decisions of the whole run.
         done: decisions already made (a resumed run).
-        stream: where to; a terminal gets the bar.
+        stream: to write to (default stderr); a terminal gets the bar.
     """
 
     def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
@@ -187,7 +187,7 @@ class Progress:
             self._bar.update(decisions - self._bar.n)
 
     def write(self, row: Mapping[str, float]) -> None:
-        """Show the figures of one row."""
+        """Show a row of figures."""
         self.known |= {name: row[name] for name in SHOWN if name in row}
         shown = [form.format(self.known[name]) for name, form in SHOWN.items() if name in self.known]
         if self._bar is not None:
@@ -199,7 +199,7 @@ class Progress:
         print(", ".join([head, *shown]), file=self.stream, flush=True)
 
     def close(self) -> None:
-        """Leave the bar as it is."""
+        """Stop updating the bar and leave it on the screen."""
         if self._bar is not None:
             self._bar.close()
 
@@ -212,10 +212,10 @@ def duration(seconds: float) -> str:
 
 
 def make_logs(options: LoggerConfig, folder: str | Path, about: Mapping[str, Any] | None = None) -> list[Log]:
-    """The further logs that ``logger=...`` asks for; ``about``: JSON-serialisable settings of the run, to be shown.
+    """The logs of ``logger=...`` beyond the CSV files; ``about``: JSON-serialisable settings of the run, for display.
 
     Raises:
-        UserError: the package that one of them needs is not installed.
+        UserError: a package is not installed.
     """
     if options.kind == "tensorboard":
         return [TensorBoardLog(Path(folder) / "tensorboard")]
@@ -252,8 +252,8 @@ class WandbLog:
     """A run of Weights & Biases below ``folder/wandb`` (extra ``wandb``), named after ``folder``'s last two parts.
 
     Offline, unless the environment variable ``WANDB_MODE`` asks for something else (``online``, ``disabled``);
-    ``wandb sync FOLDER/wandb/offline-run-*`` uploads it later. A resumed training run is a further run there, which
-    starts at the decisions of the checkpoint. ``about`` are JSON-serialisable settings, shown with the figures.
+    ``wandb sync FOLDER/wandb/offline-run-*`` uploads it later. A resumed training is a new run there that starts at
+    the decisions of the checkpoint. ``about`` holds JSON-serialisable settings, shown with the figures.
 
     Raises:
         UserError: wandb is not installed, or does not start (``WANDB_MODE=online`` without an account, for instance).
@@ -272,7 +272,7 @@ class WandbLog:
         name = "/".join(folder.absolute().parts[-2:])
         options: dict[str, Any] = {"project": project, "name": name, "dir": str(folder), "mode": mode}
         try:
-            # Without W&B's console, which would take the progress bar's stream away.
+            # W&B's console would capture the stream of the progress bar.
             settings = wandb.Settings(console="off")
             self._run = wandb.init(config=dict(about or {}), settings=settings, **options)
         except (wandb.Error, ValueError) as error:
@@ -287,5 +287,5 @@ class WandbLog:
         self._run.log(figures, step=int(row["decisions"]))
 
     def close(self) -> None:
-        """Write out what is left."""
+        """Flush and close."""
         self._run.finish()

@@ -22,18 +22,18 @@ from ganlane.training.collectors import Collector
 from ganlane.training.logs import Log, Logs
 from ganlane.training.signals import StopRequest
 
-#: Drives the greedy policy through fixed episodes and returns figures.
+#: Evaluates the greedy policy on fixed episodes and returns its figures by name.
 Evaluate = Callable[[GreedyPolicy], Mapping[str, float]]
 
 
 @dataclass(frozen=True)
 class TrainingConfig(Record):
-    """Length and schedule of a run. ``*_every`` count decisions over all environments; 0 is never.
+    """Length and schedule of a run. ``*_every`` count decisions over all environments; 0 means never.
 
-    A checkpoint is written ``checkpoint_every_s`` seconds after the last one, later if writing takes long: never
-    more than 2 % of the time. ``checkpoint_replay`` includes the replay buffer, without which a resumed run has to
-    fill it again and is not bit-exact. ``best_metric`` is the figure of the evaluation by which the best agent is
-    kept. ``progress`` shows a bar on a terminal and lines elsewhere.
+    A checkpoint is written ``checkpoint_every_s`` seconds after the last one, later if writing is slow, so that it
+    takes at most 2 % of the time. ``checkpoint_replay`` includes the replay buffer; without it a resumed run fills
+    the buffer again and is not bit-exact. ``best_metric`` is the figure of the evaluation that selects the best
+    agent. ``progress`` shows a bar on a terminal and lines elsewhere.
     """
 
     total_decisions: Count
@@ -47,10 +47,10 @@ class TrainingConfig(Record):
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """How a run ended.
+    """Result of a run.
 
-    ``stopped_by`` is the number of the signal that stopped it early, or None; an entry point then exits with 128
-    more. ``best`` is the best evaluation's ``best_metric``. ``checkpoint`` is where to resume from.
+    ``stopped_by`` is the number of the signal that stopped it early, or None. ``best`` is the ``best_metric`` of the
+    best evaluation. ``checkpoint`` is the file to resume from.
     """
 
     decisions: int
@@ -72,20 +72,20 @@ def train(
     resume: str | Path | None = None,
     identity: Mapping[str, Any] | None = None,
 ) -> TrainingResult:
-    """Train ``agent`` in ``env`` until all decisions are made or a signal asks to stop; leave a checkpoint.
+    """Train ``agent`` in ``env`` until all decisions are made or a signal stops it; write a checkpoint at the end.
 
     Args:
-        env: batch [N], writes ``observation`` and ``reward``; its state must travel in the TensorDict for a resumed
-            run to be exact. Or a collector (:mod:`ganlane.training.collectors`), which the caller closes.
+        env: batch [N], writes ``observation`` and ``reward``; a resumed run is exact only if all of its state is in
+            the TensorDict. Or a collector (:mod:`ganlane.training.collectors`), which the caller closes.
         agent: trained in place.
         config: length and schedule.
         run_folder: gets ``metrics.csv``, ``evaluation.csv`` and ``checkpoints/{last.pt, last, best.safetensors}``.
         evaluate: called with the greedy policy every ``config.evaluate_every`` decisions.
         logs: logs in addition to the CSV files and the progress.
         metadata: JSON-serialisable, written into the agent's files, e.g. the name of the observation.
-        resume: checkpoint to go on from.
-        identity: plain data that makes the run what it is (environment, traffic, reward, seed); a run with another
-            one is not resumed (:class:`~ganlane.training.checkpoint.TrainingState`).
+        resume: checkpoint to continue from.
+        identity: plain data that identifies the run (environment, traffic, reward, seed); a checkpoint with another
+            identity is refused (:class:`~ganlane.training.checkpoint.TrainingState`).
 
     Raises:
         UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not evaluated.
@@ -100,7 +100,7 @@ def train(
             log.say(f"resumed without {missing}; not bit-exact")
         state.collector.open(agent)
         if state.decisions == 0:
-            saver.save()  # so that there is something to go on from, whenever the run is killed
+            saver.save()  # a run that is killed at any time can be resumed
         with StopRequest() as stop:
             while state.decisions < config.total_decisions and stop.signal is None:
                 advance(state)
@@ -118,9 +118,9 @@ def train(
 
 
 def advance(state: TrainingState) -> TensorDictBase:
-    """One decision of every environment, [N], stored, and the updates that it pays for.
+    """Make one decision of every environment, [N], store it, and make the updates that are due.
 
-    With a collector that overlaps the updates are those of the decisions before, made while it collects.
+    With an overlapping collector the updates due from the decisions before are made while it collects.
     """
     agent, overlaps = state.agent, state.collector.overlaps
     step = collect(state, partial(learn, state) if overlaps else None)
@@ -131,7 +131,7 @@ def advance(state: TrainingState) -> TensorDictBase:
 
 
 def collect(state: TrainingState, meanwhile: Callable[[], None] | None = None) -> TensorDictBase:
-    """One decision of every environment, batch [N]; ``meanwhile`` is called while they are under way."""
+    """One decision of every environment, batch [N]; ``meanwhile`` is called while the environments step."""
     agent, collector = state.agent, state.collector
     agent.anneal(state.decisions)
     collector.begin(agent)
@@ -145,7 +145,7 @@ def collect(state: TrainingState, meanwhile: Callable[[], None] | None = None) -
 
 
 def learn(state: TrainingState) -> None:
-    """As many updates as the decisions since the last one pay for; none before the buffer is full enough."""
+    """Make the updates that are due, one per ``decisions_per_update``; none until the agent is ready (``warmup``)."""
     agent = state.agent
     if not agent.ready:
         return
@@ -156,14 +156,14 @@ def learn(state: TrainingState) -> None:
 
 
 def metrics(state: TrainingState) -> dict[str, float]:
-    """A row of metrics, read from the device."""
+    """A row of metrics, copied from the device."""
     agent = state.agent
     row = {"decisions": state.decisions, "updates": agent.updates, "wall_s": state.wall_s, **state.stats.read()}
     return row | {"sigma": float(agent.sigma()), "epsilon": agent.policy.epsilon}
 
 
 def keep_best(state: TrainingState, evaluate: Evaluate, best_metric: str, log: Logs, saver: Checkpointer) -> None:
-    """Evaluate the greedy policy and keep the best agent so far."""
+    """Evaluate the greedy policy; save it if it is the best so far."""
     state.evaluated_at = state.decisions
     row = dict(evaluate(state.agent.greedy))
     log.write_evaluation({"decisions": state.decisions, **row})
@@ -173,4 +173,4 @@ def keep_best(state: TrainingState, evaluate: Evaluate, best_metric: str, log: L
     if state.best is None or row[best_metric] > state.best:
         state.best = row[best_metric]
         saver.save_weights("best", row)
-        saver.save()  # a resumed run must know of the best, or a worse one could take its place
+        saver.save()  # else a resumed run could replace the best agent by a worse one

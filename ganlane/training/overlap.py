@@ -1,10 +1,10 @@
-"""``collector=overlap``: processes drive the environments while this one learns, with a barrier at every step.
+"""``collector=overlap``: worker processes step the environments while this process learns, with a barrier per step.
 
-:meth:`OverlapCollector.begin` chooses the actions of all environments here, with the present weights, and sends them
-to the workers; the loop then makes the updates that the steps before have paid for, and :meth:`OverlapCollector.step`
-waits for the slowest worker. So the actions come from weights that lack the updates of one step, which
-``collector=single`` would have made before. Nothing depends on which side is faster, and between two steps nothing is
-under way: a run gives the same bits every time, and so does one that was stopped there and resumed.
+:meth:`OverlapCollector.begin` chooses the actions of all environments with the current weights and sends them to the
+workers; the loop then makes the updates that are due, and :meth:`OverlapCollector.step` waits for the slowest worker.
+So the weights that choose an action lack the updates of one step, compared with ``collector=single``. The result does
+not depend on which side is faster, and nothing is in flight between two steps: runs are deterministic and resume bit
+for bit.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from ganlane.training.collectors import Collector, SingleCollector, pack, unpack
 from ganlane.training.signals import shielded_children
 from ganlane.training.workers import EPISODES_PER_WORKER, INNER, MakeEnv, why_lost
 
-#: Seconds that a worker has to end by itself.
+#: Seconds for a worker to end by itself before it is killed.
 _PATIENCE_S = 5.0
-#: Seconds until the system has taken note of the end of a process whose pipe is closed.
+#: Seconds until a process whose pipe is closed has an exit code.
 _NOTICED_S = 0.5
 
 
 class OverlapCollector(Collector):
-    """Steps of environments that are shared out evenly between worker processes.
+    """Steps environments that are divided evenly among worker processes.
 
     Row ``w * rows + i`` of a step is row i of worker w, which starts with episode ``w * 2**40 + i``.
 
@@ -56,14 +56,14 @@ class OverlapCollector(Collector):
         self._make = [partial(make_env, self.rows, first) for first in firsts]
         self._processes: list[Any] = []
         self._pipes: list[Connection] = []
-        #: What the policy sees of every environment, [N]; None: to be asked for.
+        #: Input of the policy for every environment, [N]; None: to be requested from the workers.
         self._seen: TensorDictBase | None = None
-        #: The step that is under way, and where the workers write what follows.
+        #: The step in flight, and the shared memory in which the workers write its outcome.
         self._given: TensorDictBase | None = None
         self._results: list[TensorDictBase] = []
 
     def open(self, agent: Rainbow) -> None:
-        """Start the workers, if they are not at work."""
+        """Start the workers, if they are not running."""
         self._start()
 
     def _start(self) -> None:
@@ -77,12 +77,12 @@ class OverlapCollector(Collector):
         ours, theirs = context.Pipe()
         process = context.Process(target=work, args=(theirs, make), daemon=True)
         process.start()
-        theirs.close()  # so that the end of the worker is the end of the pipe
+        theirs.close()  # so that the pipe closes when the worker ends
         self._processes.append(process)
         self._pipes.append(ours)
 
     def _ask(self, name: str, *arguments: list[Any]) -> list[Any]:
-        """The workers' answers to a request, with an argument each of every list."""
+        """Send a request to all workers, with one argument of each list per worker; return their answers."""
         self._start()
         with self._failures_as_user_errors():
             for worker, pipe in enumerate(self._pipes):
@@ -98,7 +98,7 @@ class OverlapCollector(Collector):
         return answers
 
     def begin(self, agent: Rainbow) -> None:
-        """Choose the actions with the agent's present weights and send the workers off."""
+        """Choose the actions with the agent's current weights and send them to the workers."""
         self._start()
         if self._seen is None:
             self._seen = torch.cat(self._ask("look"))
@@ -109,12 +109,12 @@ class OverlapCollector(Collector):
                 pipe.send(("step", action.numpy()))
 
     def step(self, agent: Rainbow) -> TensorDictBase:
-        """The step that was begun (:meth:`begin`), as soon as all workers have made it."""
+        """The step started by :meth:`begin`, once all workers have made it."""
         if self._given is None:
             self.begin(agent)
         assert self._given is not None
-        made = self._answers()
-        self._results = made if not self._results else self._results
+        answers = self._answers()
+        self._results = self._results or answers
         self._seen, after = (torch.cat([result.get(name) for result in self._results]) for name in ("seen", "after"))
         step, self._given = self._given.set("next", after.to(agent.device)), None
         return step
@@ -125,7 +125,7 @@ class OverlapCollector(Collector):
         return pack(torch.cat([unpack(state) for state in states]))
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Every worker goes on from its rows of ``state``."""
+        """Every worker continues from its rows of ``state``."""
         states = [pack(part) for part in unpack(state).split(self.rows)]
         self._ask("load", states, [exact] * len(states))
         self._seen = None
@@ -143,7 +143,7 @@ class OverlapCollector(Collector):
             ) from error
 
     def close(self) -> None:
-        """End the workers; one that is busy or stuck is killed."""
+        """Stop the workers; one that does not end by itself is killed."""
         processes, self._processes = self._processes, []
         pipes, self._pipes = self._pipes, []
         for pipe in pipes:
@@ -179,7 +179,7 @@ def work(pipe: Connection, make_env: Callable[[], EnvBase]) -> None:
             if name != "step" or isinstance(answer, UserError):
                 send(pipe, answer)
             elif shared is None:
-                # A copy: what is seen and what follows are the same tensors where no episode ended.
+                # A copy: ``seen`` and ``after`` share tensors if no episode ended.
                 shared = answer.clone().share_memory_()
                 pipe.send(shared)
             else:
@@ -188,12 +188,12 @@ def work(pipe: Connection, make_env: Callable[[], EnvBase]) -> None:
 
 
 def send(pipe: Connection, message: Any) -> None:
-    """Send by value: of a tensor in shared memory the receiver gets nothing once the sender is gone."""
+    """Send by value: a tensor sent through shared memory would be lost if the sender ended first."""
     pipe.send_bytes(pickle.dumps(message))
 
 
 def drive(source: SingleCollector, action: npt.NDArray[np.int64]) -> TensorDict:
-    """One decision: what ``seen`` after it, with new episodes where one ended, and ``after`` it before any reset."""
+    """One decision: ``seen``, the policy's next input (reset after an ended episode); ``after``, before any reset."""
     given = source.env_state.set(keys.ACTION, torch.from_numpy(action))
     with threads_for(source.env):
         step, source.env_state = source.env.step_and_maybe_reset(given)
@@ -202,5 +202,5 @@ def drive(source: SingleCollector, action: npt.NDArray[np.int64]) -> TensorDict:
 
 
 def visible(state: TensorDictBase) -> TensorDictBase:
-    """What a policy can read of ``state``: not the memory of the traffic and of the sensors."""
+    """``state`` without the memory of traffic and sensors, which policies do not read."""
     return state.exclude(*(name for name in INNER if name != keys.VEHICLES))

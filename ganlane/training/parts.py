@@ -1,7 +1,7 @@
-"""Whether the parts of a checkpoint can be those of this run, before they are used.
+"""Check the parts of a checkpoint against the run, before they are used.
 
-What a damaged part does later has no end: Adam writes beyond moments that are too short, a replay buffer that draws
-rows it does not have gives numbers from anywhere.
+A damaged part would do harm later: Adam writes beyond moments that are too short, and a replay buffer that samples
+rows it does not hold returns arbitrary memory.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from ganlane.agents.n_step import Step
 from ganlane.agents.replay import MASK_KEY, ROW
 from ganlane.training.stats import EpisodeStats
 
-#: Decisions, updates and rows of a run are fewer.
+#: Upper bound of the decisions, updates and rows of a run.
 MOST = 2**53
-#: Name of the masks among the rows of the replay buffer, where there are masks.
+#: Name of the action masks in the rows of the replay buffer, if there are masks.
 MASK = ".".join(MASK_KEY)
 
 
 def check_parts(
     state: Mapping[str, Any], agent: Rainbow, environments: Mapping[str, Any], stats: EpisodeStats
 ) -> None:
-    """Compare ``state`` (:meth:`~ganlane.training.checkpoint.TrainingState.state_dict`) with a run that begins.
+    """Compare ``state`` (:meth:`~ganlane.training.checkpoint.TrainingState.state_dict`) with that of a new run.
 
     Args:
         state: of the checkpoint.
-        agent: has its moments from it already.
-        environments: state of those of a run that begins.
-        stats: fresh.
+        agent: with Adam's moments already loaded from the checkpoint.
+        environments: state of the environments of a new run.
+        stats: of a new run.
 
     Raises:
-        ValueError: a part has another structure, shape or type, or numbers that cannot be.
-        TypeError, KeyError, AttributeError: it is something else altogether.
+        ValueError: a part has another structure, shape or type, or impossible numbers.
+        TypeError, KeyError, AttributeError: a part has another type altogether.
     """
     network, counters, replay = agent.network, state["counters"], state["agent"]["replay"]
     moments = agent.optimizer.state_dict()["state"]
@@ -52,7 +52,7 @@ def check_parts(
     check_like(counters, {"decisions": 0, "pending_decisions": 0, "wall_s": 0.0, "best": best}, "counters")
     if replay is not None:
         _check_replay(replay, agent)
-    if state["window"] is not None:  # so the resumed run will be exact
+    if state["window"] is not None:  # the resumed run will be exact
         check_like(state["env_state"], environments, "env_state")
         mask = environments["items"].get(keys.ACTION_MASK)
         if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
@@ -79,13 +79,13 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
         expected: dict[str, Any] = {"priorities": own.float(), "largest": torch.zeros(()), "beta": 0.0}
         check_like(replay["sampler"], expected, "replay.sampler")
         if not torch.equal(replay["sampler"]["priorities"] > 0, own):
-            raise ValueError("replay: priorities of rows that it does not have")
+            raise ValueError("replay: priorities of rows that do not exist")
 
 
 def _check_window(steps: list[dict[str, Any]], agent: Rainbow, environments: int, mask: Tensor | None) -> None:
     rows = transitions(environments, agent.network.config)
-    seen, end = rows["observation"], rows["next.terminated"]
-    step = Step(seen, rows["action"], rows["next.reward"], seen, end, end, mask)._asdict()
+    observation, end = rows["observation"], rows["next.terminated"]
+    step = Step(observation, rows["action"], rows["next.reward"], observation, end, end, mask)._asdict()
     check_like(steps, [step] * min(len(steps), agent.config.n_step - 1), "window")
     for step in steps:
         _check_actions(step["action"], agent.network.config)
@@ -102,22 +102,22 @@ def _check_stats(saved: Mapping[str, Any], fresh: EpisodeStats) -> None:
 
 def _check_actions(taken: Tensor, network: NetworkConfig) -> None:
     if ((taken < 0) | (taken >= network.actions)).any():
-        raise ValueError("actions that there are not")
+        raise ValueError("actions out of range")
 
 
 def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
-    """Shapes and types, without content, of what the replay buffer holds, by dotted key."""
+    """Shapes and types of the rows of the replay buffer as meta tensors, by dotted key."""
     number = torch.empty(rows, 1, device="meta")
-    seen = number.expand(rows, network.observation_size)
-    after = {"next.observation": seen, "next.reward": number, "next.terminated": number.bool()}
+    observation = number.expand(rows, network.observation_size)
+    after = {"next.observation": observation, "next.reward": number, "next.terminated": number.bool()}
     after[MASK] = number.expand(rows, network.actions).bool()
-    return {"observation": seen, "action": number[:, 0].long(), "steps_to_next_obs": number, **after}
+    return {"observation": observation, "action": number[:, 0].long(), "steps_to_next_obs": number, **after}
 
 
 def check_like(found: Any, like: Any, name: str) -> None:
     """Raise :class:`ValueError` unless ``found`` has at least the keys of ``like``, its lengths, shapes and types.
 
-    Numbers outside of tensors have to be finite, counts at least 0.
+    Numbers outside tensors must be finite, counts at least 0.
     """
     if isinstance(like, Tensor):
         fits = isinstance(found, Tensor) and (found.shape, found.dtype) == (like.shape, like.dtype)

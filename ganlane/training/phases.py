@@ -1,7 +1,7 @@
-"""The phases of ``ganlane train``: one or two runs of the loop, the second from the first one's agent.
+"""The phases of ``ganlane train``: one or two runs of the training loop, the second from the agent of the first.
 
-:func:`phases_of` a config are one or two :class:`Phase`; :func:`run_phase` makes collector and agent, trains, and
-leaves the agent in the folder of the phase.
+:func:`phases_of` lists the phases of a config; :func:`run_phase` makes collector and agent, trains, and writes the
+agent into the folder of the phase.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from ganlane.training.overlap import OverlapCollector
 from ganlane.training.workers import ClusterCollector, ProcessCollector
 from ganlane.transforms import observation_size
 
-#: The trained agent, in the folder of its phase; its presence says that the phase is over.
+#: File of the trained agent in the folder of its phase; it exists once the phase is finished.
 AGENT_FILE = "agent.safetensors"
 
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of training on one traffic: where its files go, what it starts from (None: random weights)."""
+    """Training on one traffic: ``folder`` of its files, ``init`` the agent to start from (None: random weights)."""
 
     name: str
     folder: Path
@@ -65,7 +65,7 @@ class Phase:
 
 
 def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
-    """The phases that ``config`` asks for, in order."""
+    """The phases of ``config``, in order."""
     main = Phase("train", folder, config.traffic, config.total_decisions, config.init.path)
     before = config.pretrain
     if before.total_decisions == 0 or before.traffic is None:
@@ -75,19 +75,19 @@ def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
 
 
 def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | None:
-    """Decisions, updates and wall time of a first phase that is over; None if it is not, or is no first phase.
+    """Decisions, updates and wall time of a finished first phase; None for any other phase.
 
     Raises:
-        UserError: it had another length or traffic than ``config`` asks for.
+        UserError: its length or traffic differ from those of ``config``.
     """
     path = phase.folder / AGENT_FILE
     if phase.name != "pretrain" or not path.is_file():
         return None
     training = read_agent(path)[2]["training"]
-    done, asked = training["decisions"], phase.total_decisions
-    if not asked <= done < asked + config.collector.environments:
+    done, wanted = training["decisions"], phase.total_decisions
+    if not wanted <= done < wanted + config.collector.environments:
         raise UserError(
-            f"pretrain.total_decisions={asked}: this phase is over, after {done} decisions; resume with what the run "
+            f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; resume with what the run "
             "was started with."
         )
     if flat(training["traffic"]) != flat(phase.traffic.description()):
@@ -100,8 +100,8 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
 
     Args:
         config: of the whole run.
-        phase: which part of it.
-        resume: checkpoint to go on from.
+        phase: the phase to train.
+        resume: checkpoint to continue from.
 
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
@@ -137,7 +137,7 @@ def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = Non
 
 
 def make_collector(config: TrainConfig, phase: Phase) -> Collector:
-    """What steps the environments of a phase: ``collector=single``, ``overlap``, ``multi`` or ``ray``.
+    """The collector of a phase: ``collector=single``, ``overlap``, ``multi`` or ``ray``.
 
     Raises:
         UserError: the environments cannot be made, or Ray is not installed.
@@ -145,7 +145,7 @@ def make_collector(config: TrainConfig, phase: Phase) -> Collector:
     collector = config.collector
     if not isinstance(collector, MultiCollectorConfig | OverlapCollectorConfig):
         return SingleCollector(training_env(config, phase, collector.num_envs, device=config.device))
-    training_env(config, phase, 1)  # a mistake shows here, before there are workers
+    training_env(config, phase, 1)  # raises the user's mistakes before any worker is started
     make_worker_env = partial(worker_env, config, phase)
     if isinstance(collector, OverlapCollectorConfig):
         return OverlapCollector(make_worker_env, collector.workers, collector.num_envs)
@@ -164,14 +164,14 @@ def training_env(
 
 
 def worker_env(config: TrainConfig, phase: Phase, rows: int, first_episode: int) -> EnvBase:
-    """The same in a process of its own, on its CPU."""
+    """Environments of a worker process, on its CPU."""
     set_threads(config.threads)
     keep_freed_memory()
     return training_env(config, phase, rows, first_episode)
 
 
 def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
-    """Drives the greedy policy through episodes of the stream kept for selection, on which nothing is trained."""
+    """A function that evaluates the greedy policy on the selection stream, whose episodes are never trained on."""
     traffic = make_traffic(phase.traffic, config.env, Stream.SELECT)
     rows = min(config.selection_episodes, config.evaluation.num_envs)
     parts = (traffic, config.env, config.observation, config.reward)
@@ -186,7 +186,7 @@ def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
 
 
 def selection_figures(table: pl.DataFrame) -> dict[str, float]:
-    """Mean reward, its standard error, crashes and lane changes of the episodes of ``table``, one per row."""
+    """Mean reward, its standard error, crash rate and lane changes per km of ``table``, one episode per row."""
     total = table.select("reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash").sum()
     reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
     spread = float(np.std(table["reward"].to_numpy()))
@@ -203,7 +203,7 @@ def selection_figures(table: pl.DataFrame) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Start:
-    """A trained agent to start from; ``moments`` are Adam's by parameter, None where the file has weights alone."""
+    """A trained agent to start from; ``moments`` are Adam's, by parameter (None: the file holds weights only)."""
 
     name: str
     weights: Mapping[str, Tensor]
@@ -213,15 +213,15 @@ class Start:
 
 
 def read_start(name: str, key: str = "init.path") -> Start:
-    """The agent that ``init.path`` means.
+    """Read the agent of ``init.path``.
 
     Args:
         name: a shipped agent or a ``.safetensors`` file; or a training run's folder or its ``last.pt``, for the agent
             as the run last saved it, with its moments.
-        key: of the command line that gave ``name``.
+        key: the configuration key of ``name``, for error messages.
 
     Raises:
-        UserError: nothing of the sort is there, or it cannot be read.
+        UserError: the file is missing or cannot be read.
     """
     path = Path(name)
     if path.suffix != ".pt" and (not path.is_dir() or name in SHIPPED):
@@ -232,8 +232,8 @@ def read_start(name: str, key: str = "init.path") -> Start:
         raise UserError(f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's file.")
     state = load_checkpoint(path, key=key)
     try:
-        agent, seen = state["agent"], state["identity"]["observation"]
-        observation = ObservationConfig(**{name: seen[name] for name in ("form", "range_m", "speed_mps")})
+        agent, trained_on = state["agent"], state["identity"]["observation"]
+        observation = ObservationConfig(**{name: trained_on[name] for name in ("form", "range_m", "speed_mps")})
         size = observation_size(observation.form, state["identity"]["env"]["vehicles"])
         rainbow = RainbowConfig(**without_removed(agent["config"], f"{key}={path}"))
         weights = {name: value.detach() for name, value in agent["network"].items()}
@@ -248,7 +248,7 @@ def read_start(name: str, key: str = "init.path") -> Start:
 
 
 def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
-    """A fresh agent for the observation of ``config``; one about to be given trained weights explores little."""
+    """A new agent for the observation of ``config``; one that will get trained weights explores little."""
     rainbow = config.agent.for_phase(phase.total_decisions)
     if phase.init is not None:
         rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
@@ -259,9 +259,9 @@ def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
 
 
 def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | None) -> tuple[TrainConfig, Rainbow]:
-    """The agent with which ``phase`` begins, and ``config`` with the support of returns that it has.
+    """The initial agent of ``phase``, and ``config`` with the agent's support of returns.
 
-    With ``resume``, an agent ready to be restored: what the run once started from may be gone.
+    With ``resume`` it is an agent to be restored, since the file that the run started from may no longer exist.
 
     Raises:
         UserError: the agent to start from does not fit.
@@ -277,7 +277,7 @@ def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | N
     if config.init.support == "trained":
         config = with_support(config, start)
     agent = make_agent(config, phase)
-    # A second phase starts from the best agent of the first, whose moments are not kept.
+    # A second phase starts from the best agent of the first, of which Adam's moments are not saved.
     with_moments = config.init.optimizer and phase.init == config.init.path
     if with_moments and not start.moments:
         raise UserError(
@@ -295,23 +295,22 @@ def with_support(config: TrainConfig, start: Start) -> TrainConfig:
 
 
 def check_observation(start: Start, config: TrainConfig) -> None:
-    """Refuse to start from an agent that was trained on another observation."""
-    theirs = asdict(config.observation.read_by(start.observation))
-    ours = asdict(config.observation)
-    for key, value in theirs.items():
-        if value != ours[key]:
+    """Raise :class:`UserError` if the agent was trained on another observation."""
+    trained_on = asdict(config.observation.read_by(start.observation))
+    configured = asdict(config.observation)
+    for key, value in trained_on.items():
+        if value != configured[key]:
             option = f"observation={value}" if key == "form" else f"observation.{key}={value}"
             raise UserError(
-                f"init.path={start.name}: this agent was trained with {option}, the run has {ours[key]}; "
+                f"init.path={start.name}: this agent was trained with {option}, the run has {configured[key]}; "
                 f"give {option} or start with init=none."
             )
 
 
 def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
-    """Write the agent of the phase: the best one where the run chose among several, else the last.
+    """Write the agent of the phase: the best one by evaluation, if there were evaluations, else the last.
 
-    Its metadata hold, with the description, the length of the run and, for the best one, its figures on the
-    stream kept for selection.
+    The metadata also hold the length of the run and, for the best agent, its figures on the selection stream.
     """
     best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)
     if result.best is not None and best.is_file():
@@ -323,24 +322,24 @@ def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: 
     save_agent(phase.folder / AGENT_FILE, agent, metadata)
 
 
-# --- what is written down
+# --- metadata
 
 
 def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
-    """What a resumed run must share with the one that was stopped."""
+    """The settings that a resumed run must share with the run that was stopped."""
     parts = {"env": config.env, "reward": config.reward, "collector": config.collector}
     defaults = {f"{name}.{key}": value for name, part in parts.items() for key, value in defaults_of(part).items()}
     collector = {name: value for name, value in asdict(config.collector).items() if name != "address"}
     if isinstance(config.collector, OverlapCollectorConfig):
-        collector["overlaps"] = True  # else the same options as those of a run that learns at other moments
+        collector["overlaps"] = True  # ``multi`` has the same options but updates at other times
     return {
-        # Of a run that was begun before there was an option, the default of the option is known.
+        # For options that did not exist when the run was started.
         DEFAULTS: {**defaults, "collector.overlaps": False},
         "env": plain(config.env),
         "traffic": phase.traffic.description(),
         "observation": asdict(config.observation),
         "reward": asdict(config.reward),
-        # Left out where there is none, as in the runs of versions that knew no masks.
+        # Absent without a mask, as in runs of versions before masks.
         **({"mask": asdict(config.mask)} if config.mask.form != "none" else {}),
         "init": config.init.path,
         "collector": collector,
@@ -371,12 +370,12 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
 
 
 def defaults_of(config: Any) -> dict[str, Any]:
-    """The defaults of a dataclass's fields by dotted name; nested dataclasses by their own fields."""
-    found: dict[str, Any] = {}
-    for known in fields(config):
-        default = known.default if known.default_factory is MISSING else known.default_factory()
+    """Default of every field of a dataclass by dotted name, nested dataclasses included."""
+    defaults: dict[str, Any] = {}
+    for each in fields(config):
+        default = each.default if each.default_factory is MISSING else each.default_factory()
         if is_dataclass(default):
-            found |= {f"{known.name}.{name}": value for name, value in defaults_of(default).items()}
+            defaults |= {f"{each.name}.{name}": value for name, value in defaults_of(default).items()}
         elif default is not MISSING:
-            found[known.name] = list(default) if isinstance(default, tuple) else default
-    return found
+            defaults[each.name] = list(default) if isinstance(default, tuple) else default
+    return defaults

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the loop finishes its step, saves and returns; its workers never see them."""
+"""Ctrl-C and SIGTERM: the loop finishes its step, saves and returns; worker processes ignore them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _STOPPING = (signal.SIGINT, signal.SIGTERM)
 class StopRequest:
     """Context in which SIGINT and SIGTERM set :attr:`signal` instead of ending the process.
 
-    A second Ctrl-C raises KeyboardInterrupt as usual. Outside the main thread, where Python allows no handlers,
-    nothing is changed.
+    A second Ctrl-C raises KeyboardInterrupt as usual. Outside the main thread, where Python allows no handlers, the
+    context does nothing.
     """
 
     def __init__(self) -> None:
-        #: The number of the signal that came, or None.
+        #: Number of the signal received, or None.
         self.signal: int | None = None
         self._previous: dict[int, Any] = {}
 
@@ -42,17 +42,17 @@ class StopRequest:
 
 @contextmanager
 def shielded_children() -> Iterator[None]:
-    """Processes started in here never see SIGINT and SIGTERM, and the handlers are afterwards what they were.
+    """Context whose child processes never receive SIGINT and SIGTERM; signal handlers are restored at its end.
 
-    A terminal sends Ctrl-C to all processes of a command, and so do Slurm and container runtimes with SIGTERM: a
-    worker would die in the middle of the step that the main process still waits for. A child inherits what is
-    blocked. Whatever arrives meanwhile reaches this process at the end. Libraries that set handlers of their own
-    (``ray.init`` does) would take those of the training loop away.
+    A terminal sends Ctrl-C to all processes of a command, as Slurm and container runtimes do with SIGTERM: a worker
+    would die in the middle of a step that the main process waits for. Children inherit the blocked signals; signals
+    that arrive meanwhile are delivered to this process at the end. The handlers are restored because some libraries
+    (``ray.init``) replace those of the training loop.
     """
     handlers = {number: signal.getsignal(number) for number in _STOPPING}
     can_block = hasattr(signal, "pthread_sigmask")
     if can_block:
-        # Started by the first child otherwise, it would unblock the signals for all that follow.
+        # Started by the first child, it would unblock the signals for all later children.
         resource_tracker.ensure_running()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPING)
     try:

@@ -1,4 +1,4 @@
-"""What happens while training, summed up on tensors and read out only when it is logged."""
+"""Statistics of training episodes and updates, summed on the device and read only for logging."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ from torch import Tensor
 
 from ganlane import keys
 
-#: Ends that are counted per finished episode, and the column that reports their share.
+#: Events at the end of an episode, and the column with the share of episodes that ended so.
 RATES = {
     "goal": "goal_rate",
     "hard_crash": "crash_rate",
     "out_of_road": "out_of_road_rate",
     "timeout": "timeout_rate",
 }
-#: Sums over the running episode of every environment.
+#: Sums over the running episode of each environment.
 RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
 
 
 class EpisodeStats:
     """Statistics of the finished episodes and of the updates since the last :meth:`read`.
 
-    Keys that an environment or a policy does not write (``events``, ``ego``, ``chosen_action_value``) are left out.
+    Figures of keys that are not written (``events``, ``ego``, ``chosen_action_value``) are left out.
 
     **Q-values against realised returns.** ``mean_return_to_go`` is the discounted return from a decision to the end
-    of its episode, averaged over all decisions of the finished episodes; ``mean_value`` is the mean of the values
-    that the policy gave its actions at the same decisions. The two agree where the values are right (an episode that
-    is cut off by time has no return beyond).
+    of its episode, averaged over all decisions of finished episodes; ``mean_value`` is the mean Q-value of the chosen
+    actions at the same decisions. The two agree if the values are right (returns after a time limit count as 0).
 
     Args:
         environments: N.
@@ -45,7 +44,7 @@ class EpisodeStats:
             torch.zeros(environments, device=device) for _ in RUNNING
         )
         self.discount = torch.ones(environments, device=device)
-        #: How often, discounted, the next reward counts in the returns from all decisions of the episode so far.
+        #: Discounted weight of the next reward in the returns to go of all decisions of the episode so far.
         self.weight = torch.ones(environments, device=device)
         self.actions = torch.arange(actions, device=device)
         self.sums: dict[str, Tensor] = {}
@@ -70,7 +69,7 @@ class EpisodeStats:
         self._add("actions", (step.get(keys.ACTION)[:, None] == self.actions).sum(0))
 
     def _finish(self, after: TensorDictBase, done: Tensor, has_values: bool) -> None:
-        """Count the episodes that ended and start their sums afresh."""
+        """Add the episodes that ended and reset their sums."""
         self._add("episodes", done.sum())
         for name in RUNNING if has_values else RUNNING[:-1]:
             self._add(name, (getattr(self, name) * done).sum())
@@ -96,7 +95,7 @@ class EpisodeStats:
         self.sums[name] = self.sums[name] + value if name in self.sums else value
 
     def read(self) -> dict[str, float]:
-        """Means since the last call; the sums start afresh. Means over no episode or no update are absent."""
+        """Means since the last call, without those over no episode or no update; resets the sums."""
         sums: dict[str, Any] = {name: value.tolist() for name, value in self.sums.items()}
         row = {name: float(value) / self.update_count for name, value in self.updates.items()}
         shares = sums.pop("actions", [])
@@ -105,7 +104,7 @@ class EpisodeStats:
         return row | _per_episode(sums)
 
     def state_dict(self) -> dict[str, Any]:
-        """Sums of the running episodes and of the present interval."""
+        """Sums of the running episodes and of the current interval."""
         names = (*RUNNING, "discount", "weight", "sums", "updates", "update_count")
         return {name: _copy(getattr(self, name)) for name in names}
 

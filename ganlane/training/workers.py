@@ -1,4 +1,4 @@
-"""``collector=multi`` and ``ray``: batches of several steps from TorchRL's workers, handed out one by one."""
+"""``collector=multi`` and ``ray``: TorchRL's collectors in worker processes, their batches handed out step by step."""
 
 from __future__ import annotations
 
@@ -29,34 +29,34 @@ from ganlane.training.collectors import Collector, pack, unpack
 from ganlane.training.signals import shielded_children
 from ganlane.transforms.sensors import PERCEIVED, SENSORS
 
-#: Makes the environments of a worker from their number and their first episode. It travels to the worker: a function
-#: of a module, or a ``functools.partial`` of one.
+#: Makes the environments of a worker from their number and first episode. It is pickled: a module-level function or
+#: a ``functools.partial`` of one.
 MakeEnv = Callable[[int, int], EnvBase]
-#: Functions that make the environments, or the policies, of one worker each.
+#: Per worker, a function that makes its environments or its policy.
 Factories = Sequence[Callable[[], Any]]
-#: A worker's first episodes are so far from the next one's that no two workers ever drive the same.
+#: Distance between the first episodes of two workers, so that no two ever drive the same episode.
 EPISODES_PER_WORKER = 2**40
-#: State of the simulation, most of a step's bytes: the workers need it, the loop does not.
+#: State of the simulation, most of a step's bytes, which the training loop does not need.
 INNER = (keys.VEHICLES, keys.TRAFFIC, keys.ROAD, PERCEIVED, SENSORS)
 
 
 class WorkerPolicy(ExploringPolicy):
-    """The exploring policy of one worker: own noise and random actions, weights from outside."""
+    """The exploring policy of a worker, with its own random numbers; the learner sends the weights."""
 
     def load(self, weights: Mapping[str, Tensor], epsilon: float) -> None:
-        """Drive with ``weights`` (:meth:`Rainbow.weights`) and random share ``epsilon``."""
+        """Use ``weights`` (:meth:`Rainbow.weights`) and the share ``epsilon`` of random actions."""
         load_parameters(self.network, weights)
         self.epsilon = epsilon
 
 
 def make_policy(config: NetworkConfig, legal: LegalActions | None, seed: int) -> WorkerPolicy:
-    """The policy of a worker, on its CPU; the first weights are still to come."""
+    """The policy of a worker, on its CPU, before it receives its first weights."""
     with torch.random.fork_rng(devices=[]):
         return WorkerPolicy(QNetwork(config), torch.Generator().manual_seed(seed), legal)
 
 
 def noise_seed(seed: int, first_episode: int) -> int:
-    """Seed of a worker's exploration: another one for every worker, and for every stretch of a resumed run."""
+    """Seed of a worker's exploration, different for every worker and every time a run is resumed."""
     return int(np.random.SeedSequence([seed, first_episode]).generate_state(1, np.uint64)[0] >> 1)
 
 
@@ -68,17 +68,17 @@ def read_by_loop(steps: TensorDictBase) -> TensorDictBase:
 class WorkerCollector(Collector):
     """Steps from TorchRL's collectors, on the CPUs of the workers.
 
-    The workers take ``config.steps`` steps with the same weights, and wait while the learner works on them. They are
-    started by :meth:`open`, at the latest by the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is
+    The workers make ``config.steps`` steps with the same weights, then wait for the learner. They are started by
+    :meth:`open` or the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is
     row i of worker w, which starts with episode ``w * 2**40 + i``.
 
     Args:
         make_env: makes the environments of one worker.
-        config: how many, and how often they get new weights.
+        config: number of workers and environments, and steps between new weights.
     """
 
     exact = False
-    #: Of ``collector=NAME``, for messages.
+    #: NAME in ``collector=NAME``, for messages.
     name: str
 
     def __init__(self, make_env: MakeEnv, config: MultiCollectorConfig) -> None:
@@ -91,14 +91,14 @@ class WorkerCollector(Collector):
 
     @abstractmethod
     def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
-        """A collector that makes these environments and policies; ``frames`` decisions of all workers at a time."""
+        """TorchRL's collector of these environments and policies, ``frames`` decisions of all workers per batch."""
 
     @abstractmethod
     def failure(self, error: Exception) -> str | None:
-        """Why a worker was lost, in words for the user; None if ``error`` is about something else."""
+        """The reason, for the user, if ``error`` means that a worker was lost; else None."""
 
     def open(self, agent: Rainbow) -> None:
-        """Start the workers, if they are not at work; each has episodes and exploration of its own."""
+        """Start the workers, if they are not running; each has its own episodes and exploration."""
         if self.collector is not None:
             return
         seed, config, legal = agent.generators["collect"].initial_seed(), agent.network.config, agent.policy.legal
@@ -111,7 +111,7 @@ class WorkerCollector(Collector):
         self._batches = iter(self.collector)
 
     def step(self, agent: Rainbow) -> TensorDictBase:
-        """The next step; where none is left, a new batch is collected with the agent's present weights."""
+        """The next step of the batch; after the last one, collect a new batch with the agent's current weights."""
         if not self._steps:
             self.open(agent)
             with self._failures_as_user_errors():
@@ -124,9 +124,9 @@ class WorkerCollector(Collector):
         return self._steps.popleft()
 
     def _send_weights(self, agent: Rainbow) -> None:
-        """Weights and the share of random actions to every worker; all of them wait for it.
+        """Send weights and epsilon to every worker; all wait for it.
 
-        Not by ``update_policy_weights_``: it sends what is in a module, the momentary noise too, and no epsilon.
+        TorchRL's ``update_policy_weights_`` would send the current noise of the noisy layers too, and no epsilon.
         """
         assert self.collector is not None
         weights = {name: value.cpu() for name, value in agent.weights().items()}
@@ -146,11 +146,11 @@ class WorkerCollector(Collector):
             ) from error
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
-        """The episodes that were under way at the end of the last batch."""
+        """The episode numbers at the end of the last batch."""
         return pack(self._last)
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Each worker begins after the last episode that it had begun; before the first :meth:`step` only."""
+        """Each worker begins after the last episode that it had begun; call before the first :meth:`step` only."""
         last = unpack(state)
         self._last = last
         if keys.EPISODE in last:
@@ -158,19 +158,19 @@ class WorkerCollector(Collector):
             self.first_episodes = [int(episode) + 1 for episode in begun.tolist()]
 
     def close(self) -> None:
-        """End the workers; one that does not end by itself is killed."""
+        """Stop the workers; one that does not end by itself is killed."""
         collector, self.collector = self.collector, None
         self._steps.clear()
         self._batches = iter(())
         if collector is not None:
             threads = torch.get_num_threads()
-            with suppress(Exception):  # a worker that is gone already is no reason to leave the others
+            with suppress(Exception):  # stop the other workers even if one is gone
                 collector.shutdown()
             torch.set_num_threads(threads)
 
 
 class ProcessCollector(WorkerCollector):
-    """``collector=multi``: TorchRL's ``MultiSyncCollector``, processes that write their steps to shared memory."""
+    """``collector=multi``: TorchRL's ``MultiSyncCollector``, processes with shared memory."""
 
     name = "multi"
 
@@ -189,14 +189,14 @@ class ProcessCollector(WorkerCollector):
         )
 
     def failure(self, error: Exception) -> str | None:
-        """A dead worker shows as a closed pipe or as TorchRL's complaint."""
+        """A dead worker closes its pipe, or makes TorchRL raise an error."""
         processes = getattr(self.collector, "procs", ())
         closed = isinstance(error, EOFError | BrokenPipeError | ConnectionResetError)
         return why_lost(processes) if closed or exit_codes(processes) else None
 
 
 def exit_codes(processes: Sequence[Any]) -> dict[int, int]:
-    """Of the workers that failed or were killed, by their number."""
+    """Exit codes of workers that failed or were killed, by worker."""
     codes: dict[int, int] = {}
     for worker, process in enumerate(processes):
         with suppress(ValueError):  # closed by TorchRL
@@ -206,7 +206,7 @@ def exit_codes(processes: Sequence[Any]) -> dict[int, int]:
 
 
 def why_lost(processes: Sequence[Any]) -> str:
-    """Of what the workers died, in words for the user."""
+    """Error message for lost workers."""
     codes = exit_codes(processes)
     who = ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items()) or "a worker"
     if any(code > 0 for code in codes.values()):
@@ -215,11 +215,11 @@ def why_lost(processes: Sequence[Any]) -> str:
 
 
 class ClusterCollector(WorkerCollector):
-    """``collector=ray``: TorchRL's ``RayCollector``, one actor per worker; only what the loop reads travels.
+    """``collector=ray``: TorchRL's ``RayCollector``, one actor per worker; the state of the simulation is not sent.
 
     Args:
-        make_env: makes the environments of one worker; on a cluster, ganlane is installed on its machines.
-        config: how many, and how often they get new weights; and the address of the cluster's head.
+        make_env: makes the environments of one worker; on a cluster, ganlane must be installed on its machines.
+        config: number of workers and environments, steps between new weights, and the address of the cluster's head.
 
     Raises:
         UserError: Ray is not installed.
@@ -236,7 +236,7 @@ class ClusterCollector(WorkerCollector):
             raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
 
     def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
-        """An actor per worker; a Ray of our own has a CPU for each, however few the machine has."""
+        """One actor per worker; a local Ray gets one CPU per worker, even on a smaller machine."""
         from torchrl.collectors.distributed import RayCollector
 
         connection: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
@@ -245,9 +245,9 @@ class ClusterCollector(WorkerCollector):
         else:
             check_reachable(self.address)
             connection["address"] = self.address
-        # A dictionary each: TorchRL writes the policy of a worker into its own.
+        # One dictionary per worker: TorchRL writes the worker's policy into it.
         own = [{"postproc": read_by_loop, "auto_register_policy_transforms": False} for _ in environments]
-        # TorchRL gets no weights to send, and warns of it twice: they are sent by _send_weights.
+        # TorchRL warns twice that it has no weights to send; :meth:`_send_weights` sends them.
         warnings.filterwarnings("ignore", message="RayCollector iteration started before weight synchronization")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -265,7 +265,7 @@ class ClusterCollector(WorkerCollector):
             )
 
     def failure(self, error: Exception) -> str | None:
-        """No cluster, an actor that is gone, or no Ray."""
+        """No cluster answers, an actor is gone, or Ray did not start."""
         import ray
         from ray.exceptions import RayActorError
 
@@ -286,7 +286,7 @@ def check_reachable(address: str, patience_s: float = 10.0) -> None:
     """
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not port.isdigit():
-        return  # auto, local, or something that Ray has a word for
+        return  # auto, local, or another form that Ray checks itself
     try:
         socket.create_connection((host.strip("[]"), int(port)), patience_s).close()
     except (OSError, OverflowError) as error:

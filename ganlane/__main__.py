@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from ganlane._version import __version__
 from ganlane.runtime import open_closed_streams
 
-#: Command to what it does; each is a module of the package with a ``main``, and has a configuration.
+#: Commands with a configuration, and what they do; each is a module of the package with a ``main``.
 COMMANDS = {
     "train": "train an agent on a traffic, then compare it with other drivers",
     "evaluate": "agents x traffics on the same episodes, as one table",
@@ -47,11 +47,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _output_refused(error: OSError) -> int:
-    """The exit status where standard output takes no more, as :func:`ganlane.config.app.run_command` has it."""
-    from ganlane.config.app import READER_LEFT, USER_ERROR, let_go_of_streams
+    """The exit status if standard output cannot be written, as in :func:`ganlane.config.app.run_command`."""
+    from ganlane.config.app import READER_LEFT, USER_ERROR, discard_broken_streams
     from ganlane.config.messages import file_sentence, is_users_matter
 
-    if let_go_of_streams() and isinstance(error, BrokenPipeError):
+    if discard_broken_streams() and isinstance(error, BrokenPipeError):
         return READER_LEFT
     if not is_users_matter(error):
         raise error
@@ -60,7 +60,7 @@ def _output_refused(error: OSError) -> int:
 
 
 def dispatch(arguments: Sequence[str] | None = None) -> int:
-    """Do what the command line asks for; the exit status."""
+    """Run the command line; return the exit status."""
     command, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if command in ("-h", "--help", "help"):
         print(usage())

@@ -1,7 +1,7 @@
-"""The frame around every command: Hydra inside; exit statuses and errors of one sentence outside.
+"""Runs a command: Hydra composes and sweeps; errors become one sentence and an exit status.
 
-Exit statuses: 0 done; 2 a user's mistake, or a disk that refuses (one sentence on stderr, nothing left on disk); 130
-stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the output has left.
+Exit statuses: 0 done; 2 a user's mistake or a failing disk (one sentence on stderr, nothing left on disk); 130
+stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the output has closed it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from ganlane.config.command_line import (
     with_shares_replaced,
     without_repetitions,
 )
-from ganlane.config.folders import cleared_after_mistakes, held, unused, write_down
+from ganlane.config.folders import cleared_after_mistakes, held, unused, write_config
 from ganlane.config.help import help_text
 from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
 from ganlane.config.resume import refuse_stored_imports, with_resumed
@@ -39,7 +39,7 @@ from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.runtime import check_process, keep_freed_memory, open_closed_streams, register_envs
 
-#: What a command does with its config in its run folder; it returns a line to print last, or None.
+#: A command's function of config and run folder; it returns the last line to print, or None.
 Task = Callable[[Any, Path], str | None]
 
 
@@ -53,12 +53,12 @@ def imported(path: str) -> Task:
 
 
 USER_ERROR = 2
-#: 128 and the number of SIGPIPE, which Windows does not have.
+#: 128 plus the number of SIGPIPE, which does not exist on Windows.
 READER_LEFT = 141
 
 
 class Stopped(BaseException):
-    """A signal ended the command after it had put its things in order; the exit status is 128 and its number."""
+    """Raised when a signal ended the command after an orderly stop; the exit status is 128 plus its number."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -69,7 +69,7 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
     """Run ``task`` as ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit status."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     open_closed_streams()
-    # TorchRL tells of every replay buffer otherwise.
+    # TorchRL would log every replay buffer.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     keep_freed_memory()
     try:
@@ -86,7 +86,7 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
             return _refused(command, error)
         if not isinstance(error, OSError):
             raise
-        reader_left = let_go_of_streams()
+        reader_left = discard_broken_streams()
         if reader_left and isinstance(error, BrokenPipeError):
             return READER_LEFT
         if not is_users_matter(error):
@@ -96,7 +96,7 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
 
 
 def _signal_behind(error: BaseException | None) -> int | None:
-    """The signal that ended the command: omegaconf, interrupted in a copy, adds an error of its own."""
+    """The signal behind ``error``, or None; omegaconf, when interrupted, raises an error of its own from it."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return signal.SIGINT
@@ -107,7 +107,7 @@ def _signal_behind(error: BaseException | None) -> int | None:
 
 
 def _refused(command: str, error: Exception) -> int:
-    """Tell the user; the exit status."""
+    """Print the error; return the exit status."""
     print(f"ganlane {command}: {sentence(error)}", file=sys.stderr)
     return USER_ERROR
 
@@ -133,19 +133,19 @@ def _run(command: str, task: Task, arguments: list[str]) -> None:
         folder = unused(folder)
     with cleared_after_mistakes(folder):
         if flags.multirun:
-            # The folder's name holds the time: given here, so that it is the one that was looked at.
+            # The default name holds the time; passed on, so that Hydra uses the folder that was checked.
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
             _hydra(command, task, ["-m", *with_shares_replaced(swept)])
             _show_sweep(folder, checked.config.columns)
         else:
             given = parse(without_repetitions(overrides))
-            asked = [str(override.input_line) for override in given if not of_hydra(override)]
-            _do(task, checked.config, folder, checked.composed, asked)
+            kept = [str(override.input_line) for override in given if not of_hydra(override)]
+            _run_in_folder(task, checked.config, folder, checked.composed, kept)
 
 
 def _show_sweep(folder: Path, columns: str) -> None:
     """One table of all comparisons of a sweep."""
-    # Imported here: they need torch, which a mistake on the command line should not wait for.
+    # Imported here, since they import torch, which takes seconds.
     from ganlane.evaluation.results import sweep_rows
     from ganlane.evaluation.table import show, text_table
 
@@ -154,11 +154,11 @@ def _show_sweep(folder: Path, columns: str) -> None:
         show("", text_table(rows), f"sweep: {folder}", columns=columns)
 
 
-def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) -> None:
-    """The task in its folder, in which its configuration is written down first."""
-    register_envs()  # for a driver or traffic of the user's own; ganlane/__init__.py leaves it to commands
+def _run_in_folder(task: Task, config: Any, folder: Path, composed: Any, overrides: list[str]) -> None:
+    """Write the configuration into the run folder, then run the task there."""
+    register_envs()  # for a user's own driver or traffic; ganlane/__init__.py leaves it to the commands
     with held(folder):
-        write_down(composed, asked, folder)
+        write_config(composed, overrides, folder)
         with numbered_refusals():
             last_line = task(config, folder)
     if last_line:
@@ -166,19 +166,19 @@ def _do(task: Task, config: Any, folder: Path, composed: Any, asked: list[str]) 
 
 
 def _hydra(command: str, task: Task, arguments: list[str]) -> None:
-    """Let Hydra show the configuration, or sweep; errors come out as they are."""
+    """Let Hydra print the configuration or run a sweep; errors are raised unchanged."""
     register(command)
     mistakes: list[Exception] = []
     here = os.getpid()
 
     def job(composed: Any) -> None:
         folder = Path(HydraConfig.get().runtime.output_dir)
-        asked = [str(override) for override in HydraConfig.get().overrides.task]
+        overrides = [str(override) for override in HydraConfig.get().overrides.task]
         try:
             with cleared_after_mistakes(folder, existed=any(folder.iterdir())):
-                _do(task, typed(composed), folder, composed, asked)
+                _run_in_folder(task, typed(composed), folder, composed, overrides)
         except (UserError, OSError) as error:
-            # Kept rather than raised, since Hydra would print a line of its own; a worker process has to raise.
+            # Kept rather than raised, because Hydra would print it too; a worker process must raise.
             mistakes.append(error)
             if os.getpid() != here:
                 raise
@@ -192,7 +192,7 @@ def _hydra(command: str, task: Task, arguments: list[str]) -> None:
 
 @contextmanager
 def _process(argv: list[str]) -> Iterator[None]:
-    """Arguments where Hydra looks for them, and errors raised rather than printed with status 1."""
+    """Set ``sys.argv`` for Hydra, and make it raise errors rather than print them and exit with status 1."""
     before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv, os.environ["HYDRA_FULL_ERROR"] = argv, "1"
     try:
@@ -210,14 +210,14 @@ def _process(argv: list[str]) -> Iterator[None]:
 
 @contextmanager
 def _sigterm_as_exception() -> Iterator[None]:
-    """Outside the training loop, which has a handler of its own, SIGTERM unwinds the stack."""
+    """Raise :class:`Stopped` on SIGTERM; the training loop has its own handler."""
 
     def stop(number: int, frame: Any) -> None:
         raise Stopped(number)
 
     try:
         before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not in the main thread: no handlers there
+    except ValueError:  # not in the main thread, where Python allows no handlers
         yield
         return
     try:
@@ -226,31 +226,31 @@ def _sigterm_as_exception() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def let_go_of_streams() -> bool:
-    """Send nowhere what can no longer be written; whether a reader has left.
+def discard_broken_streams() -> bool:
+    """Redirect streams that cannot be written to os.devnull; return whether the reader of a pipe has closed it.
 
-    Python would try again when it ends, complain, and end with a status of its own.
+    Otherwise Python would write again at exit, print an error, and exit with a status of its own.
     """
-    left = [_has_no_reader(stream) for stream in (sys.stdout, sys.stderr)]
-    for stream, gone in zip((sys.stdout, sys.stderr), left):
-        if gone or not _takes_what_is_left(stream):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, stream.fileno())
-            os.close(nowhere)
-    return any(left)
+    closed = [_has_no_reader(stream) for stream in (sys.stdout, sys.stderr)]
+    for stream, gone in zip((sys.stdout, sys.stderr), closed):
+        if gone or not _flushes(stream):
+            devnull = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(devnull, stream.fileno())
+            os.close(devnull)
+    return any(closed)
 
 
 def _has_no_reader(stream: TextIO) -> bool:
     """Whether the stream is a pipe without a reader; always False on Windows."""
     try:
-        looked = select.poll()
-        looked.register(stream.fileno(), 0)
-    except (AttributeError, OSError):  # no such call, or no file behind the stream, as in a notebook
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # Windows, or a stream without a file, as in a notebook
         return False
-    return any(event & (select.POLLERR | select.POLLHUP) for _, event in looked.poll(0))
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
-def _takes_what_is_left(stream: TextIO) -> bool:
+def _flushes(stream: TextIO) -> bool:
     try:
         stream.flush()
     except OSError:

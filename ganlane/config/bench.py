@@ -1,4 +1,4 @@
-"""Root of ``ganlane bench``."""
+"""Configuration of ``ganlane bench``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PAIR = Rule(lambda pair: len(pair) == 2 and pair[0] < pair[1], "two batch sizes
 
 @dataclass
 class BenchConfig(Record):
-    """What to measure, how often, and where to write it down.
+    """What to measure, how often, and where to write the results.
 
     Attributes:
         suite: sim: the simulator, bare and as a whole environment; traffic: every traffic model; train: the training
@@ -97,15 +97,15 @@ class BenchConfig(Record):
         check_reward(self.env, self.reward)
 
     def chosen_traffics(self) -> dict[str, TrafficConfig]:
-        """Those of ``suite=traffic``, by name."""
+        """Traffics of ``suite=traffic``, by name."""
         return chosen_traffics("traffics", self.traffics, all_traffics(), own=False)
 
     def chosen_train_traffics(self) -> dict[str, TrafficConfig]:
-        """Those of ``suite=train``, by name."""
+        """Traffics of ``suite=train``, by name."""
         return chosen_traffics("train_traffics", self.train_traffics, all_traffics(), own=False)
 
     def chosen_devices(self) -> tuple[str, ...]:
-        """Those asked for; by default the CPU, and a GPU where there is one."""
+        """The devices to measure; by default the CPU, and a GPU if there is one."""
         if self.devices is not None:
             return tuple(self.devices)
         return DEVICES if has_cuda() else DEVICES[:1]

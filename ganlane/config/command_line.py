@@ -1,4 +1,4 @@
-"""The command line: its flags and overrides, the runs that a sweep means, and their checked configurations."""
+"""The command line: flags, overrides, the runs of a sweep, and their checked configurations."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from ganlane.errors import UserError
 from ganlane.files import conf_folder
 
 VERSION_BASE = "1.3"
-#: Of Hydra's own configuration, much of which names what it is to import, a command line may give only these, the
-#: parameters of the launcher and of the sweeper, and their names.
+#: The keys of Hydra's own configuration that a command line may set, besides launcher and sweeper and their
+#: parameters: most others name code that Hydra would import.
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.num")
 HYDRA_PLUGINS = ("launcher", "sweeper")
-#: Keys that a command calls by another name, since Hydra takes ``agent=`` for the group of that name.
+#: Keys that a command calls by another name, because ``agent=`` would choose an option of the group ``agent``.
 ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
 #: A number with an exponent, and the functions of a sweep.
 _EXPONENT, _SWEPT = (
@@ -56,7 +56,7 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
 
 
 def _refuse_idle_flags(flags: Namespace) -> None:
-    """Hydra's flags that a run would pass over in silence; one of them would execute what a pickle holds."""
+    """Refuse Hydra's flags that would have no effect; one of them (experimental_rerun) would load a pickle."""
     for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
         if getattr(flags, name) is not None:
             raise UserError(f"--{name.replace('_', '-')}: ganlane has its own configuration; give key=value instead.")
@@ -66,9 +66,9 @@ def _refuse_idle_flags(flags: Namespace) -> None:
 
 
 def as_meant(command: str, override: str, multirun: bool = False) -> str:
-    """An override as Hydra takes it: ``agents=mobil`` as a list of one, ``1e5`` for a whole number as ``100000``.
+    """An override in Hydra's syntax: ``agents=mobil`` as a list of one, ``1e5`` for a whole number as ``100000``.
 
-    In a list's value commas separate entries, which need no quotes; in a sweep they separate runs.
+    In the value of a list commas separate entries, which need no quotes; in a sweep they separate runs.
     """
     key, equals, value = override.partition("=")
     key = ALIASES.get(command, {}).get(key, key)
@@ -90,7 +90,7 @@ def _whole(number: re.Match[str]) -> str:
 
 
 def _kinds(hint: Any, path: Sequence[str]) -> set[Any]:
-    """The types that may be found at ``path`` below ``hint``: those in unions and lists, too, and of subclasses."""
+    """The types allowed at ``path`` below ``hint``, including those inside unions and lists and of subclasses."""
     inner = set().union(*(_kinds(each, path) for each in get_args(hint)))
     if not path:
         return {get_origin(hint) or hint, *inner}
@@ -103,22 +103,20 @@ def _kinds(hint: Any, path: Sequence[str]) -> set[Any]:
 
 
 def quoted(value: object) -> str:
-    """``value`` as Hydra reads it back, whatever signs are in it: ``it's`` becomes ``'it\\'s'``."""
+    """``value`` quoted for Hydra: ``it's`` becomes ``'it\\'s'``."""
     return QuotedString(str(value), Quote.single).with_quotes()
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    """The overrides as Hydra understands them.
-
-    Refused are those that would add or delete keys, name no option, or make Hydra import something.
+    """Parse overrides by Hydra's grammar, and refuse some.
 
     Raises:
-        UserError: as the summary says.
+        UserError: an override would add or delete keys, names no option, or would make Hydra import something.
         hydra.errors.OverrideParseException: one is not of the form key=value.
     """
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except (ValueError, RecursionError) as error:  # Python's own bounds
+    except (ValueError, RecursionError) as error:  # limits of Python
         longest = max(overrides, key=len)
         raise UserError(f"{longest:.60}...: too long a number or too deep a list; give a shorter value.") from error
     for override in parsed:
@@ -131,12 +129,12 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 
 
 def of_hydra(override: Override) -> bool:
-    """Whether it changes Hydra's own configuration."""
+    """Whether an override changes Hydra's own configuration."""
     return re.match(r"hydra\b", override.key_or_group) is not None or (override.package or "").startswith("hydra")
 
 
 def _refuse_hydras(override: Override) -> None:
-    """Hydra imports and calls every ``_target_`` of its callbacks, launchers and log handlers."""
+    """Refuse keys by which Hydra would import and call the ``_target_`` of a callback, launcher or log handler."""
     key, value = override.key_or_group, override.value()
     group = any(key == f"hydra/{plugin}" for plugin in HYDRA_PLUGINS) and re.fullmatch(r"\w+", str(value))
     if override.type == OverrideType.CHANGE and override.package is None and (group or key in HYDRA_KEYS):
@@ -151,7 +149,7 @@ def _refuse_hydras(override: Override) -> None:
 
 
 def leaves(value: object) -> Iterator[str]:
-    """All texts in a parsed value: itself, or a list's and mapping's, names too."""
+    """All texts in a parsed value: itself, or the entries of lists and mappings, keys included."""
     if isinstance(value, Mapping):
         value = [*value, *value.values()]
     if isinstance(value, list):
@@ -162,7 +160,7 @@ def leaves(value: object) -> Iterator[str]:
 
 
 def _refuse_no_option(override: Override) -> None:
-    """A group takes the name of one option, which is no path to a file elsewhere."""
+    """Refuse a value of a group that is not the name of one option, such as a path to a file elsewhere."""
     group = override.key_or_group
     chosen = override.is_sweep_override() or isinstance(override.value(), str)
     chosen = chosen and re.search(r"[/\\]|\.\.", str(override.input_line).partition("=")[2]) is None
@@ -172,7 +170,7 @@ def _refuse_no_option(override: Override) -> None:
 
 
 def _refuse_new_keys(override: Override) -> None:
-    """``+key``, ``++key`` and ``~key`` would slip past the schema; only a target's free parameters are open."""
+    """Refuse ``+key``, ``++key`` and ``~key``, which bypass the schema, but for the free parameters of a target."""
     key = override.key_or_group
     if override.type == OverrideType.CHANGE:
         return
@@ -186,9 +184,9 @@ def _refuse_new_keys(override: Override) -> None:
 
 
 def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:
-    """Tell of a mistyped key at once: registering and composing take 0.3 s.
+    """Report a mistyped key before registering and composing, which take 0.3 s.
 
-    Keys that one option of a group has and another has not are left to composing.
+    Keys that only some options of a group have are left to composing.
 
     Raises:
         UserError: an unknown key.
@@ -212,19 +210,19 @@ def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:
 
 
 def _with_subclasses(kind: Any) -> list[Any]:
-    """A class and all that are derived from it."""
+    """A class and all of its subclasses."""
     below: list[Any] = type.__subclasses__(kind) if isinstance(kind, type) else []
     return [kind, *(each for child in below for each in _with_subclasses(child))]
 
 
 def without_repetitions(overrides: Sequence[str]) -> list[str]:
-    """The overrides with the last one of each key: Hydra itself refuses to choose an option twice."""
+    """The last override of each key; Hydra refuses to choose an option twice."""
     last = {override.get_key_element().lstrip("+"): str(override.input_line) for override in parse(overrides)}
     return list(last.values())
 
 
 def with_shares_replaced(overrides: Sequence[str]) -> list[str]:
-    """The overrides, each ``traffic.shares=...`` after a null: Hydra would merge it into an experiment's shares."""
+    """The overrides, with a null before each ``traffic.shares=...``, which Hydra would merge into an experiment's."""
     replaced = []
     for override in parse(overrides):
         key = override.key_or_group
@@ -244,7 +242,7 @@ def single_runs(overrides: Sequence[str], multirun: bool) -> list[list[str]]:
 
 @dataclass(frozen=True)
 class Checked:
-    """What is known before a command runs: the config of its (first) run, and where its results will go."""
+    """The checked config of a command's (first) run, and the folders of its results."""
 
     config: Any
     composed: DictConfig

@@ -1,7 +1,7 @@
-"""Shell completion of ``ganlane COMMAND ...``: Hydra's, with the command's own name completed first.
+"""Shell completion of ``ganlane COMMAND ...``: names of commands, then Hydra's completion of options and keys.
 
-Hydra completes programs that are one command. Its shell function asks the program on the line, here ``ganlane``, so
-the question comes without the command; it is read off the line and left out before Hydra looks at the rest.
+Hydra completes programs that are a single command: its shell function calls the program, here ``ganlane``, without
+the command, which is therefore read from the line and removed before Hydra completes the rest.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from ganlane.files import conf_folder
 SHELLS = ("bash", "zsh", "fish")
 ACTIONS = ("install", "uninstall", "query")
 PROGRAM = "ganlane"
-#: Any command will do where only the script of the shell is wanted.
+#: Any command serves to print the script of a shell.
 _ANY = "train"
-#: What Hydra leaves out: zsh needs its layer for bash's completion, and bash keeps pointing at the removed function.
+#: Missing in Hydra's scripts: zsh needs bashcompinit, and bash must forget the removed function.
 _BEFORE = {
     ("install", "zsh"): "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }\n"
     "autoload -Uz bashcompinit && bashcompinit",
@@ -55,7 +55,7 @@ def shell_completion(arguments: Sequence[str], commands: Collection[str]) -> int
 
 
 def _asked(arguments: Sequence[str]) -> tuple[str, str]:
-    """What to do, for which shell."""
+    """The action and the shell."""
     for argument in arguments:
         action, equals, shell = argument.partition("=")
         if equals and action in ACTIONS and shell in SHELLS:
@@ -65,7 +65,7 @@ def _asked(arguments: Sequence[str]) -> tuple[str, str]:
 
 
 def candidates(line: str, commands: Collection[str]) -> list[str]:
-    """What the last word of ``line`` could become.
+    """Completions of the last word of ``line``.
 
     Args:
         line: as typed so far, the program's name included.
@@ -81,7 +81,7 @@ def candidates(line: str, commands: Collection[str]) -> list[str]:
 
 
 def _completed(command: str, rest: str) -> list[str]:
-    """Hydra's answer for one command, without the names of schemas."""
+    """Hydra's completions for one command, without the names of schemas."""
     register(command)
     with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
         plugin = BashCompletion(GlobalHydra.instance().config_loader())
@@ -90,10 +90,10 @@ def _completed(command: str, rest: str) -> list[str]:
 
 
 def _script(action: str, shell: str) -> None:
-    """Print what the shell is to evaluate."""
+    """Print the script for the shell to evaluate."""
     print(_BEFORE.get((action, shell), ""))
     before = sys.argv
-    # Hydra takes the program's name from there; python -m ganlane has the path of a module.
+    # Hydra reads the program's name here; with python -m ganlane it is the path of a module.
     sys.argv = [PROGRAM]
     try:
         with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):

@@ -1,4 +1,4 @@
-"""``env=highway`` and ``env=dense``: the road, who drives on it, random first scenes, and the end of an episode."""
+"""``env=highway`` and ``env=dense``: road, vehicles, random initial scenes, and the end of an episode."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         self._check_start()
 
     def _check_start(self) -> None:
-        """Refuse first scenes that do not fit on the road, or in which a crash is unavoidable."""
-        # The defaults need no check, which loads torch: so a mistake anywhere else is reported without it.
+        """Raise an error if initial scenes do not fit on the road, or make a crash unavoidable."""
+        # The check imports torch. The defaults are valid, so a mistake elsewhere is reported without it.
         asked = (self.spawn_parameters(), self.vehicles, self.lanes, self.idm)
         if asked == (SpawnParameters(), EnvConfig.vehicles, EnvConfig.lanes, IdmParameters()):
             return
@@ -75,20 +75,20 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
         check_start(*asked)
 
     def scenes(self, others_visibility: int | None = None) -> Scenes | None:
-        """Where an episode's vehicles start: None for Table II; ``others_visibility`` is the traffic's."""
+        """Initial scenes of episodes; None: Table II. ``others_visibility`` is the traffic's."""
         return None
 
     def spawn_parameters(self) -> SpawnParameters:
-        """Table II alone."""
+        """The parameters of Table II."""
         return part_of(self, SpawnParameters)
 
     def episode_parameters(self) -> EpisodeParameters:
-        """Decision period, goal and time-out alone."""
+        """Decision period, goal and time-out."""
         return part_of(self, EpisodeParameters)
 
 
 def check_reward(env: EnvConfig, reward: RewardParameters) -> None:
-    """The speed reward runs from 0 at its base speed to 1 at the ego's desired speed, so that must be the higher."""
+    """Raise an error unless the ego's desired speed, where the speed reward is 1, is above its base speed (0)."""
     if env.ego_desired_speed_mps <= reward.base_speed_mps:
         raise ParameterError(
             f"{{env.ego_desired_speed_mps}}={env.ego_desired_speed_mps:g}: expected more than "

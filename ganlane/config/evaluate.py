@@ -1,4 +1,4 @@
-"""Roots of the commands that put drivers through episodes: ``ganlane evaluate``, ``reproduce`` and ``record``."""
+"""Configurations of ``ganlane evaluate``, ``reproduce`` and ``record``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ganlane.config.run import DrivingConfig, Environments, Episodes, Names
 from ganlane.config.traffic import TRAFFICS, TrafficConfig, all_traffics, chosen_traffics
 from ganlane.parameters.checks import DIFFERENT, Rule, Seed, Text, between, one_of
 
-#: Episodes of ``ganlane reproduce`` on traffics on which driving is slow, so that all of it takes half an hour.
+#: Episodes of ``ganlane reproduce`` on slow traffics, so that the whole takes half an hour.
 FEWER = {
     "idm_faults": 500,
     "idm_random": 400,
@@ -104,7 +104,7 @@ class ReproduceConfig(EvaluateConfig):
     trained: str = "outputs/scratch"
 
     def episodes_on(self, traffic: str) -> int:
-        """How many episodes are driven on a traffic."""
+        """Number of episodes on a traffic."""
         fewer = {**FEWER, **(self.fewer or {})}
         return min(self.episodes, fewer.get(traffic, self.episodes))
 
@@ -131,6 +131,6 @@ class RecordConfig(DrivingConfig):
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
 
     def dataset_name(self) -> str:
-        """The dataset's name, made from traffic and driver where none is given."""
+        """The dataset's name; by default made from traffic and driver."""
         parts = (re.sub(r"[^A-Za-z0-9_]+", "_", part).strip("_") for part in (self.traffic.label(), self.driver))
         return self.dataset or f"ganlane/{'/'.join(parts)}-v0"

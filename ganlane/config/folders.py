@@ -1,4 +1,4 @@
-"""Run folders: their content, the process that uses them, and that a mistake leaves none behind."""
+"""Run folders: their content, their lock, and their removal after a user's mistake."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-#: The command line of a run, in its folder.
+#: File in the run folder with the run's command line.
 OVERRIDES = "overrides.yaml"
 CONFIG = "config.yaml"
-#: Names the process that is at work in the folder, while it is.
+#: File that names the process that uses the folder.
 LOCK = ".lock"
-#: Files that cost time to make.
+#: Files that took time to make.
 EARNED = ("results.json", "agent.safetensors", "last.pt", "fits/*.pt", "generator_*.safetensors")
 #: Folders of a run that it writes to itself; others below it may be runs of their own.
 _OWN = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
@@ -32,14 +32,13 @@ _OWN = (".", "checkpoints", "pretrain", "pretrain/checkpoints", "fits")
 
 @contextmanager
 def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterator[None]:
-    """Remove what a user's mistake leaves of a folder that was not there before, and of the folders above it.
+    """Context that removes a newly made folder, and newly made folders above it, if a mistake ends the run.
 
-    What a run has earned stays: a folder with results, trained weights or a checkpoint in it is never removed, nor
-    one in which another process is at work.
+    A folder with results, trained weights or a checkpoint is never removed, nor one that another process uses.
 
     Args:
-        folder: the run's or the sweep's.
-        existed: whether it held something before; by default, whether it is there now.
+        folder: of the run or the sweep.
+        existed: whether it held something before; by default, whether it exists now.
     """
     existed = folder.exists() if existed is None else existed
     made = [parent for parent in folder.parents if not parent.exists()]
@@ -55,13 +54,13 @@ def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterato
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Work in a run's folder, which no other process may do meanwhile; it is made if need be.
+    """Context that makes and locks a run's folder.
 
-    What killed writes have left there is removed. A run that is refused leaves the command line of the run before
-    it. One that ends in an error after it has trained or saved something keeps its own: it can be resumed.
+    Partial files of killed writes are removed. A refused run restores the command line of the run before it; a run
+    that fails after it has saved something keeps its own, so that it can be resumed.
 
     Raises:
-        UserError: another run is at work there.
+        UserError: another run uses the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder):
@@ -77,13 +76,13 @@ def held(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """The folder's lock: the system's, on a file that says who has it; the system frees it when a process dies.
+    """Hold the system's lock on a file that names this process; the system releases it when the process dies.
 
-    So a file that a killed run has left stops nobody, whatever process has its number by now. Where the system or the
-    folder's file system knows no locks, nobody is stopped either.
+    So the file of a killed run blocks nobody, even if its process number is in use again. Without locks in the
+    operating or file system, nothing is locked.
 
     Raises:
-        UserError: another run has it.
+        UserError: another run holds the lock.
     """
     path = folder / LOCK
     while True:
@@ -98,15 +97,15 @@ def _locked(folder: Path) -> Iterator[None]:
             raise UserError(
                 f"{folder}: a run is at work there ({who}); wait for its end, or give another folder."
             ) from error
-        except OSError:  # no locks here
+        except OSError:  # the file system has no locks
             pass
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 break
-        file.close()  # who had it before has just removed it
+        file.close()  # the process that held it has just removed the file
     try:
         for part in _OWN:
-            remove_leftovers(folder / part)  # first, since they can be what fills the disk
+            remove_leftovers(folder / part)  # first, since they may fill the disk
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()
@@ -117,22 +116,22 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def unused(folder: Path) -> Path:
-    """``folder``, or the same name with a number where a run is there already.
+    """``folder``, or the same name with a number if it holds a run already.
 
-    The name holds time and process: two runs of one process within a second would share it.
+    The name holds time and process, so two runs of a process within a second would share it.
     """
     names = itertools.chain([folder.name], (f"{folder.name}_{number}" for number in itertools.count(2)))
     return next(folder.with_name(name) for name in names if not (folder.with_name(name) / CONFIG).exists())
 
 
 def earned(folder: Path) -> set[tuple[Path, int]]:
-    """The run's files that cost time to make, with the time of their last change."""
+    """The run's files that took time to make, with the times of their last change."""
     found = [path for part in _OWN for name in EARNED for path in (folder / part).glob(name)]
     return {(path, path.stat().st_mtime_ns) for path in found}
 
 
 def _put_back(folder: Path, kept: dict[str, bytes]) -> None:
-    """The files that describe a run as they were, those that were not there before away."""
+    """Restore the files that describe a run; remove those that did not exist before."""
     for name in (OVERRIDES, CONFIG):
         if name in kept:
             write_bytes(folder / name, kept[name])
@@ -141,15 +140,15 @@ def _put_back(folder: Path, kept: dict[str, bytes]) -> None:
 
 
 def _remove_empty(folders: list[Path]) -> None:
-    """Remove those of ``folders``, innermost first, that hold nothing."""
+    """Remove the empty ones of ``folders``, innermost first."""
     for folder in folders:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
 
 
-def write_down(composed: Any, asked: list[str], folder: Path) -> None:
-    """What was asked for, in the run folder: ``config.yaml`` has all values, ``overrides.yaml`` the command line."""
+def write_config(composed: Any, overrides: list[str], folder: Path) -> None:
+    """Write all values to ``config.yaml`` and the command line to ``overrides.yaml``."""
     from omegaconf import OmegaConf
 
     write_bytes(folder / CONFIG, OmegaConf.to_yaml(composed, resolve=True).encode())
-    write_bytes(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(asked)).encode())
+    write_bytes(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(overrides)).encode())

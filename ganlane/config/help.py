@@ -1,4 +1,4 @@
-"""``--help`` and ``--help-all``: what a command does, its options and its keys, from docstrings and YAML files."""
+"""``--help`` and ``--help-all``: a command's purpose, options and keys, from docstrings and YAML files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ exit status: 0 done, 2 a mistake in configuration, file or checkpoint or a disk 
 
 
 def help_text(command: str, everything: bool = True) -> str:
-    """What ``ganlane COMMAND --help-all`` prints, or ``--help``: names of options, and the command's own keys."""
+    """The text of ``ganlane COMMAND --help-all``; unless ``everything``, that of ``--help``."""
     chosen = chosen_options((conf_folder() / f"{command}.yaml").read_text())
     groups = {mount: option for mount, option in chosen.items() if "@" not in mount}
     listed = [_options(*each) for each in chosen.items()] if everything else map(_names, groups, groups.values())
@@ -91,7 +91,7 @@ def key_lines(
 
 
 def _lines(key: str, meaning: str) -> Iterator[str]:
-    """The key, and in a column of its own what it means."""
+    """The key, and its meaning in a column of its own."""
     first, *rest = textwrap.wrap(meaning, _END - _COLUMN - 2) or [""]
     yield f"{key:<{_COLUMN - 1}} # {first}" if first else key
     yield from (f"{'':<{_COLUMN}}# {line}" for line in rest)
@@ -102,13 +102,13 @@ def _default(field: Field[Any]) -> Any:
 
 
 def _meaning(kind: Any, name: str) -> str:
-    """The first sentence on a field in the docstring of its class, or of the base that says something of it."""
+    """The first sentence on a field in the docstring of its class or of a base class."""
     return next((found for base in kind.__mro__ if (found := _attributes(base).get(name))), "")
 
 
 @cache
 def _attributes(kind: type) -> dict[str, str]:
-    """First sentences of the section ``Attributes`` of a class's own docstring, by field."""
+    """First sentences of the section ``Attributes`` of a class's docstring, by field."""
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
     items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, flags=re.MULTILINE)
     joined = {name: " ".join(text.split()) for name, text in items}
@@ -116,5 +116,5 @@ def _attributes(kind: type) -> dict[str, str]:
 
 
 def _plain(text: str) -> str:
-    """Without the marks of a docstring: ``:data:`~ganlane.NAME``` becomes NAME."""
+    """The text without reStructuredText roles: ``:data:`~ganlane.NAME``` becomes NAME."""
     return re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text).replace("``", "")

@@ -1,7 +1,6 @@
 """Errors of Hydra, OmegaConf and the file system as one sentence: the value, what was expected, what to do.
 
-A connection that is refused or a process that is gone is an OSError, too, but none that a user can fix: it keeps its
-traceback.
+A refused connection or a lost process is an OSError too, but not one that a user can fix: it keeps its traceback.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from ganlane.errors import UserError
 from ganlane.parameters.checks import did_you_mean
 
-#: What Hydra and OmegaConf raise for a configuration that will not do.
+#: Errors of Hydra and OmegaConf for an invalid configuration.
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
-#: While values are taken over, also what a whole number of hundreds of digits raises.
+#: Errors while values are read; a whole number of hundreds of digits raises OverflowError.
 VALUE_ERRORS = (*CONFIG_ERRORS, OverflowError)
 
-#: OmegaConf's names of types in words.
+#: OmegaConf's names of types, in words.
 _TYPES = {"Integer": "a whole number", "Float": "a number", "bool": "true or false", "String": "a text"}
 _HELP = "run the command with --help to see all keys"
 _ROOM = "make room there, or write to another disk"
@@ -32,7 +31,7 @@ _RIGHTS = "check the permissions, or name a place where you may write"
 _PATH = "check the path"
 _LATER = "close other programs and run the command again"
 
-#: Error number to what to do.
+#: Advice by error number.
 ADVICE = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), _RIGHTS),
@@ -45,7 +44,7 @@ ADVICE = {
 
 
 def sentence(error: BaseException) -> str:
-    """What to tell the user."""
+    """The message for the user."""
     if isinstance(error, UserError):
         return _one_line(error) + "."
     if isinstance(error, MissingConfigException):  # an OSError, too
@@ -62,12 +61,12 @@ def sentence(error: BaseException) -> str:
 
 
 def _one_line(error: BaseException | str) -> str:
-    """The text without line breaks and final stop."""
+    """The text without line breaks and final full stop."""
     return re.sub(r"\s+", " ", str(error)).strip().rstrip(".")
 
 
 def _missing_option(error: MissingConfigException) -> str:
-    """``group=name`` without such an option."""
+    """Message for ``group=name`` without such an option."""
     group, _, name = (error.missing_cfg_file or "").rpartition("/")
     known = sorted(option for option in error.options or () if not option.endswith("_schema"))
     if not known:
@@ -76,7 +75,7 @@ def _missing_option(error: MissingConfigException) -> str:
 
 
 def _composition(error: BaseException) -> str:
-    """Options that do not fit the command."""
+    """Message for options that do not fit the command."""
     text = _one_line(error)
     group = re.search(r"Could not override '([^']+)'", text)
     if group:
@@ -89,7 +88,7 @@ def _composition(error: BaseException) -> str:
 
 
 def _value(error: OmegaConfBaseException) -> str:
-    """An unknown key, a value of the wrong type, or whatever else OmegaConf found."""
+    """Message for an unknown key, a value of the wrong type, or another error of OmegaConf."""
     key = (error.full_key or str(error.key or "")).removeprefix(".")
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         return _unknown_key(key, error)
@@ -108,7 +107,7 @@ def _value(error: OmegaConfBaseException) -> str:
 
 
 def _typed(value: str) -> str:
-    """As one types it on the command line."""
+    """The value as typed on the command line."""
     return {"None": "null", "True": "true", "False": "false"}.get(value, value)
 
 
@@ -120,7 +119,7 @@ def _unknown_key(key: str, error: OmegaConfBaseException) -> str:
 
 
 def unknown_key(key: str, known: Sequence[str], of: str | None = None) -> str:
-    """``key`` is not among the ``known`` ones of its parent, or ``of`` what the sentence says."""
+    """Message for a ``key`` that is not ``known``; ``of`` replaces the name of its parent in the sentence."""
     parent, _, name = key.rpartition(".")
     where = of or (f"{parent} has" if parent else "known are")
     listed = f"; {where} {', '.join(known)}" if known else f"; {_HELP}"
@@ -128,7 +127,7 @@ def unknown_key(key: str, known: Sequence[str], of: str | None = None) -> str:
 
 
 def is_users_matter(error: BaseException) -> bool:
-    """Whether the error is about a path, a place or a disk that the user can do something about."""
+    """Whether a user can fix the error: one about a path, a permission or a disk."""
     return isinstance(error, OSError) and error.errno in ADVICE
 
 
@@ -141,9 +140,9 @@ def file_sentence(error: OSError) -> str:
 
 @contextmanager
 def numbered_refusals() -> Iterator[None]:
-    """Raise as an OSError with its number what a library tells in its text alone.
+    """Raise errors of the file system that a library reports as text alone as OSError with the error number.
 
-    polars says "No space left on device (os error 28)" in errors of several types, without a number or a name.
+    polars raises "No space left on device (os error 28)" in errors of several types, without number or file name.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Roots of the commands that read recordings: ``ganlane prepare``, ``train_generator`` and ``realism``."""
+"""Configurations of the commands that read recordings: ``ganlane prepare``, ``train_generator``, ``realism``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ganlane.parameters.generator import FitConfig
 
 #: Names of the card's own references.
 _REFERENCES = ("random", "constant_velocity")
-#: Traffics that cannot have a card, and why.
+#: Traffics that cannot have a card, with the reason.
 _WITHOUT_CARD = {
     "replay": "it is the recordings themselves; choose a traffic that drives",
     "mixed": "a card is of one traffic; make one of each of its parts",
@@ -142,7 +142,7 @@ class RealismConfig(RunConfig):
         self.rivals()
 
     def card(self) -> str:
-        """The card's name in a document: whose it is, and from where everybody starts."""
+        """The card's name in a document: traffic and kind of starts."""
         return f"{self.traffic.label()} {'folds' if self.fold_weights else self.scenes}"
 
     def rivals(self) -> dict[str, TrafficConfig]:

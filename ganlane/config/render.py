@@ -1,4 +1,4 @@
-"""Root of ``ganlane render``."""
+"""Configuration of ``ganlane render``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ GIF_S = 30.0
 
 @dataclass
 class FilmConfig(Record):
-    """``film``: which part of the episode, how fast, how large.
+    """``film``: part of the episode, speed and size.
 
     Attributes:
         fps: frames per second.
@@ -73,7 +73,7 @@ class FilmConfig(Record):
 
 @dataclass
 class CurvesConfig(Record):
-    """``curves``: how the figures of training runs are drawn.
+    """``curves``: learning curves of training runs.
 
     Attributes:
         columns: of metrics.csv and evaluation_NAME of evaluation.csv; null: the ones that matter most.
@@ -125,14 +125,14 @@ class RenderConfig(DrivingConfig):
 
     @property
     def kind(self) -> str:
-        """``format``, or the ending of ``out``, or else png for ``run``, html for ``crashes``, gif."""
+        """``format``, else the ending of ``out``, else png for ``run``, html for ``crashes``, gif for episodes."""
         ending = Path(self.out).suffix.removeprefix(".").lower() if self.out is not None else ""
         default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
         return self.format or ending or default
 
     @property
     def end_s(self) -> float | None:
-        """``film.end_s``, or where a GIF ends by default; None: with the episode."""
+        """``film.end_s``, or the default end of a GIF; None: the end of the episode."""
         if self.film.end_s is not None or self.kind != "gif":
             return self.film.end_s
         return self.film.start_s + GIF_S
@@ -146,7 +146,7 @@ class RenderConfig(DrivingConfig):
         ]
 
     def _check_kind(self) -> None:
-        """What is asked for, what the file is called and how many episodes there are must fit together."""
+        """Raise an error unless format, file name and number of episodes fit together."""
         _check_suffix(self.out, self.kind)
         if self.run is not None and self.kind not in CHARTS:
             raise UserError(
@@ -172,7 +172,7 @@ class RenderConfig(DrivingConfig):
             raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
 
     def _check_crashes(self) -> None:
-        """Crashes are several episodes, and nothing else beside them."""
+        """Raise an error if ``crashes`` is combined with keys that do not apply to it."""
         if self.run is not None:
             raise UserError("crashes and run: either crashes or learning curves are drawn; leave one of them out.")
         if self.kind in FILMS:
@@ -180,7 +180,7 @@ class RenderConfig(DrivingConfig):
 
 
 def _check_suffix(out: str | None, kind: str) -> None:
-    """The file's name must not promise what it does not hold."""
+    """Raise an error if the ending of the file's name is that of another format."""
     ending = Path(out).suffix.removeprefix(".").lower() if out is not None else ""
     if ending and ending not in FORMATS:
         raise UserError(f"out={out}: expected one of {', '.join(FORMATS)}; give the file one of these endings.")
@@ -189,13 +189,13 @@ def _check_suffix(out: str | None, kind: str) -> None:
 
 
 def _check_out(path: Path) -> None:
-    """The film's folder must be there; nothing else is made on the way."""
+    """Raise an error if the folder of the file does not exist."""
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise UserError(f"out={path}: expected a file in a folder that exists and can be written to; make it first.")
 
 
 def require_video() -> None:
-    """Raise :class:`UserError` where the extra for mp4 is missing."""
+    """Raise :class:`UserError` if the extra for mp4 is not installed."""
     try:
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""``resume=...`` takes over the run folder and the command line of the run that is resumed."""
+"""``resume=...``: use the folder and the command line of the resumed run."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from ganlane.errors import UserError, as_typed
 from ganlane.parameters.agent import without_removed_overrides
 
 _RUNS = Path("outputs")
-#: Where a run keeps its checkpoint, below its folder.
+#: The checkpoint of a run, below its folder.
 LAST = Path("checkpoints") / "last.pt"
-#: Last names of the keys that say whose code is executed: import paths, and a Ray cluster's address.
+#: Last parts of the keys that name code to execute: import paths, and a Ray cluster's address.
 _IMPORTED_BY = ("_target_", "shares", "agents", "address")
-#: Keys whose defaults are others than in version 0.1.0.
+#: Keys whose defaults have changed since version 0.1.0.
 CHANGED_SINCE_0_1 = ("total_decisions", "collector.num_envs", "evaluation.episodes")
 
 
 def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list[str]:
-    """The overrides with those of the resumed run before them, and its folder as run folder.
+    """The overrides, preceded by those of the resumed run, with its folder as run folder.
 
     Args:
-        command: ``train``; other commands have nothing to resume.
+        command: only ``train`` resumes this way.
         overrides: of the command line.
         multirun: whether it is a sweep.
 
     Raises:
-        UserError: the run is not there, or a sweep was to be resumed.
+        UserError: there is no such run, or the command line is a sweep.
     """
     asked = _asked(overrides) if command == "train" else None
     if asked is None:
@@ -46,15 +46,14 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
     if run is None:
         print(f"resume=auto: no unfinished run below {_RUNS / command}; a new one is started.", file=sys.stderr)
         return without_repetitions([*overrides, "resume=null"])
-    stored = [*_defaults_of_then(run), *_stored(run / OVERRIDES)]
+    stored = [*_old_defaults(run), *_stored(run / OVERRIDES)]
     return without_repetitions([*stored, *overrides, f"resume={quoted(run)}", f"hydra.run.dir={quoted(run)}"])
 
 
-def _defaults_of_then(run: Path) -> list[str]:
-    """What a run had that began before train's defaults changed, where its command line said nothing.
+def _old_defaults(run: Path) -> list[str]:
+    """Overrides with the old defaults, for a run that was started before train's defaults changed.
 
-    Its config.yaml is recognised by not knowing ``compile``, which came with the new defaults; the numbers, and the
-    form of the mask if masks were known, are taken from there.
+    Such a run has no ``compile`` in its config.yaml, from which the numbers and the form of the mask are taken.
     """
     try:
         config: Any = OmegaConf.load(run / CONFIG)
@@ -62,7 +61,7 @@ def _defaults_of_then(run: Path) -> list[str]:
             return []
         kept = {key: OmegaConf.select(config, key) for key in CHANGED_SINCE_0_1}
         mask = OmegaConf.select(config, "mask.form") or "none"
-    except Exception:  # missing, no YAML, no text; what is wrong with the run, its checkpoint will tell
+    except Exception:  # missing, or not YAML; reading the checkpoint will report what is wrong
         return []
     numbers = [f"{key}={quoted(value)}" for key, value in kept.items()]
     return [f"mask={mask}", "agent=rainbow", "compile=never", *numbers]
@@ -76,7 +75,7 @@ def _stored(path: Path) -> list[str]:
     """
     try:
         found = OmegaConf.to_container(OmegaConf.load(path))
-    except Exception:  # what is no YAML, or no text, fails in many ways
+    except Exception:  # a file that is not YAML can raise many errors
         found = None
     if not isinstance(found, list) or not all(isinstance(override, str) for override in found):
         raise UserError(
@@ -90,7 +89,7 @@ def _stored(path: Path) -> list[str]:
 
 
 def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None:
-    """A run's folder is data: the command line must name what its files would execute from outside the package.
+    """Refuse code from outside the package that the run's files name, unless the command line names it too.
 
     Args:
         config: of the resumed run.
@@ -110,9 +109,9 @@ def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None
 
 
 def _imports(config: TrainConfig) -> Iterator[tuple[str, str]]:
-    """Every import path that a run would follow, and Ray's address, each with the override that names it."""
+    """Every import path of a run, and Ray's address, each with the override that names it."""
     address = getattr(config.collector, "address", None)
-    if address not in (None, "auto"):  # objects of a cluster come as pickles
+    if address not in (None, "auto"):  # a cluster sends pickles
         yield f"collector.address={address}", str(address)
     traffics = {"pretrain.traffic": config.pretrain.traffic, "traffic": config.traffic}
     for key, traffic in {**traffics, "evaluation.traffic": config.evaluation.traffic}.items():
@@ -138,7 +137,7 @@ def _asked(overrides: Sequence[str]) -> str | None:
 
 
 def run_folder(path: Path) -> Path:
-    """The run that a path means: its folder, a phase's folder, or a checkpoint in it.
+    """The run of a path to its folder, to a phase's folder or to a checkpoint in it.
 
     Raises:
         UserError: there is no run.

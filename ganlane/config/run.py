@@ -1,4 +1,4 @@
-"""What the commands share: seed, threads, device, and what everybody drives with."""
+"""Configuration shared by the commands: seed, threads, device, and the environment."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from ganlane.errors import UserError
 from ganlane.parameters.checks import DIFFERENT, CountOrZero, Record, Seed, between, one_of
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
-#: Environments driven side by side.
+#: Number of environments in a batch.
 Environments: TypeAlias = Annotated[int, between(1, 65536)]
 #: A number of episodes; their results stay in memory.
 Episodes: TypeAlias = Annotated[int, between(1, 10_000_000)]
 #: Names without repetitions.
 Names: TypeAlias = Annotated[list[str], DIFFERENT]
-#: Of printed tables.
+#: Columns of printed tables.
 Columns: TypeAlias = Annotated[str, one_of(("auto", "all"))]
 
 
 @dataclass
 class RunConfig(Record):
-    """What every command has.
+    """Keys of every command.
 
     Attributes:
         seed: of all random numbers.
@@ -51,7 +51,7 @@ def has_cuda() -> bool:
 
 @dataclass
 class GeneratorFile:
-    """``generator``: which weights generated traffic drives with.
+    """``generator``: weights of generated traffic.
 
     Attributes:
         path: weights for gan and gan_calibrated; null: the ones that ship.
@@ -62,7 +62,7 @@ class GeneratorFile:
 
 @dataclass
 class DrivingConfig(RunConfig):
-    """What every command has in which somebody drives.
+    """Keys of every command that drives an environment.
 
     Attributes:
         generator: weights of generated traffic.

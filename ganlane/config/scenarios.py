@@ -1,4 +1,4 @@
-"""Environments whose episodes start in a scene set by hand: the scenarios that ship, and one of one's own.
+"""Environments whose episodes start in a given scene: the scenarios that ship, and a scene of your own.
 
 ``env=cut_in, stalled_car, blocked_lane, stop_and_go`` are made by :mod:`ganlane.sim.scenarios`, ``env=scene`` is read
 from a file (:mod:`ganlane.sim.scene_files`).
@@ -19,7 +19,7 @@ from ganlane.parameters.episode import SpawnParameters
 if TYPE_CHECKING:
     from ganlane.sim.scenes import FixedScene, SceneVehicle
 
-#: Keys of Table II, which a scene set by hand does not have.
+#: Keys of Table II, which do not apply to a given scene.
 TABLE_II_KEYS = tuple(field.name for field in fields(SpawnParameters) if field.name != "ego_desired_speed_mps")
 
 
@@ -38,7 +38,7 @@ class SceneOptions(Record):
 
 @dataclass(frozen=True)
 class SceneEnvConfig(EnvConfig):
-    """What all scenes set by hand have in common.
+    """Base of the environments with a given scene.
 
     Attributes:
         vehicles: 0: as many as the scene has.

@@ -84,12 +84,12 @@ SUFFIX = "_schema"
 
 
 def register(command: str) -> None:
-    """Put the schemas of all options and that of a command into the ConfigStore; again does no harm."""
+    """Put the schemas of all options and of a command into the ConfigStore; may be called again."""
     store = ConfigStore.instance()
     for group, options in SCHEMAS.items():
         kept = store.repo.get(group, {}) if group else store.repo
         for name, schema in options.items():
-            # Storing one takes OmegaConf milliseconds, that of a command up to 80; and a command comes here twice.
+            # Storing a schema takes milliseconds, that of a command up to 80, and a command registers twice.
             if f"{name}{SUFFIX}.yaml" not in kept and (group or name == command):
                 store.store(group=group or None, name=name + SUFFIX, node=node_of(schema), provider="ganlane")
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
@@ -111,7 +111,7 @@ def option_of(group: str, name: str) -> tuple[Any, dict[str, Any]]:
 
 
 def node_of(config: Any) -> DictConfig:
-    """A dataclass, or one of its objects, as a node whose values can be set, those of frozen ones too."""
+    """A dataclass or an instance of one as a writable node, even if the dataclass is frozen."""
     node: DictConfig = OmegaConf.structured(config)
     _unlock(node)
     return node
@@ -145,7 +145,7 @@ def made(node: Any, where: str = "") -> Any:
 
 
 def _refused(node: DictConfig, key: str) -> str:
-    """Key of the innermost part of ``node``, itself called ``key``, that cannot be made."""
+    """Key of the innermost part of ``node`` (its own key is ``key``) that is invalid."""
     for name in node:
         child = node._get_node(name)
         if isinstance(child, DictConfig) and not child._is_none():

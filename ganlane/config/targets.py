@@ -1,4 +1,4 @@
-"""Names of Python objects in a configuration: imported, checked and called, with a sentence for what can go wrong."""
+"""Import paths in a configuration: imported, checked and called, with one sentence per error."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ Made = TypeVar("Made")
 
 
 def is_import_path(name: str) -> bool:
-    """Whether ``name`` has the form ``my.module.MyTraffic``; so may the name of a file."""
+    """Whether ``name`` has the form ``my.module.MyTraffic``, as names of files may too."""
     return "." in name and all(part.isidentifier() for part in name.split("."))
 
 
 def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
     """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
 
-    Importing a module executes it: ``path`` is one that the user gave, on the command line or in a call, or of this
-    package (:func:`ganlane.config.resume.refuse_stored_imports`).
+    Importing a module executes it: ``path`` must come from the user's command line or call, or be of this package
+    (:func:`ganlane.config.resume.refuse_stored_imports`).
 
     Args:
         path: module and name.
-        key: where the user wrote it, for the message.
-        base: what is to be made; nothing else is called.
+        key: the configuration key, for error messages.
+        base: class of the object to be made.
 
     Raises:
-        UserError: it cannot be imported, or makes something else.
+        UserError: it cannot be imported, or does not make a ``base``.
     """
     module, _, name = path.rpartition(".")
-    # A console script does not look for a user's own modules where it is started. Last, and not before one is named:
-    # what lies in that folder never replaces an installed module.
+    # A console script does not search the working folder for modules. It is added last, and only when a module is
+    # named, so that no file there replaces an installed module.
     if "" not in sys.path:
         sys.path.append("")
     try:
@@ -44,7 +44,7 @@ def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
         raise UserError(
             f"{key}={path}: {module} has no {name}; give the import path of a class or function."
         ) from error
-    except Exception as error:  # whatever a user's module does when it is imported
+    except Exception as error:  # a user's module can raise anything when imported
         raise UserError(
             f"{key}={path}: {module or path!r} cannot be imported ({type(error).__name__}: {error}); give the import "
             "path of a class or function, and start the command in the folder that holds its module."
@@ -65,16 +65,16 @@ def _makes(target: Any, base: type) -> bool:
         returned = SimpleNamespace(__annotations__={"return": target.__annotations__.get("return")})
         try:
             target = get_type_hints(returned, inspect.unwrap(target).__globals__)["return"]
-        except Exception:  # an annotation may be any text
+        except Exception:  # an annotation may be any expression
             return False
     return inspect.isclass(target) and issubclass(target, base)
 
 
 def signature_of(target: Callable[..., Any]) -> inspect.Signature:
-    """What ``target`` takes when it is called; a class: what its own constructor takes.
+    """The arguments of ``target``; for a class those of its ``__init__``.
 
-    For a class with an ``__init__`` Python below 3.11.4 tells what a base's ``__new__`` takes, which for modules of
-    TensorDict is anything.
+    For a class with an ``__init__`` Python below 3.11.4 gives those of a base's ``__new__``, which accepts anything
+    for modules of TensorDict.
     """
     if not inspect.isclass(target):
         return inspect.signature(target)
@@ -87,10 +87,10 @@ def signature_of(target: Callable[..., Any]) -> inspect.Signature:
 
 
 def call_with(target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str) -> Any:
-    """``target(...)`` with all of ``own`` and those of ``offered`` that its signature names.
+    """Call ``target`` with all of ``own`` and those of ``offered`` that its signature names.
 
     Raises:
-        UserError: ``own`` holds what the target does not take, or something that it needs is not there.
+        UserError: ``target`` does not accept an argument of ``own``, or needs one that is missing.
     """
     signature = signature_of(target)
     parameters = signature.parameters

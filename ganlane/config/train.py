@@ -1,4 +1,4 @@
-"""``ganlane train``: its root, and the groups ``init``, ``collector`` and ``logger``."""
+"""Configuration of ``ganlane train``, and the groups ``init``, ``collector`` and ``logger``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Record, Text, between, one_of
 
 Workers: TypeAlias = Annotated[int, between(1, 1024)]
-#: Compiling takes one to two minutes, which a training of so many decisions gets back.
+#: Decisions from which on compiling, which takes one to two minutes, saves time.
 WORTH_COMPILING = 300_000
 
 
@@ -128,7 +128,7 @@ class RayCollectorConfig(MultiCollectorConfig):
 
 @dataclass
 class LoggerConfig(Record):
-    """``logger=...``: where the figures of a training run go in addition to ``metrics.csv``.
+    """``logger=...``: logs of a training run in addition to ``metrics.csv``.
 
     Attributes:
         kind: csv: nowhere else; tensorboard: event files in the run folder; wandb: Weights & Biases.
@@ -215,7 +215,7 @@ class TrainConfig(DrivingConfig):
     evaluation: FinalEvaluationConfig = field(default_factory=FinalEvaluationConfig)
 
     def compiled(self) -> TrainConfig:
-        """The same with ``env.compile`` as ``compile`` says."""
+        """The config with ``env.compile`` set according to ``compile``."""
         from ganlane.runtime import can_compile
 
         worth = self.total_decisions >= WORTH_COMPILING and can_compile()
@@ -224,12 +224,12 @@ class TrainConfig(DrivingConfig):
         return replace(self, env=replace(self.env, compile=True))
 
     def all_traffic(self) -> list[TrafficConfig]:
-        """Every traffic that this run drives in."""
+        """Every traffic of the run."""
         first = [] if self.pretrain.traffic is None else [self.pretrain.traffic]
         return [*first, self.traffic, self.evaluation.traffic or self.traffic]
 
     def final_evaluation(self) -> EvaluateConfig:
-        """Config of the comparison when training is over, on training's traffic unless another one was chosen."""
+        """Config of the final comparison, by default on the traffic of the training."""
         traffic = self.evaluation.traffic or self.traffic
         shared = {name: getattr(self, name) for name in ("seed", "device", "env", "observation", "reward")}
         return EvaluateConfig(

@@ -87,8 +87,8 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
     done, wanted = training["decisions"], phase.total_decisions
     if not wanted <= done < wanted + config.collector.environments:
         raise UserError(
-            f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; resume with what the run "
-            "was started with."
+            f"pretrain.total_decisions={wanted}: this phase is over, after {done} decisions; resume with the value "
+            "that the run was started with."
         )
     if flat(training["traffic"]) != flat(phase.traffic.description()):
         raise UserError("traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same.")

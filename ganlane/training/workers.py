@@ -1,4 +1,4 @@
-"""``collector=multi`` and ``ray``: TorchRL's collectors in worker processes, their batches handed out step by step."""
+"""``collector=multi`` and ``ray``: TorchRL's collectors in worker processes; batches are returned step by step."""
 
 from __future__ import annotations
 

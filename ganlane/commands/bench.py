@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
-
-from omegaconf import OmegaConf
 
 from ganlane.bench.measure import Suite, measure
 from ganlane.bench.sim import SimSuite
 from ganlane.bench.traffic import TrafficSuite
 from ganlane.bench.train import TrainSuite
 from ganlane.config.bench import BenchConfig
-from ganlane.config.folders import OVERRIDES
+from ganlane.config.folders import stored_command
 from ganlane.evaluation import machine_sentence, write_results
 from ganlane.evaluation.table import show
 from ganlane.files import split_at_markers, write_between_markers
@@ -40,18 +37,12 @@ def bench(config: BenchConfig, folder: Path) -> str:
         print(note)
     path = write_results(folder, numbers, asdict(config), {"seed": config.seed})
     if config.report is not None:
+        command = stored_command(folder, "python -m ganlane.bench", without=("report=", "hydra."))
         parts = [
-            f"Written by the command on {date.today().isoformat()}:\n\n    {command_line(folder)}",
+            f"Written by the command on {date.today().isoformat()}:\n\n    {command}",
             f"Taken on: {machine_sentence(config.threads)}",
             *[table.markdown() for table in tables],
             *(["\n".join(f"- {note}" for note in suite.notes)] if suite.notes else []),
         ]
         write_between_markers(Path(config.report), *markers, "\n" + "\n\n".join(parts) + "\n")
     return f"results: {path}"
-
-
-def command_line(folder: Path) -> str:
-    """How the run in ``folder`` was started, without the paths in it."""
-    overrides = [str(override) for override in OmegaConf.load(folder / OVERRIDES)]
-    kept = [override for override in overrides if not override.startswith(("report=", "hydra."))]
-    return shlex.join(["python", "-m", "ganlane.bench", *kept])

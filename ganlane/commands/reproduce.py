@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -12,12 +11,11 @@ from typing import Any
 
 import polars as pl
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf
 
 from ganlane.agents import read_agent
 from ganlane.agents.checkpoint import save_agents, with_seeds
 from ganlane.config.evaluate import ReproduceConfig
-from ganlane.config.folders import OVERRIDES
+from ganlane.config.folders import stored_command
 from ganlane.crashes import find_crashes, write_crashes
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results
@@ -75,7 +73,7 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         print(table.text(), end="\n\n")
     _list_crashes(episodes, config, folder)
     record = {
-        "command": command_line(folder),
+        "command": stored_command(folder, "ganlane reproduce"),
         "rows": rows,
         "comparisons": compared,
         "failures": failed_episodes(episodes),
@@ -131,13 +129,6 @@ def _list_crashes(episodes: pl.DataFrame, config: ReproduceConfig, folder: Path)
         listed, others = find_crashes(compared, config, config.crashes)
         write_crashes(folder / "crashes.json", listed)
         print(f"crashes.json: {len(listed.crashes)} crashes; {others} ended otherwise when driven again, not listed")
-
-
-def command_line(folder: Path) -> str:
-    """The command whose run folder this is; without its keys where another program called."""
-    path = folder / OVERRIDES
-    asked: Any = OmegaConf.load(path) if path.is_file() else []
-    return shlex.join(["ganlane", "reproduce", *map(str, asked)])
 
 
 def _pairs(by_recipe: dict[tuple[str, str], Any]) -> list[tuple[str, str]]:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 import os
+import shlex
 import shutil
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from omegaconf import OmegaConf
 
 from ganlane.errors import UserError
 from ganlane.files import remove_leftovers, write_bytes
@@ -148,7 +151,15 @@ def _remove_empty(folders: list[Path]) -> None:
 
 def write_config(composed: Any, overrides: list[str], folder: Path) -> None:
     """Write all values to ``config.yaml`` and the command line to ``overrides.yaml``."""
-    from omegaconf import OmegaConf
-
     write_bytes(folder / CONFIG, OmegaConf.to_yaml(composed, resolve=True).encode())
     write_bytes(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(overrides)).encode())
+
+
+def stored_command(folder: Path, program: str, without: Sequence[str] = ()) -> str:
+    """The command line of the run in ``folder``, ``program`` first, without overrides that start as ``without`` says.
+
+    A run that was started from Python has no overrides.
+    """
+    path = folder / OVERRIDES
+    overrides = [str(override) for override in OmegaConf.load(path)] if path.is_file() else []
+    return f"{program} {shlex.join(each for each in overrides if not each.startswith(tuple(without)))}".rstrip()

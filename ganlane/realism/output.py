@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import date
@@ -14,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ganlane.config.folders import OVERRIDES
+from ganlane.config.folders import stored_command
 from ganlane.config.recordings import RealismConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, machine
@@ -60,19 +59,11 @@ def show(
     """Print the tables; write tables and figures into a document if asked for."""
     show_tables(*tables, columns=config.columns)
     if config.report is not None:
-        text = document_text(tables, numbers, command_line(folder), date.today().isoformat())
+        command = stored_command(folder, "python -m ganlane.realism", without=("report=", "figures=", "hydra."))
+        text = document_text(tables, numbers, command, date.today().isoformat())
         write_between_markers(Path(config.report), *markers(config.card()), f"\n{text}\n")
     for path in drawn if config.figures is not None else []:
         write_bytes(Path(str(config.figures)) / f"realism_{path.name}", path.read_bytes())
-
-
-def command_line(folder: Path) -> str:
-    """The command line of the run in ``folder``, without ``report`` and ``figures``."""
-    from omegaconf import OmegaConf
-
-    asked = [str(override) for override in OmegaConf.load(folder / OVERRIDES)]
-    kept = [override for override in asked if not override.startswith(("report=", "figures=", "hydra."))]
-    return shlex.join(["python", "-m", "ganlane.realism", *kept])
 
 
 def publish(starts: Starts) -> None:

@@ -34,6 +34,7 @@ DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
     "agent_idm+none": ("Agent_IDM", frozenset({"idm_mobil"})),
     "agent_gan+none": ("Agent_GAN", frozenset({"idm_mobil", "gan"})),
     "agent_idm_long+none": ("Agent_IDM, 3 M longer", frozenset({"idm_mobil"})),
+    "agent_gan_only+none": ("`gan` alone, 13 M", frozenset({"gan"})),
     "agent_idm+safe": ("Agent_IDM behind `safe`", frozenset({"idm_mobil"})),
     "agent_gan+safe": ("Agent_GAN behind `safe`", frozenset({"idm_mobil", "gan"})),
     "mobil_egoistic": ("egoistic MOBIL", frozenset()),
@@ -48,6 +49,7 @@ CLAIMS = (
     ("agent_gan+safe", "agent_idm+safe", "the same, both behind `safe`"),
     ("agent_idm_long+none", "agent_idm+none", "Agent_IDM 3 M longer over Agent_IDM"),
     ("agent_gan+none", "agent_idm_long+none", "Agent_GAN over Agent_IDM 3 M longer"),
+    ("agent_gan+none", "agent_gan_only+none", "Agent_GAN over 13 M on `gan` alone"),
     ("agent_general+safe", "agent_idm+safe", "agent_general over Agent_IDM behind `safe`"),
     ("agent_general+safe", "agent_gan+safe", "agent_general over Agent_GAN behind `safe`"),
 )

@@ -35,6 +35,8 @@ PAIRS = (
     ("agent_idm", "mobil"),
     ("agent_gan", "agent_idm_long"),
     ("agent_idm_long", "agent_idm"),
+    ("agent_gan", "agent_gan_only"),
+    ("agent_gan_only", "mobil"),
     ("agent_gan+safe", "agent_idm+safe"),
     ("agent_general", "mobil"),
     ("agent_general", "mobil_egoistic"),

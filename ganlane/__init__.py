@@ -11,7 +11,7 @@
     table = ganlane.api.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])  # a data frame
 
 Imports run one way: ``data``, ``sim`` <- ``generator`` <- ``traffic`` <- ``env`` <- ``transforms`` <- ``agents`` <-
-``evaluation`` <- ``training`` <- ``view`` <- ``config`` <- the commands' modules <- ``api`` <- ``gym``. Below all of
+``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``api`` <- ``gym`` <- ``commands``. Below all of
 them are ``keys`` (every TensorDict key), ``errors``, ``files`` and ``runtime``.
 """
 

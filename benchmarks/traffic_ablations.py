@@ -32,7 +32,7 @@ from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table
 from ganlane.files import write_json
-from ganlane.realism.long_runs import LongRun, LongRunParameters, Trajectories
+from ganlane.realism.long_runs import LongRun, LongRunParameters
 from ganlane.runtime import keep_freed_memory
 from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
@@ -71,7 +71,8 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     """Drive ``batch`` episodes at a time until the wanted vehicle-km are covered.
 
     Returns:
-        The numbers of a long run, mean speed and its spread at the end, physics steps per CPU second.
+        The numbers of a long run; at the end of the episodes the mean speed and its mean standard deviation within an
+        episode, m/s; physics steps per CPU second.
     """
     run = LongRun(Road(), parameters)
     ends: list[tuple[float, float]] = []
@@ -79,7 +80,8 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     while not run.finished:
         traffic = variant.make()
         clock = StepClock(traffic)
-        ends.append(speeds_at_the_end(run.drive(traffic, batch)))
+        last = run.drive(traffic, batch).speed[-1].astype("float64")
+        ends.append((float(last.mean()), float(last.std(axis=-1, ddof=1).mean())))
         seconds += clock.seconds
     mean, spread = (sum(values) / len(values) for values in zip(*ends))
     return {
@@ -88,12 +90,6 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
         "spread_mps": spread,
         "physics_steps_per_cpu_s": batch / median(seconds),
     }
-
-
-def speeds_at_the_end(course: Trajectories) -> tuple[float, float]:
-    """Mean speed, and standard deviation within an episode, at the end of all episodes, m/s."""
-    last = course.speed[-1].astype("float64")
-    return float(last.mean()), float(last.std(axis=-1, ddof=1).mean())
 
 
 def cells(numbers: dict[str, Any]) -> list[str]:

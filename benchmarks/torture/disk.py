@@ -113,7 +113,8 @@ def _lost_worker(tally: Tally, rng: random.Random, arguments: list[str]) -> None
     log = folder.with_suffix(".log")
     child = runs.start(arguments, log)
     metrics, end = folder / "metrics.csv", time.monotonic() + runs.AT_MOST_S
-    while time.monotonic() < end and _lines(metrics) < 3 and _runs(child):
+    running = os.WEXITED | os.WNOHANG | os.WNOWAIT  # look, without collecting the status
+    while time.monotonic() < end and _lines(metrics) < 3 and os.waitid(os.P_PID, child, running) is None:
         time.sleep(0.01)
     found = _workers(child)
     if not found:
@@ -123,10 +124,6 @@ def _lost_worker(tally: Tally, rng: random.Random, arguments: list[str]) -> None
     os.kill(rng.choice(found), signal.SIGKILL)
     attempt = runs.finish(child, log)
     _resumed(tally, "lost workers", "kill -9 of a worker", arguments, attempt, None)
-
-
-def _runs(child: int) -> bool:
-    return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
 
 def _lines(path: Path) -> int:
@@ -149,7 +146,8 @@ def _resumed(
         return
     where = f"{' '.join(arguments)}: {how}"
     tally.what[kind] += 1
-    if attempt.status != 2 or attempt.traceback or len(_complaints(attempt.said)) != 1:
+    complaints = [line for line in attempt.said.splitlines() if line.startswith("ganlane train: ")]
+    if attempt.status != 2 or attempt.traceback or len(complaints) != 1:
         tally.fail(f"{where}: not one sentence and status 2, but {attempt.status}: {attempt.said[-600:]}")
     resumed, _ = runs.to_the_end(runs.again(arguments, folder), folder.with_suffix(".log"))
     if resumed.status != 0 or not runs.finished(folder):
@@ -159,7 +157,3 @@ def _resumed(
     tally.what["resumed to the end"] += not wrong
     for each in wrong:
         tally.fail(f"{where}: {each}")
-
-
-def _complaints(said: str) -> list[str]:
-    return [line for line in said.splitlines() if line.startswith("ganlane train: ")]

@@ -28,7 +28,7 @@ Runner = Callable[[int], int]
 Row = dict[str, Any]
 
 EAGER, COMPILED, NATIVE = "eager", "compiled", "native"
-#: In a turn, however little one costs.
+#: Upper limit of the decisions in a turn.
 _MOST_DECISIONS = 2**20
 #: Decisions after which every buffer that a case needs is allocated.
 _DECISIONS_FOR_MEMORY = 3
@@ -84,11 +84,11 @@ class Suite(ABC):
 
     @abstractmethod
     def groups(self) -> Sequence[Group]:
-        """All that is timed."""
+        """All groups of cases to time."""
 
     @abstractmethod
     def findings(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """What follows from the rows, for ``results.json``."""
+        """Results computed from the rows, for ``results.json``."""
 
     @abstractmethod
     def tables(self, rows: Sequence[Row], findings: Mapping[str, Any]) -> list[Table]:
@@ -101,12 +101,12 @@ class Suite(ABC):
         return own + [(device, threads[0]) for device in devices if device != "cpu"]
 
     def labels(self, system: str, traffic: str, mode: str, threads: int, batch: int, **others: Any) -> Labels:
-        """Labels of a case on the road of the configuration; ``others`` replaces what is usual."""
+        """Labels of a case on the configured road; ``others`` overrides the defaults."""
         env = self.config.env
-        usual = Labels(
+        defaults = Labels(
             self.name, "speed", system, traffic, mode, "float32", "cpu", threads, env.vehicles, env.lanes, batch
         )
-        return replace(usual, **others)
+        return replace(defaults, **others)
 
 
 # Time

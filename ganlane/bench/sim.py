@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from tensordict import TensorDictBase
 
 from ganlane.bench.measure import (
     EAGER,
@@ -76,7 +75,7 @@ class SimSuite(Suite):
             self.notes.append("Not measured: growth with the vehicles; their number belongs to the scene.")
 
     def groups(self) -> list[Group]:
-        """Speed at every batch in turns with the peer, then the two questions of growth."""
+        """Speed at every batch in turns with HighwayEnv; growth with the batch and with the vehicles."""
         reference = highway_env_case(self) if self.has_peer else None
         speed = [
             Group(
@@ -145,9 +144,10 @@ class SimSuite(Suite):
         if self.memory:
             cases = (self._case("memory", ENVIRONMENT, EAGER, "cpu", 1, batch) for batch in batches)
             growth = growth_per_environment(*cases)
+        state = Scenario.of(self.config).build(EAGER, "cpu", 2).reset()
         return {
             "vehicles": self.config.env.vehicles,
-            "state_bytes": bytes_of(Scenario.of(self.config).build(EAGER, "cpu", 2).reset()) / 2,
+            "state_bytes": sum(leaf.nbytes for leaf in state.values(include_nested=True, leaves_only=True)) / 2,
             "batches": list(batches),
             "peak_growth_bytes": growth,
         }
@@ -190,9 +190,3 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float | None:
     if len(set(sizes)) < 2:
         return None
     return float(np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(costs, float)), 1)[0])
-
-
-def bytes_of(tensordict: TensorDictBase) -> int:
-    """Bytes of all tensors in it."""
-    leaves = tensordict.values(include_nested=True, leaves_only=True)
-    return sum(leaf.numel() * leaf.element_size() for leaf in leaves)

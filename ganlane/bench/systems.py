@@ -1,4 +1,4 @@
-"""Systems as cases: the bare physics, the environment with all around it, and HighwayEnv on the same road."""
+"""Systems as cases: bare physics, the whole environment, and HighwayEnv on the same road."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _DRAWN = 64
 
 @dataclass(frozen=True)
 class Scenario:
-    """All that makes an environment but its batch, device and mode; can be pickled."""
+    """Configuration of an environment except batch, device and mode; can be pickled."""
 
     env: EnvConfig
     traffic: TrafficConfig
@@ -44,7 +44,7 @@ class Scenario:
 
     @classmethod
     def of(cls, config: BenchConfig, traffic: TrafficConfig | None = None) -> Scenario:
-        """That of the command's configuration, with another traffic if one is given."""
+        """From the command's configuration; ``traffic`` replaces its traffic."""
         return cls(config.env, traffic or config.traffic, config.observation, config.reward, config.seed)
 
     def build(self, mode: str, device: str, batch: int) -> TransformedEnv:
@@ -181,7 +181,7 @@ class GymnasiumRunner:
 
 
 def installed_version(package: str) -> str | None:
-    """Of a package; None where it is not installed."""
+    """Version of a package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -40,7 +40,7 @@ _CHUNK = 2**16
 
 @dataclass(frozen=True)
 class Training:
-    """What is trained where; ``stored`` transitions are in the buffer when the clock starts."""
+    """Scenario and agent of a training; ``stored`` transitions are in the buffer when the clock starts."""
 
     scenario: Scenario
     agent: RainbowConfig
@@ -156,7 +156,7 @@ def advance(run: TrainingState, decisions: int) -> int:
 
 
 def with_gradients(run: Runner) -> Runner:
-    """``run`` outside of the inference mode in which cases are timed."""
+    """``run`` outside the inference mode in which cases are timed."""
 
     def learning(decisions: int) -> int:
         with torch.inference_mode(False):

@@ -86,14 +86,13 @@ def _settings(driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, e
         if not name.endswith("_epsilon"):  # noise for exploring, drawn anew by every process
             weights.update(value.cpu().numpy().tobytes())
     mask, _ = driver.behind(config.mask)
-    env = {key: value for key, value in asdict(config.env).items() if key != "compile"}
     settings = {
         "driver": driver.name,
         "weights": weights.hexdigest(),
         "mask": asdict(mask),
         "observation": asdict(config.observation.read_by(driver.observation)),
         "traffic": traffic.description(),
-        "env": env,
+        "env": {key: value for key, value in asdict(config.env).items() if key != "compile"},
         "reward": asdict(config.reward),
         "episodes": episodes,
         "stream": config.stream,
@@ -117,7 +116,7 @@ def drive(cells: Sequence[Cell], config: ReproduceConfig) -> int:
 
 
 def _driven(cells: Sequence[Cell], config: ReproduceConfig) -> Iterator[Cell]:
-    """The cells as they are finished."""
+    """Drive the cells; yield each when it is finished."""
     if min(config.workers, len(cells)) <= 1:
         for cell in cells:
             drive_cell(cell, config)
@@ -156,7 +155,7 @@ def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str
         The third: by traffic, s, all drivers together; a file that does not say it counts as 0.
 
     Raises:
-        UserError: a file that is none of ours; it is named.
+        UserError: a file without the episodes of a cell; the message names it.
     """
     tables, revisions, seconds = [], set(), dict.fromkeys((cell.traffic for cell in cells), 0.0)
     for cell in cells:

@@ -1,4 +1,4 @@
-"""What the episodes of the matrix say: a row for each driver and recipe on each traffic, and drivers compared."""
+"""Results of the matrix: a row for each recipe on each traffic, and comparisons of drivers."""
 
 from __future__ import annotations
 

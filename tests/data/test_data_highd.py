@@ -107,7 +107,7 @@ def test_units_that_cannot_be_are_refused(recording):
         read_recordings("highd", recording)
 
 
-def test_what_stands_beside_the_tracks_is_needed_and_checked(recording):
+def test_the_metadata_files_are_required_and_checked(recording):
     meta = recording.with_name("01_recordingMeta.csv")
     damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
     with pytest.raises(UserError, match=r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'"):

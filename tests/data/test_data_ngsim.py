@@ -47,9 +47,7 @@ def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_r
 
 
 @pytest.mark.parametrize(("block_bytes", "thousands"), [(10_000, True), (2**25, False)])
-def test_the_portals_periods_are_told_apart_by_time_whatever_the_order_and_the_blocks(
-    tmp_path, block_bytes, thousands
-):
+def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(tmp_path, block_bytes, thousands):
     rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, LATER_MS))).sample(fraction=1.0, shuffle=True, seed=1)
     path = portal_file(tmp_path, portal_csv(rows, thousands=thousands))
     count = RowCount()
@@ -132,7 +130,7 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
     assert str(path) in str(caught.value)
 
 
-def test_a_file_that_breaks_off_is_told_from_a_whole_one(tmp_path):
+def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
     rows = ngsim_rows(FIRST)
     whole = portal_csv(rows, thousands=False)
     assert read_recordings("ngsim", portal_file(tmp_path, whole.rstrip("\n"))).height == 540
@@ -185,7 +183,7 @@ def test_missing_columns_and_files_that_are_none_are_refused(tmp_path):
         read_recordings("ngsim", portal_file(tmp_path, portal_csv(ngsim_rows(FIRST), "peachtree")))
 
 
-def test_nothing_is_left_of_what_was_put_aside(tmp_path):
+def test_temporary_files_are_removed_after_an_error(tmp_path):
     path = portal_file(tmp_path, "\n".join(changed(500, "local_y", "far")) + "\n")
     scratch = tmp_path / "scratch"
     scratch.mkdir()

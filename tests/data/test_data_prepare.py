@@ -79,7 +79,7 @@ def test_long_recordings_are_cut_into_scenes_when_written_and_measured_whole(tmp
     assert cut_into_scenes(scenes, 100.0)["scene"].n_unique() == 6
 
 
-def test_reports_tell_rows_rates_and_durations(tmp_path):
+def test_reports_state_rows_rates_and_durations(tmp_path):
     path = tmp_path / "portal.csv"
     path.write_text(portal_csv(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0"))))
     path.write_text(path.read_text() + path.read_text().splitlines()[5] + "\n")
@@ -91,7 +91,7 @@ def test_reports_tell_rows_rates_and_durations(tmp_path):
     assert "| us-101-1 | 540 | 9 | 6 | 3 |" in long_report(prepared, "portal.csv", "report.png")
 
 
-def test_nothing_stands_at_out_unless_everything_was_written(tmp_path):
+def test_the_output_folder_appears_only_when_everything_was_written(tmp_path):
     lines = portal_csv(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0")), thousands=False).splitlines()
     (tmp_path / "bad.csv").write_text("\n".join([*lines, lines[-1].replace(",", ",x", 1)]))
     with pytest.raises(UserError, match="line 542"):
@@ -120,7 +120,7 @@ def test_names_that_differ_in_a_blank_alone_are_refused(tmp_path):
         prepare_recordings("scenes", tmp_path / "a.parquet", tmp_path / "out")
 
 
-def test_recordings_without_anybody_on_the_lanes_are_refused(tmp_path):
+def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
     write_highd(tmp_path)
     tracks = tmp_path / "01_tracks.csv"
     pl.read_csv(tracks).with_columns(laneId=pl.lit(9)).write_csv(tracks)

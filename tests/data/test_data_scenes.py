@@ -119,21 +119,24 @@ def test_a_missing_column_names_what_was_found_and_expected(tmp_path):
         read_scenes(path)
 
 
-def test_files_that_hold_nothing_or_no_table_are_refused(tmp_path):
-    path = tmp_path / "scenes.csv"
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (HEADER.encode() + b"\n", "a header but no rows"),
+        (b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50, r"line 1: not text"),
+    ],
+)
+def test_files_without_rows_or_text_are_refused(content, message, tmp_path):
+    (tmp_path / "scenes.csv").write_bytes(content)
+    with pytest.raises(UserError, match=message):
+        read_scenes(tmp_path / "scenes.csv")
+
+
+@pytest.mark.parametrize("name", ["", "scenes.csv", "x.parquet"])
+def test_absent_files_are_refused(name, tmp_path):
     with pytest.raises(UserError, match="no such file"):
-        read_scenes(path)
-    path.write_text("")
-    with pytest.raises(UserError, match="the file is empty"):
-        read_scenes(path)
-    path.write_text(HEADER + "\n")
-    with pytest.raises(UserError, match="a header but no rows"):
-        read_scenes(path)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50)
-    with pytest.raises(UserError, match=r"line 1: not text"):
-        read_scenes(path)
-    with pytest.raises(UserError, match="no such file"):
-        read_scenes(tmp_path)
+        read_scenes(tmp_path / name)
 
 
 def test_a_scene_in_two_files_is_refused(tmp_path):
@@ -145,8 +148,6 @@ def test_a_scene_in_two_files_is_refused(tmp_path):
 
 def test_damaged_parquet_is_refused(tmp_path):
     path = tmp_path / "x.parquet"
-    with pytest.raises(UserError, match="no such file"):
-        read_scenes(path)
     path.write_bytes(b"PAR1 not really")
     with pytest.raises(UserError, match="not a readable Parquet file"):
         read_scenes(path)

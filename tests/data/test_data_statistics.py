@@ -188,7 +188,7 @@ def test_the_survival_curve_takes_censored_times_as_lower_bounds():
     assert (found.complete.mean, found.complete.sd) == (3.0, 2.0)
 
 
-def test_durations_none_of_which_was_seen_whole_have_no_mean():
+def test_durations_that_are_all_censored_have_no_mean():
     durations = describe_durations([1.0, 2.0], [False, False])
     assert durations.censored == 2
     assert durations.survival_mean_s is None

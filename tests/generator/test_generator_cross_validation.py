@@ -76,7 +76,7 @@ def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(scored):
 
 
 @pytest.mark.parametrize("preset", ["paper", "calibrated"])
-def test_the_folds_generators_say_what_they_were_fitted_to(preset, frame, scored, tmp_path):
+def test_the_folds_generators_name_the_scenes_they_were_fitted_to(preset, frame, scored, tmp_path):
     scores, fits = scored[preset]
     assert list(fits) == [1, 2, 3]
     for fit, split in zip(fits.values(), scores["splits"]):

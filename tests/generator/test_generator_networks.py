@@ -43,7 +43,7 @@ def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
         torch.testing.assert_close(apply(layer.double(), x.double(), relu).float(), expected)
 
 
-def test_with_gradients_it_has_them():
+def test_gradients_reach_the_weights_of_many_rows():
     layer = nn.Linear(5, 7)
     apply(layer, torch.randn(700, 5), relu=True).sum().backward()
     assert layer.weight.grad.abs().sum() > 0
@@ -132,7 +132,7 @@ def test_a_few_vehicles_are_all_each_others_neighbours(scene):
     assert seen[1, 0].tolist() == [False] + [True] * 6 + [False] * 2
 
 
-def test_who_is_out_of_range_has_no_influence():
+def test_vehicles_out_of_range_have_no_influence():
     position = torch.tensor([[[0.0, 0.0], [RANGE_M + 1.0, 0.0], [RANGE_M - 1.0, 0.0]]])
     _, seen = nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)
     assert seen[0, 0].tolist() == [False, False, True]

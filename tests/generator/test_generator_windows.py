@@ -1,5 +1,7 @@
 """Windows cut from recorded scenes, their k-means groups, and the groups' cache."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import polars as pl
 import pytest
@@ -92,37 +94,29 @@ def test_windows_are_counted_as_they_are_cut():
     assert [count_windows(scene) for scene in scenes] == [len(cut_windows([scene])) for scene in scenes]
 
 
-class Count:
-    """Computes the same arrays and counts how often."""
-
-    def __init__(self):
-        self.calls = 0
-
-    def __call__(self):
-        self.calls += 1
-        return {"labels": np.arange(5), "more": np.ones((2, 3))}
+ARRAYS = {"labels": np.arange(5), "more": np.ones((2, 3))}
 
 
-def test_what_was_computed_once_is_computed_again_only_where_the_file_is_damaged(monkeypatch, tmp_path):
+def test_a_cached_result_is_computed_again_only_where_its_file_is_damaged(monkeypatch, tmp_path):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    compute = Count()
+    compute = Mock(return_value=ARRAYS)
     first, again = (cached("groups", "key", compute) for _ in range(2))
-    assert compute.calls == 1
+    assert compute.call_count == 1
     assert first.keys() == again.keys()
     assert all((first[name] == again[name]).all() for name in first)
     (file,) = tmp_path.iterdir()
     for damage in (b"", b"PK\x03\x04 half a file", b"something else"):
         file.write_bytes(damage)
         assert (cached("groups", "key", compute)["labels"] == np.arange(5)).all()
-    assert compute.calls == 4
+    assert compute.call_count == 4
     cached("groups", "another", compute)
-    assert compute.calls == 5
+    assert compute.call_count == 5
 
 
-def test_a_folder_that_cannot_be_written_to_is_done_without(monkeypatch, tmp_path):
+def test_an_unwritable_cache_folder_is_ignored(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("not a folder")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
-    assert (cached("groups", "key", Count())["labels"] == np.arange(5)).all()
+    assert (cached("groups", "key", lambda: ARRAYS)["labels"] == np.arange(5)).all()
 
 
 def test_an_empty_name_switches_the_cache_off_and_none_takes_the_users_folder(monkeypatch, tmp_path):
@@ -175,7 +169,7 @@ def test_kmeans_puts_two_distant_platoons_into_two_groups():
     assert labels[0] != labels[9]
 
 
-def test_mirroring_turns_only_the_chosen_groups_round():
+def test_mirroring_flips_only_the_chosen_groups():
     groups = group_windows(cut_windows(scene_tracks(recording())), size=4).select(slice(0, 2))
     flipped = groups.mirrored(torch.tensor([False, False]))
     assert (flipped.displacements == groups.displacements).all()

@@ -1,4 +1,4 @@
-"""The commands as typed calls for notebooks and scripts.
+"""The commands as typed Python calls, for notebooks and scripts.
 
 ::
 
@@ -9,8 +9,8 @@
     rollout = env.rollout(100, agent.policy)
     table = ganlane.api.evaluate([agent, "mobil", "random_legal"], ["idm_mobil", "gan"], episodes=100)
 
-Options are names, mappings or config dataclasses (:mod:`ganlane.options`), checked as on the command line. A mistake
-ends in :class:`ganlane.errors.UserError`, one sentence. docs/python_api.md puts calls and commands side by side.
+Options are names, mappings or config dataclasses (:mod:`ganlane.options`), checked as on the command line. Mistakes
+raise :class:`ganlane.errors.UserError` with one sentence. docs/python_api.md compares calls and commands.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def make_env(
         reward: ``paper``, ``considerate``, or a mapping of what differs from ``paper``, ``{"hard_crash": -200}``.
         mask: ``none``, ``legal`` or ``safe`` (writes ``action_mask`` [N, 3] bool), or a mapping.
         transforms: your own, after observation and reward.
-        seed: base of the random numbers.
+        seed: of the random numbers.
         stream: family of the episodes: ``train``, ``select`` or ``report`` (that of ``evaluate``).
         device: ``cpu`` or ``cuda``.
         overrides: keys of the environment (:class:`ganlane.config.env.EnvConfig`), ``lanes=4, idm={"headway_s": 1}``.
@@ -129,8 +129,8 @@ def load_agent(
         name: a shipped agent, a rule-based driver (``mobil``, ``mobil_egoistic``, ``keep_lane``, ``random_legal``,
             ``random``), the path of an agent's ``.safetensors``, or the import path of a policy of your own.
         env, overrides: the environment it drives in, as in :func:`make_env`; a network must fit.
-        stream: of its random numbers, if it draws any.
-        device: of its network.
+        stream: stream of its random numbers, if it draws any.
+        device: device of its network.
 
     Raises:
         UserError: no such driver, or its network takes another observation.
@@ -150,7 +150,7 @@ def evaluate(
     folder: str | Path | None = None,
     **keys: Any,
 ) -> pl.DataFrame:
-    """Every agent on every traffic, on the same episodes; one row for each pair.
+    """Evaluate every agent on every traffic, on the same episodes; one row for each pair.
 
     Args:
         agents: names, drivers from :func:`load_agent`, or policies of your own; ``mobil`` and ``random_legal`` are
@@ -218,7 +218,7 @@ def train(
         evaluation: keys of the final evaluation: ``agents, episodes, num_envs, traffic``.
         pretrain: a first phase, ``{"traffic": "idm_mobil", "total_decisions": 10_000_000}``.
         folder: the run's; None: a new one below ``outputs/train``.
-        resume: go on with the run in ``folder``; the other arguments must be those that it was started with.
+        resume: continue the run in ``folder``; the other arguments must be those of its start.
         keys: further options (``env``, ``observation``, ``reward``, ``mask``, ``agent``, ``logger``), keys of the
             command (``evaluate_every``, ``log_every``, ``device``, ...) or of the environment.
 
@@ -250,12 +250,12 @@ def render(
     film: Mapping[str, Any] | None = None,
     **keys: Any,
 ) -> Path:
-    """Episodes as a film, page or table, or the learning curves of runs; the file's path.
+    """Write episodes as a film, page or table, or the learning curves of runs; return the file's path.
 
     Args:
         agent: as ``name`` in :func:`load_agent`; several for html, csv and parquet.
         traffic: as in :func:`make_env`.
-        episode: number of the episode, which is that of ``evaluate``; several as for ``agent``.
+        episode: number of the episode, the same as in ``evaluate``; several as for ``agent``.
         out: file to write; None: into a new folder below ``outputs/render``.
         run: folders of training runs; their learning curves are drawn instead of an episode.
         film: keys of the film: ``fps, speedup, start_s, end_s, width, height, ...``.
@@ -281,7 +281,7 @@ def render(
 
 @checked_arguments
 def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
-    """Any command that writes ``results.json``: ``record``, ``prepare``, ``realism``, ``bench`` ...
+    """Run any command that writes ``results.json``: ``record``, ``prepare``, ``realism``, ``bench`` ...
 
     ``run("prepare", data={"name": "ngsim", "path": "raw.txt"}, out="us101")`` is ``ganlane prepare data=ngsim
     data.path=raw.txt out=us101`` on the command line.

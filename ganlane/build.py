@@ -1,4 +1,4 @@
-"""From config dataclasses to environments, traffic and drivers, without Hydra.
+"""Environments, traffic and drivers from config dataclasses, without Hydra.
 
 ::
 
@@ -85,7 +85,7 @@ def make_env(
     first_episode: int = 0,
     mask: MaskParameters | None = None,
 ) -> TransformedEnv:
-    """A batched environment with observation, reward and, where asked for, action mask; its stream is the traffic's.
+    """A batched environment with observation, reward and optionally action mask; its stream is that of the traffic.
 
     Raises:
         UserError: see :class:`ganlane.env.HighwayEnv`.
@@ -157,10 +157,10 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent (``agent_idm@1``: the recipe
             of ``agent_idm``, trained with seed 1), the path of an agent's file, or the import path of a policy of
             your own (a class or annotated function; it may have ``road``, ``stream``, ``idm`` and ``mobil``). A
-            suffix ``+safe``, ``+legal`` or ``+none`` sets its mask, in place of the one that it was trained with.
-        env: the environment it drives in.
-        stream: of its random numbers, if it draws any.
-        device: of its network.
+            suffix ``+safe``, ``+legal`` or ``+none`` sets its mask in place of the one in its training.
+        env: the environment in which it drives.
+        stream: stream of its random numbers, if it draws any.
+        device: device of its network.
 
     Raises:
         UserError: no such driver, or a network of another shape than the environment's observation.
@@ -188,7 +188,7 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
 
 
 def make_drivers(names: Sequence[str], env: EnvConfig, device: str = "cpu") -> list[Driver]:
-    """:func:`make_driver` for several names; ``agent_idm@all`` stands for all trainings of its recipe there are."""
+    """:func:`make_driver` for several names; ``agent_idm@all`` means every shipped training of its recipe."""
     single_names = dict.fromkeys(single for name in names for single in with_seeds(name))
     return [make_driver(name, env, device=device) for name in single_names]
 
@@ -207,7 +207,7 @@ def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
 
 
 def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
-    """The observation that an agent's metadata name.
+    """The observation in an agent's metadata.
 
     Raises:
         UserError: no observation, or an unknown one.

@@ -77,7 +77,7 @@ class Crash(Record):
 
 @dataclass(frozen=True)
 class CrashList:
-    """Crashes with what their episodes depend on: the road, the traffics' keys, and the stream of random numbers."""
+    """Crashes, and what their episodes depend on: environment, traffics and stream of random numbers."""
 
     env: EnvConfig
     traffics: Mapping[str, TrafficConfig]
@@ -115,8 +115,8 @@ def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> t
         most: episodes per driver and traffic, those with the fewest decisions first.
 
     Returns:
-        The list, and how many of the episodes ended otherwise: where traffic is generated, another batch size rounds
-        differently.
+        The list, and how many of the episodes ended otherwise: generated traffic rounds differently in batches of
+        another size.
     """
     traffics = {
         name: option

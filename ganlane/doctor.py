@@ -83,7 +83,7 @@ _INSTALL_COMPILER: Final = {"darwin": "xcode-select --install", "win32": "instal
 
 
 class State(Enum):
-    """``MISSING`` is needed and makes the exit status 1; ``ABSENT`` is for further purposes only."""
+    """``MISSING`` is needed and makes the exit status 1; ``ABSENT`` is optional."""
 
     OK = "ok"
     ABSENT = "absent"
@@ -132,7 +132,7 @@ def examine() -> dict[str, list[Finding]]:
 
 def missing(sections: Mapping[str, Sequence[Finding]]) -> list[str]:
     """Subjects that are needed and not there."""
-    return [found.subject for findings in sections.values() for found in findings if found.state is State.MISSING]
+    return [each.subject for findings in sections.values() for each in findings if each.state is State.MISSING]
 
 
 def report(sections: Mapping[str, Sequence[Finding]]) -> str:
@@ -166,11 +166,11 @@ def _install(*requirements: str) -> str:
 
 def python() -> Finding:
     """The interpreter."""
-    found = f"{platform.python_version()} ({sys.executable})"
+    version = f"{platform.python_version()} ({sys.executable})"
     if sys.version_info >= PYTHON:
-        return Finding("python", State.OK, found)
-    wanted = ".".join(map(str, PYTHON))
-    return Finding("python", State.MISSING, found, f"a virtual environment with Python {wanted} or newer")
+        return Finding("python", State.OK, version)
+    needed = ".".join(map(str, PYTHON))
+    return Finding("python", State.MISSING, version, f"a virtual environment with Python {needed} or newer")
 
 
 def required(text: str) -> Finding:
@@ -228,11 +228,10 @@ def _devices() -> Finding:
 
 def _compiler() -> Finding:
     """The C++ compiler that only ``env.compile=true`` needs; ``CXX`` names another one."""
-    path, looked = find_compiler()
+    path, names = find_compiler()
     if path is None:
-        found = f"none (looked for {looked}); env.compile=true needs one"
         fix = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
-        return Finding("C++ compiler", State.ABSENT, found, fix)
+        return Finding("C++ compiler", State.ABSENT, f"none (looked for {names}); env.compile=true needs one", fix)
     return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")
 
 

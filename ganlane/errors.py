@@ -15,14 +15,14 @@ class UserError(Exception):
 
 
 class ParameterError(UserError):
-    """A parameter out of its range, or parameters that do not go together.
+    """A parameter out of its range, or incompatible parameters.
 
-    The record that raises it knows its fields, not their keys. So the sentence holds the fields in braces,
+    The record that raises it knows its fields, not their keys. So the sentence has the fields in braces,
     ``"{timeout_s}=0: expected a number above 0."``, and a caller that knows the key adds it with :meth:`below`.
 
     Args:
         text: the sentence.
-        where: key of the record, for instance ``env.idm``; empty: fields go by their own names.
+        where: key of the record, for instance ``env.idm``; empty: fields without prefix.
     """
 
     def __init__(self, text: str, where: str = "") -> None:

@@ -33,9 +33,8 @@ def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeR
     given = {name: options.pop(name) for name in _OPTIONS if name in options}
     try:
         config: TrafficConfig = option("traffic", traffic)
-        env: EnvConfig = option("env", given.get("env", "highway"), options)
-        observation = option("observation", given.get("observation", "lane_view_overlap"))
-        reward, mask = option("reward", given.get("reward", "paper")), option("mask", given.get("mask", "none"))
+        env: EnvConfig = option("env", given.get("env"), options)
+        observation, reward, mask = (option(group, given.get(group)) for group in ("observation", "reward", "mask"))
         check_reward(env, reward)
         device = RunConfig(device=given.get("device", "cpu")).device
         stream = Stream.named(str(given.get("stream", "train")))

@@ -36,7 +36,7 @@ class Rows(ABC):
         count: N.
         space: of one observation.
         episode: decision period and time limit.
-        env, state: the TorchRL environment and the state of its rows, where there is one.
+        env, state: the TorchRL environment and the state of its rows; None with the native kernel.
     """
 
     count: int

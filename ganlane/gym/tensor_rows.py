@@ -16,7 +16,6 @@ from torchrl.envs import TransformedEnv
 from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.api import make_env
-from ganlane.errors import UserError
 from ganlane.gym.rows import Flags, Floats, Rows, observation_space
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.native.batch import Stepped
@@ -42,7 +41,6 @@ class TensorRows(Rows):
         form = next((each.form for each in env.transform if isinstance(each, ObservationTransform)), "table3")
         largest = largest_number(form, env.base_env.scenes.longest_m)
         self.space = observation_space(env.observation_spec[keys.OBSERVATION].shape[-1], largest)
-        self.state: TensorDictBase | None = None
 
     @torch.no_grad()
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
@@ -67,8 +65,7 @@ class TensorRows(Rows):
 
     def now(self) -> TensorDictBase:
         """The state of all rows; raises :class:`UserError` before the first :meth:`start`."""
-        if self.state is None:
-            raise UserError("no episode is under way; call reset() first.")
+        self.check_started()
         return self.state
 
     def observation(self) -> Floats:

@@ -39,7 +39,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random.
         render_mode: None or ``rgb_array``.
         autoreset_mode: what happens to a row that has ended, see below.
-        max_episode_steps: as ``make_vec`` gives it for a spec of this environment; ``timeout_s`` sets the limit.
+        max_episode_steps: passed by ``make_vec`` for a spec of this environment; ``timeout_s`` sets the limit.
         options: as in :class:`ganlane.gym.single.HighwayGym`.
 
     ``AutoresetMode.SAME_STEP``: a row that ends is reset in the same step: ``observation`` is the first of its next
@@ -47,8 +47,8 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
     in the next step, which ignores its action and gives the reward 0. ``DISABLED``: you reset it by
     ``reset(options={"reset_mask": mask})``, which begins the next episodes in the rows of a boolean array [N].
 
-    Row i of N runs the episodes i, i + N, i + 2N, ... of the seed, in whatever batch.
-    ``reset(options={"episode": k})`` begins with the episodes k + i instead; an array [N] gives each row its own.
+    Row i of N runs the episodes i, i + N, i + 2N, ... of the seed. ``reset(options={"episode": k})`` begins with the
+    episodes k + i instead; an array [N] sets the episode of every row.
 
     Raises:
         UserError: a wrong value.

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ganlane.build import Driver, make_env, make_traffic
@@ -27,7 +26,6 @@ from ganlane.evaluation import (
 )
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.sim.random import Stream
 from ganlane.traffic import ReplayTraffic
 
@@ -50,7 +48,7 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
     modules = {name: make_traffic(traffic, env, stream) for name, traffic in config.chosen_traffics().items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(config.num_envs, episodes), []
-    made: tuple[tuple[str, ObservationConfig, MaskParameters], EnvBase] | None = None
+    current = None
     disabled = quiet or not sys.stderr.isatty()
     with tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=disabled) as bar:
         for number, (traffic, driver) in enumerate(pairs):
@@ -58,12 +56,12 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
             mask, policy = driver.behind(config.mask)
             parts = (modules[traffic], env, observation, config.reward)
             make = partial(make_env, *parts, seed=seed, device=config.device, mask=mask)
-            if made is None or made[0] != (traffic, observation, mask):
+            if current != (traffic, observation, mask):
                 # Drivers with the same observation and mask share an environment, so that it is compiled once.
-                made = (traffic, observation, mask), make(rows)
+                current, batch = (traffic, observation, mask), make(rows)
             smaller = None if env.compile else make
             on_progress = None if quiet else _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
-            table = run_episodes(made[1], policy, range(episodes), seed, on_progress, smaller)
+            table = run_episodes(batch, policy, range(episodes), seed, on_progress, smaller)
             table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             if isinstance(module := modules[traffic], ReplayTraffic):
                 scenes = module.scenes_of_episodes(seed, table["episode"].to_list())

@@ -160,8 +160,7 @@ def installed(text: str) -> tuple[str, str | None, bool]:
 
 
 def _install(*requirements: str) -> str:
-    quoted = (f'"{text}"' for text in requirements)
-    return f"python -m pip install {' '.join(quoted)}"
+    return " ".join(["python -m pip install", *(f'"{text}"' for text in requirements)])
 
 
 def python() -> Finding:
@@ -176,10 +175,9 @@ def python() -> Finding:
 def required(text: str) -> Finding:
     """Whether a requirement is installed in a suitable version and can be imported."""
     name, version, fits = installed(text)
-    if version is None:
-        return Finding(name, State.MISSING, "not installed", _install(text))
-    if not fits:
-        return Finding(name, State.MISSING, f"{version}, needed {text.removeprefix(name)}", _install(text))
+    if version is None or not fits:
+        lacking = "not installed" if version is None else f"{version}, needed {text.removeprefix(name)}"
+        return Finding(name, State.MISSING, lacking, _install(text))
 
     def look() -> Finding:
         importlib.import_module(MODULES.get(name, name))

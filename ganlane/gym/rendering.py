@@ -41,13 +41,12 @@ class LiveView:
 
     def __init__(self, env: TransformedEnv, traffic: str, window: FilmWindow | None = None) -> None:
         self.env, self.traffic, self.window = env, traffic, window
-        self._recorder, self._label, self._outcome = Recorder(), EpisodeLabel(), ""
-        #: Frames recorded before the decision under way.
-        self._before = 0
 
     def start(self, state: TensorDictBase) -> None:
         """A new episode begins at ``state``."""
-        self._recorder, self._outcome, self._before = Recorder(), "", 0
+        self._recorder, self._outcome = Recorder(), ""
+        #: Frames recorded before the present decision.
+        self._before = 0
         self._label = _label(self.env, state, 0, self.traffic)
         self._recorder.add(state.get(keys.VEHICLES), 0.0)
         self.env.base_env.recorder = self._recorder

@@ -1,4 +1,4 @@
-"""DQN in one file, as CleanRL writes it, on gymnasium's vector interface: 64 highways stepped as one batch.
+"""DQN in one file, in CleanRL's style, on gymnasium's vector interface: 64 highways stepped as one batch.
 
 Run it with ``python examples/cleanrl_style.py``; a few seconds of training by default, more with
 ``python examples/cleanrl_style.py 500000``.
@@ -19,7 +19,7 @@ BATCH, CAPACITY, GAMMA, TARGET_EVERY = 256, 50_000, 0.98, 100
 
 
 def next_observations(observation, ended, info):
-    """What followed the decision: where an episode ended, its last observation, not the next one's first."""
+    """Observations after the decision; where an episode ended its last one, not the first of the next episode."""
     following = observation.copy()
     if ended.any():
         following[ended] = np.stack(info["final_obs"][ended])
@@ -27,13 +27,12 @@ def next_observations(observation, ended, info):
 
 
 def update(network, target, optimiser, batch):
-    """One step down the gradient of the squared temporal difference; a time-out is no end of the future."""
-    seen, action, reward, following, terminated = batch
+    """One gradient step on the temporal difference (Huber loss); time-outs are bootstrapped."""
+    observation, action, reward, following, terminated = batch
     with torch.no_grad():
-        future = target(following).amax(1)
-        wanted = reward + GAMMA * future * ~terminated
-    value = network(seen).gather(1, action[:, None])[:, 0]
-    loss = nn.functional.smooth_l1_loss(value, wanted)
+        expected = reward + GAMMA * target(following).amax(1) * ~terminated
+    value = network(observation).gather(1, action[:, None])[:, 0]
+    loss = nn.functional.smooth_l1_loss(value, expected)
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
@@ -53,7 +52,7 @@ def main(decisions=16_384, num_envs=64):
     )
     target.load_state_dict(network.state_dict())
     optimiser = torch.optim.Adam(network.parameters(), lr=5e-4)
-    shapes = {"seen": (size,), "action": (), "reward": (), "following": (size,), "terminated": ()}
+    shapes = {"observation": (size,), "action": (), "reward": (), "following": (size,), "terminated": ()}
     kinds = {"action": torch.int64, "terminated": torch.bool}
     memory = {name: torch.zeros(CAPACITY, *shape, dtype=kinds.get(name)) for name, shape in shapes.items()}
     observation, info = envs.reset(seed=0)
@@ -62,7 +61,7 @@ def main(decisions=16_384, num_envs=64):
         epsilon = max(0.05, 1.0 - 2.0 * step * num_envs / decisions)
         with torch.no_grad():
             action = network(torch.from_numpy(observation)).argmax(1).numpy()
-        # At random among the actions that stay on the road.
+        # Random actions are drawn among those that stay on the road.
         legal = info["action_mask"] * rng.random((num_envs, actions))
         action = np.where(rng.random(num_envs) < epsilon, legal.argmax(1), action)
         before = observation

@@ -18,7 +18,7 @@ from ganlane.sim.ego import ego_scene
 
 
 class LargestGap(Driver):
-    """Goes where the gap ahead is at least ``better_m`` larger, if nobody there has to brake hard."""
+    """Changes to a lane whose gap ahead is at least ``better_m`` larger, if no driver there has to brake hard."""
 
     def __init__(self, road, stream=Stream.TRAIN, better_m=20.0):
         super().__init__(road, stream)
@@ -28,14 +28,14 @@ class LargestGap(Driver):
         """The action [N] of every row."""
         scene = ego_scene(vehicles, self.road)
         lane = scene.observers.target_lane.to(vehicles.x.dtype)
-        wanted = leader(scene, lane).gap.clamp_max(200.0) + self.better_m
+        best_gap = leader(scene, lane).gap.clamp_max(200.0) + self.better_m
         action = torch.full_like(scene.observers.target_lane, KEEP)
         for side, command in ((1.0, LEFT), (-1.0, RIGHT)):
-            there = self.road.clamp_lane(lane + side)
-            gap = leader(scene, there).gap.clamp_max(200.0)
-            goes = (there != lane) & (gap > wanted) & safe_change(scene, there)
-            action = torch.where(goes, command, action)
-            wanted = torch.where(goes, gap, wanted)
+            neighbour = self.road.clamp_lane(lane + side)
+            gap = leader(scene, neighbour).gap.clamp_max(200.0)
+            change = (neighbour != lane) & (gap > best_gap) & safe_change(scene, neighbour)
+            action = torch.where(change, command, action)
+            best_gap = torch.where(change, gap, best_gap)
         return action[:, 0]
 
 

@@ -1,7 +1,7 @@
-"""A reward of your own: pay also for what the ego does to the driver behind it.
+"""A reward of your own: also penalise dangerous approaches behind the ego.
 
-Section V.C counts dangerous approaches ahead of the ego. Those behind it (the ego cut in) are reported by the
-environment, as ``events.soft_crash_behind``, but cost nothing. This transform makes them cost something. Run it with
+Section V.C counts dangerous approaches ahead of the ego. Those behind it (after the ego cut in) are reported by the
+environment as ``events.soft_crash_behind``, without a penalty. This transform adds one. Run it with
 ``python examples/own_reward.py``.
 """
 
@@ -19,7 +19,7 @@ from ganlane.transforms import RewardTransform
 
 
 class Courtesy(Transform):
-    """Takes ``penalty`` off the reward for every onset of a soft crash behind the ego."""
+    """Subtracts ``penalty`` from the reward for every onset of a soft crash behind the ego."""
 
     def __init__(self, penalty=5.0):
         super().__init__(in_keys=[keys.REWARD, keys.EVENTS], out_keys=[keys.REWARD])

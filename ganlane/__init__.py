@@ -58,10 +58,7 @@ __all__ = ["__version__", "api", *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used (PEP 562).
-
-    ``import ganlane`` must register the gymnasium environments without waiting seconds for torch.
-    """
+    """Import a public name at its first use (PEP 562), so that ``import ganlane`` does not wait seconds for torch."""
     if name in ("api", *_MODULES):
         check_process()
     if name == "api":
@@ -75,11 +72,7 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-def _starts_a_command() -> bool:
-    """Whether ``ganlane ...`` or ``python -m ganlane...`` imports this; the latter is called -m until it is found."""
-    return os.path.splitext(os.path.basename(sys.argv[0]))[0] in ("-m", "ganlane") if sys.argv else False
-
-
-# A command registers them once its keys are checked: gymnasium's import takes 0.2 of the 0.7 s of a mistyped key.
-if not _starts_a_command():
+# A command (``ganlane ...``, or ``python -m ganlane...``, where argv[0] is -m during this import) registers them only
+# after checking its keys: importing gymnasium takes 0.2 s of the 0.7 s in which a mistyped key is reported.
+if not sys.argv or os.path.splitext(os.path.basename(sys.argv[0]))[0] not in ("-m", "ganlane"):
     register_envs()

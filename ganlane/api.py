@@ -1,4 +1,4 @@
-"""The commands as typed calls for notebooks and scripts.
+"""The commands as typed Python calls, for notebooks and scripts.
 
 ::
 
@@ -9,8 +9,8 @@
     rollout = env.rollout(100, agent.policy)
     table = ganlane.api.evaluate([agent, "mobil", "random_legal"], ["idm_mobil", "gan"], episodes=100)
 
-Options are names, mappings or config dataclasses (:mod:`ganlane.options`), checked as on the command line. A mistake
-ends in :class:`ganlane.errors.UserError`, one sentence. docs/python_api.md puts calls and commands side by side.
+Options are names, mappings or config dataclasses (:mod:`ganlane.options`), checked as on the command line. Mistakes
+raise :class:`ganlane.errors.UserError` with one sentence. docs/python_api.md compares calls and commands.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def make_env(
         reward: ``paper``, ``considerate``, or a mapping of what differs from ``paper``, ``{"hard_crash": -200}``.
         mask: ``none``, ``legal`` or ``safe`` (writes ``action_mask`` [N, 3] bool), or a mapping.
         transforms: your own, after observation and reward.
-        seed: base of the random numbers.
+        seed: of the random numbers.
         stream: family of the episodes: ``train``, ``select`` or ``report`` (that of ``evaluate``).
         device: ``cpu`` or ``cuda``.
         overrides: keys of the environment (:class:`ganlane.config.env.EnvConfig`), ``lanes=4, idm={"headway_s": 1}``.
@@ -99,7 +99,7 @@ def make_env(
     config, rewards = option("env", env, overrides), option("reward", reward)
     check_reward(config, rewards)
     checked = RunConfig(seed=int(seed), device=device)
-    made = build.make_env(
+    batch = build.make_env(
         build.make_traffic(option("traffic", traffic), config, Stream.named(stream)),
         config,
         option("observation", observation),
@@ -110,8 +110,8 @@ def make_env(
         mask=option("mask", mask),
     )
     for transform in transforms:
-        made.append_transform(transform)
-    return made
+        batch.append_transform(transform)
+    return batch
 
 
 @checked_arguments
@@ -129,8 +129,8 @@ def load_agent(
         name: a shipped agent, a rule-based driver (``mobil``, ``mobil_egoistic``, ``keep_lane``, ``random_legal``,
             ``random``), the path of an agent's ``.safetensors``, or the import path of a policy of your own.
         env, overrides: the environment it drives in, as in :func:`make_env`; a network must fit.
-        stream: of its random numbers, if it draws any.
-        device: of its network.
+        stream: stream of its random numbers, if it draws any.
+        device: device of its network.
 
     Raises:
         UserError: no such driver, or its network takes another observation.
@@ -150,7 +150,7 @@ def evaluate(
     folder: str | Path | None = None,
     **keys: Any,
 ) -> pl.DataFrame:
-    """Every agent on every traffic, on the same episodes; one row for each pair.
+    """Evaluate every agent on every traffic, on the same episodes; one row for each pair.
 
     Args:
         agents: names, drivers from :func:`load_agent`, or policies of your own; ``mobil`` and ``random_legal`` are
@@ -171,14 +171,19 @@ def evaluate(
         OSError: a folder that cannot be written to.
     """
     chosen = _named_traffics(traffics)
-    agents = [each for agent in agents for each in (with_seeds(agent) if isinstance(agent, str) else [agent])]
-    keys |= {"agents": [_agent_name(agent) for agent in agents], "traffics": list(chosen)}
+    given = [each for agent in agents for each in (with_seeds(agent) if isinstance(agent, str) else [agent])]
+    agents = [Driver(type(each).__name__, each) if isinstance(each, TensorDictModuleBase) else each for each in given]
+    names = [agent.name if isinstance(agent, Driver) else str(agent) for agent in agents]
+    keys |= {"agents": names, "traffics": list(chosen)}
     keys |= {"episodes": episodes, "seed": seed, "traffic_options": {**all_traffics(), **chosen}}
     config: EvaluateConfig = command_config("evaluate", keys)
     with _torch_threads(config.threads), cleared_after_mistakes(Path(folder)) if folder else nullcontext():
         if folder is not None:  # before hours of driving
             Path(folder).mkdir(parents=True, exist_ok=True)
-        drivers = [_driver(agent, name, config) for agent, name in zip(agents, config.agents)]
+        drivers = [
+            agent if isinstance(agent, Driver) else build.make_driver(name, config.env, device=config.device)
+            for agent, name in zip(agents, config.agents)
+        ]
         table = compare(drivers, config)
     rows = plain(evaluation_rows(table))
     if folder is not None:
@@ -213,7 +218,7 @@ def train(
         evaluation: keys of the final evaluation: ``agents, episodes, num_envs, traffic``.
         pretrain: a first phase, ``{"traffic": "idm_mobil", "total_decisions": 10_000_000}``.
         folder: the run's; None: a new one below ``outputs/train``.
-        resume: go on with the run in ``folder``; the other arguments must be those that it was started with.
+        resume: continue the run in ``folder``; the other arguments must be those of its start.
         keys: further options (``env``, ``observation``, ``reward``, ``mask``, ``agent``, ``logger``), keys of the
             command (``evaluate_every``, ``log_every``, ``device``, ...) or of the environment.
 
@@ -227,11 +232,11 @@ def train(
     keys |= {"collector": {"num_envs": num_envs}, "resume": str(folder) if resume else None}
     keys |= {"evaluation": _with_traffic(evaluation), "pretrain": _with_traffic(pretrain)}
     try:
-        done = run("train", folder, **keys)
+        finished = run("train", folder, **keys)
     except Stopped as stop:
         raise KeyboardInterrupt("the run was saved; go on with its folder and resume=True") from stop
-    table = pl.DataFrame(done.results["rows"], infer_schema_length=None)
-    return TrainingRun(done.folder, done.results, Path(done.results["agent"]), table)
+    table = pl.DataFrame(finished.results["rows"], infer_schema_length=None)
+    return TrainingRun(finished.folder, finished.results, Path(finished.results["agent"]), table)
 
 
 @checked_arguments
@@ -245,12 +250,12 @@ def render(
     film: Mapping[str, Any] | None = None,
     **keys: Any,
 ) -> Path:
-    """Episodes as a film, page or table, or the learning curves of runs; the file's path.
+    """Write episodes as a film, page or table, or the learning curves of runs; return the file's path.
 
     Args:
         agent: as ``name`` in :func:`load_agent`; several for html, csv and parquet.
         traffic: as in :func:`make_env`.
-        episode: number of the episode, which is that of ``evaluate``; several as for ``agent``.
+        episode: number of the episode, the same as in ``evaluate``; several as for ``agent``.
         out: file to write; None: into a new folder below ``outputs/render``.
         run: folders of training runs; their learning curves are drawn instead of an episode.
         film: keys of the film: ``fps, speedup, start_s, end_s, width, height, ...``.
@@ -266,18 +271,17 @@ def render(
     if run is not None:
         keys["run"] = [str(each) for each in ([run] if isinstance(run, str | Path) else run)]
     config = command_config("render", {**keys, "traffic": traffic, "film": film or {}, "out": out})
-    command = _function("render")
     if out is None:
-        _, line = _run_in(None, "render", command, config)
+        _, line = _run_in(None, "render", config)
     else:
         with _torch_threads():
-            line = command(config, Path(out).parent)
+            line = _function("render")(config, Path(out).parent)
     return Path(line.partition(": ")[2])
 
 
 @checked_arguments
 def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
-    """Any command that writes ``results.json``: ``record``, ``prepare``, ``realism``, ``bench`` ...
+    """Run any command that writes ``results.json``: ``record``, ``prepare``, ``realism``, ``bench`` ...
 
     ``run("prepare", data={"name": "ngsim", "path": "raw.txt"}, out="us101")`` is ``ganlane prepare data=ngsim
     data.path=raw.txt out=us101`` on the command line.
@@ -291,7 +295,7 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
     Raises:
         UserError: no such command, a wrong value, or recordings that cannot be read.
     """
-    known = [name for name in SCHEMAS[""] if name != "render"]  # which writes a picture and no results
+    known = [name for name in SCHEMAS[""] if name != "render"]  # render writes a picture and no results
     if command not in known:
         hint = did_you_mean(command, known)
         raise UserError(f"run({command!r}): no such command{hint}; choose one of {', '.join(known)}.")
@@ -305,24 +309,23 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
             "resume=True."
         )
     named = {ALIASES.get(command, {}).get(name, name): value for name, value in keys.items()}
-    home, _ = _run_in(folder, command, _function(command), command_config(command, named))
+    home, _ = _run_in(folder, command, command_config(command, named))
     return Run(home, json.loads((home / "results.json").read_text()))
 
 
 def _function(command: str) -> Callable[[Any, Path], str]:
-    """The command itself: it takes its config and run folder, and returns the line that names its result."""
+    """The command's function: takes its config and run folder, and returns the line that names its result."""
     return getattr(importlib.import_module(f"ganlane.commands.{command}"), command)
 
 
-def _run_in(
-    folder: str | Path | None, name: str, function: Callable[[Any, Path], str], config: Any
-) -> tuple[Path, str]:
-    """Run a command in ``folder`` (None: a new one below ``outputs/NAME``); the folder and the command's last line.
+def _run_in(folder: str | Path | None, command: str, config: Any) -> tuple[Path, str]:
+    """Run a command in ``folder`` (None: a new one below ``outputs/COMMAND``); the folder and the last line printed.
 
     A mistake does not leave a new folder behind.
     """
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
-    home = Path("outputs") / name / now if folder is None else Path(folder)
+    home = Path("outputs") / command / now if folder is None else Path(folder)
+    function = _function(command)
     with cleared_after_mistakes(home), held(home), _torch_threads():
         write_bytes(home / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)).encode())
         return home, function(config, home)
@@ -330,7 +333,7 @@ def _run_in(
 
 @contextmanager
 def _torch_threads(threads: int = 0) -> Iterator[None]:
-    """Torch's threads as the commands set them, and afterwards as the caller's session had them."""
+    """Set torch's threads as the commands do, and restore the caller's number afterwards."""
     before = torch.get_num_threads()
     set_threads(threads)
     try:
@@ -339,39 +342,22 @@ def _torch_threads(threads: int = 0) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _agent_name(agent: Agent) -> str:
-    """The agent's name in the table."""
-    if isinstance(agent, (str, Path)):
-        return str(agent)
-    if isinstance(agent, Driver):
-        return agent.name
-    return type(agent).__name__
-
-
-def _driver(agent: Agent, name: str, config: EvaluateConfig) -> Driver:
-    if isinstance(agent, Driver):
-        return agent
-    if isinstance(agent, TensorDictModuleBase):
-        return Driver(name, agent)
-    return build.make_driver(name, config.env, device=config.device)
-
-
 def _named_traffics(traffics: Sequence[Option] | Mapping[str, Option]) -> dict[str, TrafficConfig]:
     """Traffics by their names in the table."""
     if isinstance(traffics, Mapping):
         return {name: option("traffic", chosen) for name, chosen in traffics.items()}
-    made = [option("traffic", chosen) for chosen in traffics]
-    labels = [config.label() for config in made]
+    configs = [option("traffic", chosen) for chosen in traffics]
+    labels = [config.label() for config in configs]
     if len(set(labels)) < len(labels):
         raise UserError(
             f"traffics={labels}: one name twice; give names of your own, traffics={{'mine': ..., 'other': ...}}."
         )
-    return dict(zip(labels, made))
+    return dict(zip(labels, configs))
 
 
 def _with_traffic(keys: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Keys of a phase, its traffic as a config."""
-    given = dict(keys or {})
-    if given.get("traffic") is not None:
-        given["traffic"] = option("traffic", given["traffic"])
-    return given
+    """Keys of a training phase, its traffic as a config."""
+    values = dict(keys or {})
+    if values.get("traffic") is not None:
+        values["traffic"] = option("traffic", values["traffic"])
+    return values

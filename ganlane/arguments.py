@@ -1,4 +1,4 @@
-"""Checks of what a Python call is given, before it does anything."""
+"""Checks of the arguments of Python calls."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def whole_number(name: str, value: Any, low: int, high: int) -> int:
     """``value`` as an int; NumPy's integers are allowed.
 
     Raises:
-        UserError: it is none, or not from ``low`` to ``high``.
+        UserError: not an integer, or not from ``low`` to ``high``.
     """
     if not _is_whole(value) or not low <= int(value) <= high:
         most = "2**63 - 1" if high == 2**63 - 1 else f"{high}"
@@ -31,7 +31,7 @@ def whole_number(name: str, value: Any, low: int, high: int) -> int:
 
 
 def _is_whole(value: Any) -> bool:
-    """Whether it counts as an int: NumPy's do, truth values and arrays do not."""
+    """Whether ``value`` counts as an int: NumPy's integers do, booleans and arrays do not."""
     try:
         operator.index(value)
     except TypeError:
@@ -40,7 +40,7 @@ def _is_whole(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """``value`` on one line, cut off where it is long."""
+    """``value`` on one line of at most 80 characters."""
     return f"{' '.join(repr(value).split()):.80}"
 
 
@@ -50,13 +50,13 @@ def seed_number(seed: Any) -> int:
 
 
 def checked_arguments(function: F) -> F:
-    """``function``, which refuses arguments of other types than its annotations say, before it does anything.
+    """Decorator: check the types of the arguments against the annotations before ``function`` is called.
 
-    NumPy's numbers count as Python's; a text holds no zero byte, which no path and no name can; where ``Any`` stands,
-    alone or in a union, everything will do.
+    NumPy's numbers count as Python's. A text must not hold a zero byte, which paths and names cannot have. ``Any``,
+    alone or in a union, accepts everything.
 
     Raises:
-        UserError: for the first such argument.
+        UserError: for the first argument of a wrong type.
     """
     signature = inspect.signature(function)
     hints = cache(lambda: get_type_hints(function))  # at the first call, when all modules are imported
@@ -73,7 +73,7 @@ def checked_arguments(function: F) -> F:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of the type that an annotation says."""
+    """Whether a value is of the annotated type."""
     kind, inner = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, each) for each in inner)
@@ -90,7 +90,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return type(value).__name__ in ("bool", "bool_")  # NumPy's, by either name
     if kind is str:
         return isinstance(value, str) and "\0" not in value
-    if getattr(kind, "_is_protocol", False):  # scenes of a user's own have what is needed of them
+    if getattr(kind, "_is_protocol", False):  # such as that of scenes, which a user may write
         return callable(value)
     return kind is Any or not inspect.isclass(kind) or isinstance(value, kind)
 

@@ -1,4 +1,4 @@
-"""From config dataclasses to environments, traffic and drivers, without Hydra.
+"""Environments, traffic and drivers from config dataclasses, without Hydra.
 
 ::
 
@@ -45,8 +45,8 @@ def make_road(env: EnvConfig) -> Road:
     return Road(env.lanes, env.lane_width_m)
 
 
-def _offered(env: EnvConfig, stream: int) -> dict[str, Any]:
-    """Arguments that the constructor of a traffic model or a driver may have, by name."""
+def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:
+    """What the constructors of traffic models and drivers are given where they have an argument of that name."""
     return {
         "road": make_road(env),
         "stream": stream,
@@ -68,10 +68,10 @@ def make_traffic(traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TR
     arguments, parts = traffic.arguments(), traffic.parts()
     if parts:
         arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
-    made = call_with(target, _offered(env, stream), arguments, key)
-    if not isinstance(made, TrafficModule):  # an annotation may be wrong
-        raise UserError(f"{key}={traffic._target_}: returned a {type(made).__name__}, expected a TrafficModule.")
-    return BlindTraffic(made, traffic.blind_share) if traffic.blind_share else made
+    module = call_with(target, _constructor_arguments(env, stream), arguments, key)
+    if not isinstance(module, TrafficModule):  # an annotation may be wrong
+        raise UserError(f"{key}={traffic._target_}: returned a {type(module).__name__}, expected a TrafficModule.")
+    return BlindTraffic(module, traffic.blind_share) if traffic.blind_share else module
 
 
 def make_env(
@@ -85,7 +85,7 @@ def make_env(
     first_episode: int = 0,
     mask: MaskParameters | None = None,
 ) -> TransformedEnv:
-    """A batched environment with observation, reward and, where asked for, action mask; its stream is the traffic's.
+    """A batched environment with observation, reward and optionally action mask; its stream is that of the traffic.
 
     Raises:
         UserError: see :class:`ganlane.env.HighwayEnv`.
@@ -113,19 +113,19 @@ def make_env(
         ObservationTransform(base.road, env.vehicles, observation.form, observation.scale(), kernel is not None)
     ]
     if mask is not None and mask.form != "none":
-        abort = env.ego.abort_lane_change
-        braking, of = mask.safe_deceleration, None if kernel is None else kernel.vehicles
-        transforms.append(ActionMaskTransform(base.road, mask.form, braking, env.idm, abort, of))
+        abort, vehicles = env.ego.abort_lane_change, None if kernel is None else kernel.vehicles
+        parameters = (mask.form, mask.safe_deceleration, env.idm, abort, vehicles)
+        transforms.append(ActionMaskTransform(base.road, *parameters))
     if env.compile:
         base.compile()
         for each in transforms:
             each.compile_graphs()
-    errors = observation.sensors
+    sensors = observation.sensors
     try:
-        sensors = [] if errors is None else [SensorTransform(errors, traffic.stream, env.decision_period_s)]
+        errors = [] if sensors is None else [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
     except ParameterError as error:
         raise error.below("observation.sensors") from error
-    return TransformedEnv(base, Compose(*sensors, *transforms, RewardTransform(env.decision_period_s, reward)))
+    return TransformedEnv(base, Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward)))
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Driver:
     Attributes:
         name: in tables.
         policy: writes ``action``.
-        observation: that it reads; None: any.
+        observation: what it reads; None: any.
         mask: of its actions; None: that of the command or call, by default none.
     """
 
@@ -157,24 +157,27 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
         name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent (``agent_idm@1``: the recipe
             of ``agent_idm``, trained with seed 1), the path of an agent's file, or the import path of a policy of
             your own (a class or annotated function; it may have ``road``, ``stream``, ``idm`` and ``mobil``). A
-            suffix ``+safe``, ``+legal`` or ``+none`` sets its mask, in place of the one that it was trained with.
-        env: the environment it drives in.
-        stream: of its random numbers, if it draws any.
-        device: of its network.
+            suffix ``+safe``, ``+legal`` or ``+none`` sets its mask in place of the one in its training.
+        env: the environment in which it drives.
+        stream: stream of its random numbers, if it draws any.
+        device: device of its network.
 
     Raises:
         UserError: no such driver, or a network of another shape than the environment's observation.
     """
-    plain, plus, form = name.rpartition("+")
+    unmasked, plus, form = name.rpartition("+")
     if plus and form in MASKS:
-        driver = make_driver(plain, env, stream, device)
-        kept = driver.mask if driver.mask is not None and driver.mask.form == form else MaskParameters(form)
-        return replace(driver, name=name, mask=kept)
+        driver = make_driver(unmasked, env, stream, device)
+        mask = driver.mask if driver.mask is not None and driver.mask.form == form else MaskParameters(form)
+        return replace(driver, name=name, mask=mask)
     if name in DRIVERS:
-        policy = call_with(DRIVERS[name], _offered(env, stream), {}, "agents")
+        policy = call_with(DRIVERS[name], _constructor_arguments(env, stream), {}, "agents")
         return Driver(name, policy.to(device))
     if names_agent(name):
-        return _trained(name, env, device)
+        network, metadata = load_agent(name, device=device)
+        observation = observation_of(metadata)
+        load_agent(name, observation_size(observation.form, env.vehicles), device)  # checks that the sizes fit
+        return Driver(name, network, observation, mask_of(metadata))
     if is_import_path(name):
         return _imported(name, env, stream, device)
     known = ", ".join((*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file())))
@@ -185,17 +188,9 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
 
 
 def make_drivers(names: Sequence[str], env: EnvConfig, device: str = "cpu") -> list[Driver]:
-    """:func:`make_driver` for several names; ``agent_idm@all`` stands for all trainings of its recipe there are."""
-    each = dict.fromkeys(single for name in names for single in with_seeds(name))
-    return [make_driver(name, env, device=device) for name in each]
-
-
-def _trained(name: str, env: EnvConfig, device: str) -> Driver:
-    """A trained agent with the observation that it was trained on."""
-    policy, metadata = load_agent(name, device=device)
-    observation = observation_of(metadata)
-    load_agent(name, observation_size(observation.form, env.vehicles), device)
-    return Driver(name, policy, observation, mask_of(metadata))
+    """:func:`make_driver` for several names; ``agent_idm@all`` means every shipped training of its recipe."""
+    single_names = dict.fromkeys(single for name in names for single in with_seeds(name))
+    return [make_driver(name, env, device=device) for name in single_names]
 
 
 def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
@@ -212,7 +207,7 @@ def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
 
 
 def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
-    """The observation that an agent's metadata name.
+    """The observation in an agent's metadata.
 
     Raises:
         UserError: no observation, or an unknown one.
@@ -228,7 +223,7 @@ def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
 def _imported(name: str, env: EnvConfig, stream: int, device: str) -> Driver:
     """A user's own policy; it reads the raw state or the observation of the command."""
     target = import_target(name, "agents", TensorDictModuleBase)
-    policy = call_with(target, _offered(env, stream), {}, "agents")
+    policy = call_with(target, _constructor_arguments(env, stream), {}, "agents")
     if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(policy, "out_keys", []):
         raise UserError(f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys name it.")
     return Driver(name, policy.to(device))

@@ -1,8 +1,8 @@
-"""A checksum inside each file that is written and read back: damage is seen, in whichever byte it is.
+"""A checksum inside each file that is written and read back, so that damage to any byte is detected.
 
-:data:`PLACE` occurs once in the content, wherever the format has room for a text: metadata, an entry, an archive's
+:data:`PLACE` occurs once in the content, wherever the format has room for text: metadata, an entry, an archive's
 comment. Its digits are the SHA-256 of the whole content with zeros in their place. This protects against damage, not
-against forgery: who changes a file on purpose can put a new checksum in.
+against forgery: anyone can compute a new checksum for a changed file.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def has_checksum(content: bytes | mmap, path: str | Path) -> bool:
     """Whether ``content`` has a checksum; files of ganlane 0.2 and before have none.
 
     Raises:
-        UserError: it has one, which is that of another content; ``path`` is named as the damaged file.
+        UserError: it has one that does not match; ``path`` is named as the damaged file.
     """
     begin, end = content.find(_BEGIN), content.find(_END)
     if begin < 0 and end < 0:
@@ -73,5 +73,5 @@ def _digits(content: bytes | mmap, begin: int) -> bytes:
 
 @cache
 def note_without_checksum(path: str | Path) -> None:
-    """Say once for each file that it is of a version that wrote no checksum."""
+    """Warn once per file that a version without checksums wrote it."""
     print(f"{path}: of a version that wrote no checksum; damage to it would not be seen.", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Drivers compared: every one on every traffic, on the same episodes."""
+"""Compare drivers: each one on each traffic, on the same episodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ganlane.build import Driver, make_env, make_traffic
@@ -27,9 +26,8 @@ from ganlane.evaluation import (
 )
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
-from ganlane.parameters.observation import MaskParameters, ObservationConfig
 from ganlane.sim.random import Stream
-from ganlane.traffic import ReplayTraffic, TrafficModule
+from ganlane.traffic import ReplayTraffic
 
 
 def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
@@ -39,7 +37,7 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
         drivers: see :func:`ganlane.build.make_driver`; each drives with its own observation and mask, or with those
             of ``config`` if it names none; the sensors are those of ``config`` for all.
         config: traffics, episodes and environment.
-        quiet: without signs of progress.
+        quiet: show no progress.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
@@ -50,7 +48,7 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
     modules = {name: make_traffic(traffic, env, stream) for name, traffic in config.chosen_traffics().items()}
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(config.num_envs, episodes), []
-    made: tuple[tuple[str, ObservationConfig, MaskParameters], EnvBase] | None = None
+    current = None
     disabled = quiet or not sys.stderr.isatty()
     with tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=disabled) as bar:
         for number, (traffic, driver) in enumerate(pairs):
@@ -58,19 +56,22 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
             mask, policy = driver.behind(config.mask)
             parts = (modules[traffic], env, observation, config.reward)
             make = partial(make_env, *parts, seed=seed, device=config.device, mask=mask)
-            if made is None or made[0] != (traffic, observation, mask):
+            if current != (traffic, observation, mask):
                 # Drivers with the same observation and mask share an environment, so that it is compiled once.
-                made = (traffic, observation, mask), make(rows)
+                current, batch = (traffic, observation, mask), make(rows)
             smaller = None if env.compile else make
             on_progress = None if quiet else _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
-            table = run_episodes(made[1], policy, range(episodes), seed, on_progress, smaller)
-            named = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
-            tables.append(_with_scenes(named, modules[traffic], seed))
+            table = run_episodes(batch, policy, range(episodes), seed, on_progress, smaller)
+            table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
+            if isinstance(module := modules[traffic], ReplayTraffic):
+                scenes = module.scenes_of_episodes(seed, table["episode"].to_list())
+                table = table.with_columns(pl.Series("scene", scenes, pl.String))
+            tables.append(table)
     return pl.concat(tables, how="diagonal")
 
 
 def _reporter(bar: tqdm, title: str, before: int) -> Callable[[int, int], None]:
-    """Shows the progress of one driver and traffic: on the bar, or as one line where there is no terminal."""
+    """Callback that shows the progress of one driver and traffic: on the bar, or as one line without a terminal."""
     bar.set_description(title)
 
     def report(finished: int, wanted: int) -> None:
@@ -79,14 +80,6 @@ def _reporter(bar: tqdm, title: str, before: int) -> Callable[[int, int], None]:
             print(f"{title}: {wanted} episodes", file=sys.stderr, flush=True)
 
     return report
-
-
-def _with_scenes(table: pl.DataFrame, traffic: TrafficModule, seed: int) -> pl.DataFrame:
-    """The episodes with the name of the recorded ``scene`` of each, if there is one."""
-    if not isinstance(traffic, ReplayTraffic):
-        return table
-    scenes = traffic.scenes_of_episodes(seed, table["episode"].to_list())
-    return table.with_columns(pl.Series("scene", scenes, pl.String))
 
 
 def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
@@ -98,14 +91,13 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
     """
     if "scene" not in table.columns:
         return []
-    found = []
+    rows = []
     recorded = table.filter(pl.col("scene").is_not_null())
     for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
         crashes = crashes_by_scene(episodes, episodes["scene"].to_list())
-        found.append(
-            {"agent": agent, "traffic": traffic, **entries("per_km", crashes.per_km), "scenes": crashes.rows}
-        )
-    return found
+        per_km = entries("per_km", crashes.per_km)
+        rows.append({"agent": agent, "traffic": traffic, **per_km, "scenes": crashes.rows})
+    return rows
 
 
 def publish(
@@ -115,7 +107,7 @@ def publish(
     seeds: Mapping[str, Any],
     numbers: Mapping[str, Any] | None = None,
 ) -> str:
-    """Print the tables of a comparison, write its episodes and ``results.json``; the line that names the latter.
+    """Print the tables of a comparison, write its episodes and ``results.json``; return the line that names it.
 
     The record also holds ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table with two drivers or
     more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`) and, where a traffic replays recorded scenes,

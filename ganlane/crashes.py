@@ -1,4 +1,4 @@
-"""Crashes and departures from the road as a list that can be driven again: numbers and actions, as JSON.
+"""Crashes and departures from the road as a list that can be driven again: episode numbers and actions, as JSON.
 
 ``ganlane reproduce`` writes such a list, ``ganlane render crashes=FILE`` plays it. Everything is driven by the tensor
 code in batches of :data:`ROWS` rows: generated traffic repeats bit by bit in batches of one size only, and a film
@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,10 +41,10 @@ ROWS = 8
 ENDS = ("hard_crash", "out_of_road")
 _KIND = "ganlane crashes"
 _ACTIONS = Rule(lambda text: re.fullmatch("[012]{1,100000}", text) is not None, "a text of the digits 0, 1 and 2")
-#: Keys of a traffic that name code; a list holds none, so options that consist of such keys are not listed.
+#: Keys of a traffic that name code. A list holds none, so traffics that need code of a user's own are not listed.
 _CODE = {"_target_", "parameters"}
 _LISTED = {name: kind for name, kind in TRAFFICS.items() if name != "mixed"}
-#: What reading a broken list raises.
+#: Errors raised by reading a broken list.
 _BROKEN = (ValueError, KeyError, TypeError, AttributeError, RecursionError, OmegaConfBaseException, UserError)
 
 
@@ -76,7 +77,7 @@ class Crash(Record):
 
 @dataclass(frozen=True)
 class CrashList:
-    """Crashes with what their episodes depend on: the road, the traffics' keys, and the stream of random numbers."""
+    """Crashes, and what their episodes depend on: environment, traffics and stream of random numbers."""
 
     env: EnvConfig
     traffics: Mapping[str, TrafficConfig]
@@ -96,18 +97,17 @@ class CrashList:
         return make_env(model, env, observation, reward, ROWS, mask=mask)
 
     def drive_again(self) -> list[Rollout]:
-        """What comes of the listed actions now; in the order of the list."""
-        found: dict[tuple[str, str, int, int], Rollout] = {}
-        for who, group in groupby(self.crashes, lambda each: (each.driver, each.traffic, each.seed)):
-            driver, traffic, seed = who
+        """The rollouts of the listed actions, in the order of the list."""
+        rollouts: dict[tuple[str, str, int, int], Rollout] = {}
+        for (driver, traffic, seed), group in groupby(self.crashes, attrgetter("driver", "traffic", "seed")):
             actions = {number: steps for each in group for number, steps in each.steps().items()}
             for rollout in replay(self.make_env(traffic), actions, seed):
-                found[driver, traffic, seed, rollout.episode] = rollout
-        return [found[each.driver, each.traffic, each.seed, each.episode] for each in self.crashes]
+                rollouts[driver, traffic, seed, rollout.episode] = rollout
+        return [rollouts[each.driver, each.traffic, each.seed, each.episode] for each in self.crashes]
 
 
 def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> tuple[CrashList, int]:
-    """Drive failed episodes again, and list those that end in the same way.
+    """Drive failed episodes again and list those that end in the same way.
 
     Args:
         episodes: rows of failed and other episodes: ``agent, traffic, episode, reason, decisions``.
@@ -115,13 +115,18 @@ def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> t
         most: episodes per driver and traffic, those with the fewest decisions first.
 
     Returns:
-        The list, and how many of the episodes ended otherwise: where traffic is generated, another batch size rounds
-        differently.
+        The list, and how many of the episodes ended otherwise: generated traffic rounds differently in batches of
+        another size.
     """
-    listed = CrashList(config.env, _listable(config.chosen_traffics()), config.stream, [])
-    failed = episodes.filter(pl.col("reason").is_in(ENDS), pl.col("traffic").is_in(list(listed.traffics)))
+    traffics = {
+        name: option
+        for name, option in config.chosen_traffics().items()
+        if name in _LISTED and option._target_ == _LISTED[name]._target_ and not option.parameters
+    }
+    listed = CrashList(config.env, traffics, config.stream, [])
+    failed = episodes.filter(pl.col("reason").is_in(ENDS), pl.col("traffic").is_in(list(traffics)))
     chosen = failed.sort("decisions", "episode").group_by("agent", "traffic", maintain_order=True).head(most)
-    found: list[Crash] = []
+    crashes: list[Crash] = []
     for (name, traffic), frame in chosen.sort("traffic", "agent").group_by("agent", "traffic", maintain_order=True):
         driver = make_driver(name, config.env)
         mask, policy = driver.behind(config.mask)
@@ -129,23 +134,10 @@ def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> t
         ends = dict(zip(frame["episode"].to_list(), frame["reason"].to_list()))
         for each in roll_out(env, policy, sorted(ends), config.seed):
             if each.end == ends[each.episode]:
-                found.append(_crash(name, traffic, config, each))
-    return replace(listed, crashes=found), len(chosen) - len(found)
-
-
-def _listable(traffics: Mapping[str, TrafficConfig]) -> dict[str, TrafficConfig]:
-    """The traffics that need no code but the package's own."""
-    return {
-        name: option
-        for name, option in traffics.items()
-        if name in _LISTED and option._target_ == _LISTED[name]._target_ and not option.parameters
-    }
-
-
-def _crash(driver: str, traffic: str, config: EvaluateConfig, found: Rollout) -> Crash:
-    actions, distance_m = "".join(map(str, found.actions)), round(max(found.distance_m, 0.0), 1)
-    who = (driver, traffic, config.seed, found.episode)
-    return Crash(*who, found.end, distance_m, found.contact, found.changing, actions)
+                outcome = (each.end, round(max(each.distance_m, 0.0), 1), each.contact, each.changing)
+                actions = "".join(map(str, each.actions))
+                crashes.append(Crash(name, traffic, config.seed, each.episode, *outcome, actions))
+    return replace(listed, crashes=crashes), len(chosen) - len(crashes)
 
 
 def write_crashes(path: str | Path, listed: CrashList) -> None:
@@ -169,18 +161,18 @@ def read_crashes(path: str | Path) -> CrashList:
         UserError: no such file, or not a list of crashes.
     """
     try:
-        found = json.loads(Path(path).read_text(encoding="utf-8"))
-        if found["kind"] != _KIND:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        if content["kind"] != _KIND:
             raise ValueError("another kind of file")
-        env, traffics = dict(found["env"]), dict(found["traffics"])
-        # OmegaConf would put something else in the place of ${...}.
-        if "${" in json.dumps(found) or any(_CODE & options.keys() for options in traffics.values()):
+        env, traffics = dict(content["env"]), dict(content["traffics"])
+        # OmegaConf would replace ${...}.
+        if "${" in json.dumps(content) or any(_CODE & options.keys() for options in traffics.values()):
             raise ValueError("it names what is not plain data")
-        crashes = [_typed(Crash, each) for each in found["crashes"]]
+        crashes = [_typed(Crash, each) for each in content["crashes"]]
         return CrashList(
             _typed(SCHEMAS["env"][env.pop("option")], env),
             {name: _typed(_LISTED[name], traffics[name]) for name in {each.traffic for each in crashes}},
-            {stream: stream for stream in ("report", "select")}[found["stream"]],
+            {stream: stream for stream in ("report", "select")}[content["stream"]],
             crashes,
         )
     except OSError as error:

@@ -1,4 +1,4 @@
-"""``ganlane doctor``: what is installed and found, what is missing, and the command that fixes it.
+"""``ganlane doctor``: what is installed and found, what is missing, and how to fix it.
 
     ganlane doctor
 
@@ -8,8 +8,7 @@ folders and extras. Nothing is written. What is MISSING is needed; what is absen
 exit status: 0 all that is needed is there, 1 something needed is missing, 2 a mistake on the command line
 """
 
-# Nothing here needs an installation that works: imports of other parts are inside functions, and what cannot be
-# imported becomes a finding.
+# This must run in a broken installation: other parts are imported inside functions, and a failed import is a finding.
 
 from __future__ import annotations
 
@@ -84,7 +83,7 @@ _INSTALL_COMPILER: Final = {"darwin": "xcode-select --install", "win32": "instal
 
 
 class State(Enum):
-    """``MISSING`` is needed and makes the exit status 1; ``ABSENT`` is for further purposes only."""
+    """``MISSING`` is needed and makes the exit status 1; ``ABSENT`` is optional."""
 
     OK = "ok"
     ABSENT = "absent"
@@ -93,7 +92,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """``subject`` was looked at, ``found`` is what there is, ``fix`` is the command where something is missing."""
+    """Result of a check: what was checked, what is there and, if something is missing, the command that fixes it."""
 
     subject: str
     state: State
@@ -101,13 +100,13 @@ class Finding:
     fix: str = ""
 
     def lines(self) -> list[str]:
-        """As the report shows it."""
+        """The lines of the report."""
         first = f"  {self.state.value:<8}{self.subject:<22}{self.found}"
         return [first, f"          fix: {self.fix}"] if self.fix else [first]
 
 
 def guarded(subject: str, look: Callable[[], Finding], fix: str = _FIX_FIRST) -> Finding:
-    """What ``look`` finds; whatever it raises is a finding too, since a broken installation can fail in any way."""
+    """The result of ``look``; any error is a finding too, since a broken installation can fail in any way."""
     try:
         return look()
     except Exception as error:
@@ -116,7 +115,7 @@ def guarded(subject: str, look: Callable[[], Finding], fix: str = _FIX_FIRST) ->
 
 
 def examine() -> dict[str, list[Finding]]:
-    """Title of a section to its findings; loads every shipped checkpoint, so it takes seconds."""
+    """Findings by title of section; loads every shipped checkpoint, so it takes seconds."""
     return {
         "software": [python(), *(guarded(text, partial(required, text)) for text in REQUIRED)],
         "machine": machine(),
@@ -132,27 +131,24 @@ def examine() -> dict[str, list[Finding]]:
 
 
 def missing(sections: Mapping[str, Sequence[Finding]]) -> list[str]:
-    """The subjects that are needed and not there."""
-    return [found.subject for findings in sections.values() for found in findings if found.state is State.MISSING]
+    """Subjects that are needed and not there."""
+    return [each.subject for findings in sections.values() for each in findings if each.state is State.MISSING]
 
 
 def report(sections: Mapping[str, Sequence[Finding]]) -> str:
-    """All findings, section by section, and a last line with the conclusion."""
+    """All findings, section by section, and the conclusion as last line."""
     blocks = [
         "\n".join([title, *(line for finding in findings for line in finding.lines())])
         for title, findings in sections.items()
     ]
-    lacking = missing(sections)
-    conclusion = (
-        f"Missing: {', '.join(lacking)}; run the commands after 'fix:'."
-        if lacking
-        else "All that is needed is there; what is absent serves further purposes only."
-    )
+    conclusion = "All that is needed is there; what is absent serves further purposes only."
+    if lacking := missing(sections):
+        conclusion = f"Missing: {', '.join(lacking)}; run the commands after 'fix:'."
     return "\n\n".join([*blocks, conclusion])
 
 
 def installed(text: str) -> tuple[str, str | None, bool]:
-    """Name of a requirement's distribution, its installed version if there is one, and whether that will do."""
+    """A requirement's distribution, its installed version (None: not installed), and whether that satisfies it."""
     from packaging.requirements import Requirement  # Hydra's and torch's own
 
     requirement = Requirement(text)
@@ -164,26 +160,24 @@ def installed(text: str) -> tuple[str, str | None, bool]:
 
 
 def _install(*requirements: str) -> str:
-    quoted = (f'"{text}"' for text in requirements)
-    return f"python -m pip install {' '.join(quoted)}"
+    return " ".join(["python -m pip install", *(f'"{text}"' for text in requirements)])
 
 
 def python() -> Finding:
     """The interpreter."""
-    found = f"{platform.python_version()} ({sys.executable})"
+    version = f"{platform.python_version()} ({sys.executable})"
     if sys.version_info >= PYTHON:
-        return Finding("python", State.OK, found)
-    wanted = ".".join(map(str, PYTHON))
-    return Finding("python", State.MISSING, found, f"a virtual environment with Python {wanted} or newer")
+        return Finding("python", State.OK, version)
+    needed = ".".join(map(str, PYTHON))
+    return Finding("python", State.MISSING, version, f"a virtual environment with Python {needed} or newer")
 
 
 def required(text: str) -> Finding:
-    """Whether a requirement is installed in a version that will do, and can be imported."""
+    """Whether a requirement is installed in a suitable version and can be imported."""
     name, version, fits = installed(text)
-    if version is None:
-        return Finding(name, State.MISSING, "not installed", _install(text))
-    if not fits:
-        return Finding(name, State.MISSING, f"{version}, needed {text.removeprefix(name)}", _install(text))
+    if version is None or not fits:
+        lacking = "not installed" if version is None else f"{version}, needed {text.removeprefix(name)}"
+        return Finding(name, State.MISSING, lacking, _install(text))
 
     def look() -> Finding:
         importlib.import_module(MODULES.get(name, name))
@@ -205,8 +199,7 @@ def extra(name: str) -> Finding:
 
 def machine() -> list[Finding]:
     """What the commands can compute on."""
-    looks = {"processor": _processor, "devices": _devices, "C++ compiler": _compiler}
-    return [guarded(subject, look) for subject, look in looks.items()]
+    return [guarded("processor", _processor), guarded("devices", _devices), guarded("C++ compiler", _compiler)]
 
 
 def _processor() -> Finding:
@@ -219,7 +212,7 @@ def _processor() -> Finding:
 
 
 def _devices() -> Finding:
-    """The values that device=... can have here; a card that torch cannot use is reported."""
+    """Possible values of ``device``; also reports a graphics card that torch cannot use."""
     import torch
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
@@ -233,11 +226,10 @@ def _devices() -> Finding:
 
 def _compiler() -> Finding:
     """The C++ compiler that only ``env.compile=true`` needs; ``CXX`` names another one."""
-    path, looked = find_compiler()
+    path, names = find_compiler()
     if path is None:
-        found = f"none (looked for {looked}); env.compile=true needs one"
         fix = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
-        return Finding("C++ compiler", State.ABSENT, found, fix)
+        return Finding("C++ compiler", State.ABSENT, f"none (looked for {names}); env.compile=true needs one", fix)
     return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")
 
 
@@ -253,28 +245,26 @@ def checkpoints() -> list[Finding]:
     from ganlane.files import CHECKPOINTS
 
     names = sorted({*NEEDED_WEIGHTS, *(path.stem for path in CHECKPOINTS.glob("*.safetensors"))})
-    return [guarded(name, _loader(name, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL) for name in names]
+    return [guarded(name, partial(_weights, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL) for name in names]
 
 
-def _loader(name: str, path: Path) -> Callable[[], Finding]:
-    def look() -> Finding:
-        if name.startswith("generator_"):
-            from ganlane.generator import load_generator
+def _weights(path: Path) -> Finding:
+    """Whether a checkpoint can be loaded."""
+    if path.stem.startswith("generator_"):
+        from ganlane.generator import load_generator
 
-            load_generator(path)
-        else:
-            from ganlane.agents import load_agent
-            from ganlane.agents.checkpoint import with_seeds
+        load_generator(path)
+    else:
+        from ganlane.agents import load_agent
+        from ganlane.agents.checkpoint import with_seeds
 
-            for agent in with_seeds(f"{path}@all") if name.startswith("seeds_of_") else [path]:
-                load_agent(agent)
-        return Finding(name, State.OK, f"{path} ({_megabytes(path)})")
-
-    return look
+        for agent in with_seeds(f"{path}@all") if path.stem.startswith("seeds_of_") else [path]:
+            load_agent(agent)
+    return Finding(path.stem, State.OK, f"{path} ({_megabytes(path)})")
 
 
 def recordings() -> Finding:
-    """The recordings that ``data.path=null`` means; needed for fitting and realism, not for training or driving."""
+    """The recordings used with ``data.path=null``; needed for fitting and realism, not for training or driving."""
     from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
 
     try:
@@ -286,7 +276,7 @@ def recordings() -> Finding:
 
 
 def cache() -> Finding:
-    """The folder with groups of windows between fits."""
+    """The folder in which groups of windows are kept between fits."""
     from ganlane.generator.windows import CACHE_VARIABLE, cache_folder
 
     folder = cache_folder()
@@ -294,9 +284,8 @@ def cache() -> Finding:
         return Finding("cache", State.OK, f"off ({CACHE_VARIABLE} is empty)")
     if not _can_write(folder):
         return Finding("cache", State.ABSENT, f"{folder} cannot be written to", f"export {CACHE_VARIABLE}=FOLDER")
-    files = list(folder.glob("*.npz")) if folder.is_dir() else []
-    size = sum(path.stat().st_size for path in files) / 2**20
-    return Finding("cache", State.OK, f"{folder} ({len(files)} files, {size:.1f} MB)")
+    files = list(folder.glob("*.npz"))
+    return Finding("cache", State.OK, f"{folder} ({len(files)} files, {_megabytes(*files)})")
 
 
 def outputs() -> Finding:
@@ -309,12 +298,12 @@ def outputs() -> Finding:
 
 def _can_write(folder: Path) -> bool:
     """Whether files can be made in ``folder``, or it can be made."""
-    there = next(path for path in (folder, *folder.parents) if path.exists())
-    return there.is_dir() and os.access(there, os.W_OK)
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    return existing.is_dir() and os.access(existing, os.W_OK)
 
 
-def _megabytes(path: Path) -> str:
-    return f"{path.stat().st_size / 2**20:.1f} MB"
+def _megabytes(*files: Path) -> str:
+    return f"{sum(path.stat().st_size for path in files) / 2**20:.1f} MB"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -331,9 +320,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"ganlane doctor: {error}", file=sys.stderr)
         return USER_ERROR
-    found = examine()
-    print(f"ganlane {__version__}\n\n{report(found)}")
-    return NEEDED_IS_MISSING if missing(found) else 0
+    sections = examine()
+    print(f"ganlane {__version__}\n\n{report(sections)}")
+    return NEEDED_IS_MISSING if missing(sections) else 0
 
 
 if __name__ == "__main__":

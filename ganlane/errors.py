@@ -1,4 +1,4 @@
-"""A user's mistake as one sentence that says what to do."""
+"""Errors that a user can correct; the message is one sentence that says what to do."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ class UserError(Exception):
 
 
 class ParameterError(UserError):
-    """A parameter out of its range, or parameters that do not go together.
+    """A parameter out of its range, or incompatible parameters.
 
-    The record that raises it knows its fields, not their keys. So the sentence holds the fields in braces,
+    The record that raises it knows its fields, not their keys. So the sentence has the fields in braces,
     ``"{timeout_s}=0: expected a number above 0."``, and a caller that knows the key adds it with :meth:`below`.
 
     Args:
         text: the sentence.
-        where: key of the record, for instance ``env.idm``; empty: fields go by their own names.
+        where: key of the record, for instance ``env.idm``; empty: fields without prefix.
     """
 
     def __init__(self, text: str, where: str = "") -> None:
@@ -39,11 +39,10 @@ class ParameterError(UserError):
 
 
 def as_typed(value: Any) -> str:
-    """A config value as one types it on the command line: ``true``, ``null``, ``-120``, ``[64,64]``."""
+    """A config value as typed on the command line: ``true``, ``null``, ``-120``, ``[64,64]``."""
     if isinstance(value, list | tuple):
         return f"[{','.join(map(as_typed, value))}]"
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
-    # The short form of a number, where it is the same number.
-    short = isinstance(value, float) and float(f"{value:g}") == value
-    return f"{value:g}" if short else str(value)
+    exact = isinstance(value, float) and float(f"{value:g}") == value  # the short form is the same number
+    return f"{value:g}" if exact else str(value)

@@ -1,6 +1,6 @@
-"""The package's own folders, files written whole or not at all, and weights that cannot execute code.
+"""The package's own folders, atomic writes, and weights as files that cannot execute code.
 
-It imports no torch, so that the command line answers quickly.
+Torch is imported inside functions, so that the command line answers quickly.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PACKAGE = Path(__file__).resolve().parent
 #: Weights that ship: ``agent_*.safetensors`` and ``generator_*.safetensors``.
 CHECKPOINTS = PACKAGE / "checkpoints"
-#: Bytes that are written to find out whether there is room; libraries leave smaller rests unused.
+#: Bytes that are written to test whether the disk is full; libraries fail with less than this left.
 _PROBE_BYTES = 2**20
 #: Ending of the temporary files, whose names begin with a dot.
 _PART = ".part"
@@ -47,7 +47,7 @@ def conf_folder() -> Path:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of ``path``; on success sync it and rename it into place.
+    """Yield a temporary path in the folder of ``path``, which is made; on success sync it and rename it into place.
 
     A process killed at any instant leaves either the old file or the new one, never a part of one.
 
@@ -57,8 +57,16 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         UserError: the path is a folder or a device.
     """
     path = Path(path)
-    _refuse_all_but_files(path)
-    part = _new_part(path)
+    if path.exists() and not path.is_file():  # renaming onto /dev/null would replace it
+        kind = "a folder" if path.is_dir() else "a device or a pipe"
+        raise UserError(f"{path}: {kind}, where a file was to be written; give the name of a file.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    os.close(handle)
+    part = Path(name)
     try:
         yield part
         with part.open("rb+") as written:
@@ -66,39 +74,21 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         part.chmod(0o644)
         part.replace(path)
     except Exception as error:
-        refused = _refusal(error, part)
-        if refused is None:
+        cause = _file_system_error(error, part)
+        if cause is None:
             raise
-        raise OSError(refused.errno, refused.strerror, str(path)) from error
+        raise OSError(cause.errno, cause.strerror, str(path)) from error
     finally:
         part.unlink(missing_ok=True)
 
 
-def _refuse_all_but_files(path: Path) -> None:
-    """Refuse folders and devices: renaming onto ``/dev/null`` would replace it."""
-    if path.exists() and not path.is_file():
-        what = "a folder" if path.is_dir() else "a device or a pipe"
-        raise UserError(f"{path}: {what}, where a file was to be written; give the name of a file.")
-
-
-def _new_part(path: Path) -> Path:
-    """An empty file in the folder of ``path``, which is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=_PART)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    os.close(handle)
-    return Path(name)
-
-
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files of writes that were killed, in a folder where nothing writes now."""
+    """Remove the temporary files of killed writes from a folder to which nothing writes now."""
     for part in folder.glob(f".*.????????{_PART}"):
         part.unlink(missing_ok=True)
 
 
-def _refusal(error: Exception, part: Path) -> OSError | None:
+def _file_system_error(error: Exception, part: Path) -> OSError | None:
     """The file system's error when ``part`` was written; None where ``error`` has another cause.
 
     Libraries report a full disk in messages of their own (torch: "unexpected pos 576 vs 534"), so a write is tried.
@@ -110,8 +100,8 @@ def _refusal(error: Exception, part: Path) -> OSError | None:
             file.write(bytes(_PROBE_BYTES))
             file.flush()
             os.fsync(file.fileno())
-    except OSError as refused:
-        return refused
+    except OSError as cause:
+        return cause
     return None
 
 
@@ -122,7 +112,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
-    """The text of the document ``path`` up to the marker ``begin``, and from ``end`` on, markers included.
+    """The text of the document ``path`` up to the marker ``begin`` and from ``end`` on, both markers included.
 
     Raises:
         UserError: there is no such file, or it does not hold the two markers once each and in order. The sentence
@@ -137,7 +127,7 @@ def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
 
 
 def write_between_markers(path: Path, begin: str, end: str, content: str) -> None:
-    """Put ``content`` on lines of its own between two markers of a document, atomically; the rest stays as it is.
+    """Replace what is between two markers of a document by ``content`` on lines of its own, atomically.
 
     Raises:
         UserError: see :func:`split_at_markers`.
@@ -147,7 +137,7 @@ def write_between_markers(path: Path, begin: str, end: str, content: str) -> Non
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write ``content`` to ``path`` as indented JSON, atomically; with its checksum if an entry is its place."""
+    """Write ``content`` to ``path`` as indented JSON, atomically; with a checksum if an entry is :data:`PLACE`."""
     text = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
     write_bytes(path, sealed(text) if PLACE.encode() in text else text)
 
@@ -186,12 +176,12 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, torch.Tensor], 
     whole = has_checksum(content, path)
     try:
         tensors = load(content)
-        header = _plain(content[8 : 8 + int.from_bytes(content[:8], "little")]).get("__metadata__") or {}
-    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a type of numbers that torch lacks
+        header = _json_object(content[8 : 8 + int.from_bytes(content[:8], "little")]).get("__metadata__") or {}
+    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a number type that torch lacks
         raise UserError(
             f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} that ganlane wrote."
         ) from error
-    metadata = _plain(header.get("ganlane", "{}"))
+    metadata = _json_object(header.get("ganlane", "{}"))
     if metadata.get("kind") != kind:
         found = metadata.get("kind", "a file that ganlane did not write")
         raise UserError(
@@ -205,10 +195,10 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, torch.Tensor], 
     return tensors, metadata
 
 
-def _plain(text: str | bytes) -> dict[str, Any]:
-    """A JSON object; empty where ``text`` is something else."""
+def _json_object(text: str | bytes) -> dict[str, Any]:
+    """The JSON object ``text``; empty if it is not one."""
     try:
-        found = json.loads(text)
+        content = json.loads(text)
     except (ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from types import TracebackType
+from contextlib import AbstractContextManager
 from typing import Any
 
 from tqdm import tqdm
@@ -17,7 +17,7 @@ _ERRORS = ("ade_m", "fde_m", "end_m")
 _BASELINE = "constant_velocity"
 _PUBLISHED_VELOCITY_M = (0.73, 1.78, 3.13, 4.78, 6.68)
 #: RMSE in m after 1 to 5 s on NGSIM, as published: on other test sets than ours, so only roughly comparable.
-PUBLISHED_RMSE_M = {
+_PUBLISHED_RMSE_M = {
     "constant velocity (published)": _PUBLISHED_VELOCITY_M,
     "CS-LSTM (published)": (0.61, 1.27, 2.09, 3.10, 4.37),
     "Social-GAN (published)": (0.57, 1.32, 2.22, 3.26, 4.40),
@@ -27,8 +27,8 @@ PUBLISHED_RMSE_M = {
 Lines = list[list[str]]
 
 
-class FitProgress:
-    """Shows a fit as a bar on a terminal, elsewhere as a line per evaluation; a context that closes the bar."""
+class FitProgress(AbstractContextManager["FitProgress"]):
+    """Shows a fit as a bar on a terminal, elsewhere as a line per improvement; a context that closes the bar."""
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
@@ -36,31 +36,28 @@ class FitProgress:
 
     def next_fit(self, name: str) -> None:
         """Start the display of another fit."""
-        self.__exit__(None, None, None)
+        self.__exit__()
         self._bar, self._best = None, math.inf
         print(name, file=sys.stderr, flush=True)
 
     def __call__(self, progress: Progress) -> None:
         """Called by the fit after every update."""
+        update, updates = progress.update, progress.updates
+        scores = "" if progress.score is None else f"validation score {progress.score:.4f}, best {progress.best:.4f}"
         if sys.stderr.isatty():
             if self._bar is None:
-                self._bar = tqdm(total=progress.updates, desc="fit", unit="update", file=sys.stderr)
-            self._bar.update(progress.update - self._bar.n)
-            if progress.score is not None:
-                self._bar.set_postfix_str(f"validation score {progress.score:.4f}, best {progress.best:.4f}")
-        elif progress.best < self._best or progress.update == progress.updates:
+                self._bar = tqdm(total=updates, desc="fit", unit="update", file=sys.stderr)
+            self._bar.update(update - self._bar.n)
+            if scores:
+                self._bar.set_postfix_str(scores)
+        elif progress.best < self._best or update == updates:
             self._best = progress.best
-            left = progress.seconds / progress.update * (progress.updates - progress.update)
-            head = f"{progress.update} of {progress.updates} updates, at most {left:.0f} s left"
-            scores = f"validation score {progress.score:.4f}, best {progress.best:.4f}"
-            print(f"{head}, {scores}", file=sys.stderr, flush=True)
+            left_s = progress.seconds / update * (updates - update)
+            print(
+                f"{update} of {updates} updates, at most {left_s:.0f} s left, {scores}", file=sys.stderr, flush=True
+            )
 
-    def __enter__(self) -> FitProgress:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.close()
 
@@ -109,7 +106,7 @@ def metrics_table(metrics: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """The ablations as text: changes of ADE over all predicted steps and over the first 0.4 s, the ratio at 5 s."""
+    """The ablations as text: change of ADE over all predicted steps and over 0.4 s, ratio of the RMSE at 5 s."""
     first = next(iter(rows.values()))
     kinds = [kind for kind in first["ade_change_percent"] if kind != _BASELINE]
     at_5_s = ["RMSE 5 s"] if "rmse_5_s_ratio" in first else []
@@ -124,8 +121,8 @@ def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
 def fold_tables(folds: Mapping[str, Any]) -> str:
     """All tables of :func:`ganlane.generator.cross_validate`'s result, as text."""
     scores = folds["open_loop"]
-    tables = [_pooled(scores), _rows("by fold", scores["folds"]), _rows("by scene", scores["scenes"])]
-    tables += [_rows("by lane (1 leftmost) and class", scores["parts"]), _direction(scores)]
+    titles = {"folds": "by fold", "scenes": "by scene", "parts": "by lane (1 leftmost) and class"}
+    tables = [_pooled(scores), *(_rows(title, scores[name]) for name, title in titles.items()), _direction(scores)]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
     return "\n\n".join(map(aligned, tables))
@@ -141,7 +138,7 @@ def _pooled(scores: Mapping[str, Any]) -> Lines:
 
 
 def _rows(title: str, rows: Mapping[str, Any]) -> Lines:
-    """Windows, constant velocity's ADE, and the generator's change of it, for every row."""
+    """Windows, constant velocity's ADE and the generator's change relative to it, for every row."""
     first = next(iter(rows.values()))
     kinds = [kind for kind in first["ade_m"] if kind in ("mean", "single") or kind.startswith("best_of")]
     lines = [[title, "windows", "CV, m", *kinds]]
@@ -152,10 +149,12 @@ def _rows(title: str, rows: Mapping[str, Any]) -> Lines:
 
 
 def _direction(scores: Mapping[str, Any]) -> Lines:
-    """Share of lateral moves of more than 0.1 m that are predicted to the right side."""
+    """Share of lateral moves of more than 0.1 m whose side is predicted correctly."""
     later, whole = scores["direction"], scores["direction_whole_window"]
-    lines = [["lateral move to the right side", "after present", "whole window"]]
-    lines.append(["windows that move", str(later["windows"]), str(whole["windows"])])
+    lines = [
+        ["lateral move to the right side", "after present", "whole window"],
+        ["windows that move", str(later["windows"]), str(whole["windows"])],
+    ]
     for kind, share in later["share_right"].items():
         shares = (share, whole["share_right"].get(kind))
         lines.append([kind, *("" if value is None else f"{100 * value:.1f} %" for value in shares)])
@@ -166,7 +165,7 @@ def _rollout(rollout: Mapping[str, Any]) -> Lines:
     """RMSE after 1 to 5 s, with published values."""
     rmse = {kind: list(values.values()) for kind, values in rollout["rmse_m"].items()}
     ratios = dict(rollout["ratio_to_constant_velocity"])
-    for kind, published in PUBLISHED_RMSE_M.items():
+    for kind, published in _PUBLISHED_RMSE_M.items():
         rmse[kind], ratios[kind] = list(published), published[-1] / _PUBLISHED_VELOCITY_M[-1]
     seconds = next(iter(rollout["rmse_m"].values()))
     lines = [[f"RMSE, m ({rollout['windows']} windows)", *seconds, "to CV"]]

@@ -10,13 +10,13 @@ N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI un
 ``vehicles.desired_speed``                 [N, M]      m/s, fixed for an episode
 ``vehicles.target_lane``                   [N, M] i64  the lane it keeps or is moving to; 0 is the rightmost
 ``vehicles.visibility``                    [N, M] i64  0 centre, 1 body, 2 signalled (:mod:`ganlane.sim.lanes`)
-``vehicles.valid``                         [N, M] b    false is padding: nowhere seen, hit or counted
-``ego.*``                                  [N]         what the environment remembers of the ego
-``traffic.*``                              free        the traffic module's own memory
-``seed, episode, step``                    [N] i64     what every random number follows from; step: 0.1 s each
-``road.lanes``                             [N, 1] i64  only where every row has a road of its own (replay)
+``vehicles.valid``                         [N, M] b    false is padding: never seen, hit or counted
+``ego.*``                                  [N]         the environment's memory of the ego
+``traffic.*``                              free        the traffic module's memory
+``seed, episode, step``                    [N] i64     they determine every random number; step: 0.1 s each
+``road.lanes``                             [N, 1] i64  only where every row has its own road (replay)
 ``road.lane_width_m``                      [N, 1]      the same, m
-``events.*``                               [N, 1]      what the last decision led to
+``events.*``                               [N, 1]      events of the last decision
 ``action``                                 [N] i64     0 keep, 1 left, 2 right
 ``action_mask``                            [N, 3] b    which of them are allowed, where there is a mask
 =========================================  ==========  ==================================================
@@ -36,15 +36,15 @@ REWARD_TERMS: Final = "reward_terms"
 SEED: Final = "seed"
 EPISODE: Final = "episode"
 STEP: Final = "step"
-#: The episodes' keys [N] int64 (:func:`ganlane.sim.random.episode_key`), handed to the traffic once a decision.
+#: The episodes' keys [N] int64 (:func:`ganlane.sim.random.episode_key`), given to the traffic once per decision.
 EPISODE_KEY: Final = "episode_key"
 ACTION: Final = "action"
-#: What a policy that tells thinks its action worth, [N] or [N, 1]; named as in TorchRL.
+#: Value of the chosen action by the policy, if it writes one, [N] or [N, 1]; named as in TorchRL.
 CHOSEN_VALUE: Final = "chosen_action_value"
 OBSERVATION: Final = "observation"
 #: Which actions are allowed, [N, 3] bool, where the environment has a mask; named as in TorchRL.
 ACTION_MASK: Final = "action_mask"
-#: Whether even keeping the lane asks somebody to brake harder than is safe, [N, 1] bool (mask ``safe``).
+#: Whether even keeping the lane makes a driver brake harder than is safe, [N, 1] bool (mask ``safe``).
 NO_SAFE_ACTION: Final = "no_safe_action"
 REWARD: Final = "reward"
 
@@ -58,7 +58,7 @@ VEHICLE_FIELDS: Final = VEHICLE_FLOATS + VEHICLE_INTEGERS + VEHICLE_FLAGS
 
 #: Boolean events; a decision ends for at most one of them.
 END_EVENTS: Final = ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")
-#: Terminal reasons that are outcomes of the driving, as against cut-offs.
+#: Ends that are outcomes of the driving; the others are cut-offs.
 TERMINAL_EVENTS: Final = ("goal", "hard_crash", "out_of_road")
 TRUNCATING_EVENTS: Final = ("timeout", "scene_end")
 #: Number of soft-crash onsets in the decision, int64.
@@ -72,7 +72,7 @@ REWARD_TERM_NAMES: Final = ("speed", "lane_change", "out_of_road", "hard_crash",
 KEEP: Final = 0
 LEFT: Final = 1
 RIGHT: Final = 2
-#: How many actions there are.
+#: Number of actions.
 ACTIONS: Final = 3
 EGO_INDEX: Final = 0
 PHYSICS_STEP_S: Final = 0.1

@@ -1,4 +1,4 @@
-"""From names, mappings and keyword arguments to config dataclasses, with the checks of the command line."""
+"""Config dataclasses from names, mappings and keyword arguments, with the checks of the command line."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.checks import did_you_mean
+from ganlane.runtime import check_default_device
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
-#: Meaning of None, and of a mapping without a name, outside a command; a command's YAML has defaults of its own.
+#: Options that None and mappings without a name mean outside a command; each command's YAML has its own defaults.
 DEFAULTS = {
     "env": "highway",
     "traffic": "idm_mobil",
@@ -31,7 +32,7 @@ DEFAULTS = {
 
 
 def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = None, default: str | None = None) -> Any:
-    """The config dataclass of ``group`` that ``chosen`` means, with ``overrides`` on top.
+    """The config dataclass of ``group`` that ``chosen`` names, with ``overrides`` on top.
 
     Args:
         group: ``env``, ``traffic``, ``observation``, ``reward`` ...
@@ -40,31 +41,28 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
         default: name of the option where none is given; None: that of :data:`DEFAULTS`.
 
     Raises:
-        UserError: no such option or key, a value of the wrong type or out of range, or torch's default device is
-            none to compute on.
+        UserError: no such option or key, a value of the wrong type or out of range, or torch's default device
+            cannot be used.
     """
-    if "torch" in sys.modules:  # which takes seconds to import, and nobody has changed its default device
-        from ganlane.runtime import check_default_device
-
+    if "torch" in sys.modules:  # otherwise its default device is unchanged, and importing it takes seconds
         check_default_device("cuda")  # no other one can be the environment's
     if is_dataclass(chosen) and not isinstance(chosen, type):
         return typed(group, chosen, overrides or {})
     if chosen is None or isinstance(chosen, str) or inspect.isclass(chosen):
-        given = {} if chosen is None else {"name": chosen}
+        values = {} if chosen is None else {"name": chosen}
     elif isinstance(chosen, Mapping):
-        given = dict(chosen)
+        values = dict(chosen)
     else:
         raise UserError(
             f"{group}={chosen!r}: expected a name, a mapping of its keys (with its name as 'name') or a config "
             "dataclass; give one of these."
         )
-    name = given.pop("name", default or DEFAULTS[group])
-    kind, own = _named(group, name)
-    return typed(group, kind, {**own, **given, **(overrides or {})})
+    kind, own = _named(group, values.pop("name", default or DEFAULTS[group]))
+    return typed(group, kind, {**own, **values, **(overrides or {})})
 
 
 def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
-    """Dataclass of an option and the values of its name."""
+    """Dataclass of an option, and its values that differ from the defaults."""
     if group == "traffic" and inspect.isclass(name):
         return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
     if group == "traffic" and isinstance(name, str) and "." in name:
@@ -81,7 +79,7 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
 
     Args:
         where: key of the config in messages, for instance ``env``; empty at the root.
-        config: what the values are put on top of.
+        config: default values.
         values: by key; nested ones as mappings.
 
     Raises:
@@ -101,7 +99,7 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
 def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
     """Give ``node`` the entries of ``values`` that a mapping of dataclasses in it lacks.
 
-    OmegaConf would make them itself, but those of frozen dataclasses read-only, and then refuse their values.
+    OmegaConf itself would make entries of frozen dataclasses read-only and then refuse their values.
     """
     for name, value in values.items():
         if not isinstance(value, (Mapping, DictConfig)) or not isinstance(node, DictConfig) or node._is_none():
@@ -113,7 +111,7 @@ def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` as OmegaConf takes it: paths as text, NumPy's and torch's numbers and arrays as Python's."""
+    """``value`` in types that OmegaConf knows: paths as text, NumPy's and torch's numbers and arrays as Python's."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,6 +1,6 @@
-"""How the process runs: compiled functions, kept memory, threads; gymnasium's registry.
+"""Settings of the process: compiled functions, memory, threads, streams; registration with gymnasium.
 
-Torch is imported inside the functions: the command line reads this module before it needs torch.
+Torch is imported inside the functions, because the command line imports this module before it needs torch.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ganlane.errors import UserError
 F = TypeVar("F", bound=Callable)
 #: Graphs that one function may have: one per batch size, road and set of parameters in a process.
 GRAPHS_PER_FUNCTION = 64
-#: With torch 2.11 on Python 3.12 a NamedTuple that leaves a compiled graph is empty; 2.13 is right.
+#: First torch whose compiler is known to be right: 2.11 on Python 3.12 returns empty NamedTuples from a graph.
 TRIED_FROM = (2, 13)
 COMPILERS = ("c++", "g++", "clang++", "cl")
 #: From glibc's malloc.h.
@@ -29,9 +29,9 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 KEPT_BYTES = 2**28
 _STATUS = Path("/proc/self/status")
 ENV_ID: Final = "ganlane/Highway-v0"
-#: Id to the arguments that differ; reference scores are in docs/gymnasium.md. The registered specs have no
-#: ``max_episode_steps``: gymnasium would cut all episodes there, whatever ``timeout_s`` and ``decision_period_s``
-#: are. That of an environment that has been made has the limit that is true for it.
+#: Arguments that differ from the defaults, by id; reference scores are in docs/gymnasium.md. The registered specs
+#: have no ``max_episode_steps``: gymnasium would cut all episodes there, whatever ``timeout_s`` and
+#: ``decision_period_s`` are. The spec of a made environment has its actual limit.
 ENV_IDS: Final[dict[str, dict[str, str]]] = {
     ENV_ID: {},
     "ganlane/HighwayDense-v0": {"env": "dense"},
@@ -41,7 +41,7 @@ ENV_IDS: Final[dict[str, dict[str, str]]] = {
 
 
 def register_envs() -> None:
-    """Register the environments with gymnasium, once; without gymnasium nothing happens."""
+    """Register the environments with gymnasium, once; do nothing without gymnasium."""
     try:
         import gymnasium
     except ModuleNotFoundError:  # the rest of the package works; 'ganlane doctor' says what is missing
@@ -78,16 +78,16 @@ def can_compile() -> bool:
 
 def check_compiler() -> None:
     """Raise :class:`UserError` where torch would find no C++ compiler."""
-    path, looked = find_compiler()
+    path, names = find_compiler()
     if path is None:
         raise UserError(
-            f"compile=true needs a C++ compiler, and there is none (looked for {looked}); install one "
+            f"compile=true needs a C++ compiler, and there is none (looked for {names}); install one "
             "(Debian: apt install g++) or set compile=false."
         )
 
 
 def compiled(function: F) -> F:
-    """``function``, a pure function on tensors without branches on their values, as one graph per shape."""
+    """Compile ``function``, pure and on tensors without branches on their values, to one graph per shape."""
     import torch
 
     torch._dynamo.config.cache_size_limit = max(torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION)
@@ -95,7 +95,7 @@ def compiled(function: F) -> F:
 
 
 def outside_autocast(function: F) -> F:
-    """``function``, computed in the types of its arguments where the caller has switched autocast on."""
+    """Decorator: ``function`` computes in the types of its arguments, even under the caller's autocast."""
 
     @wraps(function)
     def computed(*arguments: Any, **named: Any) -> Any:
@@ -113,19 +113,19 @@ def outside_autocast(function: F) -> F:
 
 
 def check_default_device(device: str) -> None:
-    """Raise :class:`UserError` where torch makes new tensors neither on the CPU nor on a ``device`` of this type."""
+    """Raise :class:`UserError` if torch's default device is neither the CPU nor of the type ``device``."""
     import torch
 
-    usual = torch.get_default_device().type
-    if usual not in ("cpu", device):
+    default = torch.get_default_device().type
+    if default not in ("cpu", device):
         raise UserError(
-            f"torch's default device is {usual}, and the highway's tensors would not meet those that are made there; "
-            "call torch.set_default_device('cpu') and choose the highway's own with device=."
+            f"torch's default device is {default}, and the highway's tensors would not meet those that are made "
+            "there; call torch.set_default_device('cpu') and choose the highway's own with device=."
         )
 
 
 def check_process() -> None:
-    """Raise :class:`UserError` where torch cannot be imported or files cannot be named."""
+    """Raise :class:`UserError` if TorchRL cannot be imported (``-OO``) or the working directory is gone."""
     if sys.flags.optimize > 1:
         raise UserError("python -OO removes the docstrings, which TorchRL needs; run it without -OO.")
     try:
@@ -135,28 +135,28 @@ def check_process() -> None:
 
 
 def open_closed_streams() -> None:
-    """Send nowhere what is written to streams that the shell has closed (``>&-``), which Python has as None."""
+    """Open streams that the shell has closed (``>&-``), for which Python has None, on ``os.devnull``."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            # The lowest free number, so that no file that is opened later gets the number that others write to.
+            # It gets the lowest free number, so that no file opened later gets a number that libraries write to.
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(nowhere, nowhere == number)
             setattr(sys, name, os.fdopen(nowhere, "w" if number else "r", closefd=False))
 
 
 def set_threads(threads: int) -> None:
-    """Let torch use so many threads; 0 takes one, which is fastest for batches of the sizes used here."""
+    """Set torch's number of threads; 0 means one, which is fastest for the batch sizes used here."""
     import torch
 
     torch.set_num_threads(threads or 1)
 
 
 def keep_freed_memory() -> bool:
-    """Let the process keep the memory it frees; whether that could be done (on Linux with glibc alone).
+    """Let the process keep the memory it frees; return whether that is possible (only on Linux with glibc).
 
-    By default glibc hands every large block back to the system as soon as it is free, and taking it again costs a
-    page fault per 4 kB: with thousands of environments more than the arithmetic. The peak does not change. It is a
-    choice for a whole process, so the commands make it and the library does not.
+    By default glibc returns every large block to the system as soon as it is free, and taking it again costs a page
+    fault per 4 kB, with thousands of environments more than the arithmetic. The peak does not change. The commands
+    set this and the library does not, because it holds for the whole process.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -167,7 +167,7 @@ def keep_freed_memory() -> bool:
 
 
 def peak_resident_bytes() -> int | None:
-    """The most memory that this process has held so far; None where the system does not report it.
+    """Peak resident memory of this process so far; None where the system does not report it.
 
     Linux's ``ru_maxrss`` is not used: a fresh process inherits its parent's.
     """

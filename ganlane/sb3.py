@@ -72,7 +72,7 @@ class HighwayVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
-        """Keep the actions [N] for :meth:`step_wait`."""
+        """Store the actions [N] for :meth:`step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Floats, Floats, npt.NDArray[np.bool_], list[dict[str, Any]]]:
@@ -90,12 +90,8 @@ class HighwayVecEnv(VecEnv):
     def _final_info(self, row: int, info: dict[str, Any], truncated: bool) -> dict[str, Any]:
         final = {name: values[row] for name, values in info["final_info"].items() if not isinstance(values, dict)}
         episode = {"r": float(self._return[row]), "l": int(self._length[row]), "t": float(final["time_s"])}
-        return {
-            **final,
-            "terminal_observation": info["final_obs"][row],
-            "TimeLimit.truncated": truncated,
-            "episode": episode,
-        }
+        final |= {"terminal_observation": info["final_obs"][row], "TimeLimit.truncated": truncated}
+        return {**final, "episode": episode}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed of the next reset; one for all rows, which drive different episodes of it."""
@@ -126,11 +122,11 @@ class HighwayVecEnv(VecEnv):
         """
         if method_name not in _OF_ROWS:
             raise UserError(f"env_method({method_name!r}): the rows have {' and '.join(_OF_ROWS)}; call one of them.")
-        found = getattr(self.highways, method_name)(*args, **kwargs)
-        return [found[row] for row in self._get_indices(indices)]
+        results = getattr(self.highways, method_name)(*args, **kwargs)
+        return [results[row] for row in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
-        """True for ``Monitor`` alone, whose episode statistics are in the infos."""
+        """True only for ``Monitor``, whose episode statistics are in the infos."""
         return [wrapper_class is Monitor for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[npt.NDArray[np.uint8] | None]:

@@ -14,13 +14,14 @@ import torch
 import ganlane
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.env import EnvConfig
+from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import GanTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.errors import UserError
 from ganlane.options import option
 from ganlane.traffic import IdmTraffic
 
-#: Blocks of the documentation that take longer, or need recordings.
+#: Blocks of the documentation that take long or need recordings.
 LONG = re.compile(r"ganlane\.api\.(train|run)\(")
 
 
@@ -42,8 +43,7 @@ def test_an_environment_takes_what_the_command_line_takes():
         "idm", 3, lanes=4, vehicles=15, recycle=True, idm={"headway_s": 1.2}, observation="table3", seed=4
     )
     base = env.base_env
-    assert (base.road.lanes, base.vehicles, base.recycle, base.batch_size[0]) == (4, 15, True, 3)
-    assert base.rules.idm.headway_s == 1.2
+    assert (base.road.lanes, base.vehicles, base.recycle, base.rules.idm.headway_s) == (4, 15, True, 1.2)
     state = env.reset()
     assert state["observation"].shape == (3, 3 + 3 * 14)
     assert state["seed"].tolist() == [4, 4, 4]
@@ -52,8 +52,7 @@ def test_an_environment_takes_what_the_command_line_takes():
 def test_options_come_as_names_mappings_configs_and_classes():
     by_mapping = ganlane.make_env({"name": "gan", "noise_scale": 0.0}, reward={"hard_crash": -200.0})
     by_config = ganlane.make_env(GanTrafficConfig(noise_scale=0.0), env=EnvConfig(lanes=2), lane_width_m=3.5)
-    assert by_config.base_env.road.lanes == 2
-    assert by_config.base_env.road.lane_width_m == 3.5
+    assert by_config.base_env.road == ganlane.Road(2, 3.5)
     assert type(by_mapping.base_env.traffic) is type(by_config.base_env.traffic)
     assert by_mapping.transform[-1].parameters.hard_crash == -200.0
     assert isinstance(ganlane.make_env(IdmTraffic).base_env.traffic, IdmTraffic)
@@ -80,36 +79,34 @@ def test_a_loaded_agent_drives_an_environment():
 def test_the_table_has_the_numbers_of_the_command(capsys):
     from ganlane.evaluate import main
 
-    arguments = ["agents=[mobil,random_legal]", "traffics=[idm,idm_mobil]", "episodes=3", "env.goal_m=40"]
-    assert main([*arguments, "seed=2"]) == 0
+    line = "agents=[mobil,random_legal] traffics=[idm,idm_mobil] episodes=3 env.goal_m=40 seed=2"
+    assert main(line.split()) == 0
     written = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: "))
     rows = json.loads(written.read_text())["rows"]
     threads = torch.get_num_threads()
     table = ganlane.api.evaluate(["mobil", "random_legal"], ["idm", "idm_mobil"], 3, seed=2, goal_m=40, folder="mine")
     assert torch.get_num_threads() == threads
-    assert isinstance(table, pl.DataFrame)
     assert json.loads(json.dumps(table.to_dicts())) == rows
     assert json.loads(Path("mine/results.json").read_text())["rows"] == rows
     assert pl.read_parquet("mine/episodes.parquet").equals(pl.read_parquet(written.parent / "episodes.parquet"))
 
 
 def test_own_drivers_and_own_names_stand_in_the_table():
-    from ganlane.sim import Road
-
-    own = DRIVERS["keep_lane"](Road(3), 2)
+    own = DRIVERS["keep_lane"](ganlane.Road(3), 2)
     traffics = {"quiet": {"name": "idm"}, "mine": IdmTraffic}
     episodes = ganlane.api.evaluate([own, ganlane.load_agent("keep_lane")], traffics, 2, goal_m=30, per_episode=True)
     assert episodes.height == 8
-    assert episodes["traffic"].unique(maintain_order=True).to_list() == ["quiet", "mine"]
-    assert episodes["agent"].unique(maintain_order=True).to_list() == [type(own).__name__, "keep_lane"]
-    totals = episodes.group_by("agent", "traffic").agg(pl.col("reward").sum())["reward"]
-    assert totals.n_unique() == 1
+    totals = episodes.group_by("traffic", "agent", maintain_order=True).agg(pl.col("reward").sum())
+    pairs = [(traffic, agent) for traffic in ("quiet", "mine") for agent in (type(own).__name__, "keep_lane")]
+    assert totals.select("traffic", "agent").rows() == pairs
+    assert totals["reward"].n_unique() == 1
 
 
 def test_a_run_is_trained_resumed_and_evaluated():
     small = {"name": "rainbow", "warmup": 64, "capacity": 1000, "hidden": [16], "batch_size": 16}
     tiny = {"agent": small, "num_envs": 8, "goal_m": 40.0, "evaluation": {"agents": ["mobil"], "episodes": 2}}
     run = ganlane.api.train("idm", "none", total_decisions=256, folder="run", logger={"progress": False}, **tiny)
+    assert run.folder == Path("run")
     assert run.agent == Path("run/agent.safetensors")
     assert run.table["agent"].to_list() == ["trained", "mobil"]
     assert run.results["decisions"] >= 256
@@ -120,62 +117,42 @@ def test_a_run_is_trained_resumed_and_evaluated():
     assert more.results["decisions"] >= 512
 
 
-def test_a_film_is_written_where_it_was_asked_for():
+def test_a_film_is_written_to_the_given_path():
     path = ganlane.api.render("keep_lane", "idm", 2, out="strip.png", goal_m=30.0, film={"width": 640, "height": 200})
     assert path == Path("strip.png")
     assert path.read_bytes().startswith(b"\x89PNG")
     assert ganlane.api.render("keep_lane", "idm", format="png", goal_m=20.0).parent.parent == Path("outputs/render")
 
 
-def test_speed_is_measured():
-    few = {"batches": [2], "modes": ["eager"], "threads": [1], "vehicle_counts": [3], "peers": False, "memory": False}
-    found = ganlane.api.run("bench", suite="sim", quick=True, **few)
-    assert found.results["rows"][0]["physics_steps_per_s"] > 0
+@pytest.mark.parametrize("command", SCHEMAS[""])
+def test_every_command_has_its_function(command):
+    assert ganlane.api._function(command).__name__ == command
 
 
-@pytest.fixture
-def recordings(tmp_path, monkeypatch):
-    """A scene CSV; nothing else is found."""
-    monkeypatch.delenv("GANLANE_DATA", raising=False)
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=8, seconds=7.0)), tmp_path / "mine.csv")
-    return tmp_path / "mine.csv"
-
-
-def test_recordings_become_a_generator_that_drives(recordings):
-    prepared = ganlane.api.run("prepare", data={"path": recordings}, out="mine")
+def test_recordings_become_a_generator_that_drives():
+    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=8, seconds=7.0)), Path("mine.csv"))
+    prepared = ganlane.api.run("prepare", data={"path": Path("mine.csv")}, out="mine")
     assert prepared.results["files"]
-    loop = {"updates": 2, "evaluate_every": 1}
-    quick = {"batch": 4, "loop": loop}
-    fitted = ganlane.api.run("train_generator", data={"path": "mine"}, generator=quick, seed=1)
+    short = {"batch": 4, "loop": {"updates": 2, "evaluate_every": 1}}
+    fitted = ganlane.api.run("train_generator", data={"path": "mine"}, generator=short, seed=1)
     assert fitted.results["ade_m"].keys() >= {"mean", "constant_velocity"}
     env = ganlane.make_env({"name": "gan", "path": fitted.results["weights"]}, 2)
     assert env.rollout(2)["next", "reward"].shape == (2, 2, 1)
-
-
-def test_a_card_is_made(recordings):
-    held_out = {"path": recordings, "held_out": ["synthetic-1", "synthetic-2"]}
-    run = ganlane.api.run("realism", "card", traffic="idm", data=held_out, quick=True, vehicle_km=0.0, resamples=100)
-    assert run.folder == Path("card")
-    assert 0.0 <= run.results["quantities"]["speed"]["distance"] <= 1.0
-    assert (run.folder / "distributions.png").is_file()
 
 
 def test_the_short_blocks_in_the_docs_run(capsys):
     page = (Path(__file__).parents[1] / "docs" / "python_api.md").read_text()
     code = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if not LONG.search(block)]
     assert len(code) == 5
-    names = {}
-    exec(
-        "\n".join(code).replace("episodes=100", "episodes=2, goal_m=30").replace('"end_s": 5.0', '"end_s": 1.0'),
-        names,
-    )
+    names, text = {}, "\n".join(code)
+    exec(text.replace("episodes=100", "episodes=2, goal_m=30").replace('"end_s": 5.0', '"end_s": 1.0'), names)
     assert names["table"].height == 6
     assert names["rollout"].batch_size == (64, 10)
     assert Path("film.gif").is_file()
 
 
 @pytest.mark.parametrize(
-    ("call", "told"),
+    ("call", "message"),
     [
         (lambda: ganlane.make_env(num_envs=0), "num_envs=0: expected a whole number from 1"),
         (lambda: ganlane.make_env(num_envs="2"), "num_envs='2': expected a whole number"),
@@ -211,8 +188,8 @@ def test_the_short_blocks_in_the_docs_run(capsys):
         (lambda: ganlane.api.run("trian"), "no such command (did you mean 'train'"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_leaves_nothing(call, told, tmp_path):
-    with pytest.raises(UserError, match=re.escape(told)) as caught:
+def test_a_mistake_is_one_sentence_and_leaves_nothing(call, message, tmp_path):
+    with pytest.raises(UserError, match=re.escape(message)) as caught:
         call()
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []

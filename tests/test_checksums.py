@@ -1,9 +1,10 @@
-"""Damage is seen: of a file that is written and read back, no byte can be changed without a refusal."""
+"""Damage to any byte of a file that is written and read back is refused."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import polars as pl
@@ -11,7 +12,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from ganlane import checksums
 from ganlane.agents import read_agent
 from ganlane.checksums import PLACE, has_checksum, sealed, sealed_archive
 from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes
@@ -26,7 +26,7 @@ from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 
 
 class SmallFit:
-    """As little as a loop can fit."""
+    """The smallest model that a loop can fit."""
 
     config = PaperConfig(loop=LoopConfig(updates=1, evaluate_every=1))
 
@@ -46,11 +46,15 @@ def fit(path: Path) -> FitLoop:
     return FitLoop(SmallFit(), path)
 
 
-def copied(source: Path) -> Callable[[Path], None]:
-    return lambda path: path.write_bytes(source.read_bytes()) and None
+def copied(source: Path) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(source.read_bytes())
 
 
-#: Every kind of file: how it is written, and read.
+def synthetic_frame() -> pl.DataFrame:
+    return synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=4))
+
+
+#: How every kind of file is written and read.
 FILES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "agent.safetensors": (
         lambda path: save_weights(path, "agent", {"a": torch.arange(4.0)}, {"name": "x"}),
@@ -60,15 +64,8 @@ FILES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "generator.safetensors": (copied(CHECKPOINTS / "generator_paper.safetensors"), load_generator),
     "reference.json": (lambda path: Reference.load(SHIPPED_REFERENCE).save(path), Reference.load),
     "fit.pt": (lambda path: fit(path).run(), fit),
-    "scenes.parquet": (
-        lambda path: write_prepared(synthetic_frame(), path),
-        read_scenes,
-    ),
+    "scenes.parquet": (lambda path: write_prepared(synthetic_frame(), path), read_scenes),
 }
-
-
-def synthetic_frame() -> pl.DataFrame:
-    return synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=4))
 
 
 def flipped(content: bytes, place: int, bit: int) -> bytes:
@@ -83,7 +80,7 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     read(path)
     whole = path.read_bytes()
     assert has_checksum(whole, path)
-    # The ends, where formats keep what holds them together, and places all over.
+    # Both ends, where formats keep their headers, and places all over.
     places = {*range(0, 200, 9), *range(len(whole) - 120, len(whole), 7), *range(0, len(whole), len(whole) // 40)}
     for place in sorted(place for place in places if place < len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))
@@ -111,15 +108,10 @@ def test_no_bit_of_a_content_can_change(seal):
 
 def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path))
-    calls = []
-
-    def compute() -> dict[str, np.ndarray]:
-        calls.append(1)
-        return {"labels": np.arange(3)}
-
+    compute = Mock(side_effect=lambda: {"labels": np.arange(3)})
     for _ in range(2):
         assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
-    assert len(calls) == 1
+    assert compute.call_count == 1
     path = tmp_path / "groups_key.npz"
     whole = path.read_bytes()
     for place in range(len(whole)):
@@ -127,7 +119,7 @@ def test_a_damaged_cache_is_computed_again(tmp_path, monkeypatch, capsys):
         assert load_arrays(path) is None
     assert capsys.readouterr().err.count("computed again") == len(whole)
     assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
-    assert (len(calls), path.read_bytes()) == (2, whole)
+    assert (compute.call_count, path.read_bytes()) == (2, whole)
     np.savez_compressed(path, labels=np.arange(4))  # as older versions wrote it
     assert cached("groups", "key", compute)["labels"].tolist() == [0, 1, 2]
     save_arrays(path, {"labels": np.arange(5)})
@@ -139,9 +131,8 @@ def test_an_old_file_loads_with_one_note(tmp_path, capsys):
     save_file({"a": torch.ones(2)}, path, metadata={"ganlane": '{"kind": "agent"}'})
     for _ in range(3):
         load_weights(path, "agent")
-    assert capsys.readouterr().err == (
-        f"{path}: of a version that wrote no checksum; damage to it would not be seen.\n"
-    )
+    note = f"{path}: of a version that wrote no checksum; damage to it would not be seen.\n"
+    assert capsys.readouterr().err == note
 
 
 def test_what_ships_has_checksums(capsys):
@@ -170,4 +161,4 @@ def test_weights_that_are_not_finite_are_refused(kind, value, tmp_path):
 
 def test_a_content_without_the_place_cannot_be_sealed():
     with pytest.raises(ValueError, match="not found"):
-        checksums.sealed(b"nothing")
+        sealed(b"nothing")

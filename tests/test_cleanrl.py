@@ -27,13 +27,13 @@ def one_by_one():
 
 
 def as_a_batch():
-    """What to put in its place for speed."""
+    """The faster replacement."""
     envs = gym.make_vec(ENV_ID, num_envs=ROWS, goal_m=100.0, autoreset_mode="next_step")
     return gym.wrappers.vector.RecordEpisodeStatistics(envs)
 
 
 def ended_returns(infos):
-    """From gymnasium 0.29, as the script looks for them: an info each in ``final_info``; from 1.x: arrays."""
+    """Returns in the form of gymnasium 0.29, which the script reads (``final_info``), or of 1.x (arrays)."""
     if "final_info" in infos:
         return [float(info["episode"]["r"]) for info in infos["final_info"] if info and "episode" in info]
     return infos["episode"]["r"][infos["_episode"]].tolist() if "episode" in infos else []
@@ -51,10 +51,8 @@ def train(envs, iterations):
     """Update an agent so many times; the losses, the returns of the episodes, and how far the weights moved."""
     assert isinstance(envs.single_action_space, gym.spaces.Discrete)
     shape = envs.single_observation_space.shape
-    critic, actor = (
-        layers(int(np.prod(shape)), 1, 1.0),
-        layers(int(np.prod(shape)), int(envs.single_action_space.n), 0.01),
-    )
+    size, choices = int(np.prod(shape)), int(envs.single_action_space.n)
+    critic, actor = layers(size, 1, 1.0), layers(size, choices, 0.01)
     weights = [*critic.parameters(), *actor.parameters()]
     first = [weight.detach().clone() for weight in weights]
     optimiser = torch.optim.Adam(weights, lr=2.5e-4, eps=1e-5)

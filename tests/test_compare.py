@@ -32,16 +32,16 @@ def table(recordings):
     env = EnvConfig(goal_m=60.0)
     traffics = {"idm": IdmTrafficConfig(), "replay": ReplayTrafficConfig(path=str(recordings))}
     drivers = [make_driver(name, env) for name in ("keep_lane", "random_legal")]
-    asked = {"traffics": list(traffics), "traffic_options": traffics, "episodes": EPISODES, "num_envs": 4}
-    return compare(drivers, EvaluateConfig(env=env, seed=5, **asked))
+    options = {"traffics": list(traffics), "traffic_options": traffics, "episodes": EPISODES, "num_envs": 4}
+    return compare(drivers, EvaluateConfig(env=env, seed=5, **options))
 
 
 def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, recordings):
     scenes = ReplayTraffic(Stream.REPORT, recordings).scenes_of_episodes(5, range(EPISODES))
     assert len(set(scenes)) == 3
     for agent in ("keep_lane", "random_legal"):
-        found = table.filter(pl.col("traffic") == "replay", pl.col("agent") == agent).sort("episode")
-        assert found["scene"].to_list() == scenes
+        episodes = table.filter(pl.col("traffic") == "replay", pl.col("agent") == agent).sort("episode")
+        assert episodes["scene"].to_list() == scenes
     assert table.filter(pl.col("traffic") == "idm")["scene"].is_null().all()
 
 

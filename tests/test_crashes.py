@@ -12,7 +12,7 @@ import pytest
 
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.crashes import Crash, CrashList, find_crashes, read_crashes, write_crashes
+from ganlane.crashes import ENDS, Crash, CrashList, find_crashes, read_crashes, write_crashes
 from ganlane.errors import UserError
 from ganlane.render import main
 
@@ -24,50 +24,39 @@ def shipped() -> CrashList:
     return read_crashes(SHIPPED)
 
 
-def ends(listed: CrashList) -> list[tuple[str, str, int, str]]:
-    return [
-        (each.driver, each.traffic, each.episode, rollout.end)
-        for each, rollout in zip(listed.crashes, listed.drive_again())
-    ]
+def earliest(listed: CrashList) -> dict[str, Crash]:
+    """The earliest crash on each traffic."""
+    return {each.traffic: each for each in sorted(listed.crashes, key=lambda each: -len(each.actions))}
 
 
-def by_length(listed: CrashList) -> list[Crash]:
-    """The earliest crash first."""
-    return sorted(listed.crashes, key=lambda each: len(each.actions))
-
-
-def as_listed(listed: CrashList) -> list[tuple[str, str, int, str]]:
-    return [(each.driver, each.traffic, each.episode, each.end) for each in listed.crashes]
+def check_they_happen_again(listed: CrashList) -> None:
+    assert [rollout.end for rollout in listed.drive_again()] == [each.end for each in listed.crashes]
 
 
 def test_the_earliest_crashes_of_the_shipped_agents_happen_again(shipped):
-    early = {each.traffic: each for each in by_length(shipped)[::-1] if len(each.actions) < 20}
+    early = {traffic: each for traffic, each in earliest(shipped).items() if len(each.actions) < 20}
     assert early.keys() >= {"idm_mobil", "idm_faults", "gan", "gan_calibrated"}
-    chosen = replace(shipped, crashes=list(early.values()))
-    assert ends(chosen) == as_listed(chosen)
+    check_they_happen_again(replace(shipped, crashes=list(early.values())))
 
 
 @pytest.mark.slow
 def test_every_crash_of_the_shipped_agents_happens_again(shipped):
-    assert ends(shipped) == as_listed(shipped)
+    check_they_happen_again(shipped)
 
 
 def test_the_list_holds_failures_of_the_published_evaluation(shipped):
     failures = json.loads((SHIPPED.parent / "results.json").read_text())["failures"]
-    known = {(f["driver"], f["traffic"], number, end) for f in failures for end in _ENDS for number in f[end]}
-    assert set(as_listed(shipped)) <= known
+    known = {(f["driver"], f["traffic"], number, end) for f in failures for end in ENDS for number in f[end]}
+    assert {(each.driver, each.traffic, each.episode, each.end) for each in shipped.crashes} <= known
     drivers = {each.driver.partition("+")[0] for each in shipped.crashes}
     assert drivers >= {f"agent_{recipe}@{seed}" for recipe in ("idm", "gan") for seed in range(4)}
     assert SHIPPED.stat().st_size < 200_000
 
 
-_ENDS = ("hard_crash", "out_of_road")
-
-
 def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
     config = EvaluateConfig(agents=["random"], traffics=["idm"], env=EnvConfig(goal_m=60.0))
-    asked = {"agent": "random", "traffic": "idm", "episode": [2, 3, 7], "decisions": [9, 1, 5]}
-    rows = pl.DataFrame({**asked, "reason": ["out_of_road", "out_of_road", "hard_crash"]})
+    episodes = {"agent": "random", "traffic": "idm", "episode": [2, 3, 7], "decisions": [9, 1, 5]}
+    rows = pl.DataFrame({**episodes, "reason": ["out_of_road", "out_of_road", "hard_crash"]})
     listed, others = find_crashes(rows, config, 3)
     assert [each.episode for each in listed.crashes] == [2, 3]
     assert others == 1
@@ -76,54 +65,38 @@ def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
     read = read_crashes(tmp_path / "crashes.json")
     assert read.crashes == listed.crashes
     assert (read.env, read.stream) == (listed.env, "report")
-    assert ends(read) == as_listed(listed)
-
-
-def _code(content):
-    content["traffics"]["gan"]["_target_"] = "os.getcwd"
-
-
-def _placeholder(content):
-    content["crashes"][0]["driver"] = "${oc.env:HOME}"
-
-
-def _unknown_traffic(content):
-    content["crashes"][0]["traffic"] = "mixed"
-
-
-def _bad_action(content):
-    content["crashes"][0]["actions"] = "0123"
-
-
-def _bad_road(content):
-    content["env"]["lanes"] = 0
-
-
-def _no_number(content):
-    content["crashes"][0]["episode"] = 1.5
-
-
-def _foreign(content):
-    content.clear()
+    check_they_happen_again(read)
 
 
 @pytest.mark.parametrize(
-    "spoil", [_code, _placeholder, _unknown_traffic, _bad_action, _bad_road, _no_number, _foreign]
+    ("path", "value"),
+    [
+        ("traffics gan _target_", "os.getcwd"),
+        ("crashes 0 driver", "${oc.env:HOME}"),
+        ("crashes 0 traffic", "mixed"),
+        ("crashes 0 actions", "0123"),
+        ("crashes 0 episode", 1.5),
+        ("env lanes", 0),
+    ],
 )
-def test_a_broken_or_foreign_list_is_refused_in_one_sentence(spoil, small_list, tmp_path):
-    content = json.loads(small_list.read_text())
-    spoil(content)
+def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small_list):
+    content = part = json.loads(small_list.read_text())
+    *parents, last = path.split()
+    for name in parents:
+        part = part[int(name) if name.isdigit() else name]
+    part[last] = value
     small_list.write_text(json.dumps(content))
     with pytest.raises(UserError, match="not a list of crashes") as refused:
         read_crashes(small_list)
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"[]", b"\xff\xfe", b"[" * 100_000, b'{"kind": 3}'])
-def test_what_is_no_json_of_ours_is_refused(content, tmp_path):
+@pytest.mark.parametrize("content", [b"", b"[]", b"{}", b"\xff\xfe", b"[" * 100_000, b'{"kind": 3}'])
+def test_other_files_are_refused_in_one_sentence(content, tmp_path):
     (tmp_path / "crashes.json").write_bytes(content)
-    with pytest.raises(UserError, match="not a list of crashes"):
+    with pytest.raises(UserError, match="not a list of crashes") as refused:
         read_crashes(tmp_path / "crashes.json")
+    assert "\n" not in str(refused.value)
     with pytest.raises(UserError, match="cannot be read"):
         read_crashes(tmp_path / "nowhere.json")
 
@@ -132,10 +105,8 @@ def test_what_is_no_json_of_ours_is_refused(content, tmp_path):
 def small_list(shipped, tmp_path, monkeypatch) -> Path:
     """Two early crashes on traffic of two kinds."""
     monkeypatch.chdir(tmp_path)
-    chosen = [
-        next(each for each in by_length(shipped) if each.traffic == traffic) for traffic in ("idm_faults", "gan")
-    ]
-    write_crashes("crashes.json", replace(shipped, crashes=chosen))
+    crashes = [earliest(shipped)[traffic] for traffic in ("idm_faults", "gan")]
+    write_crashes("crashes.json", replace(shipped, crashes=crashes))
     return Path("crashes.json")
 
 
@@ -152,7 +123,7 @@ def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
 
 @pytest.mark.usefixtures("hydra_from_memory")
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("crashes=nowhere.json", "nowhere.json: cannot be read"),
         ("crashes=crashes.json agents=[nobody]", "none of these agents"),
@@ -161,6 +132,6 @@ def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
         ("traffics=[idm]", "goes with crashes=FILE"),
     ],
 )
-def test_a_mistake_is_one_sentence(line, said, small_list, capsys):
+def test_a_mistake_is_one_sentence(line, message, small_list, capsys):
     assert main(line.split()) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err

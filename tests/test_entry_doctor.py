@@ -1,10 +1,11 @@
-"""``ganlane doctor`` tells what is there, what is not, and what to type."""
+"""``ganlane doctor`` reports what is there, what is missing, and the command that fixes it."""
 
 from __future__ import annotations
 
 import re
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -33,7 +34,7 @@ else:  # pragma: no cover
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-#: Extras that are for people who work on the package, and hold the others.
+#: Extras for developers, which include the others.
 FOR_DEVELOPERS = {"test", "dev"}
 
 
@@ -86,28 +87,22 @@ def test_versions_are_compared_as_numbers(version, allowed, monkeypatch):
 
 
 def test_a_package_that_is_not_there_comes_with_its_command():
-    found = required("no-such-package>=1.0")
-    assert found == Finding(
-        "no-such-package", State.MISSING, "not installed", 'python -m pip install "no-such-package>=1.0"'
-    )
+    fix = 'python -m pip install "no-such-package>=1.0"'
+    assert required("no-such-package>=1.0") == Finding("no-such-package", State.MISSING, "not installed", fix)
     assert required("numpy>=999").state is State.MISSING
 
 
 def test_a_package_that_cannot_be_imported_is_missing(monkeypatch):
-    def broken(name):
-        raise OSError("lib.so:\n undefined symbol")
-
+    broken = Mock(side_effect=OSError("lib.so:\n undefined symbol"))
     monkeypatch.setattr("ganlane.doctor.importlib.import_module", broken)
-    found = required("numpy>=1.26")
-    assert (found.state, found.found) == (State.MISSING, "lib.so: undefined symbol")
-    assert "--force-reinstall" in found.fix
+    fix = 'python -m pip install "numpy>=1.26" --force-reinstall'
+    assert required("numpy>=1.26") == Finding("numpy", State.MISSING, "lib.so: undefined symbol", fix)
 
 
 def test_an_extra_names_only_what_it_lacks(monkeypatch):
     monkeypatch.setitem(EXTRAS, "mixed", ("counting", ("numpy>=1.26", "no-such-package>=1")))
-    found = extra("mixed")
-    assert (found.state, found.found) == (State.ABSENT, "counting: no-such-package not installed")
-    assert found.fix == 'python -m pip install "no-such-package>=1"'
+    fix = 'python -m pip install "no-such-package>=1"'
+    assert extra("mixed") == Finding("extra mixed", State.ABSENT, "counting: no-such-package not installed", fix)
 
 
 def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
@@ -148,9 +143,9 @@ def test_a_machine_without_compiler_is_told_what_to_install(monkeypatch):
 
 
 def test_the_report_shows_every_finding_and_its_command():
-    found = {"software": [Finding("torch", State.OK, "2.13"), Finding("numpy", State.MISSING, "gone", "do this")]}
-    assert missing(found) == ["numpy"]
-    assert report(found).splitlines() == [
+    sections = {"software": [Finding("torch", State.OK, "2.13"), Finding("numpy", State.MISSING, "gone", "do this")]}
+    assert missing(sections) == ["numpy"]
+    assert report(sections).splitlines() == [
         "software",
         "  ok      torch                 2.13",
         "  MISSING numpy                 gone",

@@ -1,4 +1,4 @@
-"""Every example runs and says what it found, and the one shown in the docs is the one that runs."""
+"""Every example runs and prints its result, and the one shown in the docs is the one that runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
-#: What a run must print, so that a script that does nothing is noticed.
+#: What a run must print, so that an example that does nothing fails.
 EXAMPLES = {
     "own_traffic.py": r"mean speed of the others \d+\.\d m/s, \d+ % look away",
     "own_reward.py": r"random_legal courteous: mean return +-?\d+\.\d, \d+ onsets behind",
@@ -37,23 +37,13 @@ SHORT = {
 NEEDS = {"sb3_dqn.py": "stable_baselines3", "sb3_ppo.py": "sb3_contrib"}
 
 
-def run(name: str, *arguments: str) -> str:
-    """What ``python examples/NAME`` prints, in a process of its own."""
-    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
-    command = [sys.executable, str(ROOT / "examples" / name), *arguments]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def test_every_example_is_run_here():
     assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(EXAMPLES)
 
 
-#: One is run in a process of its own, below; the others here, where torch is loaded already.
+#: own_traffic.py runs in its own process, below; the others here, where torch is loaded already.
 @pytest.mark.parametrize("name", sorted(EXAMPLES.keys() - {"own_traffic.py"}))
-def test_the_example_runs_and_says_what_it_found(name, monkeypatch, capsys):
+def test_the_example_runs_and_prints_its_result(name, monkeypatch, capsys):
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not installed")
     monkeypatch.setattr(sys, "argv", [name, *SHORT.get(name, [])])
@@ -63,7 +53,12 @@ def test_the_example_runs_and_says_what_it_found(name, monkeypatch, capsys):
 
 
 def test_an_example_runs_as_a_user_would_run_it():
-    assert re.search(EXAMPLES["own_traffic.py"], run("own_traffic.py"))
+    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}
+    command = [sys.executable, str(ROOT / "examples" / "own_traffic.py")]
+    finished = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert re.search(EXAMPLES["own_traffic.py"], finished.stdout)
 
 
 def test_the_traffic_model_in_the_docs_is_the_one_that_runs():
@@ -81,9 +76,7 @@ def test_links_between_the_pages_lead_somewhere():
 
 
 def test_the_docs_name_only_files_that_exist():
-    missing = []
-    for page in (ROOT / "docs").glob("*.md"):
-        for name in re.findall(r"`((?:ganlane|tests|examples|conf)/[\w/]+\.(?:py|yaml))`", page.read_text()):
-            if not (ROOT / name).is_file():
-                missing.append(f"{page.name}: {name}")
-    assert not missing
+    file = re.compile(r"`((?:ganlane|tests|examples|conf)/[\w/]+\.(?:py|yaml))`")
+    names = {(page.name, name) for page in (ROOT / "docs").glob("*.md") for name in file.findall(page.read_text())}
+    assert names
+    assert {(page, name) for page, name in names if not (ROOT / name).is_file()} == set()

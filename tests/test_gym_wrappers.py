@@ -18,29 +18,20 @@ MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:
 def test_a_users_transform_pays_what_it_says():
     from torchrl.envs import RewardScaling
 
-    alone, doubled = make(), make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
-    rewards = []
-    for env in (alone, doubled):
-        env.reset(seed=0)
-        rewards.append(env.step(KEEP)[1])
-    assert rewards[1] == pytest.approx(2.0 * rewards[0])
+    plain, doubled = make(), make(transforms=[RewardScaling(loc=0.0, scale=2.0)])
+    plain.reset(seed=0)
+    doubled.reset(seed=0)
+    assert doubled.step(KEEP)[1] == pytest.approx(2.0 * plain.step(KEEP)[1])
 
 
-def test_episode_statistics_are_recorded_for_one_and_for_many():
+def test_episode_statistics_are_recorded():
     env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
     env.reset(seed=0)
-    paid = 0.0
-    while True:
-        _, reward, terminated, truncated, info = env.step(KEEP)
-        paid += reward
-        if terminated or truncated:
-            break
-    assert info["episode"]["r"] == pytest.approx(paid)
-    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_vec(2, goal_m=30.0))
-    envs.reset(seed=0)
-    while "episode" not in info or "_episode" not in info:
-        *_, info = envs.step(np.zeros(2, int))
-    assert info["episode"]["l"][info["_episode"]].min() > 0
+    total, info = 0.0, {}
+    while "episode" not in info:
+        _, reward, *_, info = env.step(KEEP)
+        total += reward
+    assert info["episode"]["r"] == pytest.approx(total)
 
 
 def test_gymnasiums_own_vectorisation_works_too():
@@ -61,16 +52,12 @@ def test_infos_of_a_batch_can_be_had_row_by_row():
     assert infos[0]["reward_terms"].keys() == infos[1]["reward_terms"].keys()
 
 
-def blocks(page):
-    """The Python in a page of the documentation."""
-    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(), re.S)
-
-
 def test_the_code_in_the_docs_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "gymnasium.md").read_text(), re.S)
     films = importlib.util.find_spec("moviepy") is not None
     names = {"np": np}
-    exec("\n".join(block for block in blocks("gymnasium.md") if films or "RecordVideo" not in block), names)
+    exec("\n".join(block for block in blocks if films or "RecordVideo" not in block), names)
     assert names["following"].shape == (64, 29)
 
 
@@ -83,19 +70,11 @@ def test_the_docs_list_every_info():
     assert set(re.search(r"`speed, (.*?)` \|", table).group(1).split(", ")) | {"speed"} == set(info["reward_terms"])
 
 
-def test_stable_baselines3_trains_on_it_unchanged():
-    baselines = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
-    env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
-    check = pytest.importorskip("stable_baselines3.common.env_checker").check_env
+def test_the_check_of_stable_baselines3_finds_nothing():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra sb3 is not installed")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check(env.unwrapped)
-    model = baselines.DQN("MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]})
-    before = [weight.clone() for weight in model.q_net.parameters()]
-    model.learn(200)
-    assert model.num_timesteps == 200
-    assert len(model.ep_info_buffer) > 0
-    assert any(not torch.equal(old, new) for old, new in zip(before, model.q_net.parameters()))
+        checker.check_env(make().unwrapped)
 
 
 def test_tianshou_trains_on_it_unchanged():
@@ -118,7 +97,7 @@ def test_tianshou_trains_on_it_unchanged():
         training_collector=collector, max_epochs=1, epoch_num_steps=200, collection_step_num_env_steps=20,
         batch_size=32, update_step_num_gradient_steps_per_sample=0.1, show_progress=False, verbose=False,
     )  # fmt: skip
-    found = algorithm.run_training(parameters)
-    assert found.train_step == 200
-    assert found.train_episode >= 10
+    result = algorithm.run_training(parameters)
+    assert result.train_step == 200
+    assert result.train_episode >= 10
     assert any(not torch.equal(old, new) for old, new in zip(before, net.parameters()))

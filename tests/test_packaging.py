@@ -1,4 +1,4 @@
-"""What an installed package holds."""
+"""The contents of an installed package."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ def test_a_checkouts_conf_comes_before_a_copy_inside():
     assert conf_folder() == PACKAGE.parent / "conf"
 
 
-def test_a_conf_folder_of_somebody_else_is_not_ours(tmp_path, monkeypatch):
+def test_a_conf_folder_of_another_project_is_not_ours(tmp_path, monkeypatch):
     (tmp_path / "conf").mkdir()
-    inside = tmp_path / "package" / "conf" / "traffic"
-    inside.mkdir(parents=True)
-    for file in (inside.parent / "train.yaml", inside / "gan.yaml"):
-        file.touch()
+    inside = tmp_path / "package" / "conf"
+    (inside / "traffic").mkdir(parents=True)
+    for name in ("train.yaml", "traffic/gan.yaml"):
+        (inside / name).touch()
     monkeypatch.setattr("ganlane.files.PACKAGE", tmp_path / "package")
-    assert conf_folder() == inside.parent
+    assert conf_folder() == inside
 
 
 def files_of_wheel(folder, monkeypatch):
-    """Names in a wheel, built here with one variant of the kernel: the others take seconds."""
+    """Names in a wheel and its bytes; built with one variant of the kernel, since the others take seconds."""
     monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
     wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling is not installed; CI builds the wheel")
-    (artifact,) = wheel.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
-    assert Path(artifact).name.startswith(f"ganlane-{ganlane.__version__}-")
+    (artifact,) = map(Path, wheel.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"]))
+    assert artifact.name.startswith(f"ganlane-{ganlane.__version__}-")
     with zipfile.ZipFile(artifact) as packed:
-        return set(packed.namelist()), Path(artifact).stat().st_size
+        return set(packed.namelist()), artifact.stat().st_size
 
 
 def test_a_light_wheel_leaves_the_further_trainings_out_and_is_below_5_mb(tmp_path, monkeypatch):

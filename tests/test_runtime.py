@@ -3,15 +3,19 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from ganlane import runtime
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def run(*command, **options):
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator is on Linux alone")
 def test_a_process_that_keeps_its_memory_is_not_given_new_pages_at_every_step():
-    torch = pytest.importorskip("torch")
     import resource
 
     def faults() -> int:
@@ -34,7 +38,6 @@ def test_elsewhere_nothing_happens(monkeypatch):
 
 
 def test_the_peak_stays_when_memory_is_given_back():
-    torch = pytest.importorskip("torch")
     before = runtime.peak_resident_bytes()
     if before is None:
         pytest.skip("this system does not report a process's peak memory")
@@ -47,46 +50,32 @@ def test_the_peak_stays_when_memory_is_given_back():
 
 @pytest.mark.parametrize("closed", ["1", "2", "0 1 2"])
 def test_a_command_runs_without_the_streams_that_the_shell_has_closed(closed):
-    shut = " ".join(f"{number}>&-" for number in closed.split())
-    done = subprocess.run(
-        ["bash", "-c", f"exec {sys.executable} -m ganlane --help {shut}"], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    redirections = " ".join(f"{number}>&-" for number in closed.split())
+    finished = run("bash", "-c", f"exec {sys.executable} -m ganlane --help {redirections}")
+    assert (finished.returncode, finished.stderr) == (0, "")
 
 
 def test_a_command_without_docstrings_is_refused_in_one_sentence():
-    command = [sys.executable, "-OO", "-m", "ganlane", "evaluate"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("ganlane evaluate: python -OO")
-    assert done.stderr.count("\n") == 1
+    finished = run(sys.executable, "-OO", "-m", "ganlane", "evaluate")
+    assert finished.returncode == 2
+    assert finished.stderr.startswith("ganlane evaluate: python -OO")
+    assert finished.stderr.count("\n") == 1
 
 
 def test_without_docstrings_help_still_lists_the_keys():
-    command = [sys.executable, "-OO", "-m", "ganlane", "prepare", "--help-all"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "held_out" in done.stdout
-
-
-def doctor(here, *options):
-    """What the doctor says, with Python's ``options``, in the folder ``here``, which is removed first."""
-    line = [
-        sys.executable,
-        *options,
-        "-c",
-        f"import os; os.rmdir({str(here)!r}); from ganlane.doctor import main; main([])",
-    ]
-    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
-    return subprocess.run(line, cwd=here, env=environment, capture_output=True, text=True, timeout=120).stderr
+    finished = run(sys.executable, "-OO", "-m", "ganlane", "prepare", "--help-all")
+    assert (finished.returncode, finished.stderr) == (0, "")
+    assert "held_out" in finished.stdout
 
 
 @pytest.mark.parametrize(
-    ("options", "told"), [((), "working directory is gone"), (("-OO",), "removes the docstrings")]
+    ("options", "message"), [((), "working directory is gone"), (("-OO",), "removes the docstrings")]
 )
-def test_a_process_in_which_nothing_can_run_is_told_in_one_sentence(options, told, tmp_path):
-    here = tmp_path / "here"
-    here.mkdir()
-    said = doctor(here, *options)
-    assert told in said
-    assert said.count("\n") == 1
+def test_the_doctor_reports_in_one_sentence_that_nothing_can_run(options, message, tmp_path):
+    folder = tmp_path / "removed"
+    folder.mkdir()
+    code = f"import os; os.rmdir({str(folder)!r}); from ganlane.doctor import main; main([])"
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
+    finished = run(sys.executable, *options, "-c", code, cwd=folder, env=environment, timeout=120)
+    assert message in finished.stderr
+    assert finished.stderr.count("\n") == 1

@@ -27,8 +27,8 @@ __all__ = ["ENV_ID", "ENV_IDS", "has_display"]
 
 
 def has_display() -> bool:
-    """Whether a window can be opened here: pygame is there and, but on Windows and macOS, a display is named."""
+    """Whether a window can be opened: pygame is installed and, except on Windows and macOS, a display is set."""
     if importlib.util.find_spec("pygame") is None:
         return False
-    named = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
-    return sys.platform in ("win32", "darwin") or any(map(os.environ.get, named))
+    variables = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    return sys.platform in ("win32", "darwin") or any(map(os.environ.get, variables))

@@ -1,5 +1,6 @@
 """Rule-driven traffic for gymnasium: the native kernel on NumPy arrays, without torch and TorchRL."""
 
+# ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
 from typing import Any
@@ -19,32 +20,34 @@ from ganlane.native.settings import NATIVE_FORMS
 from ganlane.options import Option, option
 from ganlane.parameters.episode import EpisodeParameters, Stream
 
-#: What the kernel drives, and whether it changes lanes.
+#: Traffic that the kernel implements, and whether it changes lanes.
 _TRAFFICS = {"ganlane.traffic.IdmTraffic": False, "ganlane.traffic.IdmMobilTraffic": True}
 _OPTIONS = ("env", "observation", "reward", "mask", "stream", "device", "transforms")
 
 
 def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeRows | None:
-    """N highways by the kernel; None where it cannot do what is asked, or something is wrong with it.
+    """N highways by the kernel; None where it does not implement these options, or one of them is wrong.
 
-    Arguments as those of :func:`ganlane.gym.rows.make_rows`.
+    The arguments are those of :func:`ganlane.gym.rows.make_rows`.
     """
-    own = {name: options.pop(name) for name in _OPTIONS if name in options}
+    given = {name: options.pop(name) for name in _OPTIONS if name in options}
     try:
-        chosen: TrafficConfig = option("traffic", traffic)
-        env: EnvConfig = option("env", own.get("env", "highway"), options)
-        observation = option("observation", own.get("observation", "lane_view_overlap"))
-        reward, mask = option("reward", own.get("reward", "paper")), option("mask", own.get("mask", "none"))
+        config: TrafficConfig = option("traffic", traffic)
+        env: EnvConfig = option("env", given.get("env"), options)
+        observation, reward, mask = (option(group, given.get(group)) for group in ("observation", "reward", "mask"))
         check_reward(env, reward)
-        device = RunConfig(device=own.get("device", "cpu")).device
-        stream = Stream.named(str(own.get("stream", "train")))
+        device = RunConfig(device=given.get("device", "cpu")).device
+        stream = Stream.named(str(given.get("stream", "train")))
     except UserError:
-        return None  # the other way says what is wrong
-    ruled = chosen._target_ in _TRAFFICS and not chosen.blind_share and not chosen.parameters
-    seen = observation.form in NATIVE_FORMS and observation.sensors is None
-    random_scenes = type(env).scenes is EnvConfig.scenes and env.kernel != "torch"
-    whole = isinstance(count, int) and 1 <= count <= 65536
-    if not (ruled and seen and random_scenes and whole) or device != "cpu" or len(own.get("transforms", ())):
+        return None  # TensorRows reports the mistake
+    implemented = (
+        config._target_ in _TRAFFICS and not config.blind_share and not config.parameters
+        and observation.form in NATIVE_FORMS and observation.sensors is None
+        and type(env).scenes is EnvConfig.scenes and env.kernel != "torch"
+        and isinstance(count, int) and 1 <= count <= 65536
+        and device == "cpu" and not len(given.get("transforms", ()))
+    )  # fmt: skip
+    if not implemented:
         return None
     batch = NativeBatch(
         count,
@@ -55,7 +58,7 @@ def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeR
         env.ego,
         env.episode_parameters(),
         env.idm,
-        env.mobil if _TRAFFICS[chosen._target_] else None,
+        env.mobil if _TRAFFICS[config._target_] else None,
         env.recycle_share if env.recycle else None,
         observation,
         reward,
@@ -66,7 +69,7 @@ def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeR
 
 
 class NativeRows(Rows):
-    """See :class:`ganlane.gym.rows.Rows`."""
+    """N highways by the native kernel."""
 
     def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
         self.batch, self.count, self.episode = batch, batch.rows, episode
@@ -75,34 +78,27 @@ class NativeRows(Rows):
         self._never = np.zeros(batch.rows, np.bool_)
 
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
-        """See :class:`ganlane.gym.rows.Rows`."""
         self._started = True
         self.batch.start(seed, episode)
 
     def restart(self, rows: Flags) -> None:
-        """See :class:`ganlane.gym.rows.Rows`."""
         state = self.batch.state
         self.batch.start(state["seed"], state["episode"] + self.count, rows)
 
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
-        """See :class:`ganlane.gym.rows.Rows`."""
         return self.batch.step(actions)
 
     def observation(self) -> Floats:
-        """See :class:`ganlane.gym.rows.Rows`."""
         return self.batch.observation
 
     def mask(self) -> Flags:
-        """See :class:`ganlane.gym.rows.Rows`."""
         return self.batch.mask
 
     def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-        """See :class:`ganlane.gym.rows.Rows`."""
         state = self.batch.state
         return (state["seed"], state["episode"]) if self._started else None
 
     def info(self) -> dict[str, Any]:
-        """See :class:`ganlane.gym.rows.Rows`."""
         batch, state = self.batch, self.batch.state
         lane = np.rint(state["y"][:, 0] / np.float32(batch.lane_width_m)).astype(np.int64)
         return {

@@ -1,4 +1,4 @@
-"""Gymnasium's render modes: frames of :mod:`ganlane.view`, drawn while episodes run, and a window for them."""
+"""Gymnasium's render modes: frames of :mod:`ganlane.view`, drawn while episodes run, and a window that shows them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
 from ganlane.view.frames import Picture
 from ganlane.view.record import outcome_of, road_of_row
 
-#: Physics steps of the past that are kept: as many as the trails show.
+#: Recorded physics steps that are kept: as many as the trails show.
 _KEPT = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
 
 
@@ -31,23 +31,22 @@ def _label(env: TransformedEnv, state: TensorDictBase, row: int, traffic: str) -
 
 
 class LiveView:
-    """Records the one row of an environment, physics step by physics step.
+    """Records every physics step of an environment of one row.
 
     Args:
-        env: the environment; its recorder is taken.
+        env: the environment; its recorder is replaced.
         traffic: name for the header.
-        window: shows every physics step at the pace of the simulation; None: pictures on request.
+        window: shows every physics step in real time; None: pictures on request.
     """
 
     def __init__(self, env: TransformedEnv, traffic: str, window: FilmWindow | None = None) -> None:
         self.env, self.traffic, self.window = env, traffic, window
-        self._recorder, self._label, self._outcome = Recorder(), EpisodeLabel(), ""
-        #: Frames recorded before the decision under way.
-        self._before = 0
 
     def start(self, state: TensorDictBase) -> None:
         """A new episode begins at ``state``."""
-        self._recorder, self._outcome, self._before = Recorder(), "", 0
+        self._recorder, self._outcome = Recorder(), ""
+        #: Frames recorded before the present decision.
+        self._before = 0
         self._label = _label(self.env, state, 0, self.traffic)
         self._recorder.add(state.get(keys.VEHICLES), 0.0)
         self.env.base_env.recorder = self._recorder
@@ -70,7 +69,7 @@ class LiveView:
         return self._painter().draw(len(self._recorder.frames) - 1)
 
     def pictures(self) -> Iterator[Picture]:
-        """The frames of the last decision, ten for a second; after a reset its only one."""
+        """The frames of the last decision, ten per second; after a reset, the only one."""
         painter = self._painter()
         return map(painter.draw, range(self._before, len(self._recorder.frames)))
 
@@ -83,7 +82,7 @@ class LiveView:
         return FramePainter(self._recorder.trajectory(self._label, self._outcome))
 
     def _show(self) -> None:
-        """The frames of the last decision in the window, one every physics step of real time."""
+        """Show the frames of the last decision in the window, in real time."""
         if self.window is None:
             return
         due = time.monotonic() + PHYSICS_STEP_S
@@ -127,7 +126,7 @@ class BatchView:
 
 
 class FilmWindow:
-    """A window by pygame that shows one picture after the other until its user closes it.
+    """A pygame window that shows pictures until the user closes it.
 
     Raises:
         UserError: pygame is missing, or there is no display.
@@ -166,7 +165,7 @@ class FilmWindow:
             if pygame.event.get(pygame.QUIT):
                 self.close()
             pygame.event.pump()
-        except pygame.error:  # somebody else has closed it: pygame has one window in a process
+        except pygame.error:  # closed by other code: pygame has one window per process
             self._pygame = None
 
     def wait(self, seconds: float) -> None:
@@ -175,7 +174,7 @@ class FilmWindow:
             time.sleep(seconds)
 
     def close(self) -> None:
-        """Close the window; again does no harm."""
+        """Close the window; may be called again."""
         pygame, self._pygame, self._screen = self._pygame, None, None
         if pygame is not None:
             pygame.display.quit()

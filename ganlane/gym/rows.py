@@ -1,7 +1,7 @@
-"""What both environments, single and vector, stand on: N highways behind NumPy arrays, and checks of what users give.
+"""Basis of the single and the vector environment: N highways behind NumPy arrays, and checks of arguments.
 
-:class:`Rows` is the interface. :mod:`~ganlane.gym.native_rows` has it for rule-driven traffic, by the native kernel
-alone and without torch; :mod:`~ganlane.gym.tensor_rows` for everything else, by the TorchRL environment.
+:class:`Rows` is the interface. :mod:`~ganlane.gym.native_rows` implements it for rule-driven traffic, by the native
+kernel and without torch; :mod:`~ganlane.gym.tensor_rows` for everything else, by the TorchRL environment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ganlane.parameters.episode import EpisodeParameters
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
-#: Unseeded environments draw their seed below this.
+#: Exclusive upper bound of the seeds that unseeded environments draw.
 SEEDS: Final = 2**31
 
 
@@ -36,7 +36,7 @@ class Rows(ABC):
         count: N.
         space: of one observation.
         episode: decision period and time limit.
-        env, state: the TorchRL environment and the state of its rows, where there is one.
+        env, state: the TorchRL environment and the state of its rows; None with the native kernel.
     """
 
     count: int
@@ -51,23 +51,23 @@ class Rows(ABC):
 
     @abstractmethod
     def restart(self, rows: Flags) -> None:
-        """Go on to the next episode, the present one plus N, in some rows [N]."""
+        """Begin the next episode, number n + N after n, in the rows where ``rows`` [N] is true."""
 
     @abstractmethod
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
-        """One decision of every row; no row is reset. The arrays hold until the next call."""
+        """One decision in every row; no row is reset. The arrays are valid until the next call."""
 
     @abstractmethod
     def observation(self) -> Floats:
-        """Observations [N, D], within the space; the array holds until the next call."""
+        """Observations [N, D], within the space; valid until the next call."""
 
     @abstractmethod
     def mask(self) -> Flags:
-        """Which actions are allowed now, [N, 3]; the array holds until the next call."""
+        """Allowed actions [N, 3]: the mask's, without one those that stay on the road; valid until the next call."""
 
     @abstractmethod
     def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-        """Seeds and episodes [N] under way; None before the first :meth:`start`."""
+        """Present seeds and episodes [N]; None before the first :meth:`start`."""
 
     def check_started(self) -> None:
         """Raise :class:`UserError` before the first :meth:`start`."""
@@ -76,14 +76,14 @@ class Rows(ABC):
 
     @abstractmethod
     def info(self) -> dict[str, Any]:
-        """Gymnasium's info: by name (docs/gymnasium.md) arrays [N], which hold until the next call."""
+        """Gymnasium's info (docs/gymnasium.md) as arrays [N] by name; valid until the next call."""
 
 
 def make_rows(traffic: Option, count: int, render_mode: str | None, options: Mapping[str, Any]) -> Rows:
     """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
 
-    The native kernel drives them where it can, unless the option ``kernel`` is ``torch``. It shows no physics steps,
-    so with a ``render_mode`` the tensor code does.
+    The native kernel drives them where it can, unless the option ``kernel`` is ``torch`` or there is a
+    ``render_mode``, since the kernel shows no physics steps.
 
     Raises:
         UserError: a wrong value.
@@ -91,9 +91,9 @@ def make_rows(traffic: Option, count: int, render_mode: str | None, options: Map
     if render_mode is None and why_not() is None:
         from ganlane.gym.native_rows import native_rows  # Hydra's config classes take a tenth of a second
 
-        made = native_rows(traffic, count, dict(options))
-        if made is not None:
-            return made
+        rows = native_rows(traffic, count, dict(options))
+        if rows is not None:
+            return rows
     from ganlane.gym.tensor_rows import TensorRows  # torch takes seconds
 
     return TensorRows(traffic, count, options)
@@ -107,14 +107,14 @@ def observation_space(size: int, largest: float) -> Box:
 
 
 class OnRows:
-    """An environment on top of :class:`Rows`, with a ``spec`` that has its own time limit."""
+    """Base of the environments on :class:`Rows`; their ``spec`` has their own time limit."""
 
     _rows: Rows
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How gymnasium made it; ``max_episode_steps`` follows from ``timeout_s``."""
+        """gymnasium's specification; ``max_episode_steps`` follows from ``timeout_s``."""
         return self._spec
 
     @spec.setter
@@ -125,12 +125,12 @@ class OnRows:
 
 
 def copied(info: dict[str, Any]) -> dict[str, Any]:
-    """An info whose arrays the caller may keep."""
+    """A copy of an info, which the caller may keep."""
     return {name: copied(value) if isinstance(value, dict) else value.copy() for name, value in info.items()}
 
 
 def row_of(info: dict[str, Any], row: int) -> dict[str, Any]:
-    """One row of :meth:`Rows.info`, numbers as plain Python."""
+    """One row of :meth:`Rows.info`, numbers as Python's."""
     return {name: _item(value, row) for name, value in info.items()}
 
 
@@ -141,7 +141,7 @@ def _item(value: Any, row: int) -> Any:
 
 
 def array_of(given: Any) -> npt.NDArray[Any]:
-    """What a user gave as an array; None in one where it is none, as lists of different lengths are."""
+    """A user's value as an array; an array of None if it cannot be one, such as lists of different lengths."""
     try:
         return np.asarray(given)
     except (TypeError, ValueError, RuntimeError):

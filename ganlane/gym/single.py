@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from gymnasium.wrappers import RecordVideo
 
 RENDER_MODES = ("human", "rgb_array", "rgb_array_list")
-#: Frames per second of driving, but with ``rgb_array``.
+#: Frames per second of driving, except with ``rgb_array``.
 FPS = round(1.0 / PHYSICS_STEP_S)
 
 
@@ -70,7 +70,6 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._rows = make_rows(traffic, 1, render_mode, options)
         self.observation_space: gymnasium.spaces.Box = self._rows.space  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
-        # Without a display there is no window.
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
         decisions = max(1, round(1.0 / self._rows.episode.decision_period_s))
         self.metadata = {"render_modes": modes, "render_fps": decisions if render_mode == "rgb_array" else FPS}
@@ -125,7 +124,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         return stepped.observation[0].copy(), reward, terminated, truncated, row_of(self._rows.info(), 0)
 
     def _collect(self) -> None:
-        """Keep the pictures of the last decision for ``render()``, or give them to the video."""
+        """Store the pictures of the last decision for ``render()``, or pass them to the video."""
         if self.render_mode == "rgb_array_list":
             self._pictures += self._view.pictures()
         if self._video is not None and self._video.recording:
@@ -140,11 +139,11 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._video, wrapper.frames_per_sec = wrapper, FPS
 
     def action_masks(self) -> npt.NDArray[np.bool_]:
-        """Which actions are allowed now, bool [3]; named as sb3-contrib's MaskablePPO asks for it."""
+        """Which actions are allowed now, bool [3]; the name is that of sb3-contrib's MaskablePPO."""
         return self._rows.mask()[0].copy()
 
     def render(self) -> Any:
-        """The picture [height, width, 3] uint8 of the last moment, or a list of them; ``human`` draws by itself."""
+        """The present picture [height, width, 3] uint8, or a list of them; None for ``human``, which draws itself."""
         if self._view is None:
             raise UserError(f"render(): made without render_mode; give one of {', '.join(RENDER_MODES)} to make().")
         self._rows.check_started()

@@ -1,5 +1,6 @@
 """Every traffic for gymnasium: the TorchRL environment behind NumPy arrays."""
 
+# ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -15,7 +16,6 @@ from torchrl.envs import TransformedEnv
 from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.api import make_env
-from ganlane.errors import UserError
 from ganlane.gym.rows import Flags, Floats, Rows, observation_space
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.native.batch import Stepped
@@ -26,7 +26,7 @@ from ganlane.transforms import ObservationTransform
 
 
 class TensorRows(Rows):
-    """See :class:`ganlane.gym.rows.Rows`.
+    """N highways by the TorchRL environment.
 
     Args:
         traffic: as in :func:`ganlane.api.make_env`, as are ``options``.
@@ -36,16 +36,14 @@ class TensorRows(Rows):
     env: TransformedEnv
 
     def __init__(self, traffic: Option, count: int, options: Mapping[str, Any]) -> None:
-        self.env = made = make_env(traffic, count, **options)
-        self.count, self.episode = count, made.base_env.episode
-        form = next((each.form for each in made.transform if isinstance(each, ObservationTransform)), "table3")
-        largest = largest_number(form, made.base_env.scenes.longest_m)
-        self.space = observation_space(made.observation_spec[keys.OBSERVATION].shape[-1], largest)
-        self.state: TensorDictBase | None = None
+        self.env = env = make_env(traffic, count, **options)
+        self.count, self.episode = count, env.base_env.episode
+        form = next((each.form for each in env.transform if isinstance(each, ObservationTransform)), "table3")
+        largest = largest_number(form, env.base_env.scenes.longest_m)
+        self.space = observation_space(env.observation_spec[keys.OBSERVATION].shape[-1], largest)
 
     @torch.no_grad()
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
-        """See :class:`ganlane.gym.rows.Rows`."""
         numbers = {keys.SEED: seed, keys.EPISODE: episode}
         counters = {
             name: torch.as_tensor(np.broadcast_to(value, self.count).astype(np.int64), device=self.env.device)
@@ -55,45 +53,38 @@ class TensorRows(Rows):
 
     @torch.no_grad()
     def restart(self, rows: Flags) -> None:
-        """See :class:`ganlane.gym.rows.Rows`."""
         mask = torch.as_tensor(rows, device=self.env.device)[:, None]
         self.state = self.env.reset(self.now().set("_reset", mask))
 
     @torch.no_grad()
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
-        """See :class:`ganlane.gym.rows.Rows`."""
         stepped = self.env.step(self.now().set(keys.ACTION, torch.as_tensor(actions, device=self.env.device)))
         self.state, after = self.env.step_mdp(stepped), stepped.get("next")
         reward, *ended = (_array(after.get(name)[:, 0]) for name in ("reward", "terminated", "truncated"))
         return Stepped(self.observation(), reward.astype(np.float32), *ended)
 
     def now(self) -> TensorDictBase:
-        """The state of all rows."""
-        if self.state is None:
-            raise UserError("no episode is under way; call reset() first.")
+        """The state of all rows; raises :class:`UserError` before the first :meth:`start`."""
+        self.check_started()
         return self.state
 
     def observation(self) -> Floats:
-        """See :class:`ganlane.gym.rows.Rows`."""
         return np.clip(self.now().get(keys.OBSERVATION).cpu().numpy(), self.space.low, self.space.high)
 
     def mask(self) -> Flags:
-        """The environment's mask; without one, the actions that stay on the road."""
         state = self.now()
         mask: Tensor | None = state.get(keys.ACTION_MASK, None)
         return _array(legal_actions(state, road_in(state, self.env.base_env.road)) if mask is None else mask)
 
     def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-        """See :class:`ganlane.gym.rows.Rows`."""
         state = self.state
         return None if state is None else (_array(state.get(keys.SEED)), _array(state.get(keys.EPISODE)))
 
     def info(self) -> dict[str, Any]:
-        """See :class:`ganlane.gym.rows.Rows`."""
         state = self.now()
         vehicles, ego, events = state.get(keys.VEHICLES), state.get(keys.EGO), state.get(keys.EVENTS)
         road = road_in(state, self.env.base_env.road)
-        found = {
+        values = {
             "seed": state.get(keys.SEED),
             "episode_number": state.get(keys.EPISODE),
             "time_s": state.get(keys.STEP).double() * PHYSICS_STEP_S,
@@ -105,7 +96,7 @@ class TensorRows(Rows):
             **{name: events.get(name)[:, 0] for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)},
         }
         terms = {name: _array(term[:, 0]) for name, term in state.get(keys.REWARD_TERMS).items()}
-        arrays = {name: _array(value) for name, value in found.items()}
+        arrays = {name: _array(value) for name, value in values.items()}
         return {**arrays, "action_mask": self.mask().astype(np.int8), keys.REWARD_TERMS: terms}
 
 

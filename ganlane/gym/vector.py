@@ -1,4 +1,4 @@
-"""A batch of highways as a ``gymnasium.vector.VectorEnv``: stepped together as tensors, not one by one."""
+"""A batch of highways as a ``gymnasium.vector.VectorEnv``, stepped together."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random.
         render_mode: None or ``rgb_array``.
         autoreset_mode: what happens to a row that has ended, see below.
-        max_episode_steps: as ``make_vec`` gives it for a spec of this environment; ``timeout_s`` sets the limit.
+        max_episode_steps: passed by ``make_vec`` for a spec of this environment; ``timeout_s`` sets the limit.
         options: as in :class:`ganlane.gym.single.HighwayGym`.
 
     ``AutoresetMode.SAME_STEP``: a row that ends is reset in the same step: ``observation`` is the first of its next
-    episode, ``info["final_obs"]`` and ``info["final_info"]`` hold what it ended with. ``NEXT_STEP``: it is reset in
-    the next step, which ignores its action and gives the reward 0. ``DISABLED``: you reset it, by
-    ``reset(options={"reset_mask": mask})``, which sends the rows of a boolean array [N] on to their next episodes.
+    episode, ``info["final_obs"]`` and ``info["final_info"]`` are the last of the old one. ``NEXT_STEP``: it is reset
+    in the next step, which ignores its action and gives the reward 0. ``DISABLED``: you reset it by
+    ``reset(options={"reset_mask": mask})``, which begins the next episodes in the rows of a boolean array [N].
 
-    Row i of N runs the episodes i, i + N, i + 2N, ... of the seed, in whatever batch.
-    ``reset(options={"episode": k})`` begins with the episodes k + i instead; an array [N] gives each row its own.
+    Row i of N runs the episodes i, i + N, i + 2N, ... of the seed. ``reset(options={"episode": k})`` begins with the
+    episodes k + i instead; an array [N] sets the episode of every row.
 
     Raises:
         UserError: a wrong value.
@@ -120,25 +120,20 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
 
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         each = np.arange(self.num_envs)
+        seeds: Any
         if seed is not None:
-            seeds: Any = [seed_number(one) for one in array_of(seed).ravel().tolist()]
+            seeds, first = [seed_number(one) for one in array_of(seed).ravel().tolist()], each
             super().reset(seed=seeds[0] if len(seeds) == 1 else None)
-            first = each
+        elif (present := self._rows.numbers()) is not None:
+            seeds, first = present[0].copy(), present[1] + self.num_envs
         else:
-            seeds, first = self._next(each)
+            seeds, first = int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed, each
         if episode is not None:
             first = episode_numbers(episode)
             first = first + each if first.ndim == 0 else first
         if first.shape != (self.num_envs,) or np.size(seeds) not in (1, self.num_envs):
             raise UserError(f"reset(): expected one seed and one episode, or {self.num_envs} of each.")
         self._rows.start(seeds if np.size(seeds) > 1 else np.ravel(seeds)[0], first)
-
-    def _next(self, each: npt.NDArray[np.int64]) -> tuple[Any, npt.NDArray[np.int64]]:
-        """Seeds and episodes after the present ones; at first the constructor's seed and the first episodes."""
-        now = self._rows.numbers()
-        if now is not None:
-            return now[0].copy(), now[1] + self.num_envs
-        return int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed, each
 
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
         """One decision in every row: observations [N, D], rewards, terminated, truncated [N], info."""
@@ -154,7 +149,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         terminated, truncated = stepped.terminated.copy(), stepped.truncated.copy()
         if self._view is not None:
             self._view.after_step(actions, reward)
-        if waiting.any():  # what these rows did after their ends is forgotten
+        if waiting.any():  # discard the step of these rows after their ends
             reward[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
             self._restart(waiting)
         ended = self._ended = terminated | truncated
@@ -178,7 +173,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
 
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
-    """gymnasium's mode, by itself or by its name."""
+    """gymnasium's mode, given as such or by name."""
     for known in AutoresetMode:
         if mode is known or str(mode).lower() in (known.name.lower(), known.value.lower()):
             return known
@@ -188,7 +183,7 @@ def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
 
 def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
     """Final observations in gymnasium's form: an object array [N], None outside ``rows``."""
-    found = np.full(len(rows), None, dtype=object)
+    final = np.full(len(rows), None, dtype=object)
     for row in np.flatnonzero(rows):
-        found[row] = observations[row].copy()
-    return found
+        final[row] = observations[row].copy()
+    return final

@@ -11,8 +11,8 @@
     table = ganlane.api.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])  # a data frame
 
 Imports run one way: ``data``, ``sim`` <- ``generator`` <- ``traffic`` <- ``env`` <- ``transforms`` <- ``agents`` <-
-``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``api`` <- ``gym`` <- ``commands``. Below all of
-them are ``keys`` (every TensorDict key), ``errors``, ``files`` and ``runtime``.
+``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``api`` <- ``gym`` <- ``commands``. Below all
+of them are ``keys`` (every TensorDict key), ``errors``, ``files`` and ``runtime``.
 """
 
 from __future__ import annotations

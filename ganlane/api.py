@@ -177,7 +177,10 @@ def evaluate(
     keys |= {"agents": names, "traffics": list(chosen)}
     keys |= {"episodes": episodes, "seed": seed, "traffic_options": {**all_traffics(), **chosen}}
     config: EvaluateConfig = command_config("evaluate", keys)
-    with _torch_threads(config.threads), cleared_after_mistakes(Path(folder)) if folder else nullcontext():
+    with (
+        _torch_threads(config.threads),
+        cleared_after_mistakes(Path(folder)) if folder is not None else nullcontext(),
+    ):
         if folder is not None:  # before hours of driving
             Path(folder).mkdir(parents=True, exist_ok=True)
         drivers = [

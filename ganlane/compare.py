@@ -11,19 +11,9 @@ from typing import Any
 import polars as pl
 from tqdm import tqdm
 
+from ganlane import evaluation
 from ganlane.build import Driver, make_env, make_traffic
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.evaluation import (
-    crashes_by_scene,
-    evaluation_rows,
-    failed_episodes,
-    paired_rows,
-    paired_table,
-    run_episodes,
-    text_table,
-    write_episodes,
-    write_results,
-)
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
 from ganlane.sim.random import Stream
@@ -61,7 +51,7 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
                 current, batch = (traffic, observation, mask), make(rows)
             smaller = None if env.compile else make
             on_progress = None if quiet else _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
-            table = run_episodes(batch, policy, range(episodes), seed, on_progress, smaller)
+            table = evaluation.run_episodes(batch, policy, range(episodes), seed, on_progress, smaller)
             table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             if isinstance(module := modules[traffic], ReplayTraffic):
                 scenes = module.scenes_of_episodes(seed, table["episode"].to_list())
@@ -94,7 +84,7 @@ def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
     rows = []
     recorded = table.filter(pl.col("scene").is_not_null())
     for (agent, traffic), episodes in recorded.group_by("agent", "traffic", maintain_order=True):
-        crashes = crashes_by_scene(episodes, episodes["scene"].to_list())
+        crashes = evaluation.crashes_by_scene(episodes, episodes["scene"].to_list())
         per_km = entries("per_km", crashes.per_km)
         rows.append({"agent": agent, "traffic": traffic, **per_km, "scenes": crashes.rows})
     return rows
@@ -119,9 +109,11 @@ def publish(
         config, seeds: of the run, for the record.
         numbers: further entries of the record.
     """
-    rows, paired, recorded = evaluation_rows(table), paired_rows(table), recorded_crashes(table)
-    show(text_table(rows), *([paired_table(paired)] if paired else []), columns=config.get("columns", "all"))
-    write_episodes(folder, table)
+    rows, paired, recorded = evaluation.evaluation_rows(table), evaluation.paired_rows(table), recorded_crashes(table)
+    tables = [evaluation.text_table(rows), *([evaluation.paired_table(paired)] if paired else [])]
+    show(*tables, columns=config.get("columns", "all"))
+    evaluation.write_episodes(folder, table)
     scenes = {"crashes_by_scene": recorded} if recorded else {}
-    record = {"rows": rows, "paired": paired, **scenes, "failures": failed_episodes(table), **(numbers or {})}
-    return f"results: {write_results(folder, record, config, seeds)}"
+    failures = evaluation.failed_episodes(table)
+    record = {"rows": rows, "paired": paired, **scenes, "failures": failures, **(numbers or {})}
+    return f"results: {evaluation.write_results(folder, record, config, seeds)}"

@@ -9,23 +9,9 @@ from unittest.mock import Mock
 
 import pytest
 
+from ganlane import doctor
 from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
-from ganlane.doctor import (
-    EXTRAS,
-    REQUIRED,
-    Finding,
-    State,
-    cache,
-    checkpoints,
-    extra,
-    installed,
-    machine,
-    missing,
-    outputs,
-    recordings,
-    report,
-    required,
-)
+from ganlane.doctor import Finding, State
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -70,11 +56,11 @@ def test_help_is_printed_and_keys_are_refused(capsys):
 
 
 def test_it_asks_for_what_the_package_asks_for():
-    assert list(REQUIRED) == PROJECT["dependencies"]
+    assert list(doctor.REQUIRED) == PROJECT["dependencies"]
     extras = PROJECT["optional-dependencies"]
-    assert extras.keys() - FOR_DEVELOPERS <= EXTRAS.keys()
-    for name in extras.keys() & EXTRAS.keys():
-        assert list(EXTRAS[name][1]) == extras[name], name
+    assert extras.keys() - FOR_DEVELOPERS <= doctor.EXTRAS.keys()
+    for name in extras.keys() & doctor.EXTRAS.keys():
+        assert list(doctor.EXTRAS[name][1]) == extras[name], name
 
 
 @pytest.mark.parametrize(
@@ -83,26 +69,27 @@ def test_it_asks_for_what_the_package_asks_for():
 )
 def test_versions_are_compared_as_numbers(version, allowed, monkeypatch):
     monkeypatch.setattr("ganlane.doctor.metadata.version", lambda name: version)
-    assert installed("torch>=2.11,<2.14") == ("torch", version, allowed)
+    assert doctor.installed("torch>=2.11,<2.14") == ("torch", version, allowed)
 
 
 def test_a_package_that_is_not_there_comes_with_its_command():
     fix = 'python -m pip install "no-such-package>=1.0"'
-    assert required("no-such-package>=1.0") == Finding("no-such-package", State.MISSING, "not installed", fix)
-    assert required("numpy>=999").state is State.MISSING
+    assert doctor.required("no-such-package>=1.0") == Finding("no-such-package", State.MISSING, "not installed", fix)
+    assert doctor.required("numpy>=999").state is State.MISSING
 
 
 def test_a_package_that_cannot_be_imported_is_missing(monkeypatch):
     broken = Mock(side_effect=OSError("lib.so:\n undefined symbol"))
     monkeypatch.setattr("ganlane.doctor.importlib.import_module", broken)
     fix = 'python -m pip install "numpy>=1.26" --force-reinstall'
-    assert required("numpy>=1.26") == Finding("numpy", State.MISSING, "lib.so: undefined symbol", fix)
+    assert doctor.required("numpy>=1.26") == Finding("numpy", State.MISSING, "lib.so: undefined symbol", fix)
 
 
 def test_an_extra_names_only_what_it_lacks(monkeypatch):
-    monkeypatch.setitem(EXTRAS, "mixed", ("counting", ("numpy>=1.26", "no-such-package>=1")))
+    monkeypatch.setitem(doctor.EXTRAS, "mixed", ("counting", ("numpy>=1.26", "no-such-package>=1")))
     fix = 'python -m pip install "no-such-package>=1"'
-    assert extra("mixed") == Finding("extra mixed", State.ABSENT, "counting: no-such-package not installed", fix)
+    lacking = "counting: no-such-package not installed"
+    assert doctor.extra("mixed") == Finding("extra mixed", State.ABSENT, lacking, fix)
 
 
 def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
@@ -111,32 +98,32 @@ def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
     for file in CHECKPOINTS.glob("*.safetensors"):
         (tmp_path / file.name).write_bytes(file.read_bytes()[: -100 if "paper" in file.name else None])
     monkeypatch.setattr("ganlane.files.CHECKPOINTS", tmp_path)
-    assert {found.subject for found in checkpoints() if found.state is State.MISSING} == {"generator_paper"}
+    assert {found.subject for found in doctor.checkpoints() if found.state is State.MISSING} == {"generator_paper"}
 
 
 def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
-    assert recordings().state is State.ABSENT
-    assert "export GANLANE_DATA=FOLDER" in recordings().fix
+    assert doctor.recordings().state is State.ABSENT
+    assert "export GANLANE_DATA=FOLDER" in doctor.recordings().fix
     (tmp_path / "us101_scenes.csv").write_bytes(b"x" * 2**20)
-    assert recordings().found == f"{tmp_path / 'us101_scenes.csv'} (1.0 MB)"
+    assert doctor.recordings().found == f"{tmp_path / 'us101_scenes.csv'} (1.0 MB)"
 
 
 def test_cache_and_run_folders(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_CACHE", "")
-    assert cache().found == "off (GANLANE_CACHE is empty)"
+    assert doctor.cache().found == "off (GANLANE_CACHE is empty)"
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / "cache"))
-    assert cache().found == f"{tmp_path / 'cache'} (0 files, 0.0 MB)"
+    assert doctor.cache().found == f"{tmp_path / 'cache'} (0 files, 0.0 MB)"
     (tmp_path / "cache").write_text("in the way")
-    assert cache().state is State.ABSENT
-    assert outputs().state is State.OK
+    assert doctor.cache().state is State.ABSENT
+    assert doctor.outputs().state is State.OK
     (tmp_path / "outputs").write_text("in the way")
-    assert outputs().state is State.MISSING
+    assert doctor.outputs().state is State.MISSING
 
 
 def test_a_machine_without_compiler_is_told_what_to_install(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
-    found = machine()[-1]
+    found = doctor.machine()[-1]
     assert found.state is State.ABSENT
     assert "no-such-compiler" in found.found
     assert found.fix
@@ -144,8 +131,8 @@ def test_a_machine_without_compiler_is_told_what_to_install(monkeypatch):
 
 def test_the_report_shows_every_finding_and_its_command():
     sections = {"software": [Finding("torch", State.OK, "2.13"), Finding("numpy", State.MISSING, "gone", "do this")]}
-    assert missing(sections) == ["numpy"]
-    assert report(sections).splitlines() == [
+    assert doctor.missing(sections) == ["numpy"]
+    assert doctor.report(sections).splitlines() == [
         "software",
         "  ok      torch                 2.13",
         "  MISSING numpy                 gone",

@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
 from ganlane.errors import UserError
-from ganlane.keys import ACTIONS as ACTIONS
+from ganlane.keys import ACTIONS
 from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
 from ganlane.native.library import why_not
 from ganlane.options import Option

@@ -11,18 +11,8 @@ import numpy.typing as npt
 from ganlane.arguments import checked_arguments, seed_number, whole_number
 from ganlane.errors import UserError
 from ganlane.gym import has_display
-from ganlane.gym.rows import (
-    ACTIONS,
-    SEEDS,
-    Floats,
-    OnRows,
-    actions_of,
-    array_of,
-    known_options,
-    make_rows,
-    row_of,
-)
-from ganlane.keys import PHYSICS_STEP_S
+from ganlane.gym.rows import SEEDS, Floats, OnRows, actions_of, array_of, known_options, make_rows, row_of
+from ganlane.keys import ACTIONS, PHYSICS_STEP_S
 from ganlane.options import Option, option
 
 if TYPE_CHECKING:

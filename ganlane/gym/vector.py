@@ -14,7 +14,6 @@ from gymnasium.vector.utils import batch_space
 from ganlane.arguments import checked_arguments, seed_number
 from ganlane.errors import UserError
 from ganlane.gym.rows import (
-    ACTIONS,
     SEEDS,
     Flags,
     Floats,
@@ -27,6 +26,7 @@ from ganlane.gym.rows import (
     make_rows,
     row_mask,
 )
+from ganlane.keys import ACTIONS
 from ganlane.options import Option, option
 
 

@@ -170,7 +170,7 @@ def fold_weights(paths: Sequence[Path]) -> dict[tuple[str, ...], dict[str, Path]
         if not held_out or preset in folds.get(held_out, {}):
             raise UserError(
                 f"fold_weights={path}: expected one generator per preset and fold, each fitted without the scenes of "
-                f"its fold; this one is of the preset {preset}, without {', '.join(held_out) or 'nothing'}."
+                f"its fold; this one is of the preset {preset}, left out: {', '.join(held_out) or 'none'}."
             )
         folds.setdefault(held_out, {})[preset] = path
     return folds

@@ -28,7 +28,7 @@ IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
 ACTION_NAMES = ("keep", "left", "right")
-#: A vehicle that moves further than this between two frames was recycled (placed elsewhere), m.
+#: A vehicle that moves further than this in a physics step was recycled (placed elsewhere), m.
 JUMP_M = 30.0
 
 
@@ -103,7 +103,7 @@ class Trajectory:
     def jumped(self) -> BoolArray:
         """Whether a vehicle was recycled (placed elsewhere) since the frame before, [T, M]."""
         moved = np.abs(np.diff(self.x, axis=0, prepend=self.x[:1]))
-        return moved > JUMP_M * max(1.0, self.frame_s)
+        return moved > JUMP_M * max(1.0, self.frame_s / keys.PHYSICS_STEP_S)
 
     def jerk(self) -> FloatArray:
         """Change of the acceleration since the frame before, m/s3, [T, M].

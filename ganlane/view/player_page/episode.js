@@ -1,4 +1,4 @@
-// An episode, decoded: see encoding.py for the form of "series" and "steps".
+// An episode, decoded; ganlane/view/player.py describes "series" and "steps".
 
 // A vehicle that moves further than this between two samples was put elsewhere, m per 0.1 s.
 const JUMP_M = 30;
@@ -39,6 +39,12 @@ class Episode {
   get start() { return this.time[0]; }
   get end() { return this.time[this.samples - 1]; }
 
+  // Whether a vehicle was put elsewhere between the samples `first` and `second`.
+  jumps(v, first, second) {
+    const most = JUMP_M * Math.max(1, Math.abs(this.time[second] - this.time[first]) / 0.1);
+    return Math.abs(this.x[v][second] - this.x[v][first]) > most;
+  }
+
   // The last sample not after `time`, and how much of the way to the next one has passed (0 to 1).
   place(time) {
     let low = 0;
@@ -57,8 +63,7 @@ class Episode {
   vehicle(v, place) {
     const { index, next, share, step } = place;
     if (!this.valid[v][index]) return null;
-    const moved = Math.abs(this.x[v][next] - this.x[v][index]);
-    const goesOn = this.valid[v][next] && moved < JUMP_M * Math.max(1, step / 0.1);
+    const goesOn = this.valid[v][next] && !this.jumps(v, index, next);
     const part = goesOn ? share : 0;
     const between = (values) => values[index] + part * (values[next] - values[index]);
     return {

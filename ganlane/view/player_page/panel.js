@@ -32,7 +32,7 @@ class Panel {
     const { told } = this.episode;
     const { rms_acceleration: acceleration, rms_jerk: jerk, hardest_braking: braking } = told.comfort;
     const ending = OUTCOMES[told.outcome] || "cut off";
-    return `episode ${told.episode}, seed ${told.seed}, ${told.lanes} lanes; ${ending} after ` +
+    return `episode ${told.episode}, seed ${told.seed}, ${told.lanes} lane${told.lanes === 1 ? "" : "s"}; ${ending} after ` +
       `${this.episode.end.toFixed(1)} s; root mean square of acceleration ${acceleration.toFixed(2)} m/s², ` +
       `of jerk ${jerk.toFixed(2)} m/s³; hardest braking ${braking.toFixed(2)} m/s²`;
   }

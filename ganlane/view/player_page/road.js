@@ -99,11 +99,9 @@ class Road {
     pen.lineWidth = 1.5;
     pen.beginPath();
     pen.moveTo(this.column(vehicle.x), this.row(vehicle.y));
-    let last = vehicle.x;
     for (let k = place.index; k >= 0 && episode.time[place.index] - episode.time[k] < TRAIL_S; k--) {
-      if (!episode.valid[v][k] || Math.abs(episode.x[v][k] - last) > JUMP_M * Math.max(1, place.step / 0.1)) break;
-      last = episode.x[v][k];
-      pen.lineTo(this.column(last), this.row(episode.y[v][k]));
+      if (!episode.valid[v][k] || (k < place.index && episode.jumps(v, k, k + 1))) break;
+      pen.lineTo(this.column(episode.x[v][k]), this.row(episode.y[v][k]));
     }
     pen.stroke();
   }

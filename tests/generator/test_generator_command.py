@@ -79,7 +79,7 @@ def test_what_was_fitted_stays_where_a_later_step_fails(recordings, capsys, monk
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied", "results.json")
 
-    monkeypatch.setattr(ganlane.evaluation, "write_results", refuse)
+    monkeypatch.setattr("ganlane.commands.train_generator.write_results", refuse)
     assert main([recordings, *FEW]) == 2
     assert "results.json" in capsys.readouterr().err
     assert len(list(tmp_path.rglob("fits/*.pt"))) == 1

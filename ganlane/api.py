@@ -322,7 +322,7 @@ def _function(command: str) -> Callable[[Any, Path], str]:
 
 
 def _run_in(folder: str | Path | None, command: str, config: Any) -> tuple[Path, str]:
-    """Run a command in ``folder`` (None: a new one below ``outputs/COMMAND``); the folder and the last line printed.
+    """Run a command in ``folder`` (None: a new one below ``outputs/COMMAND``); the folder and its result line.
 
     A mistake does not leave a new folder behind.
     """

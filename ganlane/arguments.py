@@ -90,7 +90,7 @@ def _fits(value: Any, hint: Any) -> bool:
         return type(value).__name__ in ("bool", "bool_")  # NumPy's, by either name
     if kind is str:
         return isinstance(value, str) and "\0" not in value
-    if getattr(kind, "_is_protocol", False):  # such as that of scenes, which a user may write
+    if getattr(kind, "_is_protocol", False):  # such as that of scenes: a user's class need not inherit
         return callable(value)
     return kind is Any or not inspect.isclass(kind) or isinstance(value, kind)
 

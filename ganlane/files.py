@@ -47,7 +47,7 @@ def conf_folder() -> Path:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of ``path``, which is made; on success sync it and rename it into place.
+    """Yield a temporary path in the folder of ``path`` (made if need be); on success sync and rename it into place.
 
     A process killed at any instant leaves either the old file or the new one, never a part of one.
 

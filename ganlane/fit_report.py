@@ -28,7 +28,7 @@ Lines = list[list[str]]
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):
-    """Shows a fit as a bar on a terminal, elsewhere as a line per improvement; a context that closes the bar."""
+    """Shows a fit: a bar on a terminal, else a line per improvement and a last one; a context that closes the bar."""
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
@@ -53,9 +53,8 @@ class FitProgress(AbstractContextManager["FitProgress"]):
         elif progress.best < self._best or update == updates:
             self._best = progress.best
             left_s = progress.seconds / update * (updates - update)
-            print(
-                f"{update} of {updates} updates, at most {left_s:.0f} s left, {scores}", file=sys.stderr, flush=True
-            )
+            parts = [f"{update} of {updates} updates", f"at most {left_s:.0f} s left", *([scores] if scores else [])]
+            print(", ".join(parts), file=sys.stderr, flush=True)
 
     def __exit__(self, *error: object) -> None:
         if self._bar is not None:

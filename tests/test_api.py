@@ -14,6 +14,7 @@ import torch
 import ganlane
 from ganlane.agents.drivers import DRIVERS
 from ganlane.config.env import EnvConfig
+from ganlane.config.folders import stored_command
 from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import GanTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
@@ -129,6 +130,13 @@ def test_every_command_has_its_function(command):
     if command == "record":
         pytest.importorskip("minari")
     assert ganlane.api._function(command).__name__ == command
+
+
+def test_speed_is_measured_and_no_command_is_made_up_for_a_call():
+    few = {"batches": [2], "modes": ["eager"], "threads": [1], "vehicle_counts": [3], "peers": False, "memory": False}
+    run = ganlane.api.run("bench", suite="sim", quick=True, **few)
+    assert run.results["rows"][0]["physics_steps_per_s"] > 0
+    assert stored_command(run.folder, "python -m ganlane.bench").startswith("called from Python")
 
 
 def test_recordings_become_a_generator_that_drives():

@@ -28,10 +28,19 @@ def test_episode_statistics_are_recorded():
     env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
     env.reset(seed=0)
     total, info = 0.0, {}
-    while "episode" not in info:
+    for _ in range(100):
+        if "episode" in info:
+            break
         _, reward, *_, info = env.step(KEEP)
         total += reward
     assert info["episode"]["r"] == pytest.approx(total)
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_vec(2, goal_m=30.0))
+    envs.reset(seed=0)
+    for _ in range(100):
+        *_, info = envs.step(np.zeros(2, int))
+        if "episode" in info:
+            break
+    assert info["episode"]["l"][info["_episode"]].min() > 0
 
 
 def test_gymnasiums_own_vectorisation_works_too():
@@ -75,6 +84,16 @@ def test_the_check_of_stable_baselines3_finds_nothing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checker.check_env(make().unwrapped)
+
+
+def test_stable_baselines3s_dqn_learns_on_it_unchanged():
+    baselines = pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
+    env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
+    model = baselines.DQN("MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]})
+    before = [weight.clone() for weight in model.q_net.parameters()]
+    model.learn(200)
+    assert model.num_timesteps == 200
+    assert any(not torch.equal(old, new) for old, new in zip(before, model.q_net.parameters()))
 
 
 def test_tianshou_trains_on_it_unchanged():

@@ -42,6 +42,10 @@ from ganlane.runtime import check_process, keep_freed_memory, open_closed_stream
 #: A command's function of config and run folder; it returns the last line to print, or None.
 Task = Callable[[Any, Path], str | None]
 
+USER_ERROR = 2
+#: 128 plus the number of SIGPIPE, which does not exist on Windows.
+READER_LEFT = 141
+
 
 def imported(path: str) -> Task:
     """The function ``module:name``, imported when it is called.
@@ -50,11 +54,6 @@ def imported(path: str) -> Task:
     """
     module, _, name = path.partition(":")
     return lambda config, folder: getattr(importlib.import_module(module), name)(config, folder)
-
-
-USER_ERROR = 2
-#: 128 plus the number of SIGPIPE, which does not exist on Windows.
-READER_LEFT = 141
 
 
 class Stopped(BaseException):

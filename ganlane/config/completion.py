@@ -11,12 +11,6 @@ import re
 import sys
 from collections.abc import Collection, Sequence
 
-from hydra import initialize_config_dir
-from hydra._internal.core_plugins.bash_completion import BashCompletion
-from hydra.core.global_hydra import GlobalHydra
-
-from ganlane.config.command_line import VERSION_BASE
-from ganlane.config.schemas import SUFFIX, register
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 
@@ -82,6 +76,14 @@ def candidates(line: str, commands: Collection[str]) -> list[str]:
 
 def _completed(command: str, rest: str) -> list[str]:
     """Hydra's completions for one command, without the names of schemas."""
+    # Imported here, as in _script: completing the name of a command then takes half of the time.
+    from hydra import initialize_config_dir
+    from hydra._internal.core_plugins.bash_completion import BashCompletion
+    from hydra.core.global_hydra import GlobalHydra
+
+    from ganlane.config.command_line import VERSION_BASE
+    from ganlane.config.schemas import SUFFIX, register
+
     register(command)
     with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
         plugin = BashCompletion(GlobalHydra.instance().config_loader())
@@ -91,6 +93,11 @@ def _completed(command: str, rest: str) -> list[str]:
 
 def _script(action: str, shell: str) -> None:
     """Print the script for the shell to evaluate."""
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    from ganlane.config.command_line import VERSION_BASE
+
     print(_BEFORE.get((action, shell), ""))
     before = sys.argv
     # Hydra reads the program's name here; with python -m ganlane it is the path of a module.

@@ -158,8 +158,10 @@ def write_config(composed: Any, overrides: list[str], folder: Path) -> None:
 def stored_command(folder: Path, program: str, without: Sequence[str] = ()) -> str:
     """The command line of the run in ``folder``, ``program`` first, without overrides that start as ``without`` says.
 
-    A run that was started from Python has no overrides.
+    For a run that was started from Python, it says so in place of a command.
     """
     path = folder / OVERRIDES
-    overrides = [str(override) for override in OmegaConf.load(path)] if path.is_file() else []
+    if not path.is_file():
+        return f"called from Python: ganlane.api.run({program.rpartition('.')[2].rpartition(' ')[2]!r}, ...)"
+    overrides = [str(override) for override in OmegaConf.load(path)]
     return f"{program} {shlex.join(each for each in overrides if not each.startswith(tuple(without)))}".rstrip()

@@ -140,7 +140,7 @@ def file_sentence(error: OSError) -> str:
 
 @contextmanager
 def numbered_refusals() -> Iterator[None]:
-    """Raise errors of the file system that a library reports as text alone as OSError with the error number.
+    """Turn errors of the file system that a library reports as text alone into OSErrors with their number.
 
     polars raises "No space left on device (os error 28)" in errors of several types, without number or file name.
     """

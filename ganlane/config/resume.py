@@ -137,7 +137,7 @@ def _asked(overrides: Sequence[str]) -> str | None:
 
 
 def run_folder(path: Path) -> Path:
-    """The run of a path to its folder, to a phase's folder or to a checkpoint in it.
+    """The run that ``path`` belongs to: its folder, a phase's folder, or a checkpoint.
 
     Raises:
         UserError: there is no run.

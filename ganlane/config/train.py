@@ -13,7 +13,7 @@ from ganlane.parameters.agent import RainbowConfig
 from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Record, Text, between, one_of
 
 Workers: TypeAlias = Annotated[int, between(1, 1024)]
-#: Decisions from which on compiling, which takes one to two minutes, saves time.
+#: Number of decisions above which compiling (one to two minutes) pays off.
 WORTH_COMPILING = 300_000
 
 

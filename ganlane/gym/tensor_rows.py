@@ -65,7 +65,8 @@ class TensorRows(Rows):
 
     def now(self) -> TensorDictBase:
         """The state of all rows; raises :class:`UserError` before the first :meth:`start`."""
-        self.check_started()
+        if self.state is None:  # asked first, since check_started copies the numbers from the device
+            self.check_started()
         return self.state
 
     def observation(self) -> Floats:

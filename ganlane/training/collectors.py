@@ -29,7 +29,7 @@ class Collector(ABC):
     overlaps: bool = False
 
     def open(self, agent: Rainbow) -> None:  # noqa: B027 (optional)
-        """Start workers, if any; otherwise the first :meth:`step` does.
+        """Start the workers, if there are any; without this call the first :meth:`step` starts them.
 
         Raises:
             UserError: they cannot be started.
@@ -83,7 +83,7 @@ class SingleCollector(Collector):
         return pack(self.env_state if exact else self.env_state.select(keys.SEED, keys.EPISODE, strict=False))
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Restore the state; unless ``exact``, begin the episodes after those of ``state``, if it has any."""
+        """Restore the state; unless ``exact``, begin the episodes after those of ``state`` (or the first)."""
         saved = unpack(state)
         if exact:
             self.env_state = saved

@@ -49,7 +49,8 @@ class TrainingConfig(Record):
 class TrainingResult:
     """Result of a run.
 
-    ``stopped_by`` is the number of the signal that stopped it early, or None. ``best`` is the ``best_metric`` of the
+    ``stopped_by`` is the number of the signal that stopped it early, or None (an entry
+    point raises :class:`~ganlane.config.app.Stopped` with it). ``best`` is the ``best_metric`` of the
     best evaluation. ``checkpoint`` is the file to resume from.
     """
 

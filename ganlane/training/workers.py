@@ -69,8 +69,8 @@ class WorkerCollector(Collector):
     """Steps from TorchRL's collectors, on the CPUs of the workers.
 
     The workers make ``config.steps`` steps with the same weights, then wait for the learner. They are started by
-    :meth:`open` or the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is
-    row i of worker w, which starts with episode ``w * 2**40 + i``.
+    :meth:`open` or the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is row i of worker w, which
+    starts with episode ``w * 2**40 + i``.
 
     Args:
         make_env: makes the environments of one worker.
@@ -206,7 +206,7 @@ def exit_codes(processes: Sequence[Any]) -> dict[int, int]:
 
 
 def why_lost(processes: Sequence[Any]) -> str:
-    """Error message for lost workers."""
+    """Why workers were lost, for an error message."""
     codes = exit_codes(processes)
     who = ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items()) or "a worker"
     if any(code > 0 for code in codes.values()):

@@ -135,6 +135,7 @@ def test_files_without_rows_or_text_are_refused(content, message, tmp_path):
 
 @pytest.mark.parametrize("name", ["", "scenes.csv", "x.parquet"])
 def test_absent_files_are_refused(name, tmp_path):
+    (tmp_path / "other.csv").write_text("scene")
     with pytest.raises(UserError, match="no such file"):
         read_scenes(tmp_path / name)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -76,6 +78,18 @@ def test_frames_are_one_step_of_driving_apart():
     assert trajectory.frame_s == pytest.approx(0.1)
     assert not trajectory.overlapping().any()
     assert not trajectory.jumped().any()
+
+
+def test_frames_a_second_apart_hold_no_jumps_of_who_just_drives():
+    whole = record_episode(highway(goal_m=200.0), always(0), seed=0, episode=0)
+    fields = {name: getattr(whole, name)[::10] for name in ("time_s", "x")}
+    coarse = replace(whole, **fields)
+    assert np.abs(np.diff(coarse.x, axis=0)).max() > 10.0
+    assert not coarse.jumped().any()
+    coarse.x[-1] += 301.0
+    assert coarse.jumped()[-1].all()
+    whole.x[-1] += 40.0
+    assert whole.jumped()[-1].all()
 
 
 def test_a_command_off_the_road_ends_the_recording_at_once():

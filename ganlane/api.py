@@ -50,8 +50,8 @@ from ganlane.evaluation.results import Run, TrainingRun, plain
 from ganlane.files import write_bytes
 from ganlane.options import Option, command_config, option
 from ganlane.parameters.checks import did_you_mean
-from ganlane.runtime import set_threads
 from ganlane.sim.random import Stream
+from ganlane.torch_settings import set_threads
 
 __all__ = ["Driver", "Run", "TrainingRun", "evaluate", "load_agent", "make_env", "render", "run", "train"]
 

@@ -27,6 +27,7 @@ from typing import Final
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
+from ganlane.files import CHECKPOINTS, conf_folder
 from ganlane.runtime import check_process, find_compiler
 
 NEEDED_IS_MISSING = 1
@@ -235,15 +236,11 @@ def _compiler() -> Finding:
 
 def _configuration() -> Finding:
     """The YAML files of the commands."""
-    from ganlane.files import conf_folder
-
     return Finding("configuration", State.OK, str(conf_folder()))
 
 
 def checkpoints() -> list[Finding]:
     """The weights that ship, each of them loaded."""
-    from ganlane.files import CHECKPOINTS
-
     names = sorted({*NEEDED_WEIGHTS, *(path.stem for path in CHECKPOINTS.glob("*.safetensors"))})
     return [guarded(name, partial(_weights, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL) for name in names]
 

@@ -17,7 +17,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.checks import did_you_mean
-from ganlane.runtime import check_default_device
+from ganlane.torch_settings import check_default_device
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any

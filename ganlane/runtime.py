@@ -1,6 +1,6 @@
-"""Settings of the process: compiled functions, memory, threads, streams; registration with gymnasium.
+"""Settings of the process: compiler, memory, streams; registration with gymnasium.
 
-Torch is imported inside the functions, because the command line imports this module before it needs torch.
+Without torch, which the command line does not need at first; its settings are in :mod:`ganlane.torch_settings`.
 """
 
 from __future__ import annotations
@@ -9,19 +9,11 @@ import ctypes
 import os
 import shutil
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
-from functools import wraps
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final
 
 from ganlane.errors import UserError
 
-F = TypeVar("F", bound=Callable)
-#: Graphs that one function may have: one per batch size, road and set of parameters in a process.
-GRAPHS_PER_FUNCTION = 64
-#: First torch whose compiler is known to be right: 2.11 on Python 3.12 returns empty NamedTuples from a graph.
-TRIED_FROM = (2, 13)
 COMPILERS = ("c++", "g++", "clang++", "cl")
 #: From glibc's malloc.h.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -68,14 +60,6 @@ def has_compiler() -> bool:
     return find_compiler()[0] is not None
 
 
-def can_compile() -> bool:
-    """Whether compiling is known to work here: a C++ compiler, and a torch from :data:`TRIED_FROM` on."""
-    import torch
-
-    version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
-    return has_compiler() and version >= TRIED_FROM
-
-
 def check_compiler() -> None:
     """Raise :class:`UserError` where torch would find no C++ compiler."""
     path, names = find_compiler()
@@ -83,44 +67,6 @@ def check_compiler() -> None:
         raise UserError(
             f"compile=true needs a C++ compiler, and there is none (looked for {names}); install one "
             "(Debian: apt install g++) or set compile=false."
-        )
-
-
-def compiled(function: F) -> F:
-    """Compile ``function``, pure and on tensors without branches on their values, to one graph per shape."""
-    import torch
-
-    torch._dynamo.config.cache_size_limit = max(torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION)
-    return torch.compile(function, dynamic=False, fullgraph=True)  # type: ignore[return-value]
-
-
-def outside_autocast(function: F) -> F:
-    """Decorator: ``function`` computes in the types of its arguments, even under the caller's autocast."""
-
-    @wraps(function)
-    def computed(*arguments: Any, **named: Any) -> Any:
-        import torch
-
-        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
-        if not kinds:
-            return function(*arguments, **named)
-        with ExitStack() as stack:
-            for kind in kinds:
-                stack.enter_context(torch.autocast(kind, enabled=False))
-            return function(*arguments, **named)
-
-    return computed  # type: ignore[return-value]
-
-
-def check_default_device(device: str) -> None:
-    """Raise :class:`UserError` if torch's default device is neither the CPU nor of the type ``device``."""
-    import torch
-
-    default = torch.get_default_device().type
-    if default not in ("cpu", device):
-        raise UserError(
-            f"torch's default device is {default}, and the highway's tensors would not meet those that are made "
-            "there; call torch.set_default_device('cpu') and choose the highway's own with device=."
         )
 
 
@@ -142,13 +88,6 @@ def open_closed_streams() -> None:
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(nowhere, nowhere == number)
             setattr(sys, name, os.fdopen(nowhere, "w" if number else "r", closefd=False))
-
-
-def set_threads(threads: int) -> None:
-    """Set torch's number of threads; 0 means one, which is fastest for the batch sizes used here."""
-    import torch
-
-    torch.set_num_threads(threads or 1)
 
 
 def keep_freed_memory() -> bool:

@@ -18,8 +18,9 @@ from safetensors.torch import save
 
 from ganlane.checksums import seal_archive
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.files import CHECKPOINTS, load_weights, save_weights
+from ganlane.files import CHECKPOINTS
 from ganlane.native.library import cache_folder
+from ganlane.weights import load_weights, save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
 AGENT, GENERATOR = CHECKPOINTS / "agent_idm.safetensors", CHECKPOINTS / "generator_paper.safetensors"

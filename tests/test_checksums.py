@@ -17,12 +17,13 @@ from ganlane.checksums import PLACE, has_checksum, sealed, sealed_archive
 from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes
 from ganlane.data.scenes import write_prepared
 from ganlane.errors import UserError
-from ganlane.files import CHECKPOINTS, load_weights, save_weights
+from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
 from ganlane.generator.fit import FitLoop
 from ganlane.generator.windows import cached, load_arrays, save_arrays
 from ganlane.parameters.generator import LoopConfig, PaperConfig
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
+from ganlane.weights import load_weights, save_weights
 
 
 class SmallFit:

@@ -40,7 +40,7 @@ def test_a_whole_installation_is_found_whole(here, capsys):
 
 
 def test_what_is_needed_and_missing_makes_the_status_1(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("ganlane.files.CHECKPOINTS", tmp_path)
+    monkeypatch.setattr("ganlane.doctor.CHECKPOINTS", tmp_path)
     assert main(["doctor"]) == 1
     shown = capsys.readouterr().out
     assert "MISSING agent_idm" in shown
@@ -97,7 +97,7 @@ def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
 
     for file in CHECKPOINTS.glob("*.safetensors"):
         (tmp_path / file.name).write_bytes(file.read_bytes()[: -100 if "paper" in file.name else None])
-    monkeypatch.setattr("ganlane.files.CHECKPOINTS", tmp_path)
+    monkeypatch.setattr("ganlane.doctor.CHECKPOINTS", tmp_path)
     assert {found.subject for found in doctor.checkpoints() if found.state is State.MISSING} == {"generator_paper"}
 
 

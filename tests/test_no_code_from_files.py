@@ -22,11 +22,12 @@ from ganlane.config.targets import import_target
 from ganlane.config.traffic import IdmTrafficConfig
 from ganlane.config.train import FinalEvaluationConfig, TrainConfig
 from ganlane.errors import UserError
-from ganlane.files import CHECKPOINTS, load_weights, save_weights
+from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
 from ganlane.generator.windows import cached
 from ganlane.realism.references import Reference
 from ganlane.traffic import TrafficModule
+from ganlane.weights import load_weights, save_weights
 
 pytestmark = pytest.mark.usefixtures("hydra_from_memory")
 

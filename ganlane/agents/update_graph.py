@@ -21,7 +21,7 @@ from ganlane.agents.loss import LeanDistributionalLoss, outside_support, pick, p
 from ganlane.agents.network import QNetwork, matrix_product, noise_of
 from ganlane.agents.policy import allowed_values
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.runtime import compiled
+from ganlane.torch_settings import compiled
 
 #: ``weight_mu, weight_sigma, bias_mu, bias_sigma`` of a noisy layer.
 _PARAMETERS = ("weight_mu", "weight_sigma", "bias_mu", "bias_sigma")

@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from itertools import cycle, islice
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -143,8 +144,6 @@ class GymnasiumRunner:
     """``gymnasium.make_vec`` (with one environment ``gymnasium.make``), random actions, resets where episodes end."""
 
     def __init__(self, scenario: Scenario, mode: str, device: str, batch: int) -> None:
-        import gymnasium
-
         options: dict[str, Any] = {"traffic": scenario.traffic, "env": replace(scenario.env, kernel=mode)}
         options |= {"observation": scenario.observation, "reward": scenario.reward, "seed": scenario.seed}
         self.batch, self.actions = batch, np.random.default_rng(scenario.seed).integers(3, size=(_DRAWN, batch))
@@ -208,7 +207,6 @@ class HighwayEnvRunner:
     """``highway-v0`` without rendering and gymnasium's checks: random actions, a reset after every end."""
 
     def __init__(self, settings: dict[str, Any], seed: int) -> None:
-        import gymnasium
         import highway_env
 
         with warnings.catch_warnings():

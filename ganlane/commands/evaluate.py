@@ -8,7 +8,7 @@ from pathlib import Path
 from ganlane.build import make_drivers
 from ganlane.compare import compare, publish
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.runtime import set_threads
+from ganlane.torch_settings import set_threads
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> str:

@@ -9,7 +9,7 @@ from ganlane.config.recordings import RealismConfig
 from ganlane.evaluation import write_results
 from ganlane.realism.card import drive_card, scenes_path
 from ganlane.realism.output import card_text, check_targets, draw, publish, show
-from ganlane.runtime import set_threads
+from ganlane.torch_settings import set_threads
 
 
 def realism(config: RealismConfig, folder: Path) -> str:

@@ -29,8 +29,8 @@ from ganlane.gym import ENV_ID
 from ganlane.gym.rows import row_of
 from ganlane.gym.tensor_rows import TensorRows
 from ganlane.keys import ACTION, ACTIONS, END_EVENTS, EPISODE
-from ganlane.runtime import set_threads
 from ganlane.sim.random import Stream
+from ganlane.torch_settings import set_threads
 
 try:
     import minari

@@ -10,8 +10,8 @@ from ganlane.config.render import FILMS, MOST_EPISODES, RenderConfig
 from ganlane.crashes import read_crashes
 from ganlane.errors import UserError
 from ganlane.evaluation.rollouts import ScriptedPolicy
-from ganlane.runtime import set_threads
 from ganlane.sim.random import Stream
+from ganlane.torch_settings import set_threads
 from ganlane.view import (
     DrawingParameters,
     Film,

@@ -24,7 +24,7 @@ from ganlane.reproduce import figures as papers
 from ganlane.reproduce import numbers, report
 from ganlane.reproduce.matrix import available, cells_of, drive, read_cells
 from ganlane.reproduce.numbers import Row
-from ganlane.runtime import set_threads
+from ganlane.torch_settings import set_threads
 
 #: Hours that one training of the paper's schedule took, on one core.
 HOURS_PER_SEED = 1.1

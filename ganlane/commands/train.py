@@ -12,7 +12,7 @@ from ganlane.config.app import Stopped
 from ganlane.config.folders import earned
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
-from ganlane.runtime import set_threads
+from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import LAST
 from ganlane.training.phases import AGENT_FILE, length_if_finished, phases_of, run_phase
 

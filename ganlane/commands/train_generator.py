@@ -17,7 +17,7 @@ from ganlane.evaluation.table import show
 from ganlane.fit_report import FitProgress, ablation_table, fold_tables, metrics_table, results_of
 from ganlane.generator import FitResult
 from ganlane.parameters.data import DataConfig, NgsimDataConfig
-from ganlane.runtime import set_threads
+from ganlane.torch_settings import set_threads
 
 
 def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:

@@ -10,6 +10,8 @@ import os
 import re
 import sys
 from collections.abc import Collection, Sequence
+from importlib import import_module
+from types import ModuleType
 
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
@@ -17,15 +19,6 @@ from ganlane.files import conf_folder
 SHELLS = ("bash", "zsh", "fish")
 ACTIONS = ("install", "uninstall", "query")
 PROGRAM = "ganlane"
-#: Any command serves to print the script of a shell.
-_ANY = "train"
-#: Missing in Hydra's scripts: zsh needs bashcompinit, and bash must forget the removed function.
-_BEFORE = {
-    ("install", "zsh"): "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }\n"
-    "autoload -Uz bashcompinit && bashcompinit",
-    ("uninstall", "bash"): f"complete -r {PROGRAM} 2> /dev/null",
-    ("uninstall", "zsh"): f"complete -r {PROGRAM} 2> /dev/null",
-}
 
 
 def shell_completion(arguments: Sequence[str], commands: Collection[str]) -> int:
@@ -44,7 +37,7 @@ def shell_completion(arguments: Sequence[str], commands: Collection[str]) -> int
         found = candidates(os.environ.get("COMP_LINE", ""), commands)
         print(("\n" if shell == "fish" else " ").join(found))
     else:
-        _script(action, shell)
+        _hydra().print_script(action, shell)
     return 0
 
 
@@ -71,41 +64,9 @@ def candidates(line: str, commands: Collection[str]) -> list[str]:
         return [name for name in commands if name.startswith(command)]
     if not (conf_folder() / f"{command}.yaml").is_file():
         return []
-    return _completed(command, rest)
+    return _hydra().completed(command, rest)
 
 
-def _completed(command: str, rest: str) -> list[str]:
-    """Hydra's completions for one command, without the names of schemas."""
-    # Imported here, as in _script: completing the name of a command then takes half of the time.
-    from hydra import initialize_config_dir
-    from hydra._internal.core_plugins.bash_completion import BashCompletion
-    from hydra.core.global_hydra import GlobalHydra
-
-    from ganlane.config.command_line import VERSION_BASE
-    from ganlane.config.schemas import SUFFIX, register
-
-    register(command)
-    with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
-        plugin = BashCompletion(GlobalHydra.instance().config_loader())
-        found = plugin._query(config_name=command, line=rest.lstrip())
-    return [word for word in found if not word.endswith(SUFFIX) and not word.startswith("hydra")]
-
-
-def _script(action: str, shell: str) -> None:
-    """Print the script for the shell to evaluate."""
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-
-    from ganlane.config.command_line import VERSION_BASE
-
-    print(_BEFORE.get((action, shell), ""))
-    before = sys.argv
-    # Hydra reads the program's name here; with python -m ganlane it is the path of a module.
-    sys.argv = [PROGRAM]
-    try:
-        with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):
-            hydra = GlobalHydra.instance().hydra
-            assert hydra is not None
-            hydra.shell_completion(config_name=_ANY, overrides=[f"{action}={shell}"])
-    finally:
-        sys.argv = before
+def _hydra() -> ModuleType:
+    """What needs Hydra, imported here: completing the name of a command takes half of the time without."""
+    return import_module("ganlane.config.hydra_completion")

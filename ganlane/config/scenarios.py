@@ -61,7 +61,7 @@ class SceneEnvConfig(EnvConfig):
                     f"{{{name}}}={as_typed(getattr(self, name))}: has no effect on a scene set by hand; "
                     "leave it out, or take env=highway."
                 )
-        there = self.fixed_scene().vehicles
+        there = self.scenes().vehicles
         if self.vehicles not in (0, there):
             raise ParameterError(
                 f"{{vehicles}}={self.vehicles}: the scene has {there}, the ego included; leave this key out."
@@ -70,15 +70,11 @@ class SceneEnvConfig(EnvConfig):
         super().__post_init__()
 
     def _check_start(self) -> None:
-        scene = self.fixed_scene()
+        scene = self.scenes()
         scene.check(scene.road, self.idm)
 
     def scenes(self, others_visibility: int | None = None) -> FixedScene:
         """The scene as the environment takes it, see :meth:`EnvConfig.scenes`."""
-        return self.fixed_scene(others_visibility)
-
-    def fixed_scene(self, others_visibility: int | None = None) -> FixedScene:
-        """The scene; ``others_visibility`` is the traffic's."""
         from ganlane.sim.scenes import FixedScene
         from ganlane.sim.state import Road
 

@@ -185,9 +185,9 @@ class TrainConfig(DrivingConfig):
 
     Attributes:
         total_decisions: of all environments together.
-        compile: always, never; auto: where compiling is known to work (:func:`ganlane.runtime.can_compile`) and the
-            training is long enough to gain by it (:data:`WORTH_COMPILING`). The final evaluation is compiled with
-            ``env.compile=true`` alone.
+        compile: always, never; auto: where compiling is known to work (:func:`ganlane.torch_settings.can_compile`)
+            and the training is long enough to gain by it (:data:`WORTH_COMPILING`). The final evaluation is compiled
+            with ``env.compile=true`` alone.
         log_every: decisions between two rows of metrics.csv.
         evaluate_every: decisions between two evaluations while training (0: none); the best agent is kept.
         selection_episodes: of each of those, on the stream kept for model selection.
@@ -216,7 +216,7 @@ class TrainConfig(DrivingConfig):
 
     def compiled(self) -> TrainConfig:
         """The config with ``env.compile`` set according to ``compile``."""
-        from ganlane.runtime import can_compile
+        from ganlane.torch_settings import can_compile
 
         worth = self.total_decisions >= WORTH_COMPILING and can_compile()
         if self.env.compile or self.compile == "never" or (self.compile == "auto" and not worth):

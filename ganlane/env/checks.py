@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import ACTIONS
-from ganlane.runtime import check_default_device
+from ganlane.torch_settings import check_default_device
 
 
 def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
-from ganlane.files import CHECKPOINTS, load_weights, save_weights
+from ganlane.files import CHECKPOINTS
 from ganlane.generator.forecasts import Metrics
 from ganlane.generator.networks import Generator
 from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
+from ganlane.weights import load_weights, save_weights
 
 KIND = "generator"
 #: Inputs in addition to the motion, by preset.

@@ -17,7 +17,6 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array, Estimate, entries
-from ganlane.files import load_weights
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.parameters.checks import assign
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
@@ -47,6 +46,7 @@ from ganlane.realism.starts import (
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule
+from ganlane.weights import load_weights
 
 #: Preset of the weights that a traffic drives with.
 PRESETS: Final[Mapping[str, Preset]] = {"gan": "paper", "gan_calibrated": "calibrated"}

@@ -18,7 +18,6 @@ import polars as pl
 
 from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.files import load_weights
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
 from ganlane.realism.measures import QUANTITIES, Measured, measure, measure_recordings, pooled_distance
 from ganlane.realism.recordings import SHORTEST_S, Recording, recorded_frame, recordings_of, units_of
@@ -26,6 +25,7 @@ from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, Rand
 from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
 from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.state import Road
+from ganlane.weights import load_weights
 
 #: Reference drivers at the ends of the scale.
 FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}

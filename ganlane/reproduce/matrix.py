@@ -24,7 +24,7 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.results import code_version
 from ganlane.files import atomic_path
-from ganlane.runtime import set_threads
+from ganlane.torch_settings import set_threads
 
 #: Name in the metadata of a cell's file.
 _ORIGIN = "ganlane"

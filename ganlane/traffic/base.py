@@ -14,10 +14,10 @@ from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
-from ganlane.runtime import compiled, outside_autocast
 from ganlane.sim.random import Stream, absorb, episode_key
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.state import Road, Vehicles
+from ganlane.torch_settings import compiled, outside_autocast
 
 #: A module's memory: name to tensor [N, M, ...].
 Memory: TypeAlias = dict[str, Tensor]

@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.runtime import compiled
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.mobil import TABLE_IV, mobil_changes
 from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road, Vehicles
+from ganlane.torch_settings import compiled
 from ganlane.traffic.base import Memory, Moved, TrafficModule
 
 #: MOBIL decides once a second of simulated time, whatever the ego's decision period.

@@ -39,14 +39,15 @@ from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import plain
 from ganlane.parameters.agent import RemovedOption, without_removed
 from ganlane.parameters.observation import ObservationConfig
-from ganlane.runtime import keep_freed_memory, set_threads
+from ganlane.runtime import keep_freed_memory
 from ganlane.sim.random import Stream
+from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint
 from ganlane.training.collectors import Collector, SingleCollector
 from ganlane.training.logs import make_logs
 from ganlane.training.loop import Evaluate, TrainingConfig, TrainingResult, train
 from ganlane.training.overlap import OverlapCollector
-from ganlane.training.workers import ClusterCollector, ProcessCollector
+from ganlane.training.workers import MakeEnv, ProcessCollector
 from ganlane.transforms import observation_size
 
 #: File of the trained agent in the folder of its phase; it exists once the phase is finished.
@@ -150,8 +151,21 @@ def make_collector(config: TrainConfig, phase: Phase) -> Collector:
     if isinstance(collector, OverlapCollectorConfig):
         return OverlapCollector(make_worker_env, collector.workers, collector.num_envs)
     if isinstance(collector, RayCollectorConfig):
-        return ClusterCollector(make_worker_env, collector)
+        return cluster_collector(make_worker_env, collector)
     return ProcessCollector(make_worker_env, collector)
+
+
+def cluster_collector(make_worker_env: MakeEnv, config: RayCollectorConfig) -> Collector:
+    """``collector=ray``.
+
+    Raises:
+        UserError: Ray is not installed.
+    """
+    try:
+        from ganlane.training.cluster import ClusterCollector
+    except ModuleNotFoundError as error:
+        raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
+    return ClusterCollector(make_worker_env, config)
 
 
 def training_env(

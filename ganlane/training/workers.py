@@ -1,10 +1,8 @@
-"""``collector=multi`` and ``ray``: TorchRL's collectors in worker processes; batches are returned step by step."""
+"""``collector=multi``: TorchRL's collectors in worker processes; batches are returned step by step."""
 
 from __future__ import annotations
 
 import socket
-import sys
-import warnings
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +21,7 @@ from ganlane import keys
 from ganlane.agents import Rainbow
 from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
 from ganlane.agents.policy import ExploringPolicy, LegalActions
-from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig
+from ganlane.config.train import MultiCollectorConfig
 from ganlane.errors import UserError
 from ganlane.training.collectors import Collector, pack, unpack
 from ganlane.training.signals import shielded_children
@@ -212,70 +210,6 @@ def why_lost(processes: Sequence[Any]) -> str:
     if any(code > 0 for code in codes.values()):
         return f"{who} failed; its own message is above"
     return f"{who} died, killed from outside or for want of memory (fewer collector.workers or num_envs need less)"
-
-
-class ClusterCollector(WorkerCollector):
-    """``collector=ray``: TorchRL's ``RayCollector``, one actor per worker; the state of the simulation is not sent.
-
-    Args:
-        make_env: makes the environments of one worker; on a cluster, ganlane must be installed on its machines.
-        config: number of workers and environments, steps between new weights, and the address of the cluster's head.
-
-    Raises:
-        UserError: Ray is not installed.
-    """
-
-    name = "ray"
-
-    def __init__(self, make_env: MakeEnv, config: RayCollectorConfig) -> None:
-        super().__init__(make_env, config)
-        self.address = config.address
-        try:
-            import ray  # noqa: F401
-        except ImportError as error:
-            raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
-
-    def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
-        """One actor per worker; a local Ray gets one CPU per worker, even on a smaller machine."""
-        from torchrl.collectors.distributed import RayCollector
-
-        connection: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-        if self.address is None:
-            connection |= {"address": "local", "num_cpus": self.config.workers, "include_dashboard": False}
-        else:
-            check_reachable(self.address)
-            connection["address"] = self.address
-        # One dictionary per worker: TorchRL writes the worker's policy into it.
-        own = [{"postproc": read_by_loop, "auto_register_policy_transforms": False} for _ in environments]
-        # TorchRL warns twice that it has no weights to send; :meth:`_send_weights` sends them.
-        warnings.filterwarnings("ignore", message="RayCollector iteration started before weight synchronization")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return RayCollector(
-                list(environments),
-                policy_factory=list(policies),
-                frames_per_batch=frames,
-                total_frames=sys.maxsize,  # its default, -1, is none at all
-                sync=True,
-                collector_kwargs=own,
-                remote_configs={"num_cpus": 1, "num_gpus": 0},
-                ray_init_config=connection,
-                trust_policy=True,
-                weight_sync_schemes={},
-            )
-
-    def failure(self, error: Exception) -> str | None:
-        """No cluster answers, an actor is gone, or Ray did not start."""
-        import ray
-        from ray.exceptions import RayActorError
-
-        if isinstance(error, ConnectionError):
-            return f"no Ray cluster answers at collector.address={self.address}, start one or leave the address out"
-        if isinstance(error, RayActorError):
-            return "a worker died or its machine was lost"
-        if not ray.is_initialized():
-            return f"Ray could not be started ({str(error).partition('.')[0]}), see whether the machine is overloaded"
-        return None
 
 
 def check_reachable(address: str, patience_s: float = 10.0) -> None:

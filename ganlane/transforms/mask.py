@@ -24,11 +24,11 @@ from ganlane.keys import ACTIONS, EGO_INDEX
 from ganlane.native.mask import SafeActions
 from ganlane.parameters.driving import IdmParameters
 from ganlane.parameters.observation import MASKS
-from ganlane.runtime import compiled
 from ganlane.sim.ego import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
+from ganlane.torch_settings import compiled
 from ganlane.transforms.sensors import PerceptionTransform
 
 

@@ -24,8 +24,8 @@ from ganlane.errors import UserError
 from ganlane.native.observation import LaneView
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale
-from ganlane.runtime import compiled
 from ganlane.sim.state import Road, Vehicles, road_in
+from ganlane.torch_settings import compiled
 from ganlane.transforms.sensors import PerceptionTransform
 
 #: Of the lane view: lane to the left, own, to the right, each ahead (+1) and behind (-1).

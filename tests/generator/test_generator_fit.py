@@ -9,7 +9,6 @@ import torch
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
-from ganlane.files import save_weights
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import assign_folds, fit_generator, learning_rate, split_for_fit
 from ganlane.generator.networks import Generator
@@ -26,6 +25,7 @@ from ganlane.generator.tasks import (
 )
 from ganlane.generator.windows import count_windows
 from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
+from ganlane.weights import save_weights
 
 SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
 HELD_OUT = ("synthetic-1",)

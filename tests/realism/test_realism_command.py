@@ -12,11 +12,11 @@ from reference.recordings import following_file
 
 from ganlane.config.recordings import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.files import load_weights, save_weights
 from ganlane.generator import shipped_generator
 from ganlane.realism import main
 from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.references import SHIPPED_REFERENCE
+from ganlane.weights import load_weights, save_weights
 
 QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
 

@@ -26,6 +26,15 @@ _EXPONENTS = (3.5, 4.5)
 _FROM_M, _TO_M, _LIMIT_MPS = -10_000.0, 200_000.0, 70.0
 
 
+def _module(name: str) -> Any:
+    """A module of HighwayEnv.
+
+    Raises:
+        UserError: highway-env is not installed.
+    """
+    return require(name, "highway_env", "highway-env", "bench")
+
+
 class HighwayEnvTraffic(TrafficModule):
     """The others driven by HighwayEnv's ``IDMVehicle``: its IDM, MOBIL and steering, its explicit Euler step.
 
@@ -48,7 +57,7 @@ class HighwayEnvTraffic(TrafficModule):
 
     def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN) -> None:
         super().__init__(road, stream)
-        require("highway_env", "highway_env", "highway-env", "bench")
+        _module("highway_env")
         if self.road.ring_m is not None:
             raise UserError(
                 f"traffic highway_env: a ring of {self.road.ring_m:g} m; HighwayEnv's roads here are straight."
@@ -99,27 +108,25 @@ class _Highway:
     """One road of HighwayEnv whose objects are filled with one row after another."""
 
     def __init__(self, lanes: int, lane_width_m: float) -> None:
-        from highway_env.road.lane import StraightLane
-        from highway_env.road.road import Road as TheirRoad
-        from highway_env.road.road import RoadNetwork
-        from highway_env.vehicle.behavior import IDMVehicle
-        from highway_env.vehicle.controller import ControlledVehicle
+        road = _module("highway_env.road.road")
 
-        class Lane(StraightLane):
+        class Lane(_module("highway_env.road.lane").StraightLane):  # type: ignore[misc]
             """A straight lane along x; the same numbers as its base class's, without arrays."""
 
             def local_coordinates(self, position: Any) -> tuple[float, float]:
                 return float(position[0]) - _FROM_M, float(position[1]) - self.offset
 
-        network = RoadNetwork()
+        network = road.RoadNetwork()
         for k in range(lanes):
             y = k * lane_width_m
             lane = Lane([_FROM_M, y], [_TO_M, y], width=lane_width_m, speed_limit=_LIMIT_MPS)
             lane.offset = y
             network.add_lane("a", "b", lane)
-        self.road = TheirRoad(network, np_random=np.random.RandomState(0))
+        self.road = road.Road(network, np_random=np.random.RandomState(0))
+        self._driver = _module("highway_env.vehicle.behavior").IDMVehicle
         # A ControlledVehicle as in HighwayEnv's own environments: the others' MOBIL asks for its target speed.
-        self._driver, self._cars = IDMVehicle, [ControlledVehicle(self.road, [0.0, 0.0])]
+        ego = _module("highway_env.vehicle.controller").ControlledVehicle
+        self._cars = [ego(self.road, [0.0, 0.0])]
 
     def drive(
         self, present: Any, fields: Any, size: Any, driver: Any, target: Any, ego_signals: bool, dt: float

@@ -21,6 +21,6 @@ def require(module: str, traffic: str, package: str, extra: str) -> ModuleType:
     Raises:
         UserError: it is not installed.
     """
-    if find_spec(module) is None:
+    if find_spec(module.partition(".")[0]) is None:
         raise UserError(f"traffic {traffic}: {package} is not installed; pip install 'ganlane[{extra}]' brings it.")
     return import_module(module)

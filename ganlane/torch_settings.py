@@ -1,0 +1,62 @@
+"""Torch's settings: compiled functions, autocast, default device, threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import wraps
+from typing import Any, TypeVar
+
+import torch
+
+from ganlane.errors import UserError
+from ganlane.runtime import has_compiler
+
+F = TypeVar("F", bound=Callable)
+#: Graphs that one function may have: one per batch size, road and set of parameters in a process.
+GRAPHS_PER_FUNCTION = 64
+#: First torch whose compiler is known to be right: 2.11 on Python 3.12 returns empty NamedTuples from a graph.
+TRIED_FROM = (2, 13)
+
+
+def can_compile() -> bool:
+    """Whether compiling is known to work here: a C++ compiler, and a torch from :data:`TRIED_FROM` on."""
+    version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
+    return has_compiler() and version >= TRIED_FROM
+
+
+def compiled(function: F) -> F:
+    """Compile ``function``, pure and on tensors without branches on their values, to one graph per shape."""
+    torch._dynamo.config.cache_size_limit = max(torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION)
+    return torch.compile(function, dynamic=False, fullgraph=True)  # type: ignore[return-value]
+
+
+def outside_autocast(function: F) -> F:
+    """Decorator: ``function`` computes in the types of its arguments, even under the caller's autocast."""
+
+    @wraps(function)
+    def computed(*arguments: Any, **named: Any) -> Any:
+        kinds = [kind for kind in ("cpu", "cuda") if torch.is_autocast_enabled(kind)]
+        if not kinds:
+            return function(*arguments, **named)
+        with ExitStack() as stack:
+            for kind in kinds:
+                stack.enter_context(torch.autocast(kind, enabled=False))
+            return function(*arguments, **named)
+
+    return computed  # type: ignore[return-value]
+
+
+def check_default_device(device: str) -> None:
+    """Raise :class:`UserError` if torch's default device is neither the CPU nor of the type ``device``."""
+    default = torch.get_default_device().type
+    if default not in ("cpu", device):
+        raise UserError(
+            f"torch's default device is {default}, and the highway's tensors would not meet those that are made "
+            "there; call torch.set_default_device('cpu') and choose the highway's own with device=."
+        )
+
+
+def set_threads(threads: int) -> None:
+    """Set torch's number of threads; 0 means one, which is fastest for the batch sizes used here."""
+    torch.set_num_threads(threads or 1)

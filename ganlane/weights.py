@@ -1,0 +1,72 @@
+"""Weights as safetensors files, which cannot execute code, with plain metadata and a checksum."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from ganlane.checksums import PLACE, has_checksum, note_without_checksum, sealed
+from ganlane.errors import UserError
+from ganlane.files import write_bytes
+
+
+def save_weights(path: str | Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+    """Save ``tensors`` and plain ``metadata`` as safetensors, atomically.
+
+    Args:
+        path: where to write.
+        kind: what the file holds (``"agent"``, ``"generator"``); :func:`load_weights` checks it.
+        tensors: flat name to tensor.
+        metadata: JSON-serialisable description (config, data, metrics, code version).
+    """
+    flat = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    header = {"ganlane": json.dumps({"kind": kind, **metadata}), "checksum": PLACE}
+    write_bytes(path, sealed(save(flat, metadata=header)))
+
+
+def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Load what :func:`save_weights` wrote: ``(tensors, metadata)``.
+
+    Raises:
+        UserError: the file is absent, damaged, not safetensors, not written by ganlane, of another kind, or holds
+            numbers that are not finite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; a checkpoint of kind {kind} (.safetensors) was expected there.")
+    content = path.read_bytes()
+    whole = has_checksum(content, path)
+    try:
+        tensors = load(content)
+        header = _json_object(content[8 : 8 + int.from_bytes(content[:8], "little")]).get("__metadata__") or {}
+    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a number type that torch lacks
+        raise UserError(
+            f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} that ganlane wrote."
+        ) from error
+    metadata = _json_object(header.get("ganlane", "{}"))
+    if metadata.get("kind") != kind:
+        found = metadata.get("kind", "a file that ganlane did not write")
+        raise UserError(
+            f"{path}: expected a ganlane checkpoint of kind {kind}, found {found}; give one that ganlane wrote."
+        )
+    for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise UserError(f"{path}: {name} holds numbers that are not finite; train or fit it again.")
+    if not whole:
+        note_without_checksum(path)
+    return tensors, metadata
+
+
+def _json_object(text: str | bytes) -> dict[str, Any]:
+    """The JSON object ``text``; empty if it is not one."""
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}

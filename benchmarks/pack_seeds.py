@@ -5,8 +5,9 @@
     python -m benchmarks.pack_seeds outputs/paper_1 outputs/paper_2 \
         --out ganlane/checkpoints/seeds_of_agent_gan.safetensors
 
-Each folder is a finished training's and holds agent.safetensors; an agent's file may be given as well. The agent with
-seed 1 is then ``agent_idm@1``, or ``FILE@1`` for a file elsewhere.
+Each folder is a finished training's and holds agent.safetensors; an agent's file may be given as well, and
+``FILE@all`` for all agents of a packed file that others are to join. The agent with seed 1 is then ``agent_idm@1``,
+or ``FILE@1`` for a file elsewhere.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from torch import Tensor
 
 from benchmarks.script import make_parser, run_script
 from ganlane.agents import NetworkConfig, read_agent
-from ganlane.agents.checkpoint import save_agents
+from ganlane.agents.checkpoint import save_agents, with_seeds
 from ganlane.errors import UserError
 
 #: Weights, network and metadata.
@@ -49,18 +50,19 @@ def of_no_machine(start: str | None) -> str | None:
     return "/".join(Path(start).parts[-3:]) if start and Path(start).is_absolute() else start
 
 
-def collect(folders: Sequence[Path]) -> dict[int, Agent]:
-    """The agents by seed.
+def collect(folders: Sequence[str]) -> dict[int, Agent]:
+    """The agents by seed; ``folders`` are folders of trainings, agents' files, ``FILE@1`` or ``FILE@all``.
 
     Raises:
         UserError: a folder without an agent, an agent without a seed, a seed that comes twice, or two recipes.
     """
     found: dict[int, Agent] = {}
     recipes: dict[str, dict[str, Any]] = {}
-    for folder in folders:
-        path = folder / AGENT_FILE if folder.is_dir() else folder
-        if not path.is_file():
-            raise UserError(f"{path}: no such file; give the folder of a finished training, which has one.")
+    for path in (each for folder in folders for each in with_seeds(folder)):
+        if Path(path).is_dir():
+            path = f"{path}/{AGENT_FILE}"
+            if not Path(path).is_file():
+                raise UserError(f"{path}: no such file; give the folder of a finished training, which has one.")
         agent = read_agent(path)
         metadata = {**agent[2], "network": asdict(agent[1])}
         seed = metadata.get("training", {}).get("seed")
@@ -68,9 +70,9 @@ def collect(folders: Sequence[Path]) -> dict[int, Agent]:
             raise UserError(f"{path}: its metadata name no seed; give an agent that 'ganlane train' wrote.")
         if seed in found:
             raise UserError(f"{path}: another run has seed {seed}, too; give each seed once.")
-        recipes[str(path)] = recipe_of(metadata)
+        recipes[path] = recipe_of(metadata)
         first, reference = next(iter(recipes.items()))
-        differing = [name for name, value in recipes[str(path)].items() if value != reference[name]]
+        differing = [name for name, value in recipes[path].items() if value != reference[name]]
         if differing:
             raise UserError(f"{path}: another recipe than {first} ({', '.join(differing)}); give runs of one recipe.")
         agent[2]["training"]["init"] = of_no_machine(metadata["training"].get("init"))
@@ -81,7 +83,7 @@ def collect(folders: Sequence[Path]) -> dict[int, Agent]:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
-    parser.add_argument("folders", type=Path, nargs="+", metavar="RUN_FOLDER")
+    parser.add_argument("folders", nargs="+", metavar="RUN_FOLDER")
     parser.add_argument("--out", type=Path, required=True, help="the .safetensors file to write")
     return parser.parse_args(arguments)
 

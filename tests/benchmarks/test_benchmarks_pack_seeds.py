@@ -86,7 +86,7 @@ def test_a_table_takes_every_seed_once(packed):
 
 
 def test_the_installation_check_loads_every_seed(packed, monkeypatch):
-    monkeypatch.setattr("ganlane.files.CHECKPOINTS", packed.parent)
+    monkeypatch.setattr("ganlane.doctor.CHECKPOINTS", packed.parent)
     monkeypatch.setattr("ganlane.doctor.NEEDED_WEIGHTS", ())
     assert [each.state for each in checkpoints()] == [State.OK, State.OK]
 
@@ -118,12 +118,25 @@ def test_only_runs_of_one_recipe_and_different_seeds_are_packed(tmp_path, capsys
         "(env)": run(tmp_path / "lanes", 2, env={"lanes": 4}),
         "another run has seed 1": run(tmp_path / "again", 1),
         "no such file": tmp_path / "empty",
+        "no such file; give the folder": tmp_path,
         "name no seed": run(tmp_path / "foreign", 2, training={}),
     }
     for said, other in cases.items():
         assert pack_seeds.main([str(one), str(other), "--out", str(tmp_path / "out.safetensors")]) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_training_joins_a_packed_file_and_leaves_the_others_as_they_are(packed, tmp_path, capsys):
+    third, out = run(tmp_path / "third", 3), tmp_path / "out.safetensors"
+    assert pack_seeds.main([f"{packed}@all", str(third), "--out", str(out)]) == 0
+    assert with_seeds(f"{out}@all") == [f"{out}@{seed}" for seed in (1, 2, 3)]
+    for seed in (1, 2):
+        before, after = read_agent(f"{packed}@{seed}"), read_agent(f"{out}@{seed}")
+        assert after[1:] == before[1:]
+        assert all(torch.equal(value, before[0][name]) for name, value in after[0].items())
+    assert pack_seeds.main([f"{packed}@all", f"{packed}@2", "--out", str(tmp_path / "twice.safetensors")]) == 2
+    assert "another run has seed 2" in capsys.readouterr().err
 
 
 def test_how_an_environment_was_computed_is_no_part_of_the_recipe(tmp_path):

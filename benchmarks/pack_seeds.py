@@ -50,7 +50,7 @@ def of_no_machine(start: str | None) -> str | None:
     return "/".join(Path(start).parts[-3:]) if start and Path(start).is_absolute() else start
 
 
-def collect(folders: Sequence[str]) -> dict[int, Agent]:
+def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
     """The agents by seed; ``folders`` are folders of trainings, agents' files, ``FILE@1`` or ``FILE@all``.
 
     Raises:
@@ -58,7 +58,7 @@ def collect(folders: Sequence[str]) -> dict[int, Agent]:
     """
     found: dict[int, Agent] = {}
     recipes: dict[str, dict[str, Any]] = {}
-    for path in (each for folder in folders for each in with_seeds(folder)):
+    for path in (each for folder in folders for each in with_seeds(str(folder))):
         if Path(path).is_dir():
             path = f"{path}/{AGENT_FILE}"
             if not Path(path).is_file():

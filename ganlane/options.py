@@ -17,7 +17,6 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.checks import did_you_mean
-from ganlane.torch_settings import check_default_device
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
@@ -45,6 +44,8 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
             cannot be used.
     """
     if "torch" in sys.modules:  # otherwise its default device is unchanged, and importing it takes seconds
+        from ganlane.torch_settings import check_default_device
+
         check_default_device("cuda")  # no other one can be the environment's
     if is_dataclass(chosen) and not isinstance(chosen, type):
         return typed(group, chosen, overrides or {})

@@ -25,16 +25,16 @@ from ganlane.files import split_at_markers, write_between_markers
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
-#: Folders below it with results of ``benchmarks.roads``, ``ganlane reproduce`` on the traffics that are not the
-#: project's own, and ``benchmarks.ablations``.
-FURTHER = ("roads", "elsewhere", "ablations")
+#: Folders below it with results of ``ganlane reproduce`` with the control trainings and with agent_general's trainings
+#: over more episodes, ``benchmarks.roads``, ``ganlane reproduce`` on the traffics that are not the project's own, and
+#: ``benchmarks.ablations``.
+FURTHER = ("controls", "general", "roads", "elsewhere", "ablations")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
     "agent_general+safe": ("agent_general", frozenset({"idm", "idm_mobil", "idm_random", "gan"})),
     "agent_idm+none": ("Agent_IDM", frozenset({"idm_mobil"})),
     "agent_gan+none": ("Agent_GAN", frozenset({"idm_mobil", "gan"})),
     "agent_idm_long+none": ("Agent_IDM, 3 M longer", frozenset({"idm_mobil"})),
-    "agent_gan_only+none": ("`gan` alone, 13 M", frozenset({"gan"})),
     "agent_idm+safe": ("Agent_IDM behind `safe`", frozenset({"idm_mobil"})),
     "agent_gan+safe": ("Agent_GAN behind `safe`", frozenset({"idm_mobil", "gan"})),
     "mobil_egoistic": ("egoistic MOBIL", frozenset()),
@@ -49,15 +49,28 @@ CLAIMS = (
     ("agent_gan+safe", "agent_idm+safe", "the same, both behind `safe`"),
     ("agent_idm_long+none", "agent_idm+none", "Agent_IDM 3 M longer over Agent_IDM"),
     ("agent_gan+none", "agent_idm_long+none", "Agent_GAN over Agent_IDM 3 M longer"),
-    ("agent_gan+none", "agent_gan_only+none", "Agent_GAN over 13 M on `gan` alone"),
     ("agent_general+safe", "agent_idm+safe", "agent_general over Agent_IDM behind `safe`"),
     ("agent_general+safe", "agent_gan+safe", "agent_general over Agent_GAN behind `safe`"),
+)
+#: Control trainings: name in a document, and the traffics that they were trained on.
+CONTROLS: Mapping[str, tuple[str, frozenset[str]]] = {
+    "agent_gan_only+none": ("`gan` alone, 13 M", frozenset({"gan"})),
+    "agent_idm_table3+none": ("Agent_IDM with Table III", frozenset({"idm_mobil"})),
+    "agent_gan_table3+none": ("Agent_GAN with Table III", frozenset({"idm_mobil", "gan"})),
+}
+#: Differences between these and the paper's agents, as :data:`CLAIMS`.
+CONTROL_CLAIMS = (
+    ("agent_gan+none", "agent_gan_only+none", "Agent_GAN over `gan` alone"),
+    ("agent_idm_table3+none", "agent_idm+none", "Agent_IDM with Table III over Agent_IDM"),
+    ("agent_gan_table3+none", "agent_gan+none", "Agent_GAN with Table III over Agent_GAN"),
+    ("agent_gan_table3+none", "agent_idm_table3+none", "Agent_GAN over Agent_IDM, both with Table III"),
 )
 #: Sections whose figures are looked up: document, and the heading of the section (None: all of it).
 CHECKED = (
     ("README.md", "## Results"),
     ("docs/results.md", "## The matrix"),
     ("docs/results.md", "## The paper's claims"),
+    ("docs/results.md", "## Controls"),
     ("docs/results.md", "## Other roads"),
     ("docs/results.md", "## Recordings, other simulators, individual drivers"),
     ("docs/search.md", "## What each part is worth"),
@@ -132,26 +145,48 @@ def failures(results: Results) -> str:
     return Table("", headings, lines).markdown(heading=False)
 
 
-def claims(results: Results) -> str:
-    """Pairs of :data:`CLAIMS` by traffics."""
+def _differences(results: Results, pairs: Sequence[tuple[str, str, str]]) -> list[list[str]]:
+    """Lines with the lead of one driver over another by traffics; pairs that are not in the results are left out."""
     found = {(row["driver"], row["over"], row["traffic"]): row for row in results["comparisons"]}
-    traffics = _traffics(results)
     lines = []
-    for first, second, name in CLAIMS:
-        rows = [found[first, second, traffic] for traffic in traffics if (first, second, traffic) in found]
+    for first, second, name in pairs:
+        rows = [found[first, second, each] for each in _traffics(results) if (first, second, each) in found]
         if rows:
             lines.append([name, *(_with_interval(row["lead"], row["lead_ci"]) for row in rows)])
-    return Table("", ["lead", *(f"`{traffic}`" for traffic in traffics)], lines).markdown(heading=False)
+    return lines
+
+
+def claims(results: Results) -> str:
+    """Pairs of :data:`CLAIMS` by traffics."""
+    headings = ["lead", *(f"`{traffic}`" for traffic in _traffics(results))]
+    return Table("", headings, _differences(results, CLAIMS)).markdown(heading=False)
+
+
+def controls(results: Results) -> str:
+    """Control trainings by traffics: lead over MOBIL and failures, then their differences from the paper's agents."""
+    own = results["controls"]
+    traffics = _traffics(own)
+    lines = []
+    for driver in _drivers(own, list(CONTROLS)):
+        name, trained = CONTROLS[driver]
+        rows = [_at(own, driver, traffic) for traffic in traffics]
+        lines.append([name, *(f"{_lead(row, trained)}; {row['hard_crash']}, {row['out_of_road']}" for row in rows)])
+    headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
+    return Table("", headings, lines + _differences(own, CONTROL_CLAIMS)).markdown(heading=False)
 
 
 def trainings(results: Results) -> str:
-    """agent_general training by training: lead over MOBIL, and failures."""
-    traffics = _traffics(results)
+    """agent_general training by training, then all of them: lead over MOBIL, and failures."""
+    own = results["general"]
+    traffics = _traffics(own)
+    together = [_at(own, "agent_general+safe", traffic) for traffic in traffics]
     lines = []
-    for place, each in enumerate(_at(results, "agent_general+safe", traffics[0])["each"]):
-        rows = [_at(results, "agent_general+safe", traffic)["each"][place] for traffic in traffics]
-        cells = map(_lead_and_failures, rows)
+    for place, each in enumerate(together[0]["each"]):
+        cells = [_lead_and_failures(row["each"][place]) for row in together]
         lines.append([f"`{each['driver'].removesuffix('+safe')}`", *cells])
+    lines.append(["together", *map(_lead_and_failures, together)])
+    mobil = [_mean_and_failures(_at(own, "mobil", traffic)) for traffic in traffics]
+    lines.append(["MOBIL (its mean reward)", *mobil])
     headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
     return Table("", headings, lines).markdown(heading=False)
 
@@ -220,6 +255,7 @@ SECTIONS: Mapping[tuple[str, str], Callable[[Results], str]] = {
     ("docs/results.md", "leads"): leads,
     ("docs/results.md", "failures"): failures,
     ("docs/results.md", "claims"): claims,
+    ("docs/results.md", "controls"): controls,
     ("docs/results.md", "roads"): roads,
     ("docs/results.md", "elsewhere"): elsewhere,
     ("docs/search.md", "ablations"): ablations,

@@ -1,7 +1,7 @@
 """The drivers of the matrix on other roads: fewer and more vehicles, fewer and more lanes than in their training.
 
-    python -m benchmarks.roads                                  # ten minutes on one core; docs/reproduce/roads
-    python -m benchmarks.roads traffics=[idm_mobil,gan] episodes=100 --out outputs/roads        # hours
+    python -m benchmarks.roads                                  # ten minutes on one core
+    python -m benchmarks.roads 'traffics=[idm_mobil,gan]' 'fewer={gan:300}' env.compile=true        # 100 minutes
 
 What is given besides ``--out`` are options of ``ganlane reproduce``. Vehicles stand at Table II's density, so that
 more of them fill a longer road (``env=dense``); with other lanes there are nine of them on 200 m, as in the paper.

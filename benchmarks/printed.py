@@ -25,7 +25,7 @@ from ganlane.files import split_at_markers, write_between_markers
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
-#: Folders below it with further results: ``ganlane reproduce`` with the control trainings, with agent_general over more
+#: Folders below it with further results: ``ganlane reproduce`` with the control trainings, agent_general over more
 #: episodes and on traffics that are not the project's own; ``benchmarks.roads`` and ``benchmarks.ablations``.
 FURTHER = ("controls", "general", "roads", "elsewhere", "ablations")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.

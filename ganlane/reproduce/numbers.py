@@ -35,6 +35,12 @@ def recipe_of(driver: str) -> str:
     return driver if packed is None else packed[1] + (packed[2] or "")
 
 
+def seed_of(driver: str) -> int:
+    """3 of ``agent_idm@3+safe``; 0 where no seed is named: ``agent_idm`` is ``agent_idm@0``."""
+    named = re.search(r"@(\d+)(?:\+|$)", driver)
+    return int(named[1]) if named else 0
+
+
 def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.DataFrame]]:
     """The episodes of the matrix by recipe and traffic, in the order in which they first appear."""
     cells: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
@@ -42,7 +48,7 @@ def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.Data
         recipe = recipe_of(str(driver))
         there = cells.setdefault((recipe, str(traffic)), {})
         there[str(driver)] = frame.sort("episode")
-        if len({name.rpartition("@")[2] for name in there}) < len(there):
+        if len({seed_of(name) for name in there}) < len(there):
             raise UserError(f"agents: two of one seed are called {recipe} ({', '.join(there)}); leave one out.")
     return cells
 
@@ -114,8 +120,8 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
     Returns:
         Per pair and traffic ``driver, over, traffic, lead`` (difference of mean rewards), ``probability`` (that a
         training of the first is above one of the second), ``crash_difference_per_1000_episodes``, and ``mcnemar``:
-        for each training of the first and its namesake of the second (same seed, or the only one) the episodes in
-        which one alone crashed, and the exact probability.
+        for each training of the first that has a namesake of the second (same seed, or the only one) the episodes
+        in which one alone crashed, and the exact probability.
     """
     found = []
     traffics = dict.fromkeys(traffic for _, traffic in cells)
@@ -128,14 +134,25 @@ def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
             hit, struck = (column(each, _ended(FAILURES[:1])) for each in (first, second))
             row: Row = {"driver": one, "over": other, "traffic": traffic}
             row |= entries("lead", difference(a, b)) | entries("probability", _probability(a, b))
-            row |= entries("crash_difference_per_1000_episodes", difference(hit, struck).scaled(1000.0))
-            matched = zip(first, range(len(first))) if len(second) in (1, len(first)) else []
+            row |= entries("crash_difference_per_1000_episodes", _crash_difference(hit, struck).scaled(1000.0))
+            theirs = {seed_of(name): crashed > 0 for name, crashed in zip(second, struck)}
+            if len(theirs) == 1:
+                theirs = dict.fromkeys(map(seed_of, first), struck[0] > 0)
             row["mcnemar"] = [
-                {"driver": name, **vars(mcnemar(hit[i] > 0, struck[i if len(second) > 1 else 0] > 0))}
-                for name, i in matched
+                {"driver": name, **vars(mcnemar(crashed > 0, theirs[seed_of(name)]))}
+                for name, crashed in zip(first, hit)
+                if seed_of(name) in theirs
             ]
             found.append(row)
     return found
+
+
+def _crash_difference(first: Array, second: Array) -> Estimate:
+    """Difference of the shares of episodes with a crash. Where there is none, resampling would leave no doubt."""
+    if first.any() or second.any():
+        return difference(first, second)
+    most = clopper_pearson(0, first.shape[1]).high or 0.0
+    return Estimate(0.0, -most, most)
 
 
 def _probability(first: Array, second: Array) -> Estimate | None:

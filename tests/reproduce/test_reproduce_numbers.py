@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import polars as pl
 import pytest
+from scipy import stats
 
 from ganlane.errors import UserError
 from ganlane.reproduce.numbers import by_recipe, comparisons, recipe_of, rows
@@ -64,7 +66,9 @@ def test_a_row_holds_the_trainings_together_and_each_alone(matrix):
     assert (row["trainings"], row["episodes"]) == (2, 4)
     assert row["mean_reward"] == pytest.approx(130.25)
     assert row["minus_mobil"] == pytest.approx(30.0)
-    assert row["minus_mobil_ci"] == pytest.approx([20.0, 40.0])  # a recipe: both trainings, or one of them twice
+    # Two trainings that lead by 20 and 40: resampled, one of them twice at the most, as wide as two tell of others.
+    width = 10.0 * np.sqrt(2 / 1) * stats.t.ppf(0.975, 1) / stats.norm.ppf(0.975)
+    assert row["minus_mobil_ci"] == pytest.approx([30.0 - width, 30.0 + width])
     assert row["probability_above_mobil"] == 1.0
     assert row["normalized_percent"] == pytest.approx(130.0)
     assert [each["mean_reward"] for each in row["each"]] == pytest.approx([120.25, 140.25])
@@ -98,7 +102,23 @@ def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):
     assert (second["only_first"], second["only_second"]) == (0, 1)
 
 
-def test_two_agents_of_one_name_and_seed_are_not_mixed():
-    both = pl.concat([driven("agent_idm@1", [0, 0]), driven("mine/agent_idm.safetensors@1", [0, 0])])
+def test_trainings_are_matched_by_their_seed():
+    crash, goal = ["hard_crash", "goal"], ["goal", "goal"]
+    ours = [driven(f"agent_gan@{seed}", [0, 0], ends) for seed, ends in ((0, goal), (1, crash), (4, goal))]
+    theirs = [driven(f"agent_idm@{seed}", [0, 0], ends) for seed, ends in ((2, goal), (1, crash))]
+    (row,) = comparisons(by_recipe(pl.concat([*ours, *theirs])), [("agent_gan", "agent_idm")])
+    assert row["mcnemar"] == [{"driver": "agent_gan@1", "only_first": 0, "only_second": 0, "p_value": 1.0}]
+
+
+def test_two_drivers_that_never_crashed_may_still_differ():
+    both = by_recipe(pl.concat([driven("mobil", [0] * 50), driven("keep_lane", [0] * 50)]))
+    (row,) = comparisons(both, [("mobil", "keep_lane")])
+    most = 1000 * (1 - 0.025 ** (1 / 50))  # the exact bound of 0 in 50
+    assert row["crash_difference_per_1000_episodes_ci"] == pytest.approx([-most, most])
+
+
+@pytest.mark.parametrize("other", ["mine/agent_idm.safetensors@0", "agent_idm"])
+def test_two_agents_of_one_name_and_seed_are_not_mixed(other):
+    both = pl.concat([driven("agent_idm@0", [0, 0]), driven(other, [0, 0])])
     with pytest.raises(UserError, match="two of one seed are called agent_idm"):
         by_recipe(both)

@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -159,7 +160,8 @@ class Variant:
     @property
     def slug(self) -> str:
         """Its name in a file's."""
-        return re.sub(r"[^a-z0-9]+", "_", f"{self.preset} {self.name}".lower()).strip("_")
+        weights = Path(self.options.get("path", "")).stem
+        return re.sub(r"[^a-z0-9]+", "_", f"{self.preset} {self.name} {weights}".lower()).strip("_")
 
 
 def gan_variants() -> list[Variant]:
@@ -204,5 +206,9 @@ def fitted_variant(label_and_file: str) -> Variant:
     label, _, file = label_and_file.partition("=")
     if not label or not file:
         raise UserError(f"--fitted {label_and_file}: expected LABEL=FILE, a name and the weights of a generator.")
-    preset = {"paper": "gan", "calibrated": "gan_calibrated"}[load_generator(file)[1]["preset"]]
-    return Variant(preset, label, {"path": file})
+    return Variant(preset_of(file), label, {"path": file})
+
+
+def preset_of(weights: str | Path) -> str:
+    """The traffic whose generator these are the weights of: gan or gan_calibrated."""
+    return {"paper": "gan", "calibrated": "gan_calibrated"}[load_generator(weights)[1]["preset"]]

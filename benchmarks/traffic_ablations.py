@@ -1,11 +1,13 @@
 """What does each option of the generated traffics do? The closed loop, driven with one of them changed at a time.
 
     python -m benchmarks.traffic_ablations
-    python -m benchmarks.traffic_ablations --report docs/traffic.md
+    python -m benchmarks.traffic_ablations --fits docs/reproduce/generators/*.safetensors --report docs/traffic.md
 
 Vehicles start as the simulator's episodes do (Table II), without an ego, and drive ``--seconds`` an episode until a
-variant has its vehicle-km. The weights are those that ship; ``--fitted LABEL=FILE`` adds others. Every variant's
-numbers stand in a file of their own in ``--folder``, so a run that was stopped goes on where it stood.
+variant has its vehicle-km. Every variant drives with the weights that ship and with each of ``--fits``, the same
+recipe fitted with other seeds; a cell then holds the mean, lowest and highest of the fits, a count their sum.
+``--fitted LABEL=FILE`` adds other weights as rows of their own. The numbers of every variant and fit are kept in a
+file in ``--folder``, so a run that was stopped goes on where it was.
 
 Two variants are no option of the package: the generator in bfloat16, and plans of several steps for the calibrated
 traffic (:mod:`benchmarks.ablation_variants`).
@@ -19,7 +21,8 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from statistics import median
@@ -27,7 +30,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.ablation_variants import Variant, calibrated_variants, fitted_variant, gan_variants
+from benchmarks.ablation_variants import Variant, calibrated_variants, fitted_variant, gan_variants, preset_of
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table
@@ -42,12 +45,12 @@ HEADINGS = (
     "variant",
     "vehicle-km",
     "lane changes per vehicle-km",
-    "overlaps per 1000 vehicle-km [95 %]",
+    "overlaps per 1000 vehicle-km",
     "off road",
     "mean speed, m/s",
     "spread, m/s",
     "acceleration 5 %, 95 %, m/s²",
-    "the guard's share",
+    "the guard's share, %",
     "physics steps/CPU-s",
 )
 
@@ -92,34 +95,60 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     }
 
 
-def cells(numbers: dict[str, Any]) -> list[str]:
-    """A row of the table behind its name."""
-    changes, overlaps = numbers["lane_changes_per_vehicle_km"], numbers["overlaps_per_1000_vehicle_km"]
-    low, high = numbers["overlaps_per_1000_vehicle_km_ci"] or (0.0, math.inf)
-    slow, fast = numbers["acceleration_quantiles"].values()
-    share = numbers["guard_share"]
+def cells(fits: Sequence[dict[str, Any]]) -> list[str]:
+    """A row of the table behind its name, of one fit or several."""
     return [
-        f"{numbers['vehicle_km']:.0f}",
-        "-" if changes is None else f"{changes:.2f}",
-        "-" if overlaps is None else f"{overlaps:.1f} [{low:.1f}, {high:.1f}]",
-        str(numbers["off_road"]),
-        f"{numbers['mean_speed_mps']:.1f}",
-        f"{numbers['spread_mps']:.2f}",
-        f"{slow:.2f}, {fast:.2f}",
-        "-" if share is None else f"{100 * share:.1f} %",
-        f"{numbers['physics_steps_per_cpu_s'] / 1000:.1f} k",
+        f"{sum(each['vehicle_km'] for each in fits):.0f}",
+        _over_fits(fits, lambda each: each["lane_changes_per_vehicle_km"], 2),
+        _over_fits(fits, lambda each: each["overlaps_per_1000_vehicle_km"], 1, "overlaps_per_1000_vehicle_km_ci"),
+        str(sum(each["off_road"] for each in fits)),
+        _over_fits(fits, lambda each: each["mean_speed_mps"], 1),
+        _over_fits(fits, lambda each: each["spread_mps"], 2),
+        ", ".join(f"{sum(levels) / len(fits):.2f}" for levels in zip(*(_quantiles(each) for each in fits))),
+        _over_fits(fits, lambda each: None if each["guard_share"] is None else 100.0 * each["guard_share"], 1),
+        f"{sum(each['physics_steps_per_cpu_s'] for each in fits) / len(fits) / 1000:.1f} k",
     ]
 
 
-def table(rows: Sequence[tuple[Variant, dict[str, Any]]]) -> str:
+def _quantiles(numbers: dict[str, Any]) -> tuple[float, ...]:
+    return tuple(numbers["acceleration_quantiles"].values())
+
+
+def _over_fits(
+    fits: Sequence[dict[str, Any]], value: Callable[[dict[str, Any]], float | None], digits: int, interval: str = ""
+) -> str:
+    """Mean, lowest and highest of several fits; the value of a single one, with its ``interval`` if it has one."""
+    values = [found for each in fits if (found := value(each)) is not None]
+    if not values:
+        return "-"
+    mean = f"{sum(values) / len(values):.{digits}f}"
+    if len(fits) > 1:
+        low, high = min(values), max(values)
+    elif interval:
+        low, high = fits[0][interval] or (0.0, math.inf)
+    else:
+        return mean
+    return f"{mean} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def table(rows: Sequence[tuple[Variant, Sequence[dict[str, Any]]]]) -> str:
     """Markdown: the variants of each preset under its name."""
-    lines = [[f"`{variant.preset}`, {variant.name}", *cells(numbers)] for variant, numbers in rows]
+    lines = [[f"`{variant.preset}`, {variant.name}", *cells(fits)] for variant, fits in rows]
     return Table("", HEADINGS, lines).markdown(heading=False)
 
 
 def settings(options: argparse.Namespace) -> dict[str, Any]:
     """What a variant's numbers depend on."""
     return {name: getattr(options, name) for name in ("vehicle_km", "vehicles", "batch", "seconds", "seed")}
+
+
+def with_each_fit(variant: Variant, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The numbers of a variant with the weights that ship, then with those of ``--fits`` for its preset."""
+    if "path" in variant.options:
+        return [driven(variant, options)]
+    others = [file for file in options.fits if preset_of(file) == variant.preset]
+    fits = [variant, *(replace(variant, options={**variant.options, "path": str(file)}) for file in others)]
+    return [driven(each, options) for each in fits]
 
 
 def driven(variant: Variant, options: argparse.Namespace) -> dict[str, Any]:
@@ -133,7 +162,7 @@ def driven(variant: Variant, options: argparse.Namespace) -> dict[str, Any]:
     asked = LongRunParameters(options.vehicles, options.vehicle_km, options.seconds, options.seed, variant.spawn)
     numbers = drive(variant, asked, options.batch)
     write_json(path, {"settings": wanted, "numbers": numbers})
-    line = f"{variant.preset}, {variant.name}: {numbers['vehicle_km']:.0f} vehicle-km"
+    line = f"{variant.slug}: {numbers['vehicle_km']:.0f} vehicle-km"
     print(f"{line} in {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
     return numbers
 
@@ -148,9 +177,16 @@ def section(options: argparse.Namespace, text: str) -> str:
         [
             f"\nWritten by the command on {date.today()}:\n\n    {command}\n",
             f"Taken on: {machine_sentence([torch.get_num_threads()])} {options.vehicles} vehicles without an ego, "
-            f"{options.batch} episodes side by side, {options.seconds:g} s each.\n\n{text}\n",
+            f"{options.batch} episodes side by side, {options.seconds:g} s each. {_meaning(options)}\n\n{text}\n",
         ]
     )
+
+
+def _meaning(options: argparse.Namespace) -> str:
+    """What the brackets hold."""
+    if options.fits:
+        return "Brackets: lowest and highest of the fits; vehicle-km and off-road events are their sums."
+    return "Brackets: exact 95 % interval."
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -161,6 +197,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--batch", type=int, default=128, help="episodes side by side")
     parser.add_argument("--seconds", type=float, default=20.0, help="of an episode")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fits", nargs="*", default=[], type=Path, help="weights fitted with other seeds")
     parser.add_argument("--fitted", action="append", default=[], metavar="LABEL=FILE", help="further weights")
     parser.add_argument("--only", nargs="*", help="variants whose name holds one of these words")
     parser.add_argument("--folder", type=Path, default=Path("outputs/traffic_ablations"))
@@ -177,7 +214,7 @@ def measure(options: argparse.Namespace) -> str:
     chosen = [*gan_variants(), *calibrated_variants(), *map(fitted_variant, options.fitted)]
     if options.only:
         chosen = [each for each in chosen if any(word in f"{each.preset} {each.name}" for word in options.only)]
-    text = table([(variant, driven(variant, options)) for variant in chosen])
+    text = table([(variant, with_each_fit(variant, options)) for variant in chosen])
     document.write(section(options, text))
     return text
 

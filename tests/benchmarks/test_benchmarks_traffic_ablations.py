@@ -1,6 +1,7 @@
 """The table of what each option of the generated traffics does, on seconds of driving."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -64,6 +65,25 @@ def test_a_document_without_the_markers_and_weights_without_a_label_end_in_a_sen
     assert "once each" in capsys.readouterr().err
     assert run(tmp_path, "--fitted", "weights.safetensors") == 2
     assert "LABEL=FILE" in capsys.readouterr().err
+
+
+def test_several_fits_give_mean_lowest_and_highest_and_sums_of_counts(tmp_path, capsys):
+    only = ["--only", "gan_calibrated as it is"]
+    fits = [tmp_path / f"fit_{seed}.safetensors" for seed in (1, 2)]
+    for fit in fits:
+        fit.write_bytes(Path(shipped_generator("calibrated")).read_bytes())
+    assert run(tmp_path, *only, "--fits", *map(str, [*fits, shipped_generator("paper")])) == 0
+    kept = sorted((tmp_path / "kept").iterdir())
+    assert len(kept) == 3  # the shipped weights and the two of this preset
+    for path, speed, km in zip(kept, (9.0, 12.0, 18.0), (0.2, 1.0, 2.0)):
+        content = json.loads(path.read_text())
+        content["numbers"].update(mean_speed_mps=speed, vehicle_km=km, off_road=2)
+        path.write_text(json.dumps(content))
+    capsys.readouterr()
+    assert run(tmp_path, *only, "--fits", *map(str, fits)) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "as it is" in line)
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert (cells[1], cells[4], cells[5]) == ("3", "6", "13.0 [9.0, 18.0]")
 
 
 def test_every_variant_has_a_name_and_a_file_of_its_own():

@@ -20,8 +20,8 @@ from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS
 from ganlane.agents.policy import MaskedPolicy
+from ganlane.arguments import call_with, import_target, is_import_path
 from ganlane.config.env import EnvConfig
-from ganlane.config.targets import call_with, import_target, is_import_path
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError

@@ -13,11 +13,10 @@ import torch
 from safetensors.torch import save_file
 
 from ganlane.agents import read_agent
-from ganlane.checksums import PLACE, has_checksum, sealed, sealed_archive
 from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes
 from ganlane.data.scenes import write_prepared
 from ganlane.errors import UserError
-from ganlane.files import CHECKPOINTS
+from ganlane.files import CHECKPOINTS, PLACE, has_checksum, sealed, sealed_archive
 from ganlane.generator import load_generator
 from ganlane.generator.fit import FitLoop
 from ganlane.generator.windows import cached, load_arrays, save_arrays

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from ganlane.config.run import DrivingConfig, Names
+from ganlane.config.commands import DrivingConfig, Names
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError, UserError, as_typed
 from ganlane.parameters.checks import (

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from ganlane.config.app import run_command
-from ganlane.config.messages import ADVICE, is_users_matter, sentence
+from ganlane.config.command_line import sentence
+from ganlane.errors import ADVICE, is_users_matter
 from ganlane.files import write_bytes
 
 
@@ -22,7 +23,7 @@ def here(tmp_path, monkeypatch):
 def refused(capsys, task, *arguments):
     """The sentence with which ``ganlane evaluate`` ends when its task is this one; nothing new is left."""
     before = sorted(Path.cwd().rglob("*"))
-    assert run_command("evaluate", task, arguments) == 2
+    assert run_command("evaluate", arguments, task) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("ganlane evaluate: ")
@@ -65,7 +66,7 @@ def test_what_was_earned_before_the_disk_was_full_stays(here, capsys):
         write_bytes(folder / "agent.safetensors", b"trained for hours")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    assert run_command("evaluate", task, ["hydra.run.dir=run"]) == 2
+    assert run_command("evaluate", ["hydra.run.dir=run"], task) == 2
     assert capsys.readouterr().err == (
         "ganlane evaluate: a file or standard output: No space left on device; "
         "make room there, or write to another disk.\n"
@@ -93,7 +94,7 @@ def test_what_no_user_can_mend_keeps_its_traceback(here):
         raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
 
     with pytest.raises(ConnectionRefusedError):
-        run_command("evaluate", task, [])
+        run_command("evaluate", [], task)
     assert list(here.rglob("*")) == []
     assert not is_users_matter(OSError("libfile.so: undefined symbol"))
     assert not is_users_matter(ValueError(errno.ENOSPC))

@@ -14,7 +14,7 @@ import torch
 from training.test_training_loop import ToyRoad, agent, settings, train
 
 from ganlane.config.app import run_command
-from ganlane.config.folders import CONFIG, LOCK, OVERRIDES, held, unused
+from ganlane.config.runs import CONFIG, LOCK, OVERRIDES, held, unused
 from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
@@ -44,7 +44,7 @@ def toy_run(config, folder):
 
 
 def command(*arguments, task=toy_run):
-    return run_command("train", task, [*arguments, "seed=3"])
+    return run_command("train", [*arguments, "seed=3"], task)
 
 
 def left_by(folder):
@@ -134,7 +134,7 @@ def test_a_second_run_in_a_folder_is_refused_while_the_first_is_at_work(here, ca
 
 def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(here):
     script = (
-        "import time; from pathlib import Path; from ganlane.config.folders import held\n"
+        "import time; from pathlib import Path; from ganlane.config.runs import held\n"
         "from ganlane.files import atomic_path\n"
         "with held(Path('run')), atomic_path('run/checkpoints/last.pt') as part:\n"
         "    part.write_bytes(b'half'); print('at work', flush=True); time.sleep(60)"

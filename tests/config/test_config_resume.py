@@ -7,8 +7,7 @@ import os
 import pytest
 
 from ganlane.config.command_line import parse, quoted, single_runs, without_repetitions
-from ganlane.config.folders import OVERRIDES
-from ganlane.config.resume import newest_unfinished, with_resumed
+from ganlane.config.runs import OVERRIDES, newest_unfinished, with_resumed
 from ganlane.errors import UserError
 
 

@@ -1,4 +1,4 @@
-"""How a command refuses what is broken: status 2 and one sentence, without a traceback, and nothing left behind."""
+"""How commands end: refused with status 2 and one sentence, nothing left behind; or naming their results."""
 
 from __future__ import annotations
 
@@ -28,3 +28,8 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def is_one_sentence(err: str, command: str) -> bool:
     """One line that names the command and ends in a full stop; no traceback."""
     return err.startswith(f"ganlane {command}: ") and err.endswith(".\n") and err.count("\n") == 1
+
+
+def last_path(out: str) -> Path:
+    """What the last line of a command's output names."""
+    return Path(out.splitlines()[-1].partition(": ")[2])

@@ -57,21 +57,17 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
             f"{group}={chosen!r}: expected a name, a mapping of its keys (with its name as 'name') or a config "
             "dataclass; give one of these."
         )
-    kind, own = _named(group, values.pop("name", default or DEFAULTS[group]))
-    return typed(group, kind, {**own, **values, **(overrides or {})})
-
-
-def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
-    """Dataclass of an option, and its values that differ from the defaults."""
+    name = values.pop("name", default or DEFAULTS[group])
     if group == "traffic" and inspect.isclass(name):
-        return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
+        name = f"{name.__module__}.{name.__qualname__}"
     if group == "traffic" and isinstance(name, str) and "." in name:
-        return TrafficConfig, {"_target_": name}
-    known = options_of(group)
-    if name not in known:
+        kind, own = TrafficConfig, {"_target_": name}
+    elif name in (known := options_of(group)):
+        kind, own = option_of(group, name)
+    else:
         hint = did_you_mean(str(name), known)
         raise UserError(f"{group}={name}: no such option{hint}; choose one of {', '.join(known)}.")
-    return option_of(group, name)
+    return typed(group, kind, {**own, **values, **(overrides or {})})
 
 
 def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:

@@ -135,8 +135,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         if of_hydra(override):
             _refuse_hydras(override)
         else:
-            _refuse_new_keys(override)
-            _refuse_no_option(override)
+            _refuse_own(override)
     return parsed
 
 
@@ -171,28 +170,23 @@ def leaves(value: object) -> Iterator[str]:
         yield str(value)
 
 
-def _refuse_no_option(override: Override) -> None:
-    """Refuse a value of a group that is not the name of one option, such as a path to a file elsewhere."""
-    group = override.key_or_group
-    chosen = override.is_sweep_override() or isinstance(override.value(), str)
-    chosen = chosen and re.search(r"[/\\]|\.\.", str(override.input_line).partition("=")[2]) is None
-    if not chosen and (conf_folder() / group).is_dir():
-        names = ", ".join(options_of(group))
-        raise UserError(f"{override.input_line}: expected the name of one option; choose one of {names}.")
+def _refuse_own(override: Override) -> None:
+    """Refuse what bypasses the schemas.
 
-
-def _refuse_new_keys(override: Override) -> None:
-    """Refuse ``+key``, ``++key`` and ``~key``, which bypass the schema, but for the free parameters of a target."""
-    key = override.key_or_group
-    if override.type == OverrideType.CHANGE:
-        return
+    That is ``+key``, ``++key`` and ``~key``, but for the free parameters of a target, and a value of a group that is
+    not the name of one option, such as a path to a file elsewhere.
+    """
+    key, line = override.key_or_group, str(override.input_line)
     if override.is_delete():
-        raise UserError(f"{override.input_line}: keys cannot be deleted; give {key}=null or leave it as it is.")
-    if ".parameters." not in key:
+        raise UserError(f"{line}: keys cannot be deleted; give {key}=null or leave it as it is.")
+    if override.type != OverrideType.CHANGE and ".parameters." not in key:
         raise UserError(
-            f"{override.input_line}: keys cannot be added; write {key}=... without + if it exists "
+            f"{line}: keys cannot be added; write {key}=... without + if it exists "
             "(+ is for traffic.parameters.NAME alone)."
         )
+    named = override.is_sweep_override() or isinstance(override.value(), str)
+    if (conf_folder() / key).is_dir() and (not named or re.search(r"[/\\]|\.\.", line.partition("=")[2])):
+        raise UserError(f"{line}: expected the name of one option; choose one of {', '.join(options_of(key))}.")
 
 
 def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:

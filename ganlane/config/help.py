@@ -8,7 +8,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from typing import Any
 
@@ -89,8 +89,10 @@ def key_lines(
     for field in fields(kind):
         if field.name in without or field.metadata == NO_KEY:
             continue
-        value = values[field.name] if field.name in values else _default(field)
-        key, meaning = f"{' ' * indent}{field.name}:", _meaning(kind, field.name)
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        value, key = values.get(field.name, default), f"{' ' * indent}{field.name}:"
+        # The first sentence on it in the docstring of its class or of a base class.
+        meaning = next((found for base in kind.__mro__ if (found := _attributes(base).get(field.name))), "")
         if is_dataclass(value):
             yield from _lines(key, meaning)
             own = {known.name: getattr(value, known.name) for known in fields(value)}
@@ -104,15 +106,6 @@ def _lines(key: str, meaning: str) -> Iterator[str]:
     first, *rest = textwrap.wrap(meaning, _END - _COLUMN - 2) or [""]
     yield f"{key:<{_COLUMN - 1}} # {first}" if first else key
     yield from (f"{'':<{_COLUMN}}# {line}" for line in rest)
-
-
-def _default(field: Field[Any]) -> Any:
-    return field.default if field.default_factory is MISSING else field.default_factory()
-
-
-def _meaning(kind: Any, name: str) -> str:
-    """The first sentence on a field in the docstring of its class or of a base class."""
-    return next((found for base in kind.__mro__ if (found := _attributes(base).get(name))), "")
 
 
 @cache

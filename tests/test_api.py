@@ -27,9 +27,7 @@ from ganlane.traffic import IdmTraffic
 LONG = re.compile(r"ganlane\.api\.(train|run)\(")
 
 
-@pytest.fixture(autouse=True)
-def _in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 def test_every_name_at_the_top_is_there():

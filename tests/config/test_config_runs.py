@@ -25,9 +25,8 @@ COLUMNS = ("decisions", "updates", "mean_return", "loss", "crash_rate")
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def here(empty_folder):
+    return empty_folder
 
 
 def toy_run(config, folder):

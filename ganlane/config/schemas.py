@@ -15,29 +15,8 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from ganlane.config.commands import BenchConfig, EvaluateConfig, RecordConfig, ReproduceConfig
-from ganlane.config.env import (
-    BlockedLaneEnvConfig,
-    CutInEnvConfig,
-    DenseEnvConfig,
-    EnvConfig,
-    FileSceneEnvConfig,
-    StalledCarEnvConfig,
-    StopAndGoEnvConfig,
-)
-from ganlane.config.recordings import PrepareConfig, RealismConfig, TrainGeneratorConfig
-from ganlane.config.render import RenderConfig
+from ganlane.config import commands, env, recordings, render, train
 from ganlane.config.traffic import TRAFFICS
-from ganlane.config.train import (
-    CollectorConfig,
-    InitConfig,
-    LoggerConfig,
-    MultiCollectorConfig,
-    NoInitConfig,
-    OverlapCollectorConfig,
-    RayCollectorConfig,
-    TrainConfig,
-)
 from ganlane.errors import ParameterError
 from ganlane.files import conf_folder
 from ganlane.parameters.agent import RainbowConfig
@@ -49,40 +28,40 @@ from ganlane.parameters.observation import MaskParameters, ObservationConfig, Re
 #: Group (empty at the root) to schema name to dataclass.
 SCHEMAS: dict[str, dict[str, Any]] = {
     "": {
-        "train": TrainConfig,
-        "evaluate": EvaluateConfig,
-        "render": RenderConfig,
-        "record": RecordConfig,
-        "bench": BenchConfig,
-        "prepare": PrepareConfig,
-        "train_generator": TrainGeneratorConfig,
-        "realism": RealismConfig,
-        "reproduce": ReproduceConfig,
+        "train": train.TrainConfig,
+        "evaluate": commands.EvaluateConfig,
+        "render": render.RenderConfig,
+        "record": commands.RecordConfig,
+        "bench": commands.BenchConfig,
+        "prepare": recordings.PrepareConfig,
+        "train_generator": recordings.TrainGeneratorConfig,
+        "realism": recordings.RealismConfig,
+        "reproduce": commands.ReproduceConfig,
     },
     "env": {
-        "highway": EnvConfig,
-        "dense": DenseEnvConfig,
-        "cut_in": CutInEnvConfig,
-        "stalled_car": StalledCarEnvConfig,
-        "stop_and_go": StopAndGoEnvConfig,
-        "blocked_lane": BlockedLaneEnvConfig,
-        "scene": FileSceneEnvConfig,
+        "highway": env.EnvConfig,
+        "dense": env.DenseEnvConfig,
+        "cut_in": env.CutInEnvConfig,
+        "stalled_car": env.StalledCarEnvConfig,
+        "stop_and_go": env.StopAndGoEnvConfig,
+        "blocked_lane": env.BlockedLaneEnvConfig,
+        "scene": env.FileSceneEnvConfig,
     },
     "traffic": TRAFFICS,
-    "init": {"none": NoInitConfig, "idm_ckpt": InitConfig},
+    "init": {"none": train.NoInitConfig, "idm_ckpt": train.InitConfig},
     "agent": {"rainbow": RainbowConfig},
     "observation": {"observation": ObservationConfig},
     "mask": {"mask": MaskParameters},
     "reward": {"paper": RewardParameters},
     "collector": {
-        "single": CollectorConfig,
-        "overlap": OverlapCollectorConfig,
-        "multi": MultiCollectorConfig,
-        "ray": RayCollectorConfig,
+        "single": train.CollectorConfig,
+        "overlap": train.OverlapCollectorConfig,
+        "multi": train.MultiCollectorConfig,
+        "ray": train.RayCollectorConfig,
     },
     "data": {"scenes": DataConfig, "ngsim": NgsimDataConfig, "highd": HighdDataConfig},
     "generator": {"paper": PaperConfig, "calibrated": CalibratedConfig},
-    "logger": {"logger": LoggerConfig},
+    "logger": {"logger": train.LoggerConfig},
 }
 SUFFIX = "_schema"
 #: OmegaConf's names of types, in words.

@@ -154,4 +154,4 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(line, empty_folder, capsys
     (empty_folder / "unmarked.md").write_text("nothing")
     command, *arguments = line.split()
     tiny = [*entry_tiny.TINY, "evaluation.agents=[random_legal]"] if command == "train" else []
-    assert MISTAKES[line] in refusal(capsys, command, *tiny, *arguments)
+    assert MISTAKES[line] in refusal(capsys, command, *tiny, *arguments, printed=command == "render")

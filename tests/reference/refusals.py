@@ -14,12 +14,16 @@ def everything_below(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.stat().st_size for path in folder.rglob("*")}
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The sentence with which a command line is refused, after all that it must not do was looked for."""
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str, printed: bool = False) -> str:
+    """The sentence with which a command line is refused, after all that it must not do was looked for.
+
+    Nothing is on stdout, unless something may have been ``printed`` before.
+    """
     before = everything_below(Path.cwd())
     status = main(arguments)
     out, err = capsys.readouterr()
     assert status == 2, (arguments, out, err)
+    assert out == "" or printed
     assert is_one_sentence(err, arguments[0]), err
     assert everything_below(Path.cwd()) == before
     return err

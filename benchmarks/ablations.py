@@ -26,7 +26,7 @@ from benchmarks.pack_seeds import AGENT_FILE, collect
 from benchmarks.script import make_parser, run_script
 from ganlane.agents.checkpoint import save_agents
 from ganlane.config.command_line import check
-from ganlane.config.evaluate import ReproduceConfig
+from ganlane.config.commands import ReproduceConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
 from ganlane.reproduce import numbers

@@ -20,7 +20,7 @@ from typing import Any
 
 from benchmarks.script import make_parser, run_script
 from ganlane.config.command_line import check
-from ganlane.config.evaluate import ReproduceConfig
+from ganlane.config.commands import ReproduceConfig
 from ganlane.evaluation import write_results
 from ganlane.reproduce import numbers
 from ganlane.reproduce.matrix import available, cells_of, drive, read_cells

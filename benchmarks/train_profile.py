@@ -30,7 +30,7 @@ from ganlane.agents import Rainbow, rainbow
 from ganlane.bench.measure import EAGER, Case, Runner, take_turns, torch_threads
 from ganlane.bench.systems import Scenario
 from ganlane.bench.train import Training, TrainSuite, advance, filled_run, make_agent, repeat, with_gradients
-from ganlane.config.bench import BenchConfig
+from ganlane.config.commands import BenchConfig
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, count, percent
 from ganlane.training.checkpoint import TrainingState

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import os
+import re
 import sys
 from collections.abc import Sequence
 
 from ganlane._version import __version__
-from ganlane.runtime import open_closed_streams
+from ganlane.errors import USER_ERROR
+from ganlane.files import conf_folder
+from ganlane.runtime import open_closed_streams, status_of
 
 #: Commands with a configuration, and what they do; each is a module of the package with a ``main``.
 COMMANDS = {
@@ -23,12 +27,15 @@ COMMANDS = {
 }
 #: Commands without a configuration: they take no keys.
 PLAIN_COMMANDS = {"doctor": "check the installation; show the command for what is missing"}
+#: All commands, with and without keys.
+ALL_COMMANDS = COMMANDS | PLAIN_COMMANDS
 COMPLETION_FLAGS = ("-sc", "--shell-completion")
+SHELLS = ("bash", "zsh", "fish")
 
 
 def usage() -> str:
     """The commands in a few lines."""
-    listed = "\n".join(f"  {name:<17}{text}" for name, text in (COMMANDS | PLAIN_COMMANDS).items())
+    listed = "\n".join(f"  {name:<17}{text}" for name, text in ALL_COMMANDS.items())
     return (
         f"usage: ganlane COMMAND key=value ...\n\n{listed}\n\nganlane COMMAND --help explains its options and keys.\n"
         'eval "$(ganlane -sc install=bash)" completes commands, options and keys in this shell.'
@@ -43,20 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except OSError as error:
-        return _output_refused(error)
-
-
-def _output_refused(error: OSError) -> int:
-    """The exit status if standard output cannot be written, as in :func:`ganlane.config.app.run_command`."""
-    from ganlane.config.app import READER_LEFT, USER_ERROR, discard_broken_streams
-    from ganlane.config.messages import file_sentence, is_users_matter
-
-    if discard_broken_streams() and isinstance(error, BrokenPipeError):
-        return READER_LEFT
-    if not is_users_matter(error):
-        raise error
-    print(f"ganlane: {file_sentence(error)}", file=sys.stderr)
-    return USER_ERROR
+        return status_of(error, "ganlane")
 
 
 def dispatch(arguments: Sequence[str] | None = None) -> int:
@@ -69,14 +63,45 @@ def dispatch(arguments: Sequence[str] | None = None) -> int:
         print(__version__)
         return 0
     if set(COMPLETION_FLAGS) & {command, *rest}:
-        from ganlane.config.completion import shell_completion
-
-        return shell_completion([command, *rest], {**COMMANDS, **PLAIN_COMMANDS})
-    if command not in COMMANDS | PLAIN_COMMANDS:
-        known = ", ".join(COMMANDS | PLAIN_COMMANDS)
-        print(f"ganlane: {command}: no such command; choose one of {known}.", file=sys.stderr)
-        return 2
+        return shell_completion([command, *rest])
+    if command not in ALL_COMMANDS:
+        print(f"ganlane: {command}: no such command; choose one of {', '.join(ALL_COMMANDS)}.", file=sys.stderr)
+        return USER_ERROR
     return importlib.import_module(f"ganlane.{command}").main(rest)
+
+
+def shell_completion(arguments: Sequence[str]) -> int:
+    """``ganlane [COMMAND] -sc install=SHELL`` and the like; the exit status.
+
+    Hydra completes programs that are a single command: its shell function calls the program, ``ganlane``, without the
+    command, which is therefore read from the line and removed before Hydra completes the rest.
+    """
+    asked = next(filter(None, (re.fullmatch(r"(install|uninstall|query)=(\w+)", each) for each in arguments)), None)
+    if asked is None or asked[2] not in SHELLS:
+        print(
+            f'ganlane: {" ".join(arguments)}: expected for instance eval "$(ganlane -sc install=bash)"; shells: '
+            f"{', '.join(SHELLS)}.",
+            file=sys.stderr,
+        )
+        return USER_ERROR
+    action, shell = asked.groups()
+    if action == "query":
+        print(("\n" if shell == "fish" else " ").join(candidates(os.environ.get("COMP_LINE", ""))))
+    else:
+        importlib.import_module("ganlane.config.help").print_completion_script(action, shell)
+    return 0
+
+
+def candidates(line: str) -> list[str]:
+    """Completions of the last word of ``line``, as typed so far, the program's name included."""
+    parts = re.match(r"\s*\S+(?:\s+(\S*)(\s.*)?)?$", line)
+    command, rest = (parts[1] or "", parts[2]) if parts else ("", None)
+    if rest is None:
+        return [name for name in ALL_COMMANDS if name.startswith(command)]
+    if not (conf_folder() / f"{command}.yaml").is_file():
+        return []
+    # Imported here: completing the name of a command takes half of the time without Hydra.
+    return importlib.import_module("ganlane.config.help").completed(command, rest)
 
 
 if __name__ == "__main__":

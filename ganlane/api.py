@@ -15,9 +15,8 @@ raise :class:`ganlane.errors.UserError` with one sentence. docs/python_api.md co
 
 from __future__ import annotations
 
-import importlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from datetime import datetime
@@ -35,13 +34,11 @@ from ganlane.agents.checkpoint import with_seeds
 from ganlane.arguments import checked_arguments, whole_number
 from ganlane.build import Driver
 from ganlane.compare import compare
-from ganlane.config.app import Stopped
+from ganlane.config.app import Stopped, function_of
 from ganlane.config.command_line import ALIASES
+from ganlane.config.commands import EvaluateConfig, RunConfig
 from ganlane.config.env import check_reward
-from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.folders import CONFIG, cleared_after_mistakes, held
-from ganlane.config.resume import LAST
-from ganlane.config.run import RunConfig
+from ganlane.config.runs import CONFIG, LAST, cleared_after_mistakes, held
 from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import TrafficConfig, all_traffics
 from ganlane.errors import UserError
@@ -278,7 +275,7 @@ def render(
         _, line = _run_in(None, "render", config)
     else:
         with _torch_threads():
-            line = _function("render")(config, Path(out).parent)
+            line = function_of("render")(config, Path(out).parent)
     return Path(line.partition(": ")[2])
 
 
@@ -316,11 +313,6 @@ def run(command: str, folder: str | Path | None = None, **keys: Any) -> Run:
     return Run(home, json.loads((home / "results.json").read_text()))
 
 
-def _function(command: str) -> Callable[[Any, Path], str]:
-    """The command's function: takes its config and run folder, and returns the line that names its result."""
-    return getattr(importlib.import_module(f"ganlane.commands.{command}"), command)
-
-
 def _run_in(folder: str | Path | None, command: str, config: Any) -> tuple[Path, str]:
     """Run a command in ``folder`` (None: a new one below ``outputs/COMMAND``); the folder and its result line.
 
@@ -328,10 +320,9 @@ def _run_in(folder: str | Path | None, command: str, config: Any) -> tuple[Path,
     """
     now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
     home = Path("outputs") / command / now if folder is None else Path(folder)
-    function = _function(command)
     with cleared_after_mistakes(home), held(home), _torch_threads():
         write_bytes(home / CONFIG, OmegaConf.to_yaml(OmegaConf.structured(config)).encode())
-        return home, function(config, home)
+        return home, function_of(command)(config, home)
 
 
 @contextmanager

@@ -1,19 +1,22 @@
-"""Checks of the arguments of Python calls."""
+"""Calls with checked arguments, and calls of what an import path names; one sentence per error."""
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import operator
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from functools import cache, wraps
 from numbers import Real
 from pathlib import Path
-from types import NoneType, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import Any, Final, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from ganlane.errors import UserError
 
 F = TypeVar("F", bound=Callable)
+Made = TypeVar("Made")
 
 
 def whole_number(name: str, value: Any, low: int, high: int) -> int:
@@ -109,3 +112,90 @@ def _in_words(hint: Any) -> str:
     if kind is Sequence:
         return f"a list (each entry {_in_words(inner[0])})"
     return _NAMES.get(kind, f"a {getattr(kind, '__name__', kind)}")
+
+
+def is_import_path(name: str) -> bool:
+    """Whether ``name`` has the form ``my.module.MyTraffic``, as names of files may too."""
+    return "." in name and all(part.isidentifier() for part in name.split("."))
+
+
+def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
+    """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
+
+    Importing a module executes it: ``path`` must come from the user's command line or call, or be of this package
+    (:func:`ganlane.config.runs.refuse_stored_imports`). ``key`` is the configuration's, for error messages.
+
+    Raises:
+        UserError: it cannot be imported, or does not make a ``base``.
+    """
+    module, _, name = path.rpartition(".")
+    # A console script does not search the working folder for modules. It is added last, and only when a module is
+    # named, so that no file there replaces an installed module.
+    if "" not in sys.path:
+        sys.path.append("")
+    try:
+        target = getattr(importlib.import_module(module), name)
+    except AttributeError as error:
+        raise UserError(
+            f"{key}={path}: {module} has no {name}; give the import path of a class or function."
+        ) from error
+    except Exception as error:  # a user's module can raise anything when imported
+        raise UserError(
+            f"{key}={path}: {module or path!r} cannot be imported ({type(error).__name__}: {error}); give the import "
+            "path of a class or function, and start the command in the folder that holds its module."
+        ) from error
+    if not _makes(target, base):
+        raise UserError(
+            f"{key}={path}: expected a subclass of {base.__module__.removesuffix('.base')}.{base.__name__} or a "
+            f"function that is annotated to return one (-> {base.__name__}); derive or annotate yours."
+        )
+    return target
+
+
+def _makes(target: Any, base: type) -> bool:
+    """Whether ``target`` is a subclass of ``base``, or a function annotated to return one."""
+    if not inspect.isclass(target):
+        if not inspect.isfunction(target):
+            return False
+        returned = SimpleNamespace(__annotations__={"return": target.__annotations__.get("return")})
+        try:
+            target = get_type_hints(returned, inspect.unwrap(target).__globals__)["return"]
+        except Exception:  # an annotation may be any expression
+            return False
+    return inspect.isclass(target) and issubclass(target, base)
+
+
+def signature_of(target: Callable[..., Any]) -> inspect.Signature:
+    """The arguments of ``target``; for a class those of its ``__init__``.
+
+    For a class with an ``__init__`` Python below 3.11.4 gives those of a base's ``__new__``, which accepts anything
+    for modules of TensorDict.
+    """
+    if not inspect.isclass(target):
+        return inspect.signature(target)
+    for each in target.__mro__[:-1]:
+        for name in ("__init__", "__new__"):
+            if name in vars(each):
+                taken = inspect.signature(getattr(each, name))
+                return taken.replace(parameters=list(taken.parameters.values())[1:])
+    return inspect.Signature()
+
+
+def call_with(target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str) -> Any:
+    """Call ``target`` with all of ``own`` and those of ``offered`` that its signature names.
+
+    Raises:
+        UserError: ``target`` does not accept an argument of ``own``, or needs one that is missing.
+    """
+    signature = signature_of(target)
+    parameters = signature.parameters
+    arguments = {**{name: value for name, value in offered.items() if name in parameters}, **own}
+    try:
+        signature.bind(**arguments)
+    except TypeError as error:
+        name = f"{target.__module__}.{getattr(target, '__qualname__', target)}"
+        raise UserError(
+            f"{key}={name}: cannot be called with {', '.join(sorted(arguments)) or 'nothing'} ({error}); "
+            f"it takes {', '.join(parameters) or 'nothing'}."
+        ) from error
+    return target(**arguments)

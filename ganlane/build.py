@@ -20,8 +20,8 @@ from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
 from ganlane.agents.drivers import DRIVERS
 from ganlane.agents.policy import MaskedPolicy
+from ganlane.arguments import call_with, import_target, is_import_path
 from ganlane.config.env import EnvConfig
-from ganlane.config.targets import call_with, import_target, is_import_path
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
@@ -178,8 +178,12 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
         observation = observation_of(metadata)
         load_agent(name, observation_size(observation.form, env.vehicles), device)  # checks that the sizes fit
         return Driver(name, network, observation, mask_of(metadata))
-    if is_import_path(name):
-        return _imported(name, env, stream, device)
+    if is_import_path(name):  # a user's own policy; it reads the raw state or the observation of the command
+        target = import_target(name, "agents", TensorDictModuleBase)
+        policy = call_with(target, _constructor_arguments(env, stream), {}, "agents")
+        if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(policy, "out_keys", []):
+            raise UserError(f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys name it.")
+        return Driver(name, policy.to(device))
     known = ", ".join((*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file())))
     raise UserError(
         f"agent {name:.100}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the "
@@ -218,12 +222,3 @@ def observation_of(metadata: dict[str, Any]) -> ObservationConfig:
         raise UserError(
             f"the agent's metadata name no observation that is known here ({error}); train it again or give another."
         ) from error
-
-
-def _imported(name: str, env: EnvConfig, stream: int, device: str) -> Driver:
-    """A user's own policy; it reads the raw state or the observation of the command."""
-    target = import_target(name, "agents", TensorDictModuleBase)
-    policy = call_with(target, _constructor_arguments(env, stream), {}, "agents")
-    if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(policy, "out_keys", []):
-        raise UserError(f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys name it.")
-    return Driver(name, policy.to(device))

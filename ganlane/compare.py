@@ -1,9 +1,10 @@
-"""Compare drivers: each one on each traffic, on the same episodes."""
+"""Compare drivers: each one on each traffic, on the same episodes; the command ``ganlane evaluate``."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,21 @@ import polars as pl
 from tqdm import tqdm
 
 from ganlane import evaluation
-from ganlane.build import Driver, make_env, make_traffic
-from ganlane.config.evaluate import EvaluateConfig
+from ganlane.build import Driver, make_drivers, make_env, make_traffic
+from ganlane.config.commands import EvaluateConfig
 from ganlane.evaluation.statistics import entries
 from ganlane.evaluation.table import show
 from ganlane.sim.random import Stream
+from ganlane.torch_settings import set_threads
 from ganlane.traffic import ReplayTraffic
+
+
+def evaluate(config: EvaluateConfig, folder: Path) -> str:
+    """``ganlane evaluate``: run the episodes, print and save the table; the line that names the results."""
+    set_threads(config.threads)
+    table = compare(make_drivers(config.agents, config.env, config.device), config)
+    seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
+    return publish(table, folder, asdict(config), seeds)
 
 
 def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:

@@ -22,8 +22,8 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs import EnvBase
 
 from ganlane.build import make_driver, make_env, make_traffic
+from ganlane.config.commands import EvaluateConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.schemas import SCHEMAS, made, node_of
 from ganlane.config.traffic import TRAFFICS, TrafficConfig
 from ganlane.errors import UserError

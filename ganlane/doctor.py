@@ -26,12 +26,11 @@ from pathlib import Path
 from typing import Final
 
 from ganlane._version import __version__
-from ganlane.errors import UserError
+from ganlane.errors import USER_ERROR, UserError
 from ganlane.files import CHECKPOINTS, conf_folder
 from ganlane.runtime import check_process, find_compiler
 
 NEEDED_IS_MISSING = 1
-USER_ERROR = 2
 PYTHON: Final = (3, 10)
 #: As in ``pyproject.toml``; a test compares them.
 REQUIRED: Final = (
@@ -100,11 +99,6 @@ class Finding:
     found: str
     fix: str = ""
 
-    def lines(self) -> list[str]:
-        """The lines of the report."""
-        first = f"  {self.state.value:<8}{self.subject:<22}{self.found}"
-        return [first, f"          fix: {self.fix}"] if self.fix else [first]
-
 
 def guarded(subject: str, look: Callable[[], Finding], fix: str = _FIX_FIRST) -> Finding:
     """The result of ``look``; any error is a finding too, since a broken installation can fail in any way."""
@@ -121,7 +115,7 @@ def examine() -> dict[str, list[Finding]]:
         "software": [python(), *(guarded(text, partial(required, text)) for text in REQUIRED)],
         "machine": machine(),
         "files": [
-            guarded("configuration", _configuration, _REINSTALL),
+            guarded("configuration", lambda: Finding("configuration", State.OK, str(conf_folder())), _REINSTALL),
             *checkpoints(),
             guarded("recordings", recordings),
             guarded("cache", cache),
@@ -138,10 +132,13 @@ def missing(sections: Mapping[str, Sequence[Finding]]) -> list[str]:
 
 def report(sections: Mapping[str, Sequence[Finding]]) -> str:
     """All findings, section by section, and the conclusion as last line."""
-    blocks = [
-        "\n".join([title, *(line for finding in findings for line in finding.lines())])
-        for title, findings in sections.items()
-    ]
+    blocks = []
+    for title, findings in sections.items():
+        lines = [title]
+        for each in findings:
+            lines.append(f"  {each.state.value:<8}{each.subject:<22}{each.found}")
+            lines += [f"          fix: {each.fix}"] if each.fix else []
+        blocks.append("\n".join(lines))
     conclusion = "All that is needed is there; what is absent serves further purposes only."
     if lacking := missing(sections):
         conclusion = f"Missing: {', '.join(lacking)}; run the commands after 'fix:'."
@@ -234,11 +231,6 @@ def _compiler() -> Finding:
     return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")
 
 
-def _configuration() -> Finding:
-    """The YAML files of the commands."""
-    return Finding("configuration", State.OK, str(conf_folder()))
-
-
 def checkpoints() -> list[Finding]:
     """The weights that ship, each of them loaded."""
     names = sorted({*NEEDED_WEIGHTS, *(path.stem for path in CHECKPOINTS.glob("*.safetensors"))})
@@ -309,10 +301,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if {"-h", "--help"} & set(arguments):
         print((__doc__ or "").strip())
         return 0
-    if arguments:
-        print(f"ganlane doctor: {arguments[0]}: it takes no keys; run ganlane doctor alone.", file=sys.stderr)
-        return USER_ERROR
     try:
+        if arguments:
+            raise UserError(f"{arguments[0]}: it takes no keys; run ganlane doctor alone.")
         check_process()
     except UserError as error:
         print(f"ganlane doctor: {error}", file=sys.stderr)

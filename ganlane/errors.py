@@ -1,9 +1,35 @@
-"""Errors that a user can correct; the message is one sentence that says what to do."""
+"""Errors that a user can correct; the message is one sentence that says what to do.
+
+Errors of the file system become such sentences too: the path, what is wrong, what to do. A refused connection or a
+lost process is an OSError that no user can fix: it keeps its traceback.
+"""
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
+
+#: Exit status after a user's mistake or a failing disk.
+USER_ERROR = 2
+
+_ROOM = "make room there, or write to another disk"
+_RIGHTS = "check the permissions, or name a place where you may write"
+_PATH = "check the path"
+_LATER = "close other programs and run the command again"
+#: Advice by error number.
+ADVICE = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), _RIGHTS),
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY), _PATH),
+    **dict.fromkeys((errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.ENXIO, errno.ENODEV), _PATH),
+    **dict.fromkeys((errno.EBUSY, errno.ETXTBSY, errno.EMFILE, errno.ENFILE, errno.ENOMEM), _LATER),
+    errno.EIO: "the disk does not work as it should; check it",
+    errno.ESTALE: "the network drive is gone; mount it again",
+}
 
 
 class UserError(Exception):
@@ -46,3 +72,30 @@ def as_typed(value: Any) -> str:
         return "null" if value is None else str(value).lower()
     exact = isinstance(value, float) and float(f"{value:g}") == value  # the short form is the same number
     return f"{value:g}" if exact else str(value)
+
+
+def is_users_matter(error: BaseException) -> bool:
+    """Whether a user can fix the error: one about a path, a permission or a disk."""
+    return isinstance(error, OSError) and error.errno in ADVICE
+
+
+def file_sentence(error: OSError) -> str:
+    """The path, what is wrong, and what to do."""
+    number = error.errno or 0
+    where = error.filename2 or error.filename or "a file or standard output"
+    return f"{where}: {error.strerror or os.strerror(number)}; {ADVICE.get(number, _PATH)}."
+
+
+@contextmanager
+def numbered_refusals() -> Iterator[None]:
+    """Turn errors of the file system that a library reports as text alone into OSErrors with their number.
+
+    polars raises "No space left on device (os error 28)" in errors of several types, without number or file name.
+    """
+    try:
+        yield
+    except Exception as error:
+        code = re.search(r"\(os error (\d+)\)", str(error))
+        if code is None or getattr(error, "errno", None) is not None or isinstance(error, UserError):
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1]))) from error

@@ -10,10 +10,10 @@ Writes results.json and episodes.parquet (one row per episode) into its run fold
 import sys
 from functools import partial
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "evaluate", imported("ganlane.commands.evaluate:evaluate"))
+main = partial(run_command, "evaluate")
 
 
 if __name__ == "__main__":

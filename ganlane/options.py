@@ -11,11 +11,10 @@ from typing import Any, TypeAlias
 
 from omegaconf import DictConfig, OmegaConf
 
-from ganlane.config.messages import VALUE_ERRORS, sentence
-from ganlane.config.schemas import SCHEMAS, made, node_of, option_of, options_of
+from ganlane.config.command_line import VALUE_ERRORS, sentence
+from ganlane.config.schemas import HELP, SCHEMAS, chosen_options, made, node_of, option_of, options_of
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
-from ganlane.files import conf_folder
 from ganlane.parameters.checks import did_you_mean
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
@@ -58,21 +57,17 @@ def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = Non
             f"{group}={chosen!r}: expected a name, a mapping of its keys (with its name as 'name') or a config "
             "dataclass; give one of these."
         )
-    kind, own = _named(group, values.pop("name", default or DEFAULTS[group]))
-    return typed(group, kind, {**own, **values, **(overrides or {})})
-
-
-def _named(group: str, name: Any) -> tuple[Any, dict[str, Any]]:
-    """Dataclass of an option, and its values that differ from the defaults."""
+    name = values.pop("name", default or DEFAULTS[group])
     if group == "traffic" and inspect.isclass(name):
-        return TrafficConfig, {"_target_": f"{name.__module__}.{name.__qualname__}"}
+        name = f"{name.__module__}.{name.__qualname__}"
     if group == "traffic" and isinstance(name, str) and "." in name:
-        return TrafficConfig, {"_target_": name}
-    known = options_of(group)
-    if name not in known:
+        kind, own = TrafficConfig, {"_target_": name}
+    elif name in (known := options_of(group)):
+        kind, own = option_of(group, name)
+    else:
         hint = did_you_mean(str(name), known)
         raise UserError(f"{group}={name}: no such option{hint}; choose one of {', '.join(known)}.")
-    return option_of(group, name)
+    return typed(group, kind, {**own, **values, **(overrides or {})})
 
 
 def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
@@ -94,7 +89,7 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
         merged: Any = OmegaConf.merge(holder, {where: given} if where else given)
         return made(merged.get(where) if where else merged, where)
     except VALUE_ERRORS as error:
-        raise UserError(sentence(error).replace("; run the command with --help to see all keys", "")) from error
+        raise UserError(sentence(error).replace(f"; {HELP}", "")) from error
 
 
 def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
@@ -124,13 +119,6 @@ def _plain(value: Any) -> Any:
     return _plain(value.tolist()) if hasattr(value, "tolist") else value
 
 
-def default_options(command: str) -> dict[str, str]:
-    """Group to option that the command's YAML chooses."""
-    listed: Any = OmegaConf.to_container(OmegaConf.load(conf_folder() / f"{command}.yaml"))
-    pairs = [pair for entry in listed["defaults"] if isinstance(entry, dict) for pair in entry.items()]
-    return {group: name for group, name in pairs if name is not None and "@" not in group}
-
-
 def command_config(command: str, keys: Mapping[str, Any]) -> Any:
     """Root config of a command.
 
@@ -141,7 +129,8 @@ def command_config(command: str, keys: Mapping[str, Any]) -> Any:
     Raises:
         UserError: see :func:`option`.
     """
-    kind, defaults = SCHEMAS[""][command], default_options(command)
+    chosen = chosen_options(command).items()
+    kind, defaults = SCHEMAS[""][command], {group: name for group, name in chosen if name and "@" not in group}
     # Outside train_generator, 'generator' only feeds interpolations of the YAML files, which a call does not read.
     own = {known.name for known in fields(kind)} - ({"generator"} - set(defaults))
     of_env = {name: value for name, value in keys.items() if name not in own} if "env" in defaults else {}

@@ -12,10 +12,10 @@ Writes one Parquet file per recording, report.md, report.png and results.json.
 import sys
 from functools import partial
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "prepare", imported("ganlane.commands.prepare:prepare"))
+main = partial(run_command, "prepare")
 
 
 if __name__ == "__main__":

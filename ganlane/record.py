@@ -12,10 +12,10 @@ Observations, actions, rewards, ends and infos are those of gymnasium's ganlane/
 import sys
 from functools import partial
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "record", imported("ganlane.commands.record:record"))
+main = partial(run_command, "record")
 
 
 if __name__ == "__main__":

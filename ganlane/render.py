@@ -13,10 +13,10 @@ The episodes are those of ``ganlane evaluate`` with the same seed.
 import sys
 from functools import partial
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "render", imported("ganlane.commands.render:render"))
+main = partial(run_command, "render")
 
 
 if __name__ == "__main__":

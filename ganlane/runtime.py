@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import ctypes
 import os
+import select
 import shutil
 import sys
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
-from ganlane.errors import UserError
+from ganlane.errors import USER_ERROR, UserError, file_sentence, is_users_matter
 
+#: Exit status when the reader of the output has closed it: 128 plus the number of SIGPIPE, which Windows lacks.
+READER_LEFT = 141
 COMPILERS = ("c++", "g++", "clang++", "cl")
 #: From glibc's malloc.h.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
@@ -88,6 +91,48 @@ def open_closed_streams() -> None:
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(nowhere, nowhere == number)
             setattr(sys, name, os.fdopen(nowhere, "w" if number else "r", closefd=False))
+
+
+def status_of(error: OSError, program: str) -> int:
+    """The exit status after an error of the file system, whose sentence is printed.
+
+    Raises:
+        OSError: the error, where it is no matter of the user's.
+    """
+    if _discard_broken_streams() and isinstance(error, BrokenPipeError):
+        return READER_LEFT
+    if not is_users_matter(error):
+        raise error
+    print(f"{program}: {file_sentence(error)}", file=sys.stderr)
+    return USER_ERROR
+
+
+def _discard_broken_streams() -> bool:
+    """Redirect streams that cannot be written to os.devnull; return whether the reader of a pipe has closed it.
+
+    Otherwise Python would write again at exit, print an error, and exit with a status of its own.
+    """
+    closed = [_has_no_reader(stream) for stream in (sys.stdout, sys.stderr)]
+    for stream, gone in zip((sys.stdout, sys.stderr), closed):
+        try:
+            stream.flush()
+        except OSError:
+            gone = True
+        if gone:
+            devnull = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(devnull, stream.fileno())
+            os.close(devnull)
+    return any(closed)
+
+
+def _has_no_reader(stream: TextIO) -> bool:
+    """Whether the stream is a pipe without a reader; always False on Windows."""
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # Windows, or a stream without a file, as in a notebook
+        return False
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 def keep_freed_memory() -> bool:

@@ -14,10 +14,10 @@ Writes agent.safetensors, metrics.csv, config.yaml, results.json and episodes.pa
 import sys
 from functools import partial
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "train", imported("ganlane.commands.train:train"))
+main = partial(run_command, "train")
 
 
 if __name__ == "__main__":

@@ -16,10 +16,10 @@ the preset is also fitted with one part changed at a time. resume=FOLDER continu
 import sys
 from functools import partial
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 #: Entry point; takes the arguments of the command line, and returns the exit status.
-main = partial(run_command, "train_generator", imported("ganlane.commands.train_generator:train_generator"))
+main = partial(run_command, "train_generator")
 
 
 if __name__ == "__main__":

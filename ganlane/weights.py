@@ -11,9 +11,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from ganlane.checksums import PLACE, has_checksum, note_without_checksum, sealed
 from ganlane.errors import UserError
-from ganlane.files import write_bytes
+from ganlane.files import PLACE, has_checksum, note_without_checksum, sealed, write_bytes
 
 
 def save_weights(path: str | Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:

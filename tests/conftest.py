@@ -30,3 +30,10 @@ def hydra_from_memory(monkeypatch):
     from reference.hydra_memory import load_from_memory
 
     monkeypatch.setattr(ConfigLoaderImpl, "load_configuration", load_from_memory)
+
+
+@pytest.fixture
+def empty_folder(tmp_path, monkeypatch):
+    """The working folder: an empty one."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

@@ -13,8 +13,9 @@ import torch
 
 import ganlane
 from ganlane.agents.drivers import DRIVERS
+from ganlane.config.app import function_of
 from ganlane.config.env import EnvConfig
-from ganlane.config.folders import stored_command
+from ganlane.config.runs import stored_command
 from ganlane.config.schemas import SCHEMAS
 from ganlane.config.traffic import GanTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
@@ -26,9 +27,7 @@ from ganlane.traffic import IdmTraffic
 LONG = re.compile(r"ganlane\.api\.(train|run)\(")
 
 
-@pytest.fixture(autouse=True)
-def _in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 def test_every_name_at_the_top_is_there():
@@ -129,7 +128,7 @@ def test_a_film_is_written_to_the_given_path():
 def test_every_command_has_its_function(command):
     if command == "record":
         pytest.importorskip("minari")
-    assert ganlane.api._function(command).__name__ == command
+    assert function_of(command).__name__ == command
 
 
 def test_speed_is_measured_and_no_command_is_made_up_for_a_call():

@@ -16,9 +16,8 @@ import torch
 from reference.refusals import everything_below, is_one_sentence, refusal
 from safetensors.torch import save
 
-from ganlane.checksums import seal_archive
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.files import CHECKPOINTS
+from ganlane.files import CHECKPOINTS, seal_archive
 from ganlane.native.library import cache_folder
 from ganlane.weights import load_weights, save_weights
 

@@ -20,8 +20,7 @@ from reference.hydra_memory import composed, own_part
 from reference.refusals import refusal
 
 from ganlane.__main__ import COMMANDS
-from ganlane.config.command_line import typed
-from ganlane.config.messages import sentence
+from ganlane.config.command_line import sentence, typed
 from ganlane.config.schemas import SCHEMAS, node_of
 from ganlane.errors import UserError
 from ganlane.files import conf_folder

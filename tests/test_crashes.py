@@ -10,8 +10,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from ganlane.config.commands import EvaluateConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.evaluate import EvaluateConfig
 from ganlane.crashes import ENDS, Crash, CrashList, find_crashes, read_crashes, write_crashes
 from ganlane.errors import UserError
 from ganlane.render import main

@@ -12,6 +12,7 @@ import pytest
 from ganlane import doctor
 from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
 from ganlane.doctor import Finding, State
+from ganlane.files import CHECKPOINTS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -24,19 +25,16 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 FOR_DEVELOPERS = {"test", "dev"}
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
-def test_a_whole_installation_is_found_whole(here, capsys):
+def test_a_whole_installation_is_found_whole(tmp_path, capsys):
     assert main(["doctor"]) == 0
     shown = capsys.readouterr().out
     for part in ("python", "torch", "devices", "C++ compiler", "agent_idm", "recordings", "cache", "extra video"):
         assert f" {part} " in shown
     assert shown.endswith("All that is needed is there; what is absent serves further purposes only.\n")
-    assert list(here.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_is_needed_and_missing_makes_the_status_1(tmp_path, monkeypatch, capsys):
@@ -93,8 +91,6 @@ def test_an_extra_names_only_what_it_lacks(monkeypatch):
 
 
 def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
-    from ganlane.files import CHECKPOINTS
-
     for file in CHECKPOINTS.glob("*.safetensors"):
         (tmp_path / file.name).write_bytes(file.read_bytes()[: -100 if "paper" in file.name else None])
     monkeypatch.setattr("ganlane.doctor.CHECKPOINTS", tmp_path)

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from reference.file_server import SHA256, Server
 from reference.recordings import START_MS, ngsim_rows, portal_csv, raw_text, traffic, write_highd
+from reference.refusals import last_path
 
 from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes, write_scene_csv
 from ganlane.evaluate import main as evaluate
@@ -21,15 +22,13 @@ from ganlane.train_generator import main as train_generator
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    """Runs in an empty folder."""
-    monkeypatch.chdir(tmp_path)
+def here(empty_folder, monkeypatch):
     monkeypatch.delenv("GANLANE_DATA", raising=False)
-    return tmp_path
+    return empty_folder
 
 
 def results(out: str) -> dict:
-    path = Path(out.splitlines()[-1].removeprefix("results: "))
+    path = last_path(out)
     assert Image.open(path.with_name("report.png")).size == (1440, 588)
     assert path.with_name("report.md").read_text().startswith("# Recordings: ")
     return json.loads(path.read_text())
@@ -85,28 +84,6 @@ def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
     weights = "generator.path=fit/generator_paper.safetensors"
     assert evaluate(["traffics=[gan]", weights, *tiny]) == 0
     capsys.readouterr()
-
-
-@pytest.mark.usefixtures("hydra_from_memory")
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        (["data.path=gone.csv"], "gone.csv: no such file"),
-        (["data=ngsim", "data.path=gone.csv"], "gone.csv: no such file"),
-        (["data=highd", "data.path=gone.csv"], "gone.csv: expected highD's XX_tracks.csv"),
-        (["data=ngsim"], "data=ngsim: which file is missing; give data.path=FILE"),
-        (["data=ngsim", "data.download=true"], "data.download=true: where to is missing"),
-        (["data=ngsim", "data.path=x", "data.url=ftp://x"], "data.url=ftp://x: expected an address"),
-        (["data=scenes", "data.format=ngsim"], "data.format=ngsim: expected scenes"),
-        (["device=cuda"], "device=cuda"),
-    ],
-)
-def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, part, here, capsys):
-    assert main(arguments) == 2
-    err = capsys.readouterr().err
-    assert part in err
-    assert err.count("\n") == 1
-    assert list(here.iterdir()) == []
 
 
 def test_damage_found_late_leaves_nothing_behind(here, capsys):

@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from reference.refusals import refusal
 
 import ganlane
 from ganlane.__main__ import main
@@ -16,18 +17,17 @@ pytest.importorskip("h5py", reason="h5py is not installed")
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
-    return tmp_path
+def here(empty_folder, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(empty_folder / "datasets"))
+    return empty_folder
 
 
-def record(*arguments):
-    return main(["record", "num_envs=4", "env.goal_m=60", "out=datasets", *arguments])
+TINY = ["num_envs=4", "env.goal_m=60", "out=datasets"]
 
 
 def test_a_dataset_is_listed_loaded_split_and_driven_again_by_minari(capsys):
-    assert record("agent=random_legal", "traffic=idm_mobil", "episodes=6", "seed=3", "mask=legal") == 0
+    six = ["agent=random_legal", "traffic=idm_mobil", "episodes=6", "seed=3", "mask=legal"]
+    assert main(["record", *TINY, *six]) == 0
     name = "ganlane/idm_mobil/random_legal-v0"
     assert f"minari.load_dataset('{name}')" in capsys.readouterr().out
     assert list(minari.list_local_datasets()) == [name]
@@ -69,22 +69,17 @@ def test_the_call_from_python_names_the_dataset_and_says_how_the_episodes_ended(
         (["agent=nobody"], "agent nobody: unknown"),
     ],
 )
-def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(here, capsys, arguments, told):
-    assert record(*arguments) == 2
-    assert told in capsys.readouterr().err
-    assert list(here.iterdir()) == []
+def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(capsys, arguments, told):
+    assert told in refusal(capsys, "record", *TINY, *arguments)
 
 
 def test_a_dataset_that_is_there_is_kept(here, capsys):
-    (kept := here / "datasets" / "mine" / "first-v0").mkdir(parents=True)
-    assert record("dataset=mine/first-v0") == 2
-    assert "mine/first-v0: a dataset is there already; give another" in capsys.readouterr().err
-    assert list(kept.iterdir()) == []
+    (here / "datasets" / "mine" / "first-v0").mkdir(parents=True)
+    err = refusal(capsys, "record", *TINY, "dataset=mine/first-v0")
+    assert "mine/first-v0: a dataset is there already; give another" in err
 
 
-def test_without_minari_the_extra_is_named(here, capsys, monkeypatch):
+def test_without_minari_the_extra_is_named(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "minari.dataset.minari_storage", None)
     monkeypatch.delitem(sys.modules, "ganlane.commands.record", raising=False)
-    assert record() == 2
-    assert "needs the extra 'minari'; run `pip install" in capsys.readouterr().err
-    assert list(here.iterdir()) == []
+    assert "needs the extra 'minari'; run `pip install" in refusal(capsys, "record", *TINY)

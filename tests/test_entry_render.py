@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 
 import polars as pl
 import pytest
 from PIL import Image
+from reference.refusals import last_path
 
 from ganlane.data import read_scenes
 from ganlane.render import main
 
 SHORT = ["env.goal_m=40", "film.fps=5", "film.width=640", "film.height=160"]
-
-
-@pytest.fixture(autouse=True)
-def _in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 @pytest.mark.parametrize("agent", ["mobil", "random"])
 def test_an_episode_becomes_a_film(agent, capsys):
     assert main([*SHORT, f"agent={agent}", "episode=2"]) == 0
-    film = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("film: "))
+    film = last_path(capsys.readouterr().out)
     assert film.name == f"{agent}_idm_mobil_0_2.gif"
     with Image.open(film) as picture:
         assert picture.size == (640, 160)
@@ -57,7 +53,7 @@ def test_agents_and_episodes_play_beside_each_other(capsys, tmp_path):
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_simulated_traffic_is_replayed_like_recorded_traffic(ending, capsys):
     assert main(["env.goal_m=300", "agent=keep_lane", "episodes=[0,1]", f"format={ending}"]) == 0
-    path = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("tracks: "))
+    path = last_path(capsys.readouterr().out)
     assert path.name == f"keep_lane_idm_mobil_0_0_1.{ending}"
     assert read_scenes(path)["scene"].n_unique() == 2
     replay = ["traffic=replay", f"traffic.path={path}", "film.end_s=5", "format=parquet", "out=again.parquet"]
@@ -84,30 +80,3 @@ def test_curves_of_runs_come_in_the_format_that_is_asked_for(asked, file, begins
     assert main(["run=first,it's", *asked.split()]) == 0
     assert capsys.readouterr().out == f"curves: {file}\n"
     assert (tmp_path / file).read_bytes().startswith(begins)
-
-
-@pytest.mark.usefixtures("hydra_from_memory")
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("agent=nobody", "agent nobody: unknown"),
-        ("episodes=[0,1]", "a film shows one episode, not 2; use format=html"),
-        ("format=html agents=[a,b,c,d] episodes=[0,1,2,3]", "16 episodes; choose at most 12"),
-        ("format=gif out=film.mp4", "the ending says mp4 and format gif"),
-        ("out=film.avi", "expected one of gif, mp4, png, html, csv, parquet"),
-        ("run=nowhere", "nowhere: no such file; expected the metrics.csv"),
-        ("out=film.svg", "for learning curves only"),
-        ("run=nowhere format=gif", "learning curves are one of png, svg, pdf"),
-        (
-            "traffic=idm agent=keep_lane film.start_s=500 film.end_s=501 env.goal_m=40 format=csv",
-            "choose a part of it",
-        ),
-        ("traffic=idm agent=keep_lane env.goal_m=40 format=html film.max_bytes=10000", "film.max_bytes"),
-    ],
-)
-def test_a_mistake_is_one_sentence_and_leaves_nothing(line, message, capsys, tmp_path):
-    assert main(line.split()) == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert err.count("\n") == 1
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

@@ -11,11 +11,7 @@ from ganlane.reproduce import main, matrix
 
 SHORT = ["episodes=3", "workers=1", "env.goal_m=60", "hydra.run.dir=out"]
 SMALL = ["agents=[random_legal,mobil,agent_idm@all+none,agent_gan+none]", "traffics=[idm,gan]"]
-
-
-@pytest.fixture(autouse=True)
-def _in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 @pytest.fixture
@@ -88,22 +84,6 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
     said = capsys.readouterr().err
     assert all(f"left out, {what}:" in said for what in ("replay", "figure 2", "figure 3"))
     assert {"replay", "figure 2", "figure 3"} == json.loads(Path("out/results.json").read_text())["left_out"].keys()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["agents=[random_legal]", "traffics=[idm]"], "expected mobil and others"),
-        (["agents=[mobil,agent_idm@77]", "traffics=[idm]"], "no training with seed 77"),
-        (["fewer={gan: 0}"], "whole numbers of at least 2"),
-        (["fewer=3"], "names of traffics with whole numbers"),
-        (["runs=[nowhere]"], "no such file"),
-        (["from=elsewhere"], "shipped, scratch"),
-    ],
-)
-def test_a_mistake_ends_in_a_sentence(arguments, said, capsys):
-    assert main([*SHORT, *arguments]) == 2
-    assert said in capsys.readouterr().err
 
 
 def test_a_damaged_cell_is_named(capsys):

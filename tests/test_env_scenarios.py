@@ -10,10 +10,11 @@ import torch
 from ganlane import keys
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.command_line import check
-from ganlane.config.env import DenseEnvConfig, EnvConfig
-from ganlane.config.scenarios import (
+from ganlane.config.env import (
     BlockedLaneEnvConfig,
     CutInEnvConfig,
+    DenseEnvConfig,
+    EnvConfig,
     StalledCarEnvConfig,
     StopAndGoEnvConfig,
     StopAndGoOptions,

@@ -12,7 +12,7 @@ import ganlane
 PACKAGE = Path(ganlane.__file__).parent
 #: From the bottom up; what stands in one line may import each other's neighbours to the left only within itself.
 ORDER = [
-    {"_version", "arguments", "keys", "errors", "checksums", "files", "weights", "runtime", "torch_settings"},
+    {"_version", "arguments", "keys", "errors", "files", "weights", "runtime", "torch_settings"},
     {"parameters"},
     {"data", "sim"},
     {"generator"},

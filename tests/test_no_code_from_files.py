@@ -14,11 +14,11 @@ import torch
 
 from ganlane.__main__ import dispatch, main
 from ganlane.agents import load_agent
+from ganlane.arguments import import_target
 from ganlane.build import make_driver
 from ganlane.config.command_line import parse
 from ganlane.config.env import EnvConfig
-from ganlane.config.resume import refuse_stored_imports
-from ganlane.config.targets import import_target
+from ganlane.config.runs import refuse_stored_imports
 from ganlane.config.traffic import IdmTrafficConfig
 from ganlane.config.train import FinalEvaluationConfig, TrainConfig
 from ganlane.errors import UserError

@@ -24,7 +24,7 @@ import torch
 
 from benchmarks.torture.readers import READERS, make_files
 from benchmarks.torture.tally import Tally, forked
-from ganlane.config.messages import CONFIG_ERRORS
+from ganlane.config.command_line import CONFIG_ERRORS
 from ganlane.errors import UserError
 
 #: Seconds and GiB that reading one small file may take.

@@ -17,7 +17,7 @@ from benchmarks.torture import damages, runs
 from benchmarks.torture.damages import BYTES, TEXT, Damage
 from ganlane.agents import load_agent
 from ganlane.config.command_line import check
-from ganlane.config.resume import with_resumed
+from ganlane.config.runs import with_resumed
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.data.prepare import read_recordings
 from ganlane.data.scenes import read_scenes, write_prepared

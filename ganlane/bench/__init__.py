@@ -22,11 +22,11 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit status."""
     # A thread of OpenMP that spins while it waits takes time from cases that run at the same time.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    return run_command("bench", imported("ganlane.commands.bench:bench"), arguments)
+    return run_command("bench", arguments)

@@ -30,7 +30,7 @@ from ganlane.bench.systems import (
     start_physics,
 )
 from ganlane.build import make_traffic
-from ganlane.config.bench import BenchConfig
+from ganlane.config.commands import BenchConfig
 from ganlane.config.env import DenseEnvConfig, EnvConfig
 from ganlane.evaluation.table import NOTHING, Table, significant
 

@@ -19,7 +19,7 @@ from torchrl.envs import TransformedEnv
 from ganlane import keys
 from ganlane.bench.measure import COMPILED, NATIVE, Case, Runner, Suite
 from ganlane.build import make_env, make_traffic
-from ganlane.config.bench import BenchConfig
+from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv

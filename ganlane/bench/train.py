@@ -18,7 +18,7 @@ from ganlane.agents.replay import TRANSITION_KEYS
 from ganlane.bench.measure import COLUMNS, EAGER, Case, Group, Row, Runner, Suite, best_rows, speed_table
 from ganlane.bench.systems import HighwayEnvRunner, Scenario, highway_env_settings, installed_version
 from ganlane.build import make_road
-from ganlane.config.bench import BenchConfig
+from ganlane.config.commands import BenchConfig
 from ganlane.evaluation.table import Table, significant
 from ganlane.training import loop
 from ganlane.training.checkpoint import TrainingState

@@ -11,8 +11,8 @@ from ganlane.bench.measure import Suite, measure
 from ganlane.bench.sim import SimSuite
 from ganlane.bench.traffic import TrafficSuite
 from ganlane.bench.train import TrainSuite
-from ganlane.config.bench import BenchConfig
-from ganlane.config.folders import stored_command
+from ganlane.config.commands import BenchConfig
+from ganlane.config.runs import stored_command
 from ganlane.evaluation import machine_sentence, write_results
 from ganlane.evaluation.table import show
 from ganlane.files import split_at_markers, write_between_markers

@@ -12,6 +12,7 @@ from typing import Final
 from ganlane.config.recordings import PrepareConfig
 from ganlane.data import Preparation, SceneSummary, byte_progress, default_scenes, download, prepare_recordings
 from ganlane.evaluation import write_results
+from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
 from ganlane.parameters.data import NgsimDataConfig
 from ganlane.runtime import peak_resident_bytes
@@ -39,8 +40,12 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
         with byte_progress("download") as progress:
             download(config.data.url, source, config.data.sha256, progress)
     out = Path(config.out) if config.out else folder / "scenes"
+
+    def show(scene: SceneSummary) -> None:  # while the others are still read
+        print(f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km", file=sys.stderr, flush=True)
+
     with byte_progress("read") as progress:
-        prepared = prepare_recordings(config.data.format, source, out, parameters, config.scene_s, progress, _show)
+        prepared = prepare_recordings(config.data.format, source, out, parameters, config.scene_s, progress, show)
     sheet = save_figure(draw_recordings(prepared.statistics), folder / "report.png")
     write_bytes(folder / "report.md", long_report(prepared, str(source), sheet.name).encode())
     print(f"{short_report(prepared)}\nscenes: {out}\nreport: {folder / 'report.md'}")
@@ -48,11 +53,6 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     cost = {"wall_s": time.perf_counter() - begun, "peak_memory_mb": None if peak is None else peak / 2**20}
     numbers = {"format": config.data.format, "source": str(source), "out": str(out), **prepared.to_dict(), **cost}
     return f"results: {write_results(folder, numbers, asdict(config), {})}"
-
-
-def _show(scene: SceneSummary) -> None:
-    """Prints a line per recording while the others are still read."""
-    print(f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km", file=sys.stderr, flush=True)
 
 
 def short_report(prepared: Preparation) -> str:
@@ -123,11 +123,6 @@ def _bullets(lines: Iterable[str]) -> str:
     return "\n".join(f"- {line}" for line in lines)
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    body = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
-    return "\n".join(body)
-
-
 def _scene_table(scenes: Sequence[SceneSummary]) -> str:
     head = [
         *("scene", "rows", "tracks", "s", "lanes", "lane width, m", "rows in the nearest lane, %", "vehicle-km"),
@@ -143,7 +138,9 @@ def _scene_table(scenes: Sequence[SceneSummary]) -> str:
         for each in scenes[:_MOST_SCENES]
     ]
     more = len(scenes) - _MOST_SCENES
-    return _table(head, rows) + (f"\n\n{more} more scenes are in results.json." if more > 0 else "")
+    return Table("", head, rows, len(head)).markdown(heading=False) + (
+        f"\n\n{more} more scenes are in results.json." if more > 0 else ""
+    )
 
 
 def _distribution_table(prepared: Preparation) -> str:
@@ -154,4 +151,4 @@ def _distribution_table(prepared: Preparation) -> str:
         quantiles = [found.quantile(level) if found.count else None for level in _SHOWN_LEVELS]
         numbers = ["" if value is None else f"{value:.2f}" for value in (found.mean, found.sd, *quantiles)]
         rows.append([title, f"{found.count:,}", *numbers])
-    return _table(head, rows)
+    return Table("", head, rows, len(head)).markdown(heading=False)

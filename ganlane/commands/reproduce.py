@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from ganlane.agents import read_agent
 from ganlane.agents.checkpoint import save_agents, with_seeds
-from ganlane.config.evaluate import ReproduceConfig
-from ganlane.config.folders import stored_command
+from ganlane.config.commands import ReproduceConfig
+from ganlane.config.runs import stored_command
 from ganlane.crashes import find_crashes, write_crashes
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results

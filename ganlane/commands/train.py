@@ -9,7 +9,7 @@ from pathlib import Path
 from ganlane.build import make_driver, make_drivers, make_traffic
 from ganlane.compare import compare, publish
 from ganlane.config.app import Stopped
-from ganlane.config.folders import earned
+from ganlane.config.runs import earned
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.torch_settings import set_threads

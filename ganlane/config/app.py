@@ -8,52 +8,52 @@ from __future__ import annotations
 
 import importlib
 import os
-import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 
 from ganlane.config.command_line import (
+    CONFIG_ERRORS,
     VERSION_BASE,
     check,
     of_hydra,
     parse,
     parse_arguments,
     quoted,
+    sentence,
     typed,
     with_shares_replaced,
     without_repetitions,
 )
-from ganlane.config.folders import cleared_after_mistakes, held, unused, write_config
 from ganlane.config.help import help_text
-from ganlane.config.messages import CONFIG_ERRORS, is_users_matter, numbered_refusals, sentence
-from ganlane.config.resume import refuse_stored_imports, with_resumed
+from ganlane.config.runs import (
+    cleared_after_mistakes,
+    held,
+    refuse_stored_imports,
+    unused,
+    with_resumed,
+    write_config,
+)
 from ganlane.config.schemas import register
-from ganlane.errors import UserError
+from ganlane.errors import USER_ERROR, UserError, numbered_refusals
 from ganlane.files import conf_folder
-from ganlane.runtime import check_process, keep_freed_memory, open_closed_streams, register_envs
+from ganlane.runtime import check_process, keep_freed_memory, open_closed_streams, register_envs, status_of
 
 #: A command's function of config and run folder; it returns the last line to print, or None.
 Task = Callable[[Any, Path], str | None]
-
-USER_ERROR = 2
-#: 128 plus the number of SIGPIPE, which does not exist on Windows.
-READER_LEFT = 141
+#: Modules of the commands' functions, each named as its command, that are not in :mod:`ganlane.commands`.
+_ELSEWHERE = {"evaluate": "ganlane.compare", "realism": "ganlane.realism.output"}
 
 
-def imported(path: str) -> Task:
-    """The function ``module:name``, imported when it is called.
-
-    A command's module needs torch, which takes seconds to import: a mistake on the command line is reported before.
-    """
-    module, _, name = path.partition(":")
-    return lambda config, folder: getattr(importlib.import_module(module), name)(config, folder)
+def function_of(command: str) -> Callable[[Any, Path], str]:
+    """The command's function; importing its module imports torch, which takes seconds."""
+    return getattr(importlib.import_module(_ELSEWHERE.get(command, f"ganlane.commands.{command}")), command)
 
 
 class Stopped(BaseException):
@@ -64,9 +64,14 @@ class Stopped(BaseException):
         self.number = number
 
 
-def run_command(command: str, task: Task, arguments: Sequence[str] | None = None) -> int:
-    """Run ``task`` as ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit status."""
+def run_command(command: str, arguments: Sequence[str] | None = None, task: Task | None = None) -> int:
+    """Run ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit status.
+
+    A ``task`` takes the place of the command's function.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    # Imported when it is called: a mistake on the command line is reported before.
+    task = task or (lambda config, folder: function_of(command)(config, folder))
     open_closed_streams()
     # TorchRL would log every replay buffer.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
@@ -82,15 +87,11 @@ def run_command(command: str, task: Task, arguments: Sequence[str] | None = None
         if number is not None:
             return 128 + number
         if isinstance(error, (UserError, *CONFIG_ERRORS)):
-            return _refused(command, error)
-        if not isinstance(error, OSError):
-            raise
-        reader_left = discard_broken_streams()
-        if reader_left and isinstance(error, BrokenPipeError):
-            return READER_LEFT
-        if not is_users_matter(error):
-            raise
-        return _refused(command, error)
+            print(f"ganlane {command}: {sentence(error)}", file=sys.stderr)
+            return USER_ERROR
+        if isinstance(error, OSError):
+            return status_of(error, f"ganlane {command}")
+        raise
     return 0
 
 
@@ -103,12 +104,6 @@ def _signal_behind(error: BaseException | None) -> int | None:
             return error.number
         error = error.__cause__ or error.__context__
     return None
-
-
-def _refused(command: str, error: Exception) -> int:
-    """Print the error; return the exit status."""
-    print(f"ganlane {command}: {sentence(error)}", file=sys.stderr)
-    return USER_ERROR
 
 
 def _run(command: str, task: Task, arguments: list[str]) -> None:
@@ -223,35 +218,3 @@ def _sigterm_as_exception() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def discard_broken_streams() -> bool:
-    """Redirect streams that cannot be written to os.devnull; return whether the reader of a pipe has closed it.
-
-    Otherwise Python would write again at exit, print an error, and exit with a status of its own.
-    """
-    closed = [_has_no_reader(stream) for stream in (sys.stdout, sys.stderr)]
-    for stream, gone in zip((sys.stdout, sys.stderr), closed):
-        if gone or not _flushes(stream):
-            devnull = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(devnull, stream.fileno())
-            os.close(devnull)
-    return any(closed)
-
-
-def _has_no_reader(stream: TextIO) -> bool:
-    """Whether the stream is a pipe without a reader; always False on Windows."""
-    try:
-        poll = select.poll()
-        poll.register(stream.fileno(), 0)
-    except (AttributeError, OSError):  # Windows, or a stream without a file, as in a notebook
-        return False
-    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
-
-
-def _flushes(stream: TextIO) -> bool:
-    try:
-        stream.flush()
-    except OSError:
-        return False
-    return True

@@ -1,4 +1,4 @@
-"""The command line: flags, overrides, the runs of a sweep, and their checked configurations."""
+"""The command line: flags, overrides, the runs of a sweep, their checked configurations; errors as one sentence."""
 
 from __future__ import annotations
 
@@ -15,14 +15,30 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType, Quote, QuotedString
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
-from ganlane.config.messages import VALUE_ERRORS, sentence, unknown_key
-from ganlane.config.schemas import SCHEMAS, made, options_of, register
-from ganlane.errors import UserError
+from ganlane.config.schemas import (
+    HELP,
+    SCHEMAS,
+    SUFFIX,
+    made,
+    one_line,
+    options_of,
+    register,
+    unknown_key,
+    value_sentence,
+)
+from ganlane.errors import UserError, file_sentence
 from ganlane.files import conf_folder
+from ganlane.parameters.checks import did_you_mean
 
 VERSION_BASE = "1.3"
+#: Errors of Hydra and OmegaConf for an invalid configuration.
+CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
+#: Errors while values are read; a whole number of hundreds of digits raises OverflowError.
+VALUE_ERRORS = (*CONFIG_ERRORS, OverflowError)
 #: The keys of Hydra's own configuration that a command line may set, besides launcher and sweeper and their
 #: parameters: most others name code that Hydra would import.
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.num")
@@ -40,7 +56,8 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
     """Hydra's flags and the overrides of a command.
 
     Raises:
-        UserError: an unknown flag, or one that would have no effect.
+        UserError: an unknown flag, or one that would have no effect; one of those (experimental_rerun) would load a
+            pickle.
     """
     parser = get_args_parser()
     parser.add_argument("--help-all", action="store_true")
@@ -50,19 +67,14 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
 
     parser.error = refuse  # type: ignore[method-assign]
     flags = parser.parse_args(list(arguments))
-    _refuse_idle_flags(flags)
-    flags.overrides = [as_meant(command, override, flags.multirun) for override in flags.overrides]
-    return flags
-
-
-def _refuse_idle_flags(flags: Namespace) -> None:
-    """Refuse Hydra's flags that would have no effect; one of them (experimental_rerun) would load a pickle."""
     for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
         if getattr(flags, name) is not None:
             raise UserError(f"--{name.replace('_', '-')}: ganlane has its own configuration; give key=value instead.")
     for name in ("resolve", "package"):
         if getattr(flags, name) and flags.cfg is None and not flags.help:
             raise UserError(f"--{name}: it goes with --cfg alone, which shows the configuration; add --cfg job.")
+    flags.overrides = [as_meant(command, override, flags.multirun) for override in flags.overrides]
+    return flags
 
 
 def as_meant(command: str, override: str, multirun: bool = False) -> str:
@@ -122,9 +134,8 @@ def parse(overrides: Sequence[str]) -> list[Override]:
     for override in parsed:
         if of_hydra(override):
             _refuse_hydras(override)
-            continue
-        _refuse_new_keys(override)
-        _refuse_no_option(override)
+        else:
+            _refuse_own(override)
     return parsed
 
 
@@ -159,28 +170,23 @@ def leaves(value: object) -> Iterator[str]:
         yield str(value)
 
 
-def _refuse_no_option(override: Override) -> None:
-    """Refuse a value of a group that is not the name of one option, such as a path to a file elsewhere."""
-    group = override.key_or_group
-    chosen = override.is_sweep_override() or isinstance(override.value(), str)
-    chosen = chosen and re.search(r"[/\\]|\.\.", str(override.input_line).partition("=")[2]) is None
-    if not chosen and (conf_folder() / group).is_dir():
-        names = ", ".join(options_of(group))
-        raise UserError(f"{override.input_line}: expected the name of one option; choose one of {names}.")
+def _refuse_own(override: Override) -> None:
+    """Refuse what bypasses the schemas.
 
-
-def _refuse_new_keys(override: Override) -> None:
-    """Refuse ``+key``, ``++key`` and ``~key``, which bypass the schema, but for the free parameters of a target."""
-    key = override.key_or_group
-    if override.type == OverrideType.CHANGE:
-        return
+    That is ``+key``, ``++key`` and ``~key``, but for the free parameters of a target, and a value of a group that is
+    not the name of one option, such as a path to a file elsewhere.
+    """
+    key, line = override.key_or_group, str(override.input_line)
     if override.is_delete():
-        raise UserError(f"{override.input_line}: keys cannot be deleted; give {key}=null or leave it as it is.")
-    if ".parameters." not in key:
+        raise UserError(f"{line}: keys cannot be deleted; give {key}=null or leave it as it is.")
+    if override.type != OverrideType.CHANGE and ".parameters." not in key:
         raise UserError(
-            f"{override.input_line}: keys cannot be added; write {key}=... without + if it exists "
+            f"{line}: keys cannot be added; write {key}=... without + if it exists "
             "(+ is for traffic.parameters.NAME alone)."
         )
+    named = override.is_sweep_override() or isinstance(override.value(), str)
+    if (conf_folder() / key).is_dir() and (not named or re.search(r"[/\\]|\.\.", line.partition("=")[2])):
+        raise UserError(f"{line}: expected the name of one option; choose one of {', '.join(options_of(key))}.")
 
 
 def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:
@@ -263,12 +269,7 @@ def typed(composed: DictConfig) -> Any:
 
 
 def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Checked:
-    """Compose and check every run that ``overrides`` mean.
-
-    Args:
-        command: name of the root config, for instance ``train``.
-        overrides: as on the command line.
-        multirun: whether commas stand for a sweep.
+    """Compose and check every run that ``overrides``, as on the command line, mean; return the first.
 
     Raises:
         UserError: an unknown key or option, a value of the wrong type or out of range.
@@ -298,3 +299,37 @@ def _check_one(command: str, overrides: Sequence[str]) -> Checked:
         folders = [Path(str(composed.hydra[mode].dir)) for mode in ("run", "sweep")]
         del composed["hydra"]
     return Checked(typed(composed), composed, *folders)
+
+
+def sentence(error: BaseException) -> str:
+    """An error of Hydra, OmegaConf or the file system in one sentence: the value, what was expected, what to do."""
+    if isinstance(error, UserError):
+        return one_line(error) + "."
+    if isinstance(error, MissingConfigException):  # an OSError, too
+        group, _, name = (error.missing_cfg_file or "").rpartition("/")
+        known = sorted(option for option in error.options or () if not option.endswith(SUFFIX))
+        if not known:
+            return f"{one_line(error)}; {HELP}."
+        return f"{group}={name}: no such option{did_you_mean(name, known)}; choose one of {', '.join(known)}."
+    if isinstance(error, OSError):
+        return file_sentence(error)
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: not of the form key=value; quote values with spaces or brackets, {HELP}."
+    if isinstance(error, OverflowError):
+        key = re.search(r"full_key: (\S+)", str(error))
+        return f"{key[1] if key else 'one of the numbers'}: too large; give a number of fewer digits."
+    found = error if isinstance(error, OmegaConfBaseException) else error.__cause__
+    return value_sentence(found) if isinstance(found, OmegaConfBaseException) else _composition(error)
+
+
+def _composition(error: BaseException) -> str:
+    """The sentence for options that do not fit the command."""
+    text = one_line(error)
+    group = re.search(r"Could not override '([^']+)'", text)
+    if group:
+        hint = f" (did you mean {group[1]}s=[NAME,NAME]?)" if group[1] in ("agent", "traffic") else ""
+        return f"{group[1]}: not an option of this command{hint}; {HELP}."
+    sweep = re.search(r"Ambiguous value for argument '([^']+)'", text)
+    if sweep:
+        return f"{sweep[1]}: several values; write key=[a,b] for a list, or add -m for a sweep."
+    return f"{text}; {HELP}."

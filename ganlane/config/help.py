@@ -1,17 +1,23 @@
-"""``--help`` and ``--help-all``: a command's purpose, options and keys, from docstrings and YAML files."""
+"""``--help`` and ``--help-all`` from docstrings and YAML files; options and keys completed in a shell by Hydra."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
 import re
+import sys
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from typing import Any
 
-from ganlane.config.schemas import SCHEMAS, option_of, options_of
+from hydra import initialize_config_dir
+from hydra._internal.core_plugins.bash_completion import BashCompletion
+from hydra.core.global_hydra import GlobalHydra
+
+from ganlane.config.command_line import VERSION_BASE
+from ganlane.config.schemas import SCHEMAS, SUFFIX, chosen_options, option_of, options_of, register
 from ganlane.errors import as_typed
 from ganlane.files import conf_folder
 from ganlane.parameters.checks import NO_KEY
@@ -26,10 +32,18 @@ _FLAGS = """flags
 exit status: 0 done, 2 a mistake in configuration, file or checkpoint or a disk that refuses, 130 stopped by Ctrl-C,
 143 by SIGTERM, 141 the reader of the output has left"""
 
+#: Missing in Hydra's scripts: zsh needs bashcompinit, and bash must forget the removed function.
+_BEFORE = {
+    ("install", "zsh"): "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit; }\n"
+    "autoload -Uz bashcompinit && bashcompinit",
+    ("uninstall", "bash"): "complete -r ganlane 2> /dev/null",
+    ("uninstall", "zsh"): "complete -r ganlane 2> /dev/null",
+}
+
 
 def help_text(command: str, everything: bool = True) -> str:
     """The text of ``ganlane COMMAND --help-all``; unless ``everything``, that of ``--help``."""
-    chosen = chosen_options((conf_folder() / f"{command}.yaml").read_text())
+    chosen = chosen_options(command)
     groups = {mount: option for mount, option in chosen.items() if "@" not in mount}
     listed = [_options(*each) for each in chosen.items()] if everything else map(_names, groups, groups.values())
     parts = [
@@ -38,30 +52,25 @@ def help_text(command: str, everything: bool = True) -> str:
         "keys (KEY=VALUE)\n" + "\n".join(key_lines(SCHEMAS[""][command], {}, 2, {*groups, "traffic_options"})),
     ]
     for group, option in groups.items() if everything else ():
-        if option != "null":
+        if option is not None:
             lines = key_lines(*option_of(group, option), 4)
             parts.append("\n".join([f"keys of {group}={option}", f"  {group}:", *lines]))
     more = [] if everything else [f"ganlane {command} --help-all explains every option, and lists their keys."]
     return "\n\n".join([*parts, *more, _FLAGS.format(command=command)])
 
 
-def _names(group: str, default: str) -> str:
+def _names(group: str, default: str | None) -> str:
     names = " ".join(f"{name}*" if name == default else name for name in options_of(group))
     return textwrap.fill(names, _END, initial_indent=f"  {group:<13}", subsequent_indent=" " * 15)
 
 
-def chosen_options(root: str) -> dict[str, str]:
-    """Mounted group to default option, in the order of the ``defaults`` list."""
-    return dict(re.findall(r"^  - ([\w@.]+): (\w+)", root, flags=re.MULTILINE))
-
-
-def _options(mount: str, default: str) -> str:
+def _options(mount: str, default: str | None) -> str:
     """A group's options with the first lines of their YAML."""
     group, _, place = mount.partition("@")
     if place.startswith("traffic_options."):
         return f"  {place}.KEY: the keys of traffic={default} (ganlane train --help shows some)"
     if place:
-        return f"  {mount}: the options of {group}; {default} by default"
+        return f"  {mount}: the options of {group}; {as_typed(default)} by default"
     lines = [f"   {'*' if name == default else ' '} {name:<18}{summary(group, name)}" for name in options_of(group)]
     return "\n".join([f"  {mount}", *lines])
 
@@ -80,8 +89,10 @@ def key_lines(
     for field in fields(kind):
         if field.name in without or field.metadata == NO_KEY:
             continue
-        value = values[field.name] if field.name in values else _default(field)
-        key, meaning = f"{' ' * indent}{field.name}:", _meaning(kind, field.name)
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        value, key = values.get(field.name, default), f"{' ' * indent}{field.name}:"
+        # The first sentence on it in the docstring of its class or of a base class.
+        meaning = next((found for base in kind.__mro__ if (found := _attributes(base).get(field.name))), "")
         if is_dataclass(value):
             yield from _lines(key, meaning)
             own = {known.name: getattr(value, known.name) for known in fields(value)}
@@ -97,15 +108,6 @@ def _lines(key: str, meaning: str) -> Iterator[str]:
     yield from (f"{'':<{_COLUMN}}# {line}" for line in rest)
 
 
-def _default(field: Field[Any]) -> Any:
-    return field.default if field.default_factory is MISSING else field.default_factory()
-
-
-def _meaning(kind: Any, name: str) -> str:
-    """The first sentence on a field in the docstring of its class or of a base class."""
-    return next((found for base in kind.__mro__ if (found := _attributes(base).get(name))), "")
-
-
 @cache
 def _attributes(kind: type) -> dict[str, str]:
     """First sentences of the section ``Attributes`` of a class's docstring, by field."""
@@ -118,3 +120,27 @@ def _attributes(kind: type) -> dict[str, str]:
 def _plain(text: str) -> str:
     """The text without reStructuredText roles: ``:data:`~ganlane.NAME``` becomes NAME."""
     return re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", text).replace("``", "")
+
+
+def completed(command: str, rest: str) -> list[str]:
+    """Hydra's completions of ``rest``, what follows a command, without the names of schemas."""
+    register(command)
+    with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE, job_name=command):
+        plugin = BashCompletion(GlobalHydra.instance().config_loader())
+        found = plugin._query(config_name=command, line=rest.lstrip())
+    return [word for word in found if not word.endswith(SUFFIX) and not word.startswith("hydra")]
+
+
+def print_completion_script(action: str, shell: str) -> None:
+    """Print the script for the shell to evaluate."""
+    print(_BEFORE.get((action, shell), ""))
+    before = sys.argv
+    # Hydra reads the program's name here; with python -m ganlane it is the path of a module.
+    sys.argv = ["ganlane"]
+    try:
+        with initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):
+            hydra = GlobalHydra.instance().hydra
+            assert hydra is not None
+            hydra.shell_completion(config_name="train", overrides=[f"{action}={shell}"])
+    finally:
+        sys.argv = before

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+from ganlane.config.commands import GeneratorFile, RunConfig
 from ganlane.config.env import EnvConfig
-from ganlane.config.run import GeneratorFile, RunConfig
 from ganlane.config.traffic import REACTING, TrafficConfig, chosen_traffics
 from ganlane.errors import UserError
 from ganlane.parameters.checks import CountOrZero, NotNegative, at_least, between, one_of

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-from ganlane.config.run import DrivingConfig, Names
+from ganlane.config.commands import DrivingConfig, Names
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError, UserError, as_typed
 from ganlane.parameters.checks import (
@@ -120,15 +121,57 @@ class RenderConfig(DrivingConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.out is not None:
-            _check_out(Path(self.out))
-        self._check_kind()
+            path = Path(self.out)
+            if path.is_dir() or not os.access(path.parent, os.W_OK):
+                raise UserError(
+                    f"out={path}: expected a file in a folder that exists and can be written to; make it first."
+                )
+        ending = self._ending()
+        if ending and ending not in FORMATS:
+            raise UserError(
+                f"out={self.out}: expected one of {', '.join(FORMATS)}; give the file one of these endings."
+            )
+        if ending and ending != self.kind:
+            raise UserError(f"out={self.out}: the ending says {ending} and format {self.kind}; give one of them.")
+        if self.run is not None and self.kind not in CHARTS:
+            raise UserError(
+                f"format={self.kind}: learning curves are one of {', '.join(CHARTS)}; choose one of these."
+            )
+        if self.run is None and self.kind in ("svg", "pdf"):
+            raise UserError(
+                f"format={self.kind}: for learning curves only; episodes are gif, mp4, png, html, csv or parquet."
+            )
+        if self.kind == "mp4" and find_spec("imageio_ffmpeg") is None:
+            raise UserError(
+                "format=mp4: needs the extra 'video'; run `pip install \"ganlane[video]\"` or choose format=gif."
+            )
+        if self.crashes is not None:
+            if self.run is not None:
+                raise UserError(
+                    "crashes and run: either crashes or learning curves are drawn; leave one of them out."
+                )
+            if self.kind in FILMS:
+                raise UserError(f"format={self.kind}: shows one episode; crashes are html, csv or parquet.")
+            return
+        if self.traffics is not None:
+            raise UserError(f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give traffic=NAME.")
+        count = len(self.pairs())
+        if self.kind in FILMS and count > 1:
+            raise UserError(
+                f"format={self.kind}: a film shows one episode, not {count}; use format=html for several."
+            )
+        if count > MOST_EPISODES:
+            raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
+
+    def _ending(self) -> str:
+        """The ending of ``out``, without the dot; empty: none."""
+        return Path(self.out or "").suffix.removeprefix(".").lower()
 
     @property
     def kind(self) -> str:
         """``format``, else the ending of ``out``, else png for ``run``, html for ``crashes``, gif for episodes."""
-        ending = Path(self.out).suffix.removeprefix(".").lower() if self.out is not None else ""
         default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
-        return self.format or ending or default
+        return self.format or self._ending() or default
 
     @property
     def end_s(self) -> float | None:
@@ -144,61 +187,3 @@ class RenderConfig(DrivingConfig):
             for episode in (self.episodes if self.episodes is not None else [self.episode])
             for agent in (self.agents if self.agents is not None else [self.driver])
         ]
-
-    def _check_kind(self) -> None:
-        """Raise an error unless format, file name and number of episodes fit together."""
-        _check_suffix(self.out, self.kind)
-        if self.run is not None and self.kind not in CHARTS:
-            raise UserError(
-                f"format={self.kind}: learning curves are one of {', '.join(CHARTS)}; choose one of these."
-            )
-        if self.run is None and self.kind in ("svg", "pdf"):
-            raise UserError(
-                f"format={self.kind}: for learning curves only; episodes are gif, mp4, png, html, csv or parquet."
-            )
-        if self.kind == "mp4":
-            require_video()
-        if self.crashes is not None:
-            self._check_crashes()
-            return
-        if self.traffics is not None:
-            raise UserError(f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give traffic=NAME.")
-        count = len(self.pairs())
-        if self.kind in FILMS and count > 1:
-            raise UserError(
-                f"format={self.kind}: a film shows one episode, not {count}; use format=html for several."
-            )
-        if count > MOST_EPISODES:
-            raise UserError(f"agents x episodes: {count} episodes; choose at most {MOST_EPISODES}.")
-
-    def _check_crashes(self) -> None:
-        """Raise an error if ``crashes`` is combined with keys that do not apply to it."""
-        if self.run is not None:
-            raise UserError("crashes and run: either crashes or learning curves are drawn; leave one of them out.")
-        if self.kind in FILMS:
-            raise UserError(f"format={self.kind}: shows one episode; crashes are html, csv or parquet.")
-
-
-def _check_suffix(out: str | None, kind: str) -> None:
-    """Raise an error if the ending of the file's name is that of another format."""
-    ending = Path(out).suffix.removeprefix(".").lower() if out is not None else ""
-    if ending and ending not in FORMATS:
-        raise UserError(f"out={out}: expected one of {', '.join(FORMATS)}; give the file one of these endings.")
-    if ending and ending != kind:
-        raise UserError(f"out={out}: the ending says {ending} and format {kind}; give one of them.")
-
-
-def _check_out(path: Path) -> None:
-    """Raise an error if the folder of the file does not exist."""
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise UserError(f"out={path}: expected a file in a folder that exists and can be written to; make it first.")
-
-
-def require_video() -> None:
-    """Raise :class:`UserError` if the extra for mp4 is not installed."""
-    try:
-        import imageio_ffmpeg  # noqa: F401
-    except ImportError as error:
-        raise UserError(
-            "format=mp4: needs the extra 'video'; run `pip install \"ganlane[video]\"` or choose format=gif."
-        ) from error

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Annotated, Any, TypeAlias
 
-from ganlane.config.targets import is_import_path
+from ganlane.arguments import is_import_path
 from ganlane.errors import ParameterError
 from ganlane.parameters.checks import Record, Rule, Share, assign, did_you_mean, part_of
 from ganlane.parameters.traffic import (

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeAlias
 
-from ganlane.config.evaluate import EvaluateConfig
-from ganlane.config.run import DrivingConfig, Environments, Episodes, Names
+from ganlane.config.commands import DrivingConfig, Environments, Episodes, EvaluateConfig, Names
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError
 from ganlane.parameters.agent import RainbowConfig

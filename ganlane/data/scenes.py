@@ -14,12 +14,11 @@ from typing import Final
 
 import polars as pl
 
-from ganlane.checksums import PLACE, has_checksum, sealed
 from ganlane.data.lanes import lane_width, scene_lane_widths
 from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, sort, validate
 from ganlane.data.tables import LINE, raise_where, read_table, reason
 from ganlane.errors import UserError
-from ganlane.files import atomic_path, write_bytes
+from ganlane.files import PLACE, atomic_path, has_checksum, sealed, write_bytes
 
 #: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0 at the centre of
 #: lane 1, which is the leftmost.

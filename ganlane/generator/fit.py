@@ -19,10 +19,9 @@ import polars as pl
 import torch
 from torch import Tensor
 
-from ganlane.checksums import has_checksum, note_without_checksum, sealed_archive
 from ganlane.data import TRACK, driving_statistics
 from ganlane.errors import UserError
-from ganlane.files import write_bytes
+from ganlane.files import has_checksum, note_without_checksum, sealed_archive, write_bytes
 from ganlane.generator.checkpoint import FitResult, Preset
 from ganlane.generator.forecasts import Metrics
 from ganlane.generator.segments import SceneTracks, scene_tracks

@@ -26,9 +26,8 @@ import torch
 from sklearn.cluster import KMeans
 from torch import Tensor
 
-from ganlane.checksums import has_checksum, sealed_archive
 from ganlane.errors import UserError
-from ganlane.files import write_bytes
+from ganlane.files import has_checksum, sealed_archive, write_bytes
 from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks
 
 #: Environment variable with the cache folder; empty switches the cache off.

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ganlane import keys
+from ganlane.config.commands import RunConfig
 from ganlane.config.env import EnvConfig, check_reward
-from ganlane.config.run import RunConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.gym.rows import Flags, Floats, Rows, observation_space

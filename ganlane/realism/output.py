@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,18 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ganlane.config.folders import stored_command
 from ganlane.config.recordings import RealismConfig
+from ganlane.config.runs import stored_command
 from ganlane.errors import UserError
-from ganlane.evaluation import code_version, machine
+from ganlane.evaluation import code_version, machine, write_results
 from ganlane.evaluation.table import aligned, number, with_interval
 from ganlane.evaluation.table import show as show_tables
 from ganlane.files import split_at_markers, write_between_markers, write_bytes
 from ganlane.realism import references
-from ganlane.realism.card import Card, floors_of
+from ganlane.realism.card import Card, drive_card, floors_of, scenes_path
 from ganlane.realism.measures import QUANTITIES, UNITS
 from ganlane.realism.starts import FLOORS, Starts, print_progress
+from ganlane.torch_settings import set_threads
 from ganlane.view.figures import (
     FAINT,
     GRID,
@@ -41,6 +42,21 @@ from ganlane.view.figures import (
 RECORDED = INK
 #: The check of a guard, and its answer where there is none.
 _GUARD, _WITHOUT_GUARD = "guard_under_5_percent", "no guard"
+
+
+def realism(config: RealismConfig, folder: Path) -> str:
+    """``ganlane realism``: drive, measure, print and save a card; the line that names its results."""
+    config = config.shortened()
+    set_threads(config.threads)
+    path = scenes_path(config)
+    check_targets(config, path)
+    card = drive_card(config, path)
+    drawn, numbers = draw(card, folder), card.numbers()
+    if config.publish:
+        publish(card.starts)
+    show(config, folder, card_text(numbers, card.long_runs), numbers, drawn)
+    seeds = {"stream": "report", "seed": config.seed}
+    return f"results: {write_results(folder, numbers, asdict(config), seeds)}"
 
 
 def check_targets(config: RealismConfig, path: Path | None) -> None:

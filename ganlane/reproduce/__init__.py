@@ -18,7 +18,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from ganlane.config.app import imported, run_command
+from ganlane.config.app import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,4 +26,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     # ``from`` is a Python keyword, so no field of a dataclass can have this name.
     given = [f"source={argument[5:]}" if argument.startswith("from=") else argument for argument in given]
-    return run_command("reproduce", imported("ganlane.commands.reproduce:reproduce"), given)
+    return run_command("reproduce", given)

@@ -16,7 +16,7 @@ from matplotlib.transforms import Affine2D
 
 from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import Driver, make_driver, make_env, make_traffic
-from ganlane.config.evaluate import ReproduceConfig
+from ganlane.config.commands import ReproduceConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from ganlane.build import Driver, make_driver, make_drivers, make_traffic
 from ganlane.compare import compare
-from ganlane.config.evaluate import ReproduceConfig
+from ganlane.config.commands import ReproduceConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.evaluation.results import code_version

@@ -12,10 +12,9 @@ import torch
 from torchrl.envs import EnvBase
 
 from ganlane.agents import Rainbow, save_agent
-from ganlane.checksums import has_checksum, note_without_checksum, seal_archive
-from ganlane.config.resume import LAST
+from ganlane.config.runs import LAST
 from ganlane.errors import UserError
-from ganlane.files import atomic_path
+from ganlane.files import atomic_path, has_checksum, note_without_checksum, seal_archive
 from ganlane.training.collectors import Collector, SingleCollector
 from ganlane.training.parts import check_parts
 from ganlane.training.stats import EpisodeStats

@@ -24,7 +24,7 @@ from ganlane.bench.systems import (
     start_physics,
 )
 from ganlane.bench.traffic import SYSTEM, TrafficSuite
-from ganlane.config.bench import BenchConfig
+from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig, TrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv

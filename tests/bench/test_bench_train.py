@@ -20,7 +20,7 @@ from ganlane.bench.train import (
     start_baselines,
     with_gradients,
 )
-from ganlane.config.bench import BenchConfig
+from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
 from ganlane.parameters.agent import RainbowConfig

@@ -20,7 +20,7 @@ from benchmarks.train_profile import (
 )
 from ganlane.bench.systems import Scenario
 from ganlane.bench.train import Training, TrainSuite, filled_run
-from ganlane.config.bench import BenchConfig
+from ganlane.config.commands import BenchConfig
 from ganlane.parameters.agent import RainbowConfig
 
 CONFIG = BenchConfig(suite="train", threads=[1, 2])

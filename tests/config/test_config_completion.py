@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, main
-from ganlane.config.completion import candidates
+from ganlane.__main__ import COMMANDS, PLAIN_COMMANDS, candidates, main
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = [*COMMANDS, *PLAIN_COMMANDS]
@@ -40,16 +39,16 @@ TRAFFICS = sorted(path.stem for path in (ROOT / "conf" / "traffic").glob("*.yaml
     ],
 )
 def test_the_last_word_is_completed(line, expected):
-    assert candidates(line, NAMES) == expected
+    assert candidates(line) == expected
 
 
 def test_a_key_is_completed_with_its_present_value():
-    assert candidates("ganlane train env.lanes=", NAMES) == ["env.lanes=3"]
-    assert candidates("ganlane train env=dense env.vehicles=", NAMES) == ["env.vehicles=30"]
+    assert candidates("ganlane train env.lanes=") == ["env.lanes=3"]
+    assert candidates("ganlane train env=dense env.vehicles=") == ["env.vehicles=30"]
 
 
 def test_nothing_of_hydras_and_no_schema_is_offered():
-    offered = candidates("ganlane train ", NAMES)
+    offered = candidates("ganlane train ")
     assert {"traffic=", "seed=", "env."} <= set(offered)
     assert not [word for word in offered if "schema" in word or word.startswith("hydra")]
 

@@ -1,7 +1,12 @@
-"""A wrong value or flag gives one sentence that names it, without waiting for torch, and leaves nothing behind."""
+"""A wrong value or flag, or a disk that refuses, gives one sentence, and leaves nothing half-written behind.
+
+A wrong value is reported without waiting for torch.
+"""
 
 from __future__ import annotations
 
+import errno
+import os
 import pickle
 import signal
 import subprocess
@@ -13,12 +18,14 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig, ListConfig, Node, OmegaConf
 from reference.hydra_memory import composed, own_part
+from reference.refusals import everything_below, is_one_sentence, refusal
 
 from ganlane.__main__ import COMMANDS, main
-from ganlane.config.app import Stopped
-from ganlane.config.command_line import as_meant, check, parse, refuse_unknown_keys
+from ganlane.config.app import Stopped, run_command
+from ganlane.config.command_line import as_meant, check, parse, refuse_unknown_keys, sentence
 from ganlane.config.schemas import SCHEMAS
-from ganlane.errors import UserError
+from ganlane.errors import ADVICE, UserError, is_users_matter
+from ganlane.files import write_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSED = {command: own_part(composed(command)) for command in COMMANDS}
@@ -87,6 +94,15 @@ def test_a_key_that_any_option_of_a_group_has_passes_it_too(group):
     refuse_unknown_keys(command, parse([f"{group}.{name}=1" for name in of_options]))
 
 
+#: Flags without effect.
+IDLE_FLAGS = {
+    "--resolve": "--resolve: it goes with --cfg alone",
+    "--package env": "--package: it goes with --cfg alone",
+    "--info config --resolve": "--resolve: it goes with --cfg alone",
+    "--config-dir .": "--config-dir: ganlane has its own configuration",
+    "--config-name train": "--config-name: ganlane has its own configuration",
+    "--cfg job --config-path .": "--config-path: ganlane has its own configuration",
+}
 #: Command line to a part of its sentence.
 MISTAKES = {
     "train env.lane=3": "env.lane: no such key (did you mean 'lanes'?)",
@@ -128,25 +144,17 @@ MISTAKES = {
     "train agent.noisy=perhaps": "agent.noisy=perhaps: expected true or false",
     "evaluate agents={a:1}": "agents: expected a list in brackets",
     "train traffic=mixed traffic.shares=3": "names of traffics with whole numbers",
-    "fly": "fly: no such command; choose one of train, evaluate",
+    **{f"evaluate {flags}": told for flags, told in IDLE_FLAGS.items()},
 }
 
 
 @pytest.mark.parametrize("line", MISTAKES)
-def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(line.split()) == 2
-    out, err = capsys.readouterr()
-    assert MISTAKES[line] in err
-    assert err.count("\n") == 1
-    assert err.rstrip().endswith(".")
-    assert out == ""
-    assert list(tmp_path.iterdir()) == []
+def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, empty_folder, capsys):
+    assert MISTAKES[line] in refusal(capsys, *line.split())
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt(), Stopped(signal.SIGTERM)], ids=["SIGINT", "SIGTERM"])
-def test_a_signal_while_the_configuration_is_composed_is_no_error(stop, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_signal_while_the_configuration_is_composed_is_no_error(stop, empty_folder, monkeypatch, capsys):
 
     def interrupted(self):
         raise stop
@@ -154,7 +162,7 @@ def test_a_signal_while_the_configuration_is_composed_is_no_error(stop, tmp_path
     monkeypatch.setattr(Node, "_key", interrupted)  # omegaconf cleans up after it, with an error of its own
     assert main(["train", "traffic=idm"]) == 128 + getattr(stop, "number", signal.SIGINT)
     assert capsys.readouterr().err in ("", "ganlane train: stopped by Ctrl-C.\n")
-    assert list(tmp_path.iterdir()) == []
+    assert list(empty_folder.iterdir()) == []
 
 
 def loaded(program: str, *names: str) -> str:
@@ -194,32 +202,15 @@ class Trap:
         return (open, ("sprung", "w"))
 
 
-@pytest.mark.parametrize(
-    ("flags", "told"),
-    [
-        (["--resolve"], "--resolve: it goes with --cfg alone"),
-        (["--package", "env"], "--package: it goes with --cfg alone"),
-        (["--info", "config", "--resolve"], "--resolve: it goes with --cfg alone"),
-        (["--config-dir", "."], "--config-dir: ganlane has its own configuration"),
-        (["--config-name", "train"], "--config-name: ganlane has its own configuration"),
-        (["--cfg", "job", "--config-path", "."], "--config-path: ganlane has its own configuration"),
-    ],
-)
-def test_a_flag_without_effect_is_refused_in_one_sentence(flags, told, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["evaluate", *flags]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith(f"ganlane evaluate: {told}")
-    assert err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+def test_a_pickled_run_is_not_opened(empty_folder, capsys):
+    (empty_folder / "run.pkl").write_bytes(pickle.dumps(Trap()))
+    err = refusal(capsys, "evaluate", "--cfg", "job", "--experimental-rerun", "run.pkl")
+    assert "--experimental-rerun: ganlane has its own configuration" in err
 
 
-def test_a_pickled_run_is_not_opened(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "run.pkl").write_bytes(pickle.dumps(Trap()))
-    assert main(["evaluate", "--cfg", "job", "--experimental-rerun", "run.pkl"]) == 2
-    assert "--experimental-rerun: ganlane has its own configuration" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["run.pkl"]
+def test_a_command_that_there_is_not(capsys):
+    assert main(["fly"]) == 2
+    assert capsys.readouterr().err.startswith("ganlane: fly: no such command; choose one of train, evaluate")
 
 
 def test_resolve_and_package_go_with_cfg(capsys):
@@ -244,3 +235,91 @@ def test_a_whole_number_that_no_float_can_hold_is_one_sentence(key):
 def test_a_whole_number_of_more_than_64_bits_is_out_of_range(key):
     with pytest.raises(UserError, match=key):
         check("train", [f"{key}={2**63}"])
+
+
+# --- a disk that refuses
+
+
+def refused(capsys, task, *arguments):
+    """The sentence with which ``ganlane evaluate`` ends when its task is this one; nothing new is left."""
+    before = everything_below(Path.cwd())
+    assert run_command("evaluate", arguments, task) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert is_one_sentence(err, "evaluate")
+    assert everything_below(Path.cwd()) == before
+    return err
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (errno.ENOSPC, "No space left on device; make room there"),
+        (errno.EROFS, "Read-only file system; check the permissions"),
+    ],
+)
+def test_a_refusal_while_a_command_writes(number, told, empty_folder, capsys):
+    def task(config, folder):
+        write_bytes(folder / "first.txt", b"whole")
+        with (folder / "second.txt").open("w") as file:
+            file.write("half")
+            raise OSError(number, os.strerror(number), str(folder / "second.txt"))
+
+    err = refused(capsys, task)
+    assert f"second.txt: {told}" in err
+
+
+@pytest.mark.parametrize("kind", [OSError, RuntimeError])
+def test_a_library_that_gives_the_number_in_its_text_alone(kind, empty_folder, capsys):
+    """So does polars."""
+
+    def task(config, folder):
+        raise kind("underlying IO error: No space left on device (os error 28)")
+
+    assert "a file or standard output: No space left on device; make room" in refused(capsys, task)
+
+
+def test_what_was_earned_before_the_disk_was_full_stays(empty_folder, capsys):
+    def task(config, folder):
+        write_bytes(folder / "agent.safetensors", b"trained for hours")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    assert run_command("evaluate", ["hydra.run.dir=run"], task) == 2
+    assert capsys.readouterr().err == (
+        "ganlane evaluate: a file or standard output: No space left on device; "
+        "make room there, or write to another disk.\n"
+    )
+    assert (empty_folder / "run" / "agent.safetensors").read_bytes() == b"trained for hours"
+
+
+def test_a_run_folder_below_a_file(empty_folder, capsys):
+    (empty_folder / "file").write_text("no folder")
+    err = refused(capsys, lambda config, folder: None, "hydra.run.dir=file/run")
+    assert "file/run: Not a directory; check the path." in err
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the administrator may write anywhere")
+def test_a_folder_without_the_right_to_write(empty_folder, capsys):
+    empty_folder.chmod(0o555)
+    try:
+        assert "Permission denied; check the permissions" in refused(capsys, lambda config, folder: None)
+    finally:
+        empty_folder.chmod(0o755)
+
+
+def test_what_no_user_can_mend_keeps_its_traceback(empty_folder):
+    def task(config, folder):
+        raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+
+    with pytest.raises(ConnectionRefusedError):
+        run_command("evaluate", [], task)
+    assert list(empty_folder.rglob("*")) == []
+    assert not is_users_matter(OSError("libfile.so: undefined symbol"))
+    assert not is_users_matter(ValueError(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("number", ADVICE, ids=errno.errorcode.get)
+def test_every_refusal_has_a_sentence(number):
+    told = sentence(OSError(number, os.strerror(number), "a.txt"))
+    assert told == f"a.txt: {os.strerror(number)}; {ADVICE[number]}."
+    assert is_users_matter(OSError(number, ""))

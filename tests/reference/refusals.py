@@ -1,4 +1,4 @@
-"""How a command refuses what is broken: status 2 and one sentence, without a traceback, and nothing left behind."""
+"""How commands end: refused with status 2 and one sentence, nothing left behind; or naming their results."""
 
 from __future__ import annotations
 
@@ -14,12 +14,16 @@ def everything_below(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.stat().st_size for path in folder.rglob("*")}
 
 
-def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The sentence with which a command line is refused, after all that it must not do was looked for."""
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str, printed: bool = False) -> str:
+    """The sentence with which a command line is refused, after all that it must not do was looked for.
+
+    Nothing is on stdout, unless something may have been ``printed`` before.
+    """
     before = everything_below(Path.cwd())
     status = main(arguments)
     out, err = capsys.readouterr()
     assert status == 2, (arguments, out, err)
+    assert out == "" or printed
     assert is_one_sentence(err, arguments[0]), err
     assert everything_below(Path.cwd()) == before
     return err
@@ -28,3 +32,8 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def is_one_sentence(err: str, command: str) -> bool:
     """One line that names the command and ends in a full stop; no traceback."""
     return err.startswith(f"ganlane {command}: ") and err.endswith(".\n") and err.count("\n") == 1
+
+
+def last_path(out: str) -> Path:
+    """What the last line of a command's output names."""
+    return Path(out.splitlines()[-1].partition(": ")[2])

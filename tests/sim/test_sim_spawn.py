@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference.worlds import DOUBLE, packed, vehicles
 
-from ganlane.config.env import EnvConfig
-from ganlane.config.scenarios import CutInEnvConfig
+from ganlane.config.env import CutInEnvConfig, EnvConfig
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters

@@ -13,8 +13,7 @@ from scipy.stats import binomtest
 
 from ganlane import keys
 from ganlane.build import make_env, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.scenarios import CutInEnvConfig
+from ganlane.config.env import CutInEnvConfig, EnvConfig
 from ganlane.config.traffic import (
     IdmMobilTrafficConfig,
     IdmTrafficConfig,

@@ -5,8 +5,8 @@ import torch
 from tensordict import TensorDict
 from training.test_training_loop import ToyRoad, agent, settings, train
 
-from ganlane.checksums import PLACE
 from ganlane.errors import UserError
+from ganlane.files import PLACE
 from ganlane.training.checkpoint import LAST, TrainingState, load_checkpoint, save_checkpoint
 from ganlane.training.collectors import pack, unpack
 

@@ -1,4 +1,4 @@
-"""A run's folder has one run at a time, and what a run has earned can be gone on with, however it ended."""
+"""A run's folder has one run at a time; what a run has earned can be gone on with, however it ended."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import torch
 from training.test_training_loop import ToyRoad, agent, settings, train
 
 from ganlane.config.app import run_command
-from ganlane.config.folders import CONFIG, LOCK, OVERRIDES, held, unused
+from ganlane.config.command_line import parse, quoted, single_runs, without_repetitions
+from ganlane.config.runs import CONFIG, LOCK, OVERRIDES, held, newest_unfinished, unused, with_resumed
 from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
@@ -24,9 +25,8 @@ COLUMNS = ("decisions", "updates", "mean_return", "loss", "crash_rate")
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def here(empty_folder):
+    return empty_folder
 
 
 def toy_run(config, folder):
@@ -44,7 +44,7 @@ def toy_run(config, folder):
 
 
 def command(*arguments, task=toy_run):
-    return run_command("train", task, [*arguments, "seed=3"])
+    return run_command("train", [*arguments, "seed=3"], task)
 
 
 def left_by(folder):
@@ -134,7 +134,7 @@ def test_a_second_run_in_a_folder_is_refused_while_the_first_is_at_work(here, ca
 
 def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(here):
     script = (
-        "import time; from pathlib import Path; from ganlane.config.folders import held\n"
+        "import time; from pathlib import Path; from ganlane.config.runs import held\n"
         "from ganlane.files import atomic_path\n"
         "with held(Path('run')), atomic_path('run/checkpoints/last.pt') as part:\n"
         "    part.write_bytes(b'half'); print('at work', flush=True); time.sleep(60)"
@@ -158,7 +158,7 @@ def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(her
 def test_a_run_with_a_limit_on_the_size_of_its_files_goes_on_without_it(here):
     """The checkpoint grows with its replay buffer until the system refuses it."""
     script = (
-        "import resource, sys; from config.test_config_folders import command\n"
+        "import resource, sys; from config.test_config_runs import command\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), -1)); sys.exit(command(*sys.argv[2:]))"
     )
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}", "OMP_NUM_THREADS": "1"}
@@ -180,3 +180,74 @@ def test_two_runs_of_one_process_in_one_second_have_folders_of_their_own(tmp_pat
         taken.mkdir()
         (taken / "config.yaml").write_text("")
         assert unused(first) == Path(following)
+
+
+# --- the command line of a resumed run
+
+
+def make_run(folder, overrides, age_s=0, finished=False):
+    """A run's folder as far as resuming looks at it."""
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / OVERRIDES).write_text("".join(f"- {line}\n" for line in overrides) or "[]\n")
+    checkpoint = folder / "checkpoints" / "last.pt"
+    checkpoint.touch()
+    os.utime(checkpoint, (1_000_000 - age_s, 1_000_000 - age_s))
+    if finished:
+        (folder / "results.json").touch()
+
+
+def test_a_resumed_run_keeps_its_command_line_and_its_folder(tmp_path):
+    run = tmp_path / "run"
+    make_run(run, ["traffic=idm", "seed=3"])
+    merged = with_resumed("train", [f"resume={run}", "seed=4"], multirun=False)
+    assert merged == ["traffic=idm", "seed=4", f"resume='{run}'", f"hydra.run.dir='{run}'"]
+
+
+def test_a_checkpoint_stands_for_its_run(tmp_path):
+    run = tmp_path / "run"
+    make_run(run, [])
+    make_run(run / "pretrain", [])
+    (run / "pretrain" / OVERRIDES).unlink()
+    for path in (run / "checkpoints" / "last.pt", run / "pretrain", run / "pretrain" / "checkpoints" / "last.pt"):
+        assert f"hydra.run.dir='{run}'" in with_resumed("train", [f"resume={path}"], multirun=False)
+
+
+def test_auto_takes_the_newest_unfinished_run(tmp_path):
+    runs = tmp_path / "outputs" / "train"
+    make_run(runs / "old", [], age_s=100)
+    make_run(runs / "new", [], age_s=50)
+    make_run(runs / "done", [], finished=True)
+    assert newest_unfinished(runs) == runs / "new"
+    assert "hydra.run.dir='outputs/train/new'" in with_resumed("train", ["resume=auto"], multirun=False)
+
+
+def test_auto_starts_afresh_without_an_unfinished_run():
+    assert with_resumed("train", ["resume=auto", "seed=1"], multirun=False) == ["resume=null", "seed=1"]
+
+
+def test_a_folder_without_a_checkpoint_is_refused(tmp_path):
+    with pytest.raises(UserError, match="no checkpoint there"):
+        with_resumed("train", [f"resume={tmp_path}"], multirun=False)
+
+
+def test_the_last_of_several_overrides_counts():
+    assert without_repetitions(["traffic=idm", "seed=1", "traffic=gan"]) == ["traffic=gan", "seed=1"]
+
+
+def test_a_sweep_is_every_combination():
+    runs = single_runs(["seed=0,1", "traffic=idm,gan", "threads=1"], multirun=True)
+    assert [sorted(run) for run in runs] == [
+        sorted([f"seed={seed}", f"traffic={traffic}", "threads=1"]) for seed in (0, 1) for traffic in ("idm", "gan")
+    ]
+
+
+@pytest.mark.parametrize("name", ["it's", "a'b'", "two words, [one]", "back\\\\", "back\\\\'s"])
+def test_a_folder_may_be_called_anything(name, tmp_path):
+    run = tmp_path / name
+    make_run(run, ["seed=3"])
+    merged = with_resumed("train", [f"resume={quoted(run)}"], multirun=False)
+    assert {override.key_or_group: override.value() for override in parse(merged)} == {
+        "seed": 3,
+        "resume": str(run),
+        "hydra.run.dir": str(run),
+    }

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import pytest
 from tensordict.nn import TensorDictModuleBase
 
-from ganlane.config.targets import call_with, signature_of
+from ganlane.arguments import call_with, signature_of
 from ganlane.errors import UserError
 
 

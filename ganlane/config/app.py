@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -64,21 +64,40 @@ class Stopped(BaseException):
         self.number = number
 
 
+class Job(NamedTuple):
+    """A run that is checked and about to begin.
+
+    Attributes:
+        config: of the command.
+        folder: of the run.
+        composed: the same as Hydra composed it, for the folder.
+        overrides: the command line, for the folder.
+    """
+
+    config: Any
+    folder: Path
+    composed: Any
+    overrides: list[str]
+
+
 def run_command(command: str, arguments: Sequence[str] | None = None, task: Task | None = None) -> int:
     """Run ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit status.
 
     A ``task`` takes the place of the command's function.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    # Imported when it is called: a mistake on the command line is reported before.
-    task = task or (lambda config, folder: function_of(command)(config, folder))
     open_closed_streams()
     # TorchRL would log every replay buffer.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     keep_freed_memory()
     try:
         with _sigterm_as_exception():
-            _run(command, task, arguments)
+            job = _checked(command, task, arguments)
+            if job is not None:
+                with cleared_after_mistakes(job.folder), _in_folder(job):
+                    last_line = (task or function_of(command))(job.config, job.folder)
+                if last_line:
+                    print(last_line)
             sys.stdout.flush()
     except BaseException as error:
         number = _signal_behind(error)
@@ -106,35 +125,37 @@ def _signal_behind(error: BaseException | None) -> int | None:
     return None
 
 
-def _run(command: str, task: Task, arguments: list[str]) -> None:
+def _checked(command: str, task: Task | None, arguments: list[str]) -> Job | None:
+    """The run that ``arguments`` ask for; None if they ask for something else, such as help or a sweep, done here."""
     flags = parse_arguments(command, arguments)
     if flags.help or flags.help_all:
         print(help_text(command, flags.help_all))
-        return
+        return None
     check_process()
     parse(flags.overrides)
     if flags.cfg or flags.info or flags.shell_completion or flags.hydra_help:
         as_given = parse_arguments("", arguments).overrides
         hydras = dict(zip(as_given, flags.overrides))
         _hydra(command, task, [hydras.get(argument, argument) for argument in arguments])
-        return
+        return None
     overrides = with_resumed(command, flags.overrides, flags.multirun)
     checked = check(command, overrides, flags.multirun)
     if command == "train" and checked.config.resume is not None:
         refuse_stored_imports(checked.config, flags.overrides)
-    folder = (checked.sweep_folder if flags.multirun else checked.run_folder).absolute()
-    if not flags.multirun and not any(each.startswith("hydra.run.dir=") for each in overrides):
-        folder = unused(folder)
-    with cleared_after_mistakes(folder):
-        if flags.multirun:
+    if flags.multirun:
+        folder = checked.sweep_folder.absolute()
+        with cleared_after_mistakes(folder):
             # The default name holds the time; passed on, so that Hydra uses the folder that was checked.
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
             _hydra(command, task, ["-m", *with_shares_replaced(swept)])
             _show_sweep(folder, checked.config.columns)
-        else:
-            given = parse(without_repetitions(overrides))
-            kept = [str(override.input_line) for override in given if not of_hydra(override)]
-            _run_in_folder(task, checked.config, folder, checked.composed, kept)
+        return None
+    folder = checked.run_folder.absolute()
+    if not any(each.startswith("hydra.run.dir=") for each in overrides):
+        folder = unused(folder)
+    given = parse(without_repetitions(overrides))
+    kept = [str(override.input_line) for override in given if not of_hydra(override)]
+    return Job(checked.config, folder, checked.composed, kept)
 
 
 def _show_sweep(folder: Path, columns: str) -> None:
@@ -148,36 +169,39 @@ def _show_sweep(folder: Path, columns: str) -> None:
         show("", text_table(rows), f"sweep: {folder}", columns=columns)
 
 
-def _run_in_folder(task: Task, config: Any, folder: Path, composed: Any, overrides: list[str]) -> None:
-    """Write the configuration into the run folder, then run the task there."""
+@contextmanager
+def _in_folder(job: Job) -> Iterator[None]:
+    """Hold the run folder, with the configuration written into it."""
     register_envs()  # for a user's own driver or traffic; ganlane/__init__.py leaves it to the commands
-    with held(folder):
-        write_config(composed, overrides, folder)
+    with held(job.folder):
+        write_config(job.composed, job.overrides, job.folder)
         with numbered_refusals():
-            last_line = task(config, folder)
-    if last_line:
-        print(last_line, flush=True)
+            yield
 
 
-def _hydra(command: str, task: Task, arguments: list[str]) -> None:
+def _hydra(command: str, task: Task | None, arguments: list[str]) -> None:
     """Let Hydra print the configuration or run a sweep; errors are raised unchanged."""
     register(command)
     mistakes: list[Exception] = []
     here = os.getpid()
 
-    def job(composed: Any) -> None:
+    def run(composed: Any) -> None:
         folder = Path(HydraConfig.get().runtime.output_dir)
         overrides = [str(override) for override in HydraConfig.get().overrides.task]
         try:
             with cleared_after_mistakes(folder, existed=any(folder.iterdir())):
-                _run_in_folder(task, typed(composed), folder, composed, overrides)
+                job = Job(typed(composed), folder, composed, overrides)
+                with _in_folder(job):
+                    last_line = (task or function_of(command))(job.config, folder)
+            if last_line:
+                print(last_line, flush=True)
         except (UserError, OSError) as error:
             # Kept rather than raised, because Hydra would print it too; a worker process must raise.
             mistakes.append(error)
             if os.getpid() != here:
                 raise
 
-    application = hydra.main(version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command)(job)
+    application = hydra.main(version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command)(run)
     with _process([f"ganlane {command}", *arguments]):
         application()
     if mistakes:

@@ -16,7 +16,7 @@ from ganlane.config.schemas import SCHEMAS, made, node_of, option_of, options_of
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.parameters.checks import did_you_mean
+from ganlane.parameters import did_you_mean
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any

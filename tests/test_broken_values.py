@@ -25,7 +25,7 @@ from ganlane.config.messages import sentence
 from ganlane.config.schemas import SCHEMAS, node_of
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.parameters.checks import NO_KEY
+from ganlane.parameters import NO_KEY
 
 SCENE = Path(__file__).parent / "reference" / "scene.csv"
 

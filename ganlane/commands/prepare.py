@@ -13,7 +13,7 @@ from ganlane.config.recordings import PrepareConfig
 from ganlane.data import Preparation, SceneSummary, byte_progress, default_scenes, download, prepare_recordings
 from ganlane.evaluation import write_results
 from ganlane.files import write_bytes
-from ganlane.parameters.data import NgsimDataConfig
+from ganlane.parameters.generator import NgsimDataConfig
 from ganlane.runtime import peak_resident_bytes
 from ganlane.view.figures import draw_recordings, save_figure
 

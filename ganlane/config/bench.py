@@ -9,8 +9,8 @@ from ganlane.config.env import EnvConfig, Vehicles, check_reward
 from ganlane.config.run import Columns, Names, has_cuda
 from ganlane.config.traffic import TrafficConfig, all_traffics, chosen_traffics
 from ganlane.errors import UserError
+from ganlane.parameters import DIFFERENT, Record, Rule, Seed, between, one_of
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.checks import DIFFERENT, Record, Rule, Seed, between, one_of
 from ganlane.parameters.observation import ObservationConfig, RewardParameters
 
 MODES = ("eager", "compiled", "native")

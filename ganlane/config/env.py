@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import Positive, Share, assign, between, one_of, part_of
+from ganlane.parameters import Positive, Share, assign, between, one_of, part_of
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters
 from ganlane.parameters.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.parameters.observation import RewardParameters

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from ganlane.config.run import DrivingConfig, Environments, Episodes, Names
 from ganlane.config.traffic import TRAFFICS, TrafficConfig, all_traffics, chosen_traffics
-from ganlane.parameters.checks import DIFFERENT, Rule, Seed, Text, between, one_of
+from ganlane.parameters import DIFFERENT, Rule, Seed, Text, between, one_of
 
 #: Episodes of ``ganlane reproduce`` on slow traffics, so that the whole takes half an hour.
 FEWER = {

@@ -14,7 +14,7 @@ from typing import Any
 from ganlane.config.schemas import SCHEMAS, option_of, options_of
 from ganlane.errors import as_typed
 from ganlane.files import conf_folder
-from ganlane.parameters.checks import NO_KEY
+from ganlane.parameters import NO_KEY
 
 #: Column at which the meanings of keys begin, and where their lines end.
 _COLUMN, _END = 34, 118

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ganlane.errors import UserError
-from ganlane.parameters.checks import did_you_mean
+from ganlane.parameters import did_you_mean
 
 #: Errors of Hydra and OmegaConf for an invalid configuration.
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)

@@ -7,7 +7,7 @@ from typing import Annotated, TypeAlias
 
 from ganlane.config.env import EnvConfig, check_reward
 from ganlane.errors import UserError
-from ganlane.parameters.checks import DIFFERENT, CountOrZero, Record, Seed, between, one_of
+from ganlane.parameters import DIFFERENT, CountOrZero, Record, Seed, between, one_of
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 #: Number of environments in a batch.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from ganlane.config.env import EnvConfig
 from ganlane.config.targets import call_with
 from ganlane.errors import ParameterError, as_typed
-from ganlane.parameters.checks import NotNegative, Positive, Record, Text, assign, between
+from ganlane.parameters import NotNegative, Positive, Record, Text, assign, between
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 

@@ -38,8 +38,7 @@ from ganlane.config.train import (
 from ganlane.errors import ParameterError
 from ganlane.files import conf_folder
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.data import DataConfig, HighdDataConfig, NgsimDataConfig
-from ganlane.parameters.generator import CalibratedConfig, PaperConfig
+from ganlane.parameters.generator import CalibratedConfig, DataConfig, HighdDataConfig, NgsimDataConfig, PaperConfig
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 #: Group (empty at the root) to schema name to dataclass.

@@ -9,7 +9,7 @@ All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mob
 :mod:`~ganlane.traffic.presets` builds the chains that ship.
 """
 
-from ganlane.parameters.traffic import AbortFaults, BrakingFaults, HesitationFaults, RandomDrivers, ReactionFaults
+from ganlane.parameters.driving import AbortFaults, BrakingFaults, HesitationFaults, RandomDrivers, ReactionFaults
 from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import Overlay, TrafficModule, TrafficSequential
 from ganlane.traffic.faults import AbortedLaneChange, HesitantLaneChange, LateReaction, PhantomBraking

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.traffic import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
+from ganlane.parameters.driving import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
 from ganlane.sim.lanes import lane_change_done
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.state import Road, Vehicles

@@ -10,8 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.parameters.traffic import RandomDrivers, Range
+from ganlane.parameters.driving import IdmParameters, MobilParameters, RandomDrivers, Range
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
 from ganlane.sim.feasibility import needed_deceleration
 from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration

@@ -10,8 +10,13 @@ from typing import Any
 from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
 from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
-from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.parameters.traffic import CalibratedGanParameters, DriverFaults, GanParameters
+from ganlane.parameters.driving import (
+    CalibratedGanParameters,
+    DriverFaults,
+    GanParameters,
+    IdmParameters,
+    MobilParameters,
+)
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV

@@ -28,8 +28,7 @@ from ganlane.data import (
 )
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
-from ganlane.parameters.driving import IdmParameters, Visibility
-from ganlane.parameters.traffic import ReplayParameters
+from ganlane.parameters.driving import IdmParameters, ReplayParameters, Visibility
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule

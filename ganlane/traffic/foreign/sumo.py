@@ -12,9 +12,8 @@ from torch import Tensor
 
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import IdmParameters, Visibility
+from ganlane.parameters.driving import IdmParameters, SumoParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.parameters.traffic import SumoParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.ego import ego_scene, move_ego
 from ganlane.sim.idm import TABLE_V, following_acceleration

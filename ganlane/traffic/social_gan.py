@@ -72,13 +72,8 @@ class GeneratedTraffic(TrafficModule):
         self.noise_period_s, self.noise_scale = noise_period_s, noise_scale
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
-
-    @property
-    def memory_fields(self) -> MemoryFields:  # type: ignore[override]
-        """Trailing shapes of the memory."""
-        sizes = self.generator.sizes
         motions: MemoryFields = {name: ((4 * sizes.hidden,), None) for name in self.motions}
-        return {**motions, "displacement": ((2,), None), "noise": ((sizes.noise,), None)}
+        self.memory_fields = {**motions, "displacement": ((2,), None), "noise": ((sizes.noise,), None)}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
@@ -138,13 +133,9 @@ class SocialGanTraffic(GeneratedTraffic):
                 f"{generator.sizes.predicted}."
             )
         self.execute_k = execute_k
-
-    @property
-    def memory_fields(self) -> MemoryFields:  # type: ignore[override]
-        """Trailing shapes of the memory."""
-        if self.execute_k == 1:
-            return super().memory_fields
-        return {**super().memory_fields, "plan": ((self.execute_k, 2), None), "plan_left": ((), torch.int64)}
+        if execute_k > 1:
+            plan: MemoryFields = {"plan": ((execute_k, 2), None), "plan_left": ((), torch.int64)}
+            self.memory_fields = {**self.memory_fields, **plan}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; no plan is left."""
@@ -157,12 +148,10 @@ class SocialGanTraffic(GeneratedTraffic):
     @torch.no_grad()
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Predict, and drive the first displacement (or what is left of the plan)."""
-        noise = self.next_noise(memory, key, step)
+        noise, network = self.next_noise(memory, key, step), self.network(vehicles.x.dtype)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
         history = self.history(memory)
-        moved, history, plan = paper_step(
-            self.network(vehicles.x.dtype), vehicles, history, self.noise_scale * noise, plan
-        )
+        moved, history, plan = paper_step(network, vehicles, history, self.noise_scale * noise, plan)
         kept = {**self.kept(history), "noise": noise}
         return moved, kept if plan is None else {**kept, "plan": plan.ahead, "plan_left": plan.left}
 
@@ -192,11 +181,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
     ) -> None:
         super().__init__(generator, road, stream, noise_period_s, noise_scale)
         self.headway_quantiles_s, self.anchor = headway_quantiles_s, anchor
-
-    @property
-    def memory_fields(self) -> MemoryFields:  # type: ignore[override]
-        """Trailing shapes of the memory."""
-        return {**super().memory_fields, "residual_mean": ((2,), None), "headway": ((), None)}
+        self.memory_fields = {**self.memory_fields, "residual_mean": ((2,), None), "headway": ((), None)}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
@@ -209,11 +194,8 @@ class AnchoredGanTraffic(GeneratedTraffic):
     @torch.no_grad()
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
-        noise = self.next_noise(memory, key, step)
+        noise, network = self.next_noise(memory, key, step), self.network(vehicles.x.dtype)
         driver = DriverMemory(self.history(memory), memory["residual_mean"], memory["headway"])
-        scaled = self.noise_scale * noise
-        moved, driver = anchored_step(
-            self.network(vehicles.x.dtype), vehicles, self.road, driver, scaled, self.anchor
-        )
+        moved, driver = anchored_step(network, vehicles, self.road, driver, self.noise_scale * noise, self.anchor)
         kept = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
         return moved, {**self.kept(driver.history), **kept}

@@ -19,7 +19,7 @@ from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane.traffic import IdmTraffic
-from ganlane.traffic.foreign.sumo import LorryScenes
+from ganlane.traffic.sumo import LorryScenes
 
 LORRIES = {"truck_share": 0.4}
 

@@ -20,7 +20,7 @@ from ganlane.traffic import (
     TrafficModule,
     TrafficSequential,
 )
-from ganlane.traffic.lane_change import distance_hazard, literal_hazard, random_side
+from ganlane.traffic.overlays import distance_hazard, literal_hazard, random_side
 
 
 class Drift(TrafficModule):

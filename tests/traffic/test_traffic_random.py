@@ -14,7 +14,7 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps
 from ganlane.traffic import IdmMobilTraffic, IdmRandomTraffic, RandomDrivers
-from ganlane.traffic.idm_random import DriverParams, start_braking
+from ganlane.traffic.idm_mobil import DriverParams, start_braking
 
 #: Everybody drives by Tables IV and V.
 ALIKE = RandomDrivers((1.6, 1.6), (0.7, 0.7), (1.7, 1.7), (20.0, 20.0), (1, 1), (1, 1), (0, 0), (0, 0), (10, 10))

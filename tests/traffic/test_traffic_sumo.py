@@ -19,6 +19,7 @@ from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import body_lanes
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmTraffic, SumoTraffic
+from ganlane.traffic.sumo_roads import ORIGIN_M
 
 LEFT, RIGHT = 1, 2
 
@@ -144,7 +145,9 @@ def test_stand_ins_are_where_the_ego_is(traffic):
 
     def compare(vehicles, running):
         x = float(vehicles.x[0, 0] + 0.5 * vehicles.length[0, 0])
-        stand_ins = traffic._roads.stand_ins(0)
+        roads = traffic._simulation.roads
+        place = roads.libsumo.vehicle.getLanePosition
+        stand_ins = {lane: place(name) - ORIGIN_M for lane, name in roads._stand_ins[0].items()}
         lanes_seen.add(tuple(sorted(stand_ins)))
         wrong.extend(abs(place - x) for place in stand_ins.values())
         y = float(vehicles.y[0, 0])

@@ -1,17 +1,23 @@
-"""Lane changes laid over a traffic model without any: the paper's literal ones and calibrated ones."""
+"""Laid over a traffic model: lane changes (literal and calibrated), sudden accelerations, and the guard.
+
+The first are what the paper adds to its generated traffic, and a calibrated form of it. The guard keeps generated
+vehicles on the road, in their lanes and off their leaders' bumpers: a network with relative positions as its only
+input drifts off the road within a minute, and to any speed.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.sim.idm import TABLE_V
-from ganlane.sim.lanes import lane_change_done
+from ganlane.sim.idm import TABLE_V, acceleration_behind
+from ganlane.sim.lanes import lane_change_done, spanned
 from ganlane.sim.mobil import one_at_a_time, safe_change, without_ego
-from ganlane.sim.neighbours import Scene, perceive
+from ganlane.sim.neighbours import Scene, leader, perceive
 from ganlane.sim.random import Purpose, Stream, normal, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, Overlay
@@ -50,8 +56,7 @@ class LiteralChanges:
 
     Attributes:
         mean_steps: ``t_m``, in steps of 0.1 s.
-        lateral_speed_mps: mean of the Gaussian of lateral speeds, m/s.
-        lateral_speed_sd_mps: its standard deviation, m/s.
+        lateral_speed_mps, lateral_speed_sd_mps: mean and standard deviation of the Gaussian of lateral speeds, m/s.
         slowest_mps: lower bound of a drawn speed, so that every change ends, m/s.
     """
 
@@ -64,8 +69,8 @@ class LiteralChanges:
 class LiteralLaneChange(Overlay):
     """The paper's lane changes: hazard ``t / t_m`` per step, blind, at a lateral speed drawn per change.
 
-    Memory: ``clock``, steps since the last change ended, and ``lateral_speed`` of the current change (m/s, positive
-    to the left, 0 without one).
+    Memory: ``clock``, steps since the last change ended (0 at the start, too), and ``lateral_speed`` of the current
+    change (m/s, positive to the left, 0 without one).
     """
 
     memory_fields = {"clock": ((), torch.int64), "lateral_speed": ((), None)}  # noqa: RUF012
@@ -75,10 +80,6 @@ class LiteralLaneChange(Overlay):
     ) -> None:
         super().__init__(road, stream)
         self.changes = changes or LiteralChanges()
-
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """The clock starts at 0, as the paper's does after each change."""
-        return {"clock": torch.zeros_like(vehicles.target_lane), "lateral_speed": torch.zeros_like(vehicles.x)}
 
     def _start(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Side of the changes that start now (0: none), and the lateral speed drawn for them, m/s."""
@@ -156,11 +157,6 @@ class CalibratedLaneChange(Overlay):
             safe_deceleration=self.changes.safe_deceleration, exclusive_m=self.changes.exclusive_m
         )
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """No wishes."""
-        zero = torch.zeros_like(vehicles.target_lane)
-        return {"wish": zero, "waited": zero.clone()}
-
     def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
         """The current wish, or a new one."""
         u, u_side = _hazard_and_side(vehicles, key, step)
@@ -173,8 +169,7 @@ class CalibratedLaneChange(Overlay):
         """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
         vehicles, pairs = scene.vehicles, scene.pairs
         target = vehicles.target_lane.to(lane.dtype)
-        changing = (self.road.lane_of(vehicles.y) != target) & vehicles.valid
-        changing = torch.cat((torch.zeros_like(changing[:, :1]), changing[:, 1:]), dim=1)
+        changing = without_ego((self.road.lane_of(vehicles.y) != target) & vehicles.valid)
         near = torch.minimum(pairs.ahead, pairs.behind) < self.changes.exclusive_m
         return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
 
@@ -191,3 +186,132 @@ class CalibratedLaneChange(Overlay):
         rest = torch.where((starts != 0) | given_up, 0, wish)
         moved = moved.with_(target_lane=vehicles.target_lane + starts)
         return moved, {"wish": rest, "waited": torch.where(rest == 0, 0, waited)}
+
+
+def _accelerated(vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float) -> Vehicles:
+    """``moved`` with another speed and position along the road for ``who`` [N, M]: at ``acceleration``, m/s2."""
+    speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
+    return moved.with_(
+        speed=torch.where(who, speed, moved.speed),
+        acceleration=torch.where(who, (speed - vehicles.speed) / dt, moved.acceleration),
+        x=torch.where(who, vehicles.x + 0.5 * (vehicles.speed + speed) * dt, moved.x),
+    )
+
+
+@dataclass(frozen=True)
+class SuddenAccelerations:
+    """Mean time between two (s), duration (s), mean and standard deviation of their Gaussian (m/s2)."""
+
+    every_s: float = 10.0
+    lasts_s: float = 1.0
+    mean: float = 0.0
+    sd: float = 0.8
+
+
+class AccelerationOverlay(Overlay):
+    """The paper's 'instant-acceleration or instant-slowing', drawn from the recorded accelerations.
+
+    The paper says that accelerations 'were added manually' and no more. Here they come at a constant hazard and
+    replace the base model's acceleration for a second. Memory: the acceleration (m/s2) and its remaining steps.
+    """
+
+    memory_fields = {"acceleration": ((), None), "left": ((), torch.int64)}  # noqa: RUF012
+
+    def __init__(
+        self, road: Road | None = None, stream: int = Stream.TRAIN, sudden: SuddenAccelerations | None = None
+    ) -> None:
+        super().__init__(road, stream)
+        self.sudden = sudden or SuddenAccelerations()
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Replace speed and position along the road during a sudden acceleration."""
+        s, m, dtype = self.sudden, vehicles.x.shape[1], vehicles.x.dtype
+        u = uniform(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
+        acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
+        left = torch.where(starts, round(s.lasts_s / self.dt), memory["left"])
+        moved = _accelerated(vehicles, moved, left > 0, acceleration, self.dt)
+        return moved, {"acceleration": acceleration, "left": (left - 1).clamp_min(0)}
+
+
+@dataclass(frozen=True)
+class GuardParameters:
+    """Limits of the guard.
+
+    Attributes:
+        headway_s: time headway of the IDM acceleration that is the upper bound.
+        slack: the lower bound is IDM's acceleration minus this, m/s2, times speed over desired speed, so that a
+            network that always slows ends at a crawl instead of standing still on a free road.
+        hardest_braking: lowest acceleration, m/s2.
+        centring_per_s: rate at which the offset from the target lane's centre is reduced (the P of the PD).
+        damping: share of the network's lateral motion that is kept (the D).
+        edge_margin_m: minimum distance of the turned body from the edge of the road.
+        steepest_rad: largest angle to the road.
+    """
+
+    headway_s: float = 0.8
+    slack: float = 1.5
+    hardest_braking: float = -8.0
+    centring_per_s: float = 0.5
+    damping: float = 0.8
+    edge_margin_m: float = 0.1
+    steepest_rad: float = 0.2
+
+
+#: Called with the vehicles at t, as the chain moved them, and as the guard moves them.
+Observer = Callable[[Vehicles, Vehicles, Vehicles], None]
+
+
+class Guard(Overlay):
+    """Bound the acceleration, pull towards the target lane, keep the body on the road.
+
+    :attr:`observer`, if set, is called with every correction.
+    """
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        guard: GuardParameters | None = None,
+        idm: IdmParameters = TABLE_V,
+    ) -> None:
+        super().__init__(road, stream)
+        self.guard, self.idm = guard or GuardParameters(), idm
+        self.observer: Observer | None = None
+
+    def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
+        """``moved`` with its acceleration between the bounds by IDM."""
+        g = self.guard
+        scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
+        ahead = leader(scene, spanned(scene.attention))
+        close = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
+        usual = acceleration_behind(scene, ahead, self.idm).amin(-1)
+        highest = close.clamp_min(g.hardest_braking)
+        lowest = (usual - g.slack * vehicles.speed / vehicles.desired_speed).clamp_min(g.hardest_braking)
+        wanted = (moved.speed - vehicles.speed) / self.dt
+        acceleration = torch.minimum(torch.maximum(wanted, torch.minimum(lowest, highest)), highest)
+        return _accelerated(vehicles, moved, acceleration != wanted, acceleration, self.dt)
+
+    def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
+        """``moved`` pulled towards its lane's centre where it keeps a lane, and inside the edges everywhere."""
+        g = self.guard
+        offset = self.road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
+        pulled = vehicles.y + g.damping * (moved.y - vehicles.y) + g.centring_per_s * self.dt * offset
+        y = torch.where(offset.abs() < 0.5 * self.road.lane_width_m, pulled, moved.y)
+        half = 0.5 * moved.width
+        left, right = self.road.left_edge_m() - g.edge_margin_m, self.road.right_edge_m() + g.edge_margin_m
+        y = torch.minimum(torch.maximum(y, right + half), left - half)
+        heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
+        heading = torch.where(y == moved.y, moved.heading, heading)
+        # A turned body is wider by half its length times the sine, which the angle exceeds.
+        room = torch.minimum(left - y, y - right) - half
+        steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)
+        return moved.with_(y=y, heading=torch.minimum(torch.maximum(heading, -steepest), steepest))
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Along the road, then across it."""
+        guarded = self.across(vehicles, self.along(vehicles, moved))
+        if self.observer is not None:
+            self.observer(vehicles, moved, guarded)
+        return guarded, memory

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,8 +23,8 @@ from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import TABLE_II, RandomScenes
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.foreign.sumo_roads import Array, Place, SumoDriver, SumoRoads, require_libsumo
+from ganlane.traffic.base import Memory, Moved, TrafficModule, require
+from ganlane.traffic.sumo_roads import LIBSUMO, Array, Place, SumoDriver, SumoRoads
 
 #: Vehicles of this length (m) and more are driven as lorries.
 LORRY_M = 7.0
@@ -78,15 +79,12 @@ class LorryScenes:
         length = torch.where(is_lorry, max(self.length_m, self.cars.parameters.length_m), scene.length)
         low, high = self.desired_speed_mps
         desired = torch.where(is_lorry, (low + u[..., 1] * (high - low)).to(dtype), scene.desired_speed)
-        x = scene.x + _room_taken(scene, length - scene.length)
+        # Each centre moves forward by what those behind it in its lane and its own rear half are longer.
+        extra = length - scene.length
+        same = scene.target_lane[:, :, None] == scene.target_lane[:, None, :]
+        behind = scene.x[:, None, :] < scene.x[:, :, None]
+        x = scene.x + ((extra[:, None, :] * (same & behind)).sum(-1) + 0.5 * extra)
         return scene.with_(x=x - x[:, EGO_INDEX, None], length=length, desired_speed=desired)
-
-
-def _room_taken(scene: Vehicles, extra: Tensor) -> Tensor:
-    """How far forward each centre moves, m, [N, M], where bodies are longer by ``extra`` and net gaps stay."""
-    same = scene.target_lane[:, :, None] == scene.target_lane[:, None, :]
-    behind = scene.x[:, None, :] < scene.x[:, :, None]
-    return (extra[:, None, :] * (same & behind)).sum(-1) + 0.5 * extra
 
 
 @dataclass(frozen=True)
@@ -119,10 +117,8 @@ class SumoTraffic(TrafficModule):
     Args:
         road, stream, idm, steering: as for every traffic module; idm and steering are the ego's.
         spawn: Table II, for the first scenes.
-        truck_share: of the others, 0 to 1, where ``spawn`` has none.
-        truck_length_m: length of a lorry.
-        lane_change_s: duration of a lane change.
-        keep_right: LC2013's ``lcKeepRight``.
+        truck_share, truck_length_m, lane_change_s, keep_right: see
+            :class:`~ganlane.parameters.driving.SumoParameters`.
         speed_wander: amplitude of a desired speed's variation, as a share of it; the periods are 20 to 60 s.
 
     Raises:
@@ -148,18 +144,17 @@ class SumoTraffic(TrafficModule):
         speed_wander: float = SumoParameters.speed_wander,
     ) -> None:
         super().__init__(road, stream)
-        require_libsumo()
+        require(*LIBSUMO)
         if self.road.ring_m is not None:
             raise UserError(f"traffic sumo: a ring of {self.road.ring_m:g} m; SUMO's roads here are straight.")
         self.idm, self.steering, self.spawn = idm, steering, spawn
         self.truck_share, self.truck_length_m = truck_share, truck_length_m
         self.lane_change_s, self.keep_right, self.speed_wander = lane_change_s, keep_right, speed_wander
-        self._roads: SumoRoads | None = None
-        self._episodes: _Episodes | None = None
+        self._simulation: _Simulation | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the simulation: a copy, or another process, starts its own."""
-        return {**self.__dict__, "_roads": None, "_episodes": None}
+        return {**self.__dict__, "_simulation": None}
 
     def compile_graphs(self) -> None:
         """Nothing can be compiled."""
@@ -173,32 +168,29 @@ class SumoTraffic(TrafficModule):
             return cars
         return LorryScenes(cars, self.truck_share, self.truck_length_m)
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
-        """Wheels straight; only the ego's are used."""
-        return {"steering": torch.zeros_like(vehicles.x)}
-
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
-        """One step of SUMO; rows at step 0 are set up anew first."""
-        fresh = (step == 0).cpu().numpy()
-        roads, episodes = self._simulation(vehicles, fresh)
-        seen = _Seen.of(vehicles)
-        driving = self._check(episodes, seen, fresh, key.cpu().numpy())
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """One step of SUMO; rows at step 0 are set up anew first. Only the ego's steering is used."""
+        fresh, seen = (step == 0).cpu().numpy(), _arrays(vehicles)
+        now = self._running(seen, fresh)
+        driving = self._check(now, seen, fresh, key.cpu().numpy())
         for row in np.flatnonzero(fresh):
-            self._start(roads, episodes, int(row), seen, key)
-        ego, steering = self._ego_next(vehicles, memory["steering"])
-        self._lead_egos(roads, driving, vehicles, ego, seen)
-        self._wander(roads, episodes, driving, step.cpu().numpy())
-        roads.step()
-        moved = self._moved(roads, driving, vehicles, seen)
-        episodes.inputs, episodes.outputs = seen, _Seen.of(moved)
-        return moved, {"steering": torch.cat((steering[:, None], memory["steering"][:, 1:]), dim=1)}
+            self._start(now, int(row), seen, key)
+        # Where the egos will be at t + 0.1 s, as the environment moves them.
+        acceleration = following_acceleration(ego_scene(vehicles, self.road), self.idm)[:, 0]
+        steering = memory["steering"]
+        ego, wheels = move_ego(vehicles, acceleration, steering[:, 0], self.road, self.steering, self.dt)
+        self._lead_egos(now.roads, driving, ego, seen)
+        self._wander(now, driving, step.cpu().numpy())
+        now.roads.step()
+        moved = self._moved(now.roads, driving, vehicles, seen)
+        now.inputs, now.outputs = seen, _arrays(moved)
+        return moved, {"steering": torch.cat((wheels[:, None], steering[:, 1:]), dim=1)}
 
-    def _simulation(self, vehicles: Vehicles, fresh: NDArray[np.bool_]) -> tuple[SumoRoads, _Episodes]:
+    def _running(self, seen: Any, fresh: NDArray[np.bool_]) -> _Simulation:
         """The running simulation, or a new one if all episodes begin."""
-        n, m = vehicles.x.shape
-        roads, episodes = self._roads, self._episodes
-        if roads is not None and episodes is not None and roads.is_open and episodes.shape == (n, m):
-            return roads, episodes
+        now, (n, m) = self._simulation, seen.x.shape
+        if now is not None and now.roads.is_open and now.desired_speed.shape == (n, m):
+            return now
         if not fresh.all():
             raise UserError(
                 "traffic sumo: the simulation of this episode is gone, since a process has one SUMO and "
@@ -206,92 +198,80 @@ class SumoTraffic(TrafficModule):
             )
         assert isinstance(self.road.lanes, int)
         width = float(self.road.lane_width_m)
-        roads = self._roads = SumoRoads(n, self.road.lanes, width, self.lane_change_s, self.keep_right)
-        episodes = self._episodes = _Episodes(n, m)
-        return roads, episodes
+        roads = SumoRoads(n, self.road.lanes, width, self.lane_change_s, self.keep_right)
+        self._simulation = _Simulation(roads, n, m)
+        return self._simulation
 
     def _check(
-        self, episodes: _Episodes, seen: _Seen, fresh: NDArray[np.bool_], key: NDArray[np.int64]
+        self, now: _Simulation, seen: Any, fresh: NDArray[np.bool_], key: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
         """Which rows drive in this step. A row that has ended comes again as it was, and is taken off the road.
+
+        With ``env.recycle`` some of the others may be elsewhere along the road.
 
         Raises:
             UserError: the state of a row is neither the one that SUMO left nor one that has ended.
         """
-        assert self._roads is not None
-        follows = fresh | (seen.same(episodes.outputs) & ~episodes.ended & (key == episodes.keys))
-        waits = ~follows & seen.same(episodes.inputs) & (key == episodes.keys)
-        shifted = ~follows & ~waits & ~episodes.ended & seen.shifted(episodes.outputs) & (key == episodes.keys)
-        for row in np.flatnonzero(waits & ~episodes.ended):
-            self._roads.clear(int(row))
-        for row in np.flatnonzero(shifted):
-            self._shift(int(row), seen, episodes.outputs)
+        known = key == now.keys
+        left = known & ~now.ended & _same(seen, now.outputs, ("y", "speed", "valid"))
+        follows = fresh | (left & _same(seen, now.outputs, ("x",)))
+        waits = ~follows & known & _same(seen, now.inputs, ("x", "y", "speed", "valid"))
+        shifted = ~follows & ~waits & left
+        for row in np.flatnonzero(waits & ~now.ended):
+            now.roads.clear(int(row))
+        for row, i in np.argwhere(shifted[:, None] & (seen.x != now.outputs.x)) if shifted.any() else ():
+            if i != EGO_INDEX:
+                now.roads.replace(int(row), int(i) - 1, self._place(seen, row, i))
         if not (follows | waits | shifted).all():
             raise UserError(
                 "traffic sumo: this state is not the one that SUMO left (it was loaded, copied or changed), and "
                 "SUMO can only drive on from where it is; start the episode again."
             )
-        episodes.ended = waits
+        now.ended = waits
         return follows | shifted
 
-    def _shift(self, row: int, seen: _Seen, left: _Seen | None) -> None:
-        """Follow ``env.recycle``: some of the others are elsewhere along the road."""
-        assert self._roads is not None
-        assert left is not None
-        for i in np.flatnonzero(seen.x[row, 1:] != left.x[row, 1:]) + 1:
-            self._roads.replace(row, int(i) - 1, self._place(seen, row, int(i)))
-
-    def _place(self, seen: _Seen, row: int, i: int) -> Place:
+    def _place(self, seen: Any, row: int, i: int) -> Place:
         lane = round(float(seen.y[row, i]) / float(self.road.lane_width_m))
         return Place(min(max(lane, 0), int(self.road.lanes) - 1), float(seen.x[row, i]), float(seen.speed[row, i]))
 
-    def _start(self, roads: SumoRoads, episodes: _Episodes, row: int, seen: _Seen, key: Tensor) -> None:
+    def _start(self, now: _Simulation, row: int, seen: Any, key: Tensor) -> None:
         """A new episode on a highway."""
         m = seen.x.shape[1]
-        roads.clear(row)
+        now.roads.clear(row)
         purposes = list(range(Purpose.FOREIGN_DRIVER, Purpose.FOREIGN_DRIVER + _PACE_PHASE + 1))
         u = uniform(key[row : row + 1].cpu(), 0, m, purposes, torch.float64)[0].numpy()
         drivers = [_driver(u[i], seen, row, i) if seen.valid[row, i] else None for i in range(1, m)]
-        roads.fill(row, drivers, [self._place(seen, row, i) for i in range(1, m)])
-        episodes.keys[row] = int(key[row])
-        episodes.ended[row] = False
-        episodes.desired_speed[row] = seen.desired_speed[row]
-        episodes.pace_turns[row] = 0.1 / (20.0 + 40.0 * u[:, _PACE_PERIOD])
-        episodes.pace_phase[row] = u[:, _PACE_PHASE]
+        now.roads.fill(row, drivers, [self._place(seen, row, i) for i in range(1, m)])
+        now.keys[row], now.ended[row] = int(key[row]), False
+        now.desired_speed[row] = seen.desired_speed[row]
+        now.pace_turns[row], now.pace_phase[row] = 0.1 / (20.0 + 40.0 * u[:, _PACE_PERIOD]), u[:, _PACE_PHASE]
 
-    def _ego_next(self, vehicles: Vehicles, steering: Tensor) -> tuple[Vehicles, Tensor]:
-        """Where the ego will be at t + 0.1 s, fields [N], and its steering angle [N]: as the environment moves it."""
-        acceleration = following_acceleration(ego_scene(vehicles, self.road), self.idm)[:, 0]
-        return move_ego(vehicles, acceleration, steering[:, 0], self.road, self.steering, self.dt)
-
-    def _lead_egos(
-        self, roads: SumoRoads, driving: NDArray[np.bool_], vehicles: Vehicles, ego: Vehicles, seen: _Seen
-    ) -> None:
-        """The stand-ins on their way to where the egos will be."""
+    def _lead_egos(self, roads: SumoRoads, driving: NDArray[np.bool_], ego: Vehicles, seen: Any) -> None:
+        """The stand-ins, ordinary cars for SUMO's drivers, on their way to where the egos will be."""
         one = Vehicles(*(field[:, None] for field in ego))
         body = body_lanes(one, self.road)
         lanes = presence(one, self.road, body, with_target(body, one))
         low, high, x = (field[:, 0].tolist() for field in (lanes.low, lanes.high, one.x))
+        now = seen.at(EGO_INDEX)
         for row in np.flatnonzero(driving):
-            driver = _stand_in(seen, int(row))
-            here = Place(0, float(seen.x[row, EGO_INDEX]), float(seen.speed[row, EGO_INDEX]))
-            there = range(int(low[row]), int(high[row]) + 1) if seen.valid[row, EGO_INDEX] else range(0)
+            desired, length, width = (float(field[row]) for field in (now.desired_speed, now.length, now.width))
+            driver = SumoDriver(desired, length, width, 1.0, 2.6, 4.5, 9.0, 2.5)
+            here = Place(0, float(now.x[row]), float(now.speed[row]))
+            there = range(int(low[row]), int(high[row]) + 1) if now.valid[row] else range(0)
             roads.lead_ego(int(row), there, driver, here, x[row])
 
-    def _wander(
-        self, roads: SumoRoads, episodes: _Episodes, driving: NDArray[np.bool_], step: NDArray[np.int64]
-    ) -> None:
+    def _wander(self, now: _Simulation, driving: NDArray[np.bool_], step: NDArray[np.int64]) -> None:
         """Once a second the drivers of a row change their desired speeds: a sine of each driver's own."""
         if self.speed_wander == 0.0:
             return
         for row in np.flatnonzero(driving & (step % _PACE_STEPS == 0)):
-            turns = step[row] * episodes.pace_turns[row] + episodes.pace_phase[row]
-            speeds = episodes.desired_speed[row] * (1.0 + self.speed_wander * np.sin(2.0 * np.pi * turns))
-            for name, speed in zip(roads.names[row], speeds[1:].tolist()):
+            turns = step[row] * now.pace_turns[row] + now.pace_phase[row]
+            speeds = now.desired_speed[row] * (1.0 + self.speed_wander * np.sin(2.0 * np.pi * turns))
+            for name, speed in zip(now.roads.names[row], speeds[1:].tolist()):
                 if name:
-                    roads.set_desired_speed(name, speed)
+                    now.roads.set_desired_speed(name, speed)
 
-    def _moved(self, roads: SumoRoads, driving: NDArray[np.bool_], vehicles: Vehicles, seen: _Seen) -> Vehicles:
+    def _moved(self, roads: SumoRoads, driving: NDArray[np.bool_], vehicles: Vehicles, seen: Any) -> Vehicles:
         """SUMO's state as our fields; rows that do not drive stay as they are."""
         rows, index, front, speeds = roads.read()
         index = index + 1
@@ -304,7 +284,11 @@ class SumoTraffic(TrafficModule):
         heading[rows, index] = np.clip(np.arctan2(dy, np.maximum(dx, 1e-6)), -_STEEPEST_RAD, _STEEPEST_RAD)
         acceleration[rows, index] = (speeds - speed[rows, index]) / self.dt
         x[rows, index], y[rows, index], speed[rows, index] = new_x, front[:, 1], speeds
-        target[rows, index] = self._targets(front[:, 1], dy)
+        # The lane that a vehicle keeps, or is moving to: the next centre in the direction in which it moves.
+        lane, close = front[:, 1] / float(self.road.lane_width_m), 1e-3
+        left, right = np.ceil(lane - close), np.floor(lane + close)
+        lane = np.where(dy > _SIDEWAYS_M, left, np.where(dy < -_SIDEWAYS_M, right, np.round(lane)))
+        target[rows, index] = np.clip(lane, 0, int(self.road.lanes) - 1)
         valid[:, 1:] &= ~driving[:, None]
         valid[rows, index] = True
         made = {"x": x, "y": y, "speed": speed, "heading": heading, "acceleration": acceleration}
@@ -317,62 +301,32 @@ class SumoTraffic(TrafficModule):
         )
         return moved.where(torch.as_tensor(driving).to(like.device), vehicles).with_first(vehicles.at(EGO_INDEX))
 
-    def _targets(self, y: Array, dy: Array) -> NDArray[np.int64]:
-        """The lane that each vehicle keeps, or is moving to: the next centre in the direction that it moves."""
-        lane, close = y / float(self.road.lane_width_m), 1e-3
-        left, right = np.ceil(lane - close), np.floor(lane + close)
-        target = np.where(dy > _SIDEWAYS_M, left, np.where(dy < -_SIDEWAYS_M, right, np.round(lane)))
-        return np.clip(target, 0, int(self.road.lanes) - 1).astype(np.int64)
+
+class _Simulation:
+    """The roads in SUMO, and the state of their rows outside of it; [N] or [N, M]."""
+
+    def __init__(self, roads: SumoRoads, n: int, m: int) -> None:
+        self.roads = roads
+        self.keys, self.ended = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
+        #: The vehicles (:func:`_arrays`) before and after the last step.
+        self.inputs: Any = None
+        self.outputs: Any = None
+        self.desired_speed, self.pace_turns, self.pace_phase = np.ones((n, m)), np.zeros((n, m)), np.zeros((n, m))
 
 
-class _Seen:
-    """The used fields of vehicles as arrays [N, M] on the CPU."""
-
-    def __init__(self, vehicles: Vehicles) -> None:
-        def array(field: Tensor) -> Any:
-            return field.detach().cpu().numpy()
-
-        self.x, self.y, self.speed, self.heading = map(
-            array, (vehicles.x, vehicles.y, vehicles.speed, vehicles.heading)
-        )
-        self.length, self.width = array(vehicles.length), array(vehicles.width)
-        self.desired_speed = array(vehicles.desired_speed)
-        self.target_lane, self.valid = array(vehicles.target_lane), array(vehicles.valid)
-
-    @classmethod
-    def of(cls, vehicles: Vehicles) -> _Seen:
-        """From tensors, which must not be written to afterwards."""
-        return cls(vehicles)
-
-    def same(self, other: _Seen | None) -> NDArray[np.bool_]:
-        """Rows [N] in which the others are where they are in ``other``."""
-        if other is None:
-            return np.zeros(len(self.x), dtype=bool)
-        return self.shifted(other) & (self.x[:, 1:] == other.x[:, 1:]).all(1)
-
-    def shifted(self, other: _Seen | None) -> NDArray[np.bool_]:
-        """Rows [N] in which the others are as in ``other``, but perhaps somewhere else along the road."""
-        if other is None:
-            return np.zeros(len(self.x), dtype=bool)
-        alike = (self.y == other.y) & (self.speed == other.speed) & (self.valid == other.valid)
-        return alike[:, 1:].all(1)
+def _arrays(vehicles: Vehicles) -> Any:
+    """The vehicles with arrays on the CPU as fields; the tensors must not be written to afterwards."""
+    return Vehicles(*(field.detach().cpu().numpy() for field in vehicles))  # type: ignore[arg-type]
 
 
-class _Episodes:
-    """State of the rows outside SUMO; [N] or [N, M]."""
-
-    def __init__(self, n: int, m: int) -> None:
-        self.shape = (n, m)
-        self.keys = np.zeros(n, dtype=np.int64)
-        self.ended = np.zeros(n, dtype=bool)
-        self.inputs: _Seen | None = None
-        self.outputs: _Seen | None = None
-        self.desired_speed = np.ones((n, m))
-        self.pace_turns = np.zeros((n, m))
-        self.pace_phase = np.zeros((n, m))
+def _same(seen: Any, other: Any, names: Iterable[str]) -> NDArray[np.bool_]:
+    """Rows [N] in which these fields of the others are as in ``other``; none without it."""
+    if other is None:
+        return np.zeros(len(seen.x), dtype=bool)
+    return np.all([(getattr(seen, name) == getattr(other, name))[:, 1:].all(1) for name in names], axis=0)
 
 
-def _driver(u: Array, seen: _Seen, row: int, i: int) -> SumoDriver:
+def _driver(u: Array, seen: Any, row: int, i: int) -> SumoDriver:
     """A driver by the uniforms ``u`` in [0, 1)."""
     ranges = LORRIES if seen.length[row, i] >= LORRY_M else CARS
 
@@ -389,9 +343,3 @@ def _driver(u: Array, seen: _Seen, row: int, i: int) -> SumoDriver:
         emergency_decel=ranges.emergency_decel,
         min_gap=drawn(ranges.min_gap, _MIN_GAP),
     )
-
-
-def _stand_in(seen: _Seen, row: int) -> SumoDriver:
-    """The ego's stand-in: an ordinary car for SUMO's drivers."""
-    length, width = float(seen.length[row, EGO_INDEX]), float(seen.width[row, EGO_INDEX])
-    return SumoDriver(float(seen.desired_speed[row, EGO_INDEX]), length, width, 1.0, 2.6, 4.5, 9.0, 2.5)

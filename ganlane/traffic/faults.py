@@ -68,7 +68,7 @@ class Fault(Overlay, Generic[Faults]):
 
     def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN, faults: Faults | None = None) -> None:
         super().__init__(road, stream)
-        self.faults = faults or self.kind()
+        self.faults: Faults = faults or self.kind()
 
     def draw(self, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
         """A uniform number per vehicle, [N, M]."""

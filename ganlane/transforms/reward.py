@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -57,27 +59,24 @@ class RewardTransform(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.terms(next_tensordict)
-        first, *rest = terms.values()
-        total = first
-        for term in rest:
-            total = total + term
-        batch = next_tensordict.batch_size
-        next_tensordict.set(keys.REWARD_TERMS, TensorDict._new_unsafe(terms, batch_size=batch))
-        return next_tensordict.set(keys.REWARD, total)
+        nested = TensorDict._new_unsafe(terms, batch_size=next_tensordict.batch_size)
+        return next_tensordict.set(keys.REWARD_TERMS, nested).set(keys.REWARD, reduce(torch.add, terms.values()))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
         terms = {name: zero for name in self.parameters.term_names}
-        batch = tensordict_reset.batch_size
-        return tensordict_reset.set(keys.REWARD_TERMS, TensorDict._new_unsafe(terms, batch_size=batch))
+        nested = TensorDict._new_unsafe(terms, batch_size=tensordict_reset.batch_size)
+        return tensordict_reset.set(keys.REWARD_TERMS, nested)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the terms to the observation spec; they are zero after a reset."""
         assert isinstance(observation_spec, Composite)
-        dtype, device = observation_spec[keys.VEHICLES, "x"].dtype, observation_spec.device
-        shape = observation_spec.shape
-        term = Unbounded(shape=(*shape, 1), dtype=dtype, device=device)
-        observation_spec[keys.REWARD_TERMS] = Composite(
-            {name: term.clone() for name in self.parameters.term_names}, shape=shape
-        ).to(device)
+        dtype, device, shape = (
+            observation_spec[keys.VEHICLES, "x"].dtype,
+            observation_spec.device,
+            observation_spec.shape,
+        )
+        names = self.parameters.term_names
+        terms = {name: Unbounded(shape=(*shape, 1), dtype=dtype, device=device) for name in names}
+        observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(device)
         return observation_spec

@@ -23,7 +23,7 @@ from ganlane.transforms import (
     SensorParameters,
     observation_size,
 )
-from ganlane.transforms.sensors import Measurement, measure
+from ganlane.transforms.observation import Measurement, measure
 
 EGO = (0.0, 1, 20.0, 25.0)
 EMPTY = [1.0, 0.0, 0.0]

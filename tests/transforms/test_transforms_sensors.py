@@ -29,7 +29,7 @@ from ganlane.traffic import IdmMobilTraffic
 from ganlane.train import main as train
 from ganlane.training.collectors import pack, unpack
 from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform
-from ganlane.transforms.sensors import measure
+from ganlane.transforms.observation import measure
 
 EVERYTHING = SensorParameters(1.0, 0.5, 2.0, dropout=0.2, delay_s=2.0)
 #: Own speed and lanes, which no sensor error touches.

@@ -14,16 +14,15 @@ from ganlane import keys
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.observation import RewardParameters
 
-SECTION_V_C = RewardParameters()
-
 
 def speed_reward(
-    speed: Tensor, desired_speed: Tensor, mean_acceleration: Tensor, parameters: RewardParameters = SECTION_V_C
+    speed: Tensor, desired_speed: Tensor, mean_acceleration: Tensor, parameters: RewardParameters | None = None
 ) -> Tensor:
     """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard on average over the decision."""
-    reward = (speed - parameters.base_speed_mps) / (desired_speed - parameters.base_speed_mps)
-    punished = -reward if parameters.literal_low_acceleration else -reward.abs()
-    return torch.where(mean_acceleration < parameters.low_acceleration, punished, reward)
+    p = parameters or RewardParameters()
+    reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
+    punished = -reward if p.literal_low_acceleration else -reward.abs()
+    return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
 
 
 class RewardTransform(Transform):
@@ -71,12 +70,8 @@ class RewardTransform(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the terms to the observation spec; they are zero after a reset."""
         assert isinstance(observation_spec, Composite)
-        dtype, device, shape = (
-            observation_spec[keys.VEHICLES, "x"].dtype,
-            observation_spec.device,
-            observation_spec.shape,
-        )
-        names = self.parameters.term_names
-        terms = {name: Unbounded(shape=(*shape, 1), dtype=dtype, device=device) for name in names}
+        device, shape = observation_spec.device, observation_spec.shape
+        term = Unbounded(shape=(*shape, 1), dtype=observation_spec[keys.VEHICLES, "x"].dtype, device=device)
+        terms = {name: term.clone() for name in self.parameters.term_names}
         observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(device)
         return observation_spec

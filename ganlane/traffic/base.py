@@ -48,16 +48,9 @@ def _put(tensordict: TensorDictBase, key: str, fields: Memory) -> None:
 
 
 def require(module: str, traffic: str, package: str, extra: str) -> Any:
-    """The ``module`` of a foreign simulator, imported only now.
+    """The ``module`` of a foreign simulator, imported only now; :class:`UserError` if its ``package`` is missing.
 
-    Args:
-        module: its name.
-        traffic: the option of the group ``traffic`` that needs it.
-        package: as it is called on PyPI.
-        extra: of ours that brings it.
-
-    Raises:
-        UserError: it is not installed.
+    ``traffic`` is the option that needs it, ``extra`` the one of ours that brings it.
     """
     if find_spec(module.partition(".")[0]) is None:
         raise UserError(f"traffic {traffic}: {package} is not installed; pip install 'ganlane[{extra}]' brings it.")

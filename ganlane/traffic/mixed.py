@@ -215,13 +215,10 @@ class MemoryExchange:
         self.rows, self.known = rows, known
         self.given: dict[int, Compact] = {}
 
-    def gather(self, memory: TensorDictBase) -> TensorDictBase:
-        """``memory`` of the whole batch in the part's rows."""
-        return _nested({name: self._gather(value) for name, value in memory.items()}, self.rows)
-
-    def _gather(self, whole: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
+    def gather(self, whole: Any) -> Any:
+        """The memory (or a tensor of it) of the ``whole`` batch in the part's rows."""
         if not isinstance(whole, Tensor):
-            return self.gather(whole)
+            return _nested({name: self.gather(value) for name, value in whole.items()}, self.rows)
         found = self.known.get(id(whole))
         same = found is not None and found.whole is whole and found.picked is self.rows.picked
         if found is None or not same or found.version is None or found.version != _version(whole):
@@ -230,14 +227,11 @@ class MemoryExchange:
         self.given[id(found.part)] = found
         return found.part
 
-    def scatter(self, memory: TensorDictBase, compact: dict[int, Compact]) -> TensorDictBase:
-        """The part's ``memory`` in the whole batch, zero elsewhere; ``compact`` collects the pairs."""
-        named = {name: self._scatter(value, compact) for name, value in memory.items()}
-        return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)
-
-    def _scatter(self, part: Tensor | TensorDictBase, compact: dict[int, Compact]) -> Tensor | TensorDictBase:
+    def scatter(self, part: Any, compact: dict[int, Compact]) -> Any:
+        """The ``part``'s memory (or a tensor of it) in the whole batch, zero elsewhere; ``compact`` collects pairs."""
         if not isinstance(part, Tensor):
-            return self.scatter(part, compact)
+            named = {name: self.scatter(value, compact) for name, value in part.items()}
+            return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)
         found = self.given.get(id(part))
         if found is None or found.part is not part:
             # All other rows select one row of zeros at the end: a third faster than zeros and then copies.

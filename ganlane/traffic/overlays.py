@@ -81,25 +81,20 @@ class LiteralLaneChange(Overlay):
         super().__init__(road, stream)
         self.changes = changes or LiteralChanges()
 
-    def _start(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Side of the changes that start now (0: none), and the lateral speed drawn for them, m/s."""
-        c, dtype = self.changes, vehicles.x.dtype
-        u, u_side = _hazard_and_side(vehicles, key, step)
-        gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
-        idle = memory["lateral_speed"] == 0
-        starts = idle & vehicles.valid & (u < literal_hazard(memory["clock"].to(dtype), c.mean_steps))
-        side = random_side(u_side, vehicles.target_lane, self.road.lanes)
-        pace = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
-        return torch.where(starts, side, 0), pace
-
     def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Start changes, and move current ones sideways at their own speed until they arrive.
 
         A vehicle whose target lane was set back (:class:`ganlane.traffic.AbortedLaneChange`) returns at that speed.
         """
-        side, pace = self._start(vehicles, memory, key, step)
+        c, dtype = self.changes, vehicles.x.dtype
+        u, u_side = _hazard_and_side(vehicles, key, step)
+        gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
+        idle = memory["lateral_speed"] == 0
+        starts = idle & vehicles.valid & (u < literal_hazard(memory["clock"].to(dtype), c.mean_steps))
+        side = torch.where(starts, random_side(u_side, vehicles.target_lane, self.road.lanes), 0)
+        drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
         target = vehicles.target_lane + side
-        pace = torch.where(side != 0, pace, memory["lateral_speed"].abs())
+        pace = torch.where(side != 0, drawn, memory["lateral_speed"].abs())
         changing = pace != 0
         remaining = self.road.centre_of(target, vehicles.y.dtype) - vehicles.y
         lateral = torch.copysign(pace, remaining)
@@ -107,11 +102,8 @@ class LiteralLaneChange(Overlay):
         arrives = changing & (remaining.abs() <= stride.abs())
         y = vehicles.y + torch.where(arrives, remaining, stride)
         heading = torch.atan(lateral / vehicles.speed.clamp_min(1.0))
-        moved = moved.with_(
-            target_lane=target,
-            y=torch.where(changing, y, moved.y),
-            heading=torch.where(changing, heading, moved.heading),
-        )
+        y, heading = torch.where(changing, y, moved.y), torch.where(changing, heading, moved.heading)
+        moved = moved.with_(target_lane=target, y=y, heading=heading)
         clock = torch.where(changing, 0, memory["clock"] + 1)
         return moved, {"clock": clock, "lateral_speed": torch.where(arrives, 0.0, lateral)}
 

@@ -41,7 +41,7 @@ MOST_VEHICLES = 128
 _HALF_WINDOW = 5
 #: A vehicle that moves less than this in the window keeps its heading along the road, m.
 _LEAST_PATH_M = 1.0
-_X, _LENGTH = VEHICLE_FLOATS.index("x"), VEHICLE_FLOATS.index("length")
+_X = VEHICLE_FLOATS.index("x")
 #: Lower bound of a recorded driver's desired speed, m/s (it may be stopped in a jam all the time).
 LEAST_DESIRED_SPEED_MPS = 10.0
 
@@ -172,8 +172,7 @@ class ReplayTraffic(TrafficModule):
 
     Args:
         stream: as for every traffic module.
-        path: input of :func:`ganlane.data.read_scenes`; by default the US-101 scenes of the recordings' folder.
-        least_s: minimum time that the replaced vehicle is recorded from the start on, s.
+        path, least_s: see :class:`~ganlane.parameters.driving.ReplayParameters`.
         recordings: tensors instead of a file.
 
     Raises:
@@ -198,11 +197,6 @@ class ReplayTraffic(TrafficModule):
         for name, value in vars(recorded).items():
             if isinstance(value, Tensor):
                 self.register_buffer(f"_{name}", value, persistent=False)
-
-    @property
-    def longest_m(self) -> float:
-        """Length of the longest recorded vehicle, m."""
-        return float(self._samples[:, _LENGTH].max())
 
     def start_of(self, key: Tensor) -> Tensor:
         """Number of the start, [N] int64, of the episodes with ``key`` [N]."""
@@ -264,12 +258,9 @@ class ReplayTraffic(TrafficModule):
 
 @dataclass(frozen=True)
 class RecordedScenes:
-    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`).
+    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`), M ``vehicles`` with the ego.
 
-    Attributes:
-        traffic: with the recordings.
-        vehicles: M, the ego included.
-        ego_visibility, ego_desired_speed_mps: of the ego; the recorded driver's are not known.
+    What is said of the ego is not known of the recorded driver.
     """
 
     traffic: ReplayTraffic
@@ -280,7 +271,7 @@ class RecordedScenes:
     @property
     def longest_m(self) -> float:
         """Length of the longest vehicle that was recorded, m."""
-        return self.traffic.longest_m
+        return float(self.traffic._samples[:, VEHICLE_FLOATS.index("length")].max())
 
     def check(self, road: Road, idm: IdmParameters) -> None:
         """Recorded scenes are not checked."""

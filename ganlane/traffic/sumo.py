@@ -35,27 +35,21 @@ _STEEPEST_RAD = 0.2
 #: Physics steps between two changes of a driver's desired speed.
 _PACE_STEPS = 10
 #: Columns of :attr:`ganlane.sim.random.Purpose.FOREIGN_DRIVER`: the first two of the initial scene, then a driver's.
-_IS_LORRY, _DESIRED, _TAU, _ACCEL, _DECEL, _MIN_GAP, _PACE_PERIOD, _PACE_PHASE = range(8)
+_IS_LORRY, _DESIRED, _TAU, _PACE_PERIOD, _PACE_PHASE = 0, 1, 2, 6, 7
 
 
 @dataclass(frozen=True)
 class LorryScenes:
-    """:class:`ganlane.sim.spawn.RandomScenes` with lorries among the others, at the same net gaps.
+    """``cars`` with lorries among the others, at the same net gaps.
 
     A lorry takes more of its lane, so whoever drives ahead of it there starts so much further ahead: nobody has to
-    brake harder than in the scene of cars.
-
-    Attributes:
-        cars: the scenes to start from.
-        share: of the others, 0 to 1; each is a lorry or not by itself.
-        length_m: of a lorry; its width is that of a car.
-        desired_speed_mps: (low, high) of a lorry's desired speed; 80 to 90 km/h.
+    brake harder than in the scene of cars. Each of the others is a lorry with probability ``share``, of a car's width
+    and with a desired speed of 22 to 25 m/s, 80 to 90 km/h.
     """
 
     cars: RandomScenes
     share: float = 0.15
     length_m: float = 12.0
-    desired_speed_mps: tuple[float, float] = (22.0, 25.0)
 
     @property
     def vehicles(self) -> int:
@@ -77,8 +71,7 @@ class LorryScenes:
         u = uniform(key, 0, self.vehicles, [Purpose.FOREIGN_DRIVER + _IS_LORRY, Purpose.FOREIGN_DRIVER + _DESIRED])
         is_lorry = (u[..., 0] < self.share) & (torch.arange(self.vehicles, device=key.device) != EGO_INDEX)
         length = torch.where(is_lorry, max(self.length_m, self.cars.parameters.length_m), scene.length)
-        low, high = self.desired_speed_mps
-        desired = torch.where(is_lorry, (low + u[..., 1] * (high - low)).to(dtype), scene.desired_speed)
+        desired = torch.where(is_lorry, (22.0 + u[..., 1] * (25.0 - 22.0)).to(dtype), scene.desired_speed)
         # Each centre moves forward by what those behind it in its lane and its own rear half are longer.
         extra = length - scene.length
         same = scene.target_lane[:, :, None] == scene.target_lane[:, None, :]
@@ -87,19 +80,10 @@ class LorryScenes:
         return scene.with_(x=x - x[:, EGO_INDEX, None], length=length, desired_speed=desired)
 
 
-@dataclass(frozen=True)
-class DriverRanges:
-    """Ranges (low, high) of the drivers' parameters: s, m/s2, m. SUMO's defaults lie within."""
-
-    tau: tuple[float, float] = (0.9, 1.6)
-    accel: tuple[float, float] = (1.5, 3.0)
-    decel: tuple[float, float] = (3.5, 5.0)
-    min_gap: tuple[float, float] = (1.5, 3.0)
-    emergency_decel: float = 9.0
-
-
-CARS = DriverRanges()
-LORRIES = DriverRanges(tau=(1.2, 2.0), accel=(0.8, 1.3), decel=(3.0, 4.5), min_gap=(2.0, 3.5), emergency_decel=7.0)
+#: Ranges (low, high) of the drivers' parameters, s, m/s2, m, in the order of their columns; SUMO's defaults lie
+#: within.
+CARS = {"tau": (0.9, 1.6), "accel": (1.5, 3.0), "decel": (3.5, 5.0), "min_gap": (1.5, 3.0)}
+LORRIES = {"tau": (1.2, 2.0), "accel": (0.8, 1.3), "decel": (3.0, 4.5), "min_gap": (2.0, 3.5)}
 
 
 class SumoTraffic(TrafficModule):
@@ -328,18 +312,8 @@ def _same(seen: Any, other: Any, names: Iterable[str]) -> NDArray[np.bool_]:
 
 def _driver(u: Array, seen: Any, row: int, i: int) -> SumoDriver:
     """A driver by the uniforms ``u`` in [0, 1)."""
-    ranges = LORRIES if seen.length[row, i] >= LORRY_M else CARS
-
-    def drawn(bounds: tuple[float, float], column: int) -> float:
-        return bounds[0] + float(u[column]) * (bounds[1] - bounds[0])
-
-    return SumoDriver(
-        desired_speed=float(seen.desired_speed[row, i]),
-        length=float(seen.length[row, i]),
-        width=float(seen.width[row, i]),
-        tau=drawn(ranges.tau, _TAU),
-        accel=drawn(ranges.accel, _ACCEL),
-        decel=drawn(ranges.decel, _DECEL),
-        emergency_decel=ranges.emergency_decel,
-        min_gap=drawn(ranges.min_gap, _MIN_GAP),
-    )
+    ranges, emergency_decel = (LORRIES, 7.0) if seen.length[row, i] >= LORRY_M else (CARS, 9.0)
+    columns = enumerate(ranges.items(), _TAU)
+    drawn = {name: low + float(u[column]) * (high - low) for column, (name, (low, high)) in columns}
+    own = {name: float(getattr(seen, name)[row, i]) for name in ("desired_speed", "length", "width")}
+    return SumoDriver(**own, **drawn, emergency_decel=emergency_decel)

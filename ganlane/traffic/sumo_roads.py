@@ -66,7 +66,6 @@ class SumoRoads:
     _current: SumoRoads | None = None
 
     def __init__(self, rows: int, lanes: int, lane_width_m: float, change_s: float, keep_right: float) -> None:
-        self.rows, self.lanes, self.lane_width_m = rows, lanes, lane_width_m
         self.libsumo = require(*LIBSUMO)
         if SumoRoads._current is not None:
             SumoRoads._current = None
@@ -209,12 +208,10 @@ def _network(rows: int, lanes: int, width: float) -> str:
 
 def _routes(rows: int, keep_right: float) -> str:
     """The route file: one route per highway, one type of driver, whose numbers are set vehicle by vehicle."""
-    kind = (
-        '<vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" speedDev="0" maxSpeed="70" '
-        f'lcKeepRight="{keep_right}"/>'
-    )
+    routes = "".join(f'<route id="{_edge(row)}" edges="{_edge(row)}"/>' for row in range(rows))
     return (
-        "<routes>" + kind + "".join(f'<route id="{_edge(r)}" edges="{_edge(r)}"/>' for r in range(rows)) + "</routes>"
+        '<routes><vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" speedDev="0" '
+        f'maxSpeed="70" lcKeepRight="{keep_right}"/>{routes}</routes>'
     )
 
 

@@ -228,7 +228,7 @@ class MemoryExchange:
         return found.part
 
     def scatter(self, part: Any, compact: dict[int, Compact]) -> Any:
-        """The ``part``'s memory (or a tensor of it) in the whole batch, zero elsewhere; ``compact`` collects pairs."""
+        """The ``part``'s memory (or a tensor of it) in the whole batch, else zero; ``compact`` collects pairs."""
         if not isinstance(part, Tensor):
             named = {name: self.scatter(value, compact) for name, value in part.items()}
             return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)

@@ -43,6 +43,26 @@ def overlaps(vehicles):
     return pair_overlaps(Vehicles(*(field.flatten(0, 1) for field in vehicles))).sum().item()
 
 
+def overlaps_of_the_others(env, least_km, seconds=None, ego=False):
+    """Steps with overlaps in ``least_km`` of the others' driving, in episodes of ``seconds``; ``ego``: its, too."""
+    km, count, first, decisions = 0.0, 0, 0 if ego else 1, 0
+
+    def record(now, running):
+        nonlocal km, count
+        km += (now.speed * running[:, None])[:, 1:].sum().item() * 1e-4
+        count += pair_overlaps(now)[:, first:, first:].sum().item()
+
+    env.recorder = record
+    state = env.reset()
+    while km < least_km:
+        decisions += 1
+        state = env.step(state.set(keys.ACTION, torch.zeros(env.batch_size, dtype=torch.int64)))["next"]
+        if seconds and decisions % seconds == 0:
+            state[keys.EPISODE] = state[keys.EPISODE] + env.batch_size[0]
+            state = env.reset(state.select(keys.SEED, keys.EPISODE))
+    return count
+
+
 def assert_same_alone(make, traffic, episodes, decisions):
     """Every episode of a batch is bit for bit the same as by itself in the environment ``make(traffic, 1)``."""
     together, running, _ = drive(make(traffic, len(episodes)), episodes, decisions, turns)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from reference.foreign import overlaps_of_the_others
 from reference.worlds import DOUBLE, environment, placed, same_bits, step, vehicles
 from scipy.stats import binomtest
 
@@ -286,27 +287,6 @@ def test_a_delay_shorter_than_a_step_is_refused():
         LateReaction(faults=ReactionFaults(delay_s=0.01))
 
 
-def overlaps_in(traffic: TrafficModule, vehicle_km: float, rows: int, seconds: int) -> int:
-    """Steps with overlapping others in ``vehicle_km`` of their driving, 13 to a row, in episodes of ``seconds``."""
-    env = HighwayEnv(traffic, rows, 14, SpawnParameters(spread_m=300.0))
-    km, overlaps = 0.0, 0
-
-    def record(now: Vehicles, running: torch.Tensor) -> None:
-        nonlocal km, overlaps
-        km += (now.speed * running[:, None])[:, 1:].sum().item() * 1e-4
-        overlaps += pair_overlaps(now)[:, 1:, 1:].sum().item() // 2
-
-    env.recorder = record
-    td, number = env.reset(), 0
-    while km < vehicle_km:
-        td = step(env, td)
-        number += 1
-        if number % seconds == 0:
-            td[keys.EPISODE] = td[keys.EPISODE] + rows
-            td = env.reset(td.select(keys.SEED, keys.EPISODE))
-    return overlaps
-
-
 #: Ten times the default rates.
 TENFOLD = DriverFaults(BrakingFaults(60.0), ReactionFaults(120.0), HesitationFaults(0.5), AbortFaults(0.5))
 
@@ -316,7 +296,8 @@ TENFOLD = DriverFaults(BrakingFaults(60.0), ReactionFaults(120.0), HesitationFau
     [(TENFOLD, 100.0, 24, 60), pytest.param(None, 5000.0, 128, 100, marks=pytest.mark.slow)],
 )
 def test_faults_make_no_overlaps(faults, vehicle_km, rows, seconds):
-    assert overlaps_in(idm_faults_traffic(Road(), 2, faults=faults), vehicle_km, rows, seconds) == 0
+    env = HighwayEnv(idm_faults_traffic(Road(), 2, faults=faults), rows, 14, SpawnParameters(spread_m=300.0))
+    assert overlaps_of_the_others(env, vehicle_km, seconds) == 0
 
 
 def test_faults_lie_over_generated_traffic_too():

@@ -157,11 +157,3 @@ def test_a_model_without_memory_drives_through_rollouts_and_resets(overlays):
     assert env.rollout(12, break_when_any_done=False)["next", "done"].any()
     again = env.rollout(3, tensordict=env.reset(), auto_reset=False, break_when_any_done=False)
     assert again.shape == (3, 3)
-
-
-def test_each_part_of_a_chain_keeps_its_own_memory():
-    parts = {"base": IdmTraffic(), "change": LiteralLaneChange(), "guard": Guard()}
-    assert TrafficSequential(parts).memory_spec(2, 5).keys() == parts.keys()
-    state = run(2, 5, 1, **parts)[1]
-    assert set(state["traffic"].keys()) == parts.keys()
-    assert state["traffic", "base", "steering"].shape == (2, 5)

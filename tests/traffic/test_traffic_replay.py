@@ -9,7 +9,6 @@ import polars as pl
 import pytest
 import torch
 from scipy.stats import chisquare
-from tensordict import TensorDict
 
 from ganlane import keys
 from ganlane.data import SyntheticTraffic, default_scenes, sort, synthetic_scenes, write_scene_csv
@@ -212,20 +211,6 @@ def test_heading_and_acceleration_are_those_of_the_path():
     assert heading[:60].tolist() == pytest.approx([np.arctan(1 / 200.0)] * 60)
     assert acceleration[:60].tolist() == pytest.approx([1.0] * 60)
     assert heading[60:].abs().max() == acceleration[60:].abs().max() == 0.0
-
-
-def test_the_module_keeps_its_contract():
-    traffic, key = ReplayTraffic(recordings=recorded(3)), keys_of(range(5))
-    before = TensorDict(traffic.scenes(9)(key, torch.float32).as_dict(), [5])
-    counters = {keys.SEED: torch.zeros_like(key), keys.EPISODE: torch.arange(5), keys.STEP: torch.full((5,), 3)}
-    state = TensorDict({keys.VEHICLES: before.clone(), **counters}, [5])
-    traffic(state)
-    assert (state[keys.VEHICLES] == before).all()
-    assert set(state[keys.MOVED].keys()) == set(keys.VEHICLE_FIELDS)
-    for name, value in state[keys.MOVED].items():
-        assert (value.shape, value.dtype) == (before[name].shape, before[name].dtype), name
-    assert traffic.memory_spec(5, 9) == {}
-    assert torch.equal(state[keys.MOVED, "x"][:, 1:], play(traffic, key, 4).x[:, 1:].float())
 
 
 def test_a_scene_file_is_read(tmp_path):

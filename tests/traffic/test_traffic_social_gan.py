@@ -56,21 +56,6 @@ def drive(module, td, steps):
     return td
 
 
-def test_every_leaf_of_the_memory_is_per_vehicle_and_as_declared(module):
-    td, spec = begin(module), module.memory_spec(4, 9)
-    for _ in range(2):
-        assert {name: (tuple(leaf.shape), leaf.dtype) for name, leaf in td["traffic"].items()} == spec
-        td = drive(module, td, 1)
-
-
-def test_the_state_at_t_is_never_written(module):
-    td = begin(module)
-    before = td["vehicles"].clone()
-    moved = module(td)["moved"]
-    assert (td["vehicles"] == before).all()
-    assert (moved["x"] > before["x"]).all()
-
-
 def test_an_episode_is_the_same_alone_and_in_a_batch(module):
     together, alone = drive(module, begin(module), 15), drive(module, begin(module)[2:3], 15)
     for name in ("x", "y", "speed"):

@@ -94,7 +94,7 @@ def test_calibrated_drivers_keep_different_headways_and_their_own():
     assert torch.equal(after["traffic", "generator", "headway"], headway)
 
 
-@pytest.mark.parametrize("preset", [gan_traffic, gan_calibrated_traffic])
+@pytest.mark.parametrize("preset", [gan_traffic, lambda: gan_traffic(execute_k=3), gan_calibrated_traffic])
 def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding(preset):
     many, alone = (drive(HighwayEnv(preset(), len(rows)), rows, 5)[2]["vehicles"] for rows in (range(6), [4]))
     for name in ("x", "y", "speed"):

@@ -133,15 +133,6 @@ def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> Recordings:
     return Recordings.of(sort(pl.concat(parts)), "synthetic", 4.0)
 
 
-def test_an_episode_is_the_same_in_every_batch_and_slot():
-    traffic = ReplayTraffic(recordings=recorded())
-    together, order = keys_of(range(64)), torch.randperm(64, generator=torch.Generator().manual_seed(0))
-    for step in (1, 30, 60):
-        all_rows = play(traffic, together, step)
-        for some in (order, slice(17, 18)):
-            assert all(map(torch.equal, (field[some] for field in all_rows), play(traffic, together[some], step)))
-
-
 def test_every_scene_is_equally_likely_and_every_start_within_it():
     traffic, episodes = ReplayTraffic(recordings=recorded()), range(20_000)
     starts = traffic.start_of(keys_of(episodes))

@@ -258,7 +258,6 @@ def test_a_transform_with_the_traffics_stream_is_inserted_where_there_are_errors
     assert names == [*first, "ObservationTransform", "RewardTransform"]
     if first:
         assert (env.transform[0].parameters, env.transform[0].stream) == (LATE, Stream.REPORT)
-        check_env_specs(env, seed=0)
 
 
 def test_metadata_that_know_nothing_of_sensors_go_on_naming_an_observation():

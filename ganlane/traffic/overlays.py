@@ -274,8 +274,7 @@ class Guard(Overlay):
 
     def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
         """``moved`` with its acceleration between the bounds by IDM."""
-        g = self.guard
-        scene = perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
+        g, scene = self.guard, perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
         ahead = leader(scene, spanned(scene.attention))
         close = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
         usual = acceleration_behind(scene, ahead, self.idm).amin(-1)

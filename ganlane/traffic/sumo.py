@@ -80,8 +80,7 @@ class LorryScenes:
         return scene.with_(x=x - x[:, EGO_INDEX, None], length=length, desired_speed=desired)
 
 
-#: Ranges (low, high) of the drivers' parameters, s, m/s2, m, in the order of their columns; SUMO's defaults lie
-#: within.
+#: Ranges (low, high) of the drivers' parameters, s, m/s2, m, in the order of their columns; SUMO's own lie within.
 CARS = {"tau": (0.9, 1.6), "accel": (1.5, 3.0), "decel": (3.5, 5.0), "min_gap": (1.5, 3.0)}
 LORRIES = {"tau": (1.2, 2.0), "accel": (0.8, 1.3), "decel": (3.0, 4.5), "min_gap": (2.0, 3.5)}
 
@@ -203,9 +202,9 @@ class SumoTraffic(TrafficModule):
         shifted = ~follows & ~waits & left
         for row in np.flatnonzero(waits & ~now.ended):
             now.roads.clear(int(row))
-        for row, i in np.argwhere(shifted[:, None] & (seen.x != now.outputs.x)) if shifted.any() else ():
-            if i != EGO_INDEX:
-                now.roads.replace(int(row), int(i) - 1, self._place(seen, row, i))
+        if shifted.any():
+            for row, index in np.argwhere(shifted[:, None] & (seen.x != now.outputs.x)[:, 1:]):
+                now.roads.replace(int(row), int(index), self._place(seen, row, index + 1))
         if not (follows | waits | shifted).all():
             raise UserError(
                 "traffic sumo: this state is not the one that SUMO left (it was loaded, copied or changed), and "

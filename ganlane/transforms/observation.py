@@ -225,15 +225,9 @@ def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> O
     lane = ((own_lane - road.lane_of(ego.y)) / _widest(road.lanes)).clamp(-1.0, 1.0)
     # Offset to the left of the lane's centre over half of the lane's width.
     drift = (2.0 * (others.y - road.centre_of(own_lane, others.y.dtype)) / road.lane_width_m).clamp(-1.0, 1.0)
-    valid = others.valid
-    return Others(
-        torch.where(valid, position, 1.0),
-        torch.where(valid, speed, 0.0),
-        torch.where(valid, lane, 0.0),
-        valid,
-        torch.where(valid, drift, 0.0),
-        torch.where(valid, 0.5 * ego.length + 0.5 * others.length, 0.0),
-    )
+    bumpers_m, valid = 0.5 * ego.length + 0.5 * others.length, others.valid
+    speed, lane, drift, bumpers_m = (torch.where(valid, each, 0.0) for each in (speed, lane, drift, bumpers_m))
+    return Others(torch.where(valid, position, 1.0), speed, lane, valid, drift, bumpers_m)
 
 
 def _widest(lanes: int | Tensor) -> int | Tensor:

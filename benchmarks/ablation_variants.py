@@ -128,7 +128,7 @@ def common_headway(traffic: TrafficSequential) -> None:
 
 
 def with_changes(settings: dict[str, Any], traffic: TrafficSequential) -> None:
-    """Another :class:`ganlane.traffic.lane_change.CalibratedChanges`."""
+    """Another :class:`ganlane.traffic.overlays.CalibratedChanges`."""
     old = cast(CalibratedLaneChange, traffic.parts["lane_change"])
     traffic.parts["lane_change"] = CalibratedLaneChange(
         old.road, old.stream, replace(old.changes, **settings), old.idm

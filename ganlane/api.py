@@ -46,7 +46,7 @@ from ganlane.evaluation import evaluation_rows, paired_rows, write_episodes, wri
 from ganlane.evaluation.results import Run, TrainingRun, plain
 from ganlane.files import write_bytes
 from ganlane.options import Option, command_config, option
-from ganlane.parameters.checks import did_you_mean
+from ganlane.parameters import did_you_mean
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 

@@ -31,7 +31,7 @@ from ganlane.evaluation.episodes import SIDES
 from ganlane.evaluation.results import plain
 from ganlane.evaluation.rollouts import Rollout, replay, roll_out
 from ganlane.files import write_json
-from ganlane.parameters.checks import NotNegative, Record, Rule, Seed, Text, one_of
+from ganlane.parameters import NotNegative, Record, Rule, Seed, Text, one_of
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 from ganlane.sim.random import Stream
 

@@ -15,7 +15,7 @@ from ganlane.config.command_line import VALUE_ERRORS, sentence
 from ganlane.config.schemas import HELP, SCHEMAS, chosen_options, made, node_of, option_of, options_of
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
-from ganlane.parameters.checks import did_you_mean
+from ganlane.parameters import did_you_mean
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any

@@ -24,7 +24,7 @@ from ganlane.config.command_line import sentence, typed
 from ganlane.config.schemas import SCHEMAS, node_of
 from ganlane.errors import UserError
 from ganlane.files import conf_folder
-from ganlane.parameters.checks import NO_KEY
+from ganlane.parameters import NO_KEY
 
 SCENE = Path(__file__).parent / "reference" / "scene.csv"
 

@@ -66,7 +66,7 @@ def test_an_unknown_driver_is_refused_with_the_known_ones():
     [("libsumo", SumoTrafficConfig(), "sumo"), ("highway_env", HighwayEnvTrafficConfig(), "bench")],
 )
 def test_where_the_package_is_missing_a_sentence_names_the_extra(monkeypatch, module, config, extra):
-    monkeypatch.setattr("ganlane.traffic.foreign.packages.find_spec", lambda name: None)
+    monkeypatch.setattr("ganlane.traffic.base.find_spec", lambda name: None)
     monkeypatch.delitem(sys.modules, module, raising=False)
     with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'"):
         make_traffic(config, EnvConfig())

@@ -25,7 +25,7 @@ from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.windows import CACHE_VARIABLE, cached
-from ganlane.parameters.data import NgsimParameters
+from ganlane.parameters.generator import NgsimParameters
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 from ganlane.sim.scene_files import read_scene
 from ganlane.training.checkpoint import TrainingState

@@ -14,7 +14,7 @@ from ganlane.data import Preparation, SceneSummary, byte_progress, default_scene
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
-from ganlane.parameters.data import NgsimDataConfig
+from ganlane.parameters.generator import NgsimDataConfig
 from ganlane.runtime import peak_resident_bytes
 from ganlane.view.figures import draw_recordings, save_figure
 

@@ -16,7 +16,7 @@ from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import show
 from ganlane.fit_report import FitProgress, ablation_table, fold_tables, metrics_table, results_of
 from ganlane.generator import FitResult
-from ganlane.parameters.data import DataConfig, NgsimDataConfig
+from ganlane.parameters.generator import DataConfig, NgsimDataConfig
 from ganlane.torch_settings import set_threads
 
 

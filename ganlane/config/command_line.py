@@ -32,7 +32,7 @@ from ganlane.config.schemas import (
 )
 from ganlane.errors import UserError, file_sentence
 from ganlane.files import conf_folder
-from ganlane.parameters.checks import did_you_mean
+from ganlane.parameters import did_you_mean
 
 VERSION_BASE = "1.3"
 #: Errors of Hydra and OmegaConf for an invalid configuration.

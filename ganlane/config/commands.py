@@ -9,8 +9,8 @@ from typing import Annotated, Any, TypeAlias
 from ganlane.config.env import EnvConfig, Vehicles, check_reward
 from ganlane.config.traffic import TRAFFICS, TrafficConfig, all_traffics, chosen_traffics
 from ganlane.errors import UserError
+from ganlane.parameters import DIFFERENT, CountOrZero, Record, Rule, Seed, Text, between, one_of
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.checks import DIFFERENT, CountOrZero, Record, Rule, Seed, Text, between, one_of
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 #: Number of environments in a batch.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from ganlane.arguments import call_with
 from ganlane.errors import ParameterError, as_typed
-from ganlane.parameters.checks import (
+from ganlane.parameters import (
     NotNegative,
     Positive,
     Record,

@@ -20,7 +20,7 @@ from ganlane.config.command_line import VERSION_BASE
 from ganlane.config.schemas import SCHEMAS, SUFFIX, chosen_options, option_of, options_of, register
 from ganlane.errors import as_typed
 from ganlane.files import conf_folder
-from ganlane.parameters.checks import NO_KEY
+from ganlane.parameters import NO_KEY
 
 #: Column at which the meanings of keys begin, and where their lines end.
 _COLUMN, _END = 34, 118

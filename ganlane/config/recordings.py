@@ -10,9 +10,8 @@ from ganlane.config.commands import GeneratorFile, RunConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import REACTING, TrafficConfig, chosen_traffics
 from ganlane.errors import UserError
-from ganlane.parameters.checks import CountOrZero, NotNegative, at_least, between, one_of
-from ganlane.parameters.data import DataConfig
-from ganlane.parameters.generator import FitConfig
+from ganlane.parameters import CountOrZero, NotNegative, at_least, between, one_of
+from ganlane.parameters.generator import DataConfig, FitConfig
 
 #: Names of the card's own references.
 _REFERENCES = ("random", "constant_velocity")

@@ -11,7 +11,7 @@ from typing import Annotated
 from ganlane.config.commands import DrivingConfig, Names
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError, UserError, as_typed
-from ganlane.parameters.checks import (
+from ganlane.parameters import (
     DIFFERENT,
     Count,
     NotNegative,

@@ -19,10 +19,9 @@ from ganlane.config import commands, env, recordings, render, train
 from ganlane.config.traffic import TRAFFICS
 from ganlane.errors import ParameterError
 from ganlane.files import conf_folder
+from ganlane.parameters import did_you_mean
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.checks import did_you_mean
-from ganlane.parameters.data import DataConfig, HighdDataConfig, NgsimDataConfig
-from ganlane.parameters.generator import CalibratedConfig, PaperConfig
+from ganlane.parameters.generator import CalibratedConfig, DataConfig, HighdDataConfig, NgsimDataConfig, PaperConfig
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 #: Group (empty at the root) to schema name to dataclass.

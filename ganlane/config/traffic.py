@@ -7,7 +7,7 @@ with ``parameters``. A model of your own needs no more than its import path::
     python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
     python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic +traffic.parameters.pace=0.9
 
-The numbers of each option are declared in :mod:`ganlane.parameters.traffic`.
+The numbers of each option are declared in :mod:`ganlane.parameters.driving`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import Annotated, Any, TypeAlias
 
 from ganlane.arguments import is_import_path
 from ganlane.errors import ParameterError
-from ganlane.parameters.checks import Record, Rule, Share, assign, did_you_mean, part_of
-from ganlane.parameters.traffic import (
+from ganlane.parameters import Record, Rule, Share, assign, did_you_mean, part_of
+from ganlane.parameters.driving import (
     CalibratedGanParameters,
     DriverFaults,
     GanParameters,

@@ -8,8 +8,8 @@ from typing import Annotated, TypeAlias
 from ganlane.config.commands import DrivingConfig, Environments, Episodes, EvaluateConfig, Names
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import ParameterError
+from ganlane.parameters import Count, CountOrZero, NotNegative, Record, Text, between, one_of
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Record, Text, between, one_of
 
 Workers: TypeAlias = Annotated[int, between(1, 1024)]
 #: Number of decisions above which compiling (one to two minutes) pays off.

@@ -31,7 +31,7 @@ from ganlane.data.statistics import (
     survival_curve,
 )
 from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes
-from ganlane.parameters.data import NgsimParameters
+from ganlane.parameters.generator import NgsimParameters
 
 __all__ = [
     "FRAME_S",

@@ -35,7 +35,7 @@ from ganlane.data.tables import (
     read_blocks,
 )
 from ganlane.errors import UserError
-from ganlane.parameters.data import MOTORWAYS, NgsimParameters
+from ganlane.parameters.generator import MOTORWAYS, NgsimParameters
 
 FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100

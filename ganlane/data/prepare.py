@@ -35,7 +35,7 @@ from ganlane.data.statistics import (
 )
 from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
-from ganlane.parameters.data import NgsimParameters
+from ganlane.parameters.generator import NgsimParameters
 
 #: Bins of each quantity in m/s, m/s2, s or m; quantiles are accurate to a bin's width.
 QUANTITIES: Final = {

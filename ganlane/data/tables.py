@@ -15,7 +15,7 @@ from typing import Final
 import polars as pl
 
 from ganlane.errors import UserError
-from ganlane.parameters.data import BLOCK_BYTES
+from ganlane.parameters.generator import BLOCK_BYTES
 
 #: Line of the first row of data below a header, which is line 1.
 FIRST_LINE: Final = 2

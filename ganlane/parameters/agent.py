@@ -1,7 +1,6 @@
 """Rainbow's hyperparameters and switches, and options that released versions had in addition.
 
-The latter lost the search of the hyperparameters (docs/search.md). Agents, checkpoints and command lines of released
-versions hold them at their defaults; those load as before.
+Agents, checkpoints and command lines of released versions hold the latter at their defaults and load as before.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from ganlane.errors import ParameterError, UserError, as_typed
-from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Number, Positive, PositiveShare, Record, Share
+from ganlane.parameters import Count, CountOrZero, NotNegative, Number, Positive, PositiveShare, Record, Share
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class RemovedOption(UserError):
     """A stored file or a command line asks for an option that was removed."""
 
 
-#: The last revision that had them.
+#: The last revision that had the options that lost the search of the hyperparameters (docs/search.md).
 LAST_REVISION: Final = "2f3f5feca555"
 #: Options of the agent and their defaults.
 AGENT_OPTIONS: Final[dict[str, Any]] = {
@@ -120,8 +119,7 @@ AGENT_OPTIONS: Final[dict[str, Any]] = {
 }
 #: Those that changed what an agent does; the others were details of the encoder.
 _SWITCHES: Final = ("encoder", "decide_when_free")
-OBSERVATIONS: Final = ("fixed_order",)
-_SEARCH: Final = "search/"
+_OBSERVATION: Final = "fixed_order"
 
 
 def without_removed(options: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -138,7 +136,7 @@ def without_removed(options: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 def refuse_removed_observation(form: str) -> None:
     """Raise :class:`RemovedOption` if ``form`` is an observation that is no more."""
-    if form in OBSERVATIONS:
+    if form == _OBSERVATION:
         raise _removed(f"observation={form}", "it")
 
 
@@ -155,7 +153,7 @@ def without_removed_overrides(overrides: Iterable[str], where: str) -> list[str]
         if name != key and name in AGENT_OPTIONS:
             if name in _SWITCHES and value != as_typed(AGENT_OPTIONS[name]):
                 raise _removed(where, override)
-        elif value in OBSERVATIONS or (key == "experiment" and value.startswith(_SEARCH)):
+        elif value == _OBSERVATION or (key == "experiment" and value.startswith("search/")):
             raise _removed(where, override)
         else:
             kept.append(override)

@@ -1,13 +1,30 @@
-"""How drivers follow and change lanes: Tables IV and V, and what is special about the ego."""
+"""Who drives and how: car following and lane changes (Tables IV and V), the ego, and the traffics' own drivers.
+
+The latter are generated, random, faulty and recorded ones, and those of SUMO.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Annotated
 
-from ganlane.parameters.checks import NotNegative, Positive, Record, below, one_of
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.parameters import (
+    Negative,
+    NotNegative,
+    Positive,
+    PositiveRange,
+    PositiveShare,
+    Range,
+    Record,
+    Rule,
+    Share,
+    at_least,
+    between,
+    one_of,
+)
 
 
 class Visibility(IntEnum):
@@ -21,9 +38,6 @@ class Visibility(IntEnum):
     def named(cls, name: str) -> Visibility:
         """From its name in lower case, as on the command line."""
         return cls[name.upper()]
-
-
-VISIBILITIES = tuple(kind.name.lower() for kind in Visibility)
 
 
 @dataclass(frozen=True)
@@ -44,7 +58,7 @@ class IdmParameters(Record):
     min_gap_m: NotNegative = 2.0
     headway_s: NotNegative = 1.6
     comfortable_deceleration: Positive = 1.7
-    min_acceleration: Annotated[float, below(0)] = -20.0
+    min_acceleration: Negative = -20.0
     max_acceleration: Positive = 0.7
 
     def per_lane(self) -> IdmParameters:
@@ -87,7 +101,7 @@ class EgoParameters(Record):
     """
 
     abort_lane_change: bool = False
-    visibility: Annotated[str, one_of(VISIBILITIES)] = "body"
+    visibility: Annotated[str, one_of(kind.name.lower() for kind in Visibility)] = "body"
     soft_crash_ttc_s: NotNegative = 1.5
     soft_crash_gap_m: NotNegative = 2.0
 
@@ -104,3 +118,184 @@ class SteeringParameters:
     #: Below this speed the law is one of distance travelled, not of time: a standing car does not turn its wheels.
     slow_mps: float = 3.0
     max_angle_rad: float = 0.5
+
+
+#: A time that lasts a physics step at least, s.
+Steps = Annotated[float, at_least(PHYSICS_STEP_S)]
+
+
+@dataclass(frozen=True)
+class GanParameters(Record):
+    """The paper's generated traffic (:func:`ganlane.traffic.presets.gan_traffic`).
+
+    Attributes:
+        path: weights of the preset 'paper'; null: the ones that ship.
+        guard: false: without it vehicles leave the road within a minute.
+        noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
+        execute_k: predicted steps driven before predicting again, 1 (the paper) to 8.
+    """
+
+    path: str | None = None
+    guard: bool = True
+    noise_scale: NotNegative = 1.0
+    execute_k: Annotated[int, between(1, 8)] = 1
+
+
+@dataclass(frozen=True)
+class CalibratedGanParameters(Record):
+    """The calibrated generated traffic (:func:`ganlane.traffic.presets.gan_calibrated_traffic`).
+
+    The two numbers of the noise were chosen on the scenes that the generator is fitted to: as fitted (1 and 5 s) too
+    few drivers accelerate.
+
+    Attributes:
+        path: weights of the preset 'calibrated'; null: the ones that ship.
+        noise_scale: of the latent vectors; 1 as fitted, 0 drives everybody by the mean prediction.
+        noise_period_s: time in which a driver's latent vector is forgotten, s; 5 in fitting, 0: at once.
+        changes_per_km: wishes for a lane change per vehicle-km; null: from the recordings.
+    """
+
+    path: str | None = None
+    noise_scale: NotNegative = 1.4
+    noise_period_s: NotNegative = 3.0
+    changes_per_km: NotNegative | None = None
+
+
+@dataclass(frozen=True)
+class SumoParameters(Record):
+    """What SUMO's drivers have in common (:class:`ganlane.traffic.SumoTraffic`).
+
+    Attributes:
+        truck_share: lorries among the others, 0 to 1, where the first scene has none of its own.
+        truck_length_m: length of a lorry, m.
+        lane_change_s: how long a lane change takes, s; below 1 it would look like a jump.
+        keep_right: LC2013's lcKeepRight; 0: no change to the right for its own sake.
+        speed_wander: how far a driver's desired speed strays from its mean, as a share of it.
+    """
+
+    truck_share: Share = 0.15
+    truck_length_m: Annotated[float, between(4.5, 25)] = 12.0
+    lane_change_s: Annotated[float, at_least(1)] = 4.0
+    keep_right: NotNegative = 1.0
+    speed_wander: Annotated[float, between(0, 0.2)] = 0.03
+
+
+@dataclass(frozen=True)
+class ReplayParameters(Record):
+    """Recorded traffic (:class:`ganlane.traffic.ReplayTraffic`).
+
+    Attributes:
+        path: scene CSV, or Parquet from ganlane prepare; null: US-101 in GANLANE_DATA or ../shared/data.
+        least_s: the vehicle that the ego replaces is recorded at least so long from the start on, s.
+    """
+
+    path: str | None = None
+    least_s: Steps = 4.0
+
+
+@dataclass(frozen=True)
+class RandomDrivers(Record):
+    """Ranges (low, high) that every driver's parameters are drawn from, uniformly and independently, per episode.
+
+    Attributes:
+        headway_s: IDM's time headway T, s. The recorded followers' middle half on US-101 keeps 0.93 to 1.93 s
+            (median 1.27); Kesting and Treiber (2008) fit 1.2 to 1.5 s, Treiber and Kesting (2013, table 11.2) take
+            1.0 s on highways.
+        max_acceleration: m/s2; 1.0 there, Table V has 0.7, calibrations on trajectories give up to about 1.5.
+        comfortable_deceleration: m/s2; 1.5 there, Table V has 1.7.
+        strongest_braking: m/s2, more only where the first scene asks for it
+            (:func:`ganlane.traffic.idm_mobil.start_braking`). About 9 is what dry asphalt allows, 4 is a hesitant
+            driver or a wet road.
+        desired_speed: factor on the desired speed that the scene gives (Table II: 18 to 26 m/s).
+        politeness: factor on MOBIL's weights of the followers (Table IV), 0 is an egoist.
+        reaction_s: time that passes before an acceleration decided on is driven, s. Drivers' reaction times of about
+            1 s are partly made up for by anticipation (Treiber, Kesting and Helbing 2006), which IDM has none of, so
+            the range lies below them.
+        sway_m: how far the line that a driver aims at wanders from its lane's centre, m; less in narrow lanes.
+        sway_period_s: periods of that wandering, s.
+    """
+
+    headway_s: Range = (0.8, 2.2)
+    max_acceleration: PositiveRange = (0.6, 1.6)
+    comfortable_deceleration: PositiveRange = (1.2, 2.5)
+    strongest_braking: PositiveRange = (4.0, 9.0)
+    desired_speed: PositiveRange = (0.9, 1.1)
+    politeness: Range = (0.0, 1.0)
+    reaction_s: Annotated[
+        Range, Rule(lambda value: value[1] <= 3, "two numbers [low, high], 0 <= low <= high <= 3")
+    ] = (0.0, 0.6)
+    sway_m: Range = (0.0, 0.25)
+    sway_period_s: PositiveRange = (8.0, 20.0)
+
+
+@dataclass(frozen=True)
+class BrakingFaults(Record):
+    """Phantom braking.
+
+    Attributes:
+        per_hour: how often, per driver and hour of driving without it; 0: never.
+        deceleration: how hard, m/s2; a driver who brakes harder anyway is not changed.
+        lasts_s: how long, s.
+    """
+
+    per_hour: NotNegative = 6.0
+    deceleration: Positive = 4.0
+    lasts_s: Steps = 1.0
+
+
+@dataclass(frozen=True)
+class ReactionFaults(Record):
+    """Late reactions.
+
+    Attributes:
+        per_hour: lapses of attention per driver and hour of driving with attention; 0: never.
+        delay_s: how late the driver reacts meanwhile, s, at least one physics step.
+        lasts_s: how long a lapse lasts, s.
+    """
+
+    per_hour: NotNegative = 12.0
+    delay_s: Steps = 0.8
+    lasts_s: Steps = 5.0
+
+
+@dataclass(frozen=True)
+class HesitationFaults(Record):
+    """Hesitant lane changes.
+
+    Attributes:
+        share: of the lane changes, 0 to 1.
+        pace: their lateral speed over the usual one, above 0 to 1.
+    """
+
+    share: Share = 0.2
+    pace: PositiveShare = 0.5
+
+
+@dataclass(frozen=True)
+class AbortFaults(Record):
+    """Aborted lane changes.
+
+    Attributes:
+        share: of the lane changes, 0 to 1.
+        at: how far the change has come when the driver turns back, 0 to 1; 0.5 is the line between the lanes.
+    """
+
+    share: Share = 0.1
+    at: Share = 0.5
+
+
+@dataclass(frozen=True)
+class DriverFaults(Record):
+    """How often drivers make which faults; a rate or share of 0 switches one off.
+
+    Attributes:
+        phantom_braking: a driver brakes for nothing.
+        late_reaction: a driver accelerates and brakes too late for a while.
+        hesitant_change: a lane change takes longer.
+        aborted_change: a driver turns back during a lane change.
+    """
+
+    phantom_braking: BrakingFaults = field(default_factory=BrakingFaults)
+    late_reaction: ReactionFaults = field(default_factory=ReactionFaults)
+    hesitant_change: HesitationFaults = field(default_factory=HesitationFaults)
+    aborted_change: AbortFaults = field(default_factory=AbortFaults)

@@ -7,31 +7,22 @@ from typing import Annotated
 
 from ganlane import keys
 from ganlane.errors import ParameterError
-from ganlane.parameters.agent import refuse_removed_observation
-from ganlane.parameters.checks import (
+from ganlane.parameters import (
+    Negative,
     NotNegative,
+    NotPositive,
     Number,
     Positive,
     Record,
     Share,
     assign,
-    at_most,
-    below,
     one_of,
     part_of,
 )
+from ganlane.parameters.agent import refuse_removed_observation
 
-#: How far a delay may be from a whole number of decisions, in decisions.
-_TOLERANCE = 1e-6
 #: What the agent can see, see :data:`ganlane.transforms.OBSERVATIONS`.
-FORMS = (
-    "table3",
-    "table3_progress",
-    "lane_view",
-    "lane_view_drift",
-    "lane_view_overlap",
-    "table3_lane_view",
-)
+FORMS = ("table3", "table3_progress", "lane_view", "lane_view_drift", "lane_view_overlap", "table3_lane_view")
 #: Scale of the nearness in the lane view, m.
 NEARNESS_M = 15.0
 #: Overlap along the road that adds 1 to the nearness, m: drivers at the side brake so hard that one metre decides.
@@ -73,13 +64,9 @@ class SensorParameters(Record):
     delay_s: NotNegative = 0.0
 
     def delay_decisions(self, decision_period_s: float) -> int:
-        """The delay in decisions.
-
-        Raises:
-            ParameterError: it is not a whole number of them.
-        """
+        """The delay in decisions; :class:`ParameterError` unless that is a whole number."""
         decisions = self.delay_s / decision_period_s
-        if abs(decisions - round(decisions)) > _TOLERANCE:
+        if abs(decisions - round(decisions)) > 1e-6:
             raise ParameterError(
                 f"{{delay_s}}={self.delay_s:g}: expected a multiple of the decision period "
                 f"({decision_period_s:g} s), since the ego measures once per decision; change one of them."
@@ -155,14 +142,14 @@ class RewardParameters(Record):
     """
 
     base_speed_mps: Number = 15.0
-    low_acceleration: Annotated[float, below(0)] = -2.0
+    low_acceleration: Negative = -2.0
     literal_low_acceleration: bool = False
     lane_change: Number = -1.0
     out_of_road: Number = -100.0
     hard_crash: Number = -100.0
     soft_crash: Number = -10.0
     goal: Number = 100.0
-    soft_crash_behind: Annotated[float, at_most(0)] = 0.0
+    soft_crash_behind: NotPositive = 0.0
 
     @property
     def term_names(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from ganlane.data import data_folder, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array, Estimate, entries
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
-from ganlane.parameters.checks import assign
+from ganlane.parameters import assign
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
 from ganlane.realism.measures import (
     RESAMPLES,

@@ -26,7 +26,7 @@ from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, uniform
 from ganlane.sim.state import Vehicles
 from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.lane_change import random_side
+from ganlane.traffic.overlays import random_side
 
 #: The file that ships.
 SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"

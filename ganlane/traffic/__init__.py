@@ -1,25 +1,35 @@
 """Traffic models: TensorDictModules that move the other vehicles, swappable by ``traffic=NAME``.
 
-All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules, in
-:mod:`~ganlane.traffic.idm_random` with individual drivers, :mod:`~ganlane.traffic.social_gan` by a generator;
-:mod:`~ganlane.traffic.replay` plays recordings, and in :mod:`~ganlane.traffic.foreign` SUMO and HighwayEnv drive.
+All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules,
+:mod:`~ganlane.traffic.social_gan` by a generator; :mod:`~ganlane.traffic.replay` plays recordings.
 :mod:`~ganlane.traffic.mixed` chooses a model per episode, or hides the ego. Overlays
-(:mod:`~ganlane.traffic.lane_change`, :mod:`~ganlane.traffic.acceleration`, :mod:`~ganlane.traffic.faults`) and the
-:mod:`~ganlane.traffic.guard` follow a base model in a :class:`TrafficSequential`;
-:mod:`~ganlane.traffic.presets` builds the chains that ship.
+(:mod:`~ganlane.traffic.overlays`, :mod:`~ganlane.traffic.faults`) follow a base model in a
+:class:`TrafficSequential`; :mod:`~ganlane.traffic.presets` builds the chains that ship.
+
+In :mod:`~ganlane.traffic.sumo` (Krauss and LC2013; its roads in :mod:`~ganlane.traffic.sumo_roads`) and
+:mod:`~ganlane.traffic.highway_env` foreign simulators drive, for tests with drivers that are not ours: the ego is
+moved by the environment as always, and there a stand-in drives in its place. Their packages are imported when a model
+is made, not before.
 """
 
-from ganlane.parameters.traffic import AbortFaults, BrakingFaults, HesitationFaults, RandomDrivers, ReactionFaults
-from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
+from ganlane.parameters.driving import AbortFaults, BrakingFaults, HesitationFaults, RandomDrivers, ReactionFaults
 from ganlane.traffic.base import Overlay, TrafficModule, TrafficSequential
 from ganlane.traffic.faults import AbortedLaneChange, HesitantLaneChange, LateReaction, PhantomBraking
-from ganlane.traffic.foreign import HighwayEnvTraffic, SumoTraffic
-from ganlane.traffic.guard import Guard, GuardParameters
-from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
-from ganlane.traffic.idm_random import IdmRandomTraffic
-from ganlane.traffic.lane_change import CalibratedChanges, CalibratedLaneChange, LiteralChanges, LiteralLaneChange
+from ganlane.traffic.highway_env import HighwayEnvTraffic
+from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic
 from ganlane.traffic.mixed import BlindTraffic, MixedTraffic
+from ganlane.traffic.overlays import (
+    AccelerationOverlay,
+    CalibratedChanges,
+    CalibratedLaneChange,
+    Guard,
+    GuardParameters,
+    LiteralChanges,
+    LiteralLaneChange,
+    SuddenAccelerations,
+)
 from ganlane.traffic.replay import RecordedScenes, Recordings, ReplayTraffic
+from ganlane.traffic.sumo import SumoTraffic
 
 __all__ = [
     "AbortFaults",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, TypeAlias, cast
 
 import torch
@@ -45,6 +47,16 @@ def _put(tensordict: TensorDictBase, key: str, fields: Memory) -> None:
     tensordict._set_str(key, nested, validated=True, inplace=False, non_blocking=False)
 
 
+def require(module: str, traffic: str, package: str, extra: str) -> Any:
+    """The ``module`` of a foreign simulator, imported only now; :class:`UserError` if its ``package`` is missing.
+
+    ``traffic`` is the option that needs it, ``extra`` the one of ours that brings it.
+    """
+    if find_spec(module.partition(".")[0]) is None:
+        raise UserError(f"traffic {traffic}: {package} is not installed; pip install 'ganlane[{extra}]' brings it.")
+    return import_module(module)
+
+
 class TrafficModule(TensorDictModuleBase):
     """Base of all traffic models.
 
@@ -54,8 +66,8 @@ class TrafficModule(TensorDictModuleBase):
     of invalid vehicles may be any finite numbers. Random numbers come from :mod:`ganlane.sim.random` and the counters
     only.
 
-    A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields` and
-    fills them in :meth:`fresh_memory`::
+    A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields`, and fills
+    them in :meth:`fresh_memory` unless they begin with zeros::
 
         class Cruise(TrafficModule):
             def move(self, vehicles, memory, key, step):
@@ -63,7 +75,7 @@ class TrafficModule(TensorDictModuleBase):
 
     Args:
         road: lanes and lane width, fixed for the module's life.
-        stream: family of episodes that the random numbers belong to (:class:`ganlane.sim.random.Stream`).
+        stream: family of episodes that the random numbers belong to.
     """
 
     in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
@@ -98,8 +110,9 @@ class TrafficModule(TensorDictModuleBase):
         raise NotImplementedError
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """Memory as if every vehicle had just entered; ``key`` [N] is for random per-driver parameters."""
-        return {}
+        """Memory as if every vehicle had just entered, here zeros; ``key`` [N] is for random parameters."""
+        (n, m), x = vehicles.x.shape, vehicles.x
+        return {name: x.new_zeros((n, m, *shape), dtype=kind) for name, (shape, kind) in self.memory_fields.items()}
 
     def road_of(self, key: Tensor, dtype: torch.dtype) -> Road:
         """The road of the episodes with ``key`` [N]."""
@@ -144,14 +157,9 @@ class TrafficModule(TensorDictModuleBase):
         return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])
 
     def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
-        """The start of episodes: the vehicles, unchanged here, and the memory.
+        """The start of the episodes of these keys and numbers [N] int64: the initial scene, and the memory.
 
         A traffic that sets visibilities or desired speeds itself overrides this method.
-
-        Args:
-            vehicles: the initial scene, fields [N, M].
-            key: the episodes' keys [N] int64.
-            episode: their numbers [N] int64.
         """
         return vehicles, self.init_memory(vehicles, absorb(key, 0))
 
@@ -179,8 +187,31 @@ class Overlay(TrafficModule):
         self.rewrite = compiled(self.rewrite)  # type: ignore[method-assign]
 
 
-class TrafficSequential(TrafficModule):
-    """A base model followed by overlays, each with its own memory under its name.
+class TrafficParts(TrafficModule):
+    """Base of traffics made of several, each with its own memory under its name; road and stream are the first's."""
+
+    def __init__(self, parts: Mapping[str, TrafficModule]) -> None:
+        first = next(iter(parts.values()))
+        super().__init__(first.road, first.stream)
+        self.parts = nn.ModuleDict(parts)
+        self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
+
+    def named_parts(self) -> list[tuple[str, TrafficModule]]:
+        """Names and parts, in order."""
+        return [(name, cast(TrafficModule, part)) for name, part in self.parts.items()]
+
+    def compile_graphs(self) -> None:
+        """Compile every part."""
+        for _, part in self.named_parts():
+            part.compile_graphs()
+
+    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
+        """The parts' specs, by name."""
+        return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}
+
+
+class TrafficSequential(TrafficParts):
+    """A base model followed by overlays.
 
     Args:
         parts: name to module, the base model first. Road, stream and visibility are the first one's.
@@ -193,14 +224,8 @@ class TrafficSequential(TrafficModule):
         base = next(iter(parts.values()))
         if base.own_roads:
             raise UserError("overlays behind replayed traffic: they go where they went; lay faults over a model.")
-        super().__init__(base.road, base.stream)
-        self.parts = nn.ModuleDict(parts)
+        super().__init__(parts)
         self.visibility = base.visibility
-        self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
-
-    def named_parts(self) -> list[tuple[str, TrafficModule]]:
-        """Names and parts, in order."""
-        return [(name, cast(TrafficModule, part)) for name, part in self.parts.items()]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Run the parts in order."""
@@ -211,11 +236,6 @@ class TrafficSequential(TrafficModule):
             kept[name] = tensordict.get(keys.TRAFFIC)
         tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
         return tensordict
-
-    def compile_graphs(self) -> None:
-        """Compile every part."""
-        for _, part in self.named_parts():
-            part.compile_graphs()
 
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """The parts' memories, by name."""
@@ -228,7 +248,3 @@ class TrafficSequential(TrafficModule):
         for name, part in self.named_parts():
             vehicles, memories[name] = part.enter(vehicles, key, episode)
         return vehicles, TensorDict(memories, batch_size=[vehicles.x.shape[0]])
-
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
-        """The parts' specs, by name."""
-        return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}

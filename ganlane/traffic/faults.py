@@ -8,21 +8,23 @@ every model that ships does.
 from __future__ import annotations
 
 import math
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.traffic import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
+from ganlane.parameters.driving import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
 from ganlane.sim.lanes import lane_change_done
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.base import Memory, MemoryFields, Moved, Overlay, TrafficModule, TrafficSequential
+from ganlane.traffic.base import Memory, Moved, Overlay, TrafficModule, TrafficSequential
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its heading.
 _SHORTEST_M = 1e-3
 #: No lane to turn back to.
 _NO_LANE = -1
+Faults = TypeVar("Faults", BrakingFaults, ReactionFaults, HesitationFaults, AbortFaults)
 
 
 def other_drivers(vehicles: Vehicles) -> Tensor:
@@ -31,14 +33,9 @@ def other_drivers(vehicles: Vehicles) -> Tensor:
     return vehicles.valid & (index != EGO_INDEX)
 
 
-def chance_per_step(per_hour: float, dt: float) -> float:
-    """Probability per step of ``dt`` s of an event that comes ``per_hour`` times an hour, at a constant hazard."""
-    return -math.expm1(-per_hour * dt / 3600.0)
-
-
-def draw(key: Tensor, step: Tensor, vehicles: Vehicles, purpose: Purpose) -> Tensor:
-    """A uniform number per vehicle, [N, M]."""
-    return uniform(key, step, vehicles.x.shape[1], [purpose], vehicles.x.dtype)[..., 0]
+def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
+    """Drivers whose lane change the model below has just begun, bool [N, M]."""
+    return (moved.target_lane != vehicles.target_lane) & other_drivers(vehicles)
 
 
 def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: float) -> Vehicles:
@@ -63,42 +60,48 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
     )
 
 
+class Fault(Overlay, Generic[Faults]):
+    """A fault that comes at random, as often as its ``faults`` say; ``purpose`` of its random numbers."""
+
+    kind: type[Faults]
+    purpose: Purpose
+
+    def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN, faults: Faults | None = None) -> None:
+        super().__init__(road, stream)
+        self.faults: Faults = faults or self.kind()
+
+    def draw(self, vehicles: Vehicles, key: Tensor, step: Tensor) -> Tensor:
+        """A uniform number per vehicle, [N, M]."""
+        return uniform(key, step, vehicles.x.shape[1], [self.purpose], vehicles.x.dtype)[..., 0]
+
+
 def steps_left(
     left: Tensor, u: Tensor, vehicles: Vehicles, faults: BrakingFaults | ReactionFaults, dt: float
 ) -> Tensor:
     """Remaining steps of a fault, [N, M] int64: ``left``, or all of them where a fault begins now.
 
-    A fault begins where there is none, with the probability per step, by the uniform numbers ``u`` [N, M].
+    A fault begins where there is none, at a constant hazard, by the uniform numbers ``u`` [N, M].
     """
-    begins = (left == 0) & other_drivers(vehicles) & (u < chance_per_step(faults.per_hour, dt))
+    begins = (left == 0) & other_drivers(vehicles) & (u < -math.expm1(-faults.per_hour * dt / 3600.0))
     return torch.where(begins, round(faults.lasts_s / dt), left)
 
 
-class PhantomBraking(Overlay):
+class PhantomBraking(Fault[BrakingFaults]):
     """At times a driver brakes without a reason. Memory: the remaining steps of braking."""
 
     memory_fields = {"left": ((), torch.int64)}  # noqa: RUF012
-
-    def __init__(
-        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: BrakingFaults | None = None
-    ) -> None:
-        super().__init__(road, stream)
-        self.faults = faults or BrakingFaults()
-
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """No braking."""
-        return {"left": torch.zeros_like(vehicles.target_lane)}
+    kind, purpose = BrakingFaults, Purpose.FAULT
 
     def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Brake during a fault."""
         f = self.faults
-        left = steps_left(memory["left"], draw(key, step, vehicles, Purpose.FAULT), vehicles, f, self.dt)
+        left = steps_left(memory["left"], self.draw(vehicles, key, step), vehicles, f, self.dt)
         brakes = (left > 0) & (moved.acceleration > -f.deceleration)
         braking = driven_at(vehicles, moved, torch.full_like(moved.acceleration, -f.deceleration), self.dt)
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
-class LateReaction(Overlay):
+class LateReaction(Fault[ReactionFaults]):
     """During a lapse a driver accelerates and brakes as it should have done ``delay_s`` before.
 
     What is delayed is the acceleration that the model below decides on, ``a(t) = f(state(t - delay))``: the
@@ -109,17 +112,14 @@ class LateReaction(Overlay):
     the present one), and ``left``, the remaining steps of the lapse.
     """
 
+    kind, purpose = ReactionFaults, Purpose.LATE_REACTION
+
     def __init__(
         self, road: Road | None = None, stream: int = Stream.TRAIN, faults: ReactionFaults | None = None
     ) -> None:
-        super().__init__(road, stream)
-        self.faults = faults or ReactionFaults()
+        super().__init__(road, stream, faults)
         self.delay_steps = round(self.faults.delay_s / self.dt)
-
-    @property
-    def memory_fields(self) -> MemoryFields:  # type: ignore[override]
-        """Trailing shapes of the memory."""
-        return {"past": ((self.delay_steps,), None), "left": ((), torch.int64)}
+        self.memory_fields = {"past": ((self.delay_steps,), None), "left": ((), torch.int64)}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """No lapse, a constant past acceleration."""
@@ -128,46 +128,31 @@ class LateReaction(Overlay):
 
     def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Drive at the acceleration of ``delay_s`` ago during a lapse."""
-        u = draw(key, step, vehicles, Purpose.LATE_REACTION)
-        left = steps_left(memory["left"], u, vehicles, self.faults, self.dt)
+        left = steps_left(memory["left"], self.draw(vehicles, key, step), vehicles, self.faults, self.dt)
         late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
         past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
         return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}
 
 
-def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
-    """Drivers whose lane change the model below has just begun, bool [N, M]."""
-    return (moved.target_lane != vehicles.target_lane) & other_drivers(vehicles)
-
-
-class HesitantLaneChange(Overlay):
+class HesitantLaneChange(Fault[HesitationFaults]):
     """Some changes take longer: lateral motion is multiplied by ``pace`` until the change is complete.
 
     Memory: whether the current change is ``hesitant``.
     """
 
     memory_fields = {"hesitant": ((), torch.bool)}  # noqa: RUF012
-
-    def __init__(
-        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: HesitationFaults | None = None
-    ) -> None:
-        super().__init__(road, stream)
-        self.faults = faults or HesitationFaults()
-
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """No hesitant change."""
-        return {"hesitant": torch.zeros_like(vehicles.valid)}
+    kind, purpose = HesitationFaults, Purpose.HESITANT_CHANGE
 
     def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Reduce the lateral motion of hesitant changes."""
-        begins, u = starting(vehicles, moved), draw(key, step, vehicles, Purpose.HESITANT_CHANGE)
+        begins, u = starting(vehicles, moved), self.draw(vehicles, key, step)
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
         slowed = vehicles.y + self.faults.pace * (moved.y - vehicles.y)
         moved = moved.with_(y=torch.where(hesitant, slowed, moved.y))
         return moved, {"hesitant": hesitant & ~lane_change_done(moved, self.road)}
 
 
-class AbortedLaneChange(Overlay):
+class AbortedLaneChange(Fault[AbortFaults]):
     """Some changes are aborted: the driver turns back to its old lane.
 
     At the default of half way the body is still in the old lane, where the others have seen it all the time, so its
@@ -175,12 +160,7 @@ class AbortedLaneChange(Overlay):
     """
 
     memory_fields = {"origin": ((), torch.int64)}  # noqa: RUF012
-
-    def __init__(
-        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: AbortFaults | None = None
-    ) -> None:
-        super().__init__(road, stream)
-        self.faults = faults or AbortFaults()
+    kind, purpose = AbortFaults, Purpose.ABORTED_CHANGE
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """No lane to turn back to."""
@@ -188,7 +168,7 @@ class AbortedLaneChange(Overlay):
 
     def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Set the old lane as the target where the change has come far enough."""
-        begins, u = starting(vehicles, moved), draw(key, step, vehicles, Purpose.ABORTED_CHANGE)
+        begins, u = starting(vehicles, moved), self.draw(vehicles, key, step)
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])
         start, end = (self.road.centre_of(lane, moved.y.dtype) for lane in (origin, moved.target_lane))

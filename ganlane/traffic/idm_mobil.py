@@ -1,22 +1,37 @@
-"""Rule-driven traffic: IDM along the road, MOBIL or no lane changes, steered like the ego."""
+"""Rule-driven traffic: IDM, MOBIL or no lane changes, steered like the ego; drivers who are alike or random."""
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.keys import EGO_INDEX
+from ganlane.parameters import Range
+from ganlane.parameters.driving import IdmParameters, MobilParameters, RandomDrivers
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
-from ganlane.sim.idm import TABLE_V, following_acceleration
-from ganlane.sim.mobil import TABLE_IV, mobil_changes
-from ganlane.sim.neighbours import Scene, perceive
-from ganlane.sim.random import Stream
+from ganlane.sim.feasibility import needed_deceleration
+from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration
+from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
+from ganlane.sim.neighbours import Scene, in_lane, perceive
+from ganlane.sim.random import Purpose, Stream, absorb, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.torch_settings import compiled
-from ganlane.traffic.base import Memory, Moved, TrafficModule
+from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule
 
 #: MOBIL decides once a second of simulated time, whatever the ego's decision period.
 MOBIL_PERIOD_STEPS = 10
+#: Minimum distance of a swaying body from its lane's markings, m.
+_LANE_MARGIN_M = 0.1
+#: A random driver's strongest braking is at least this many times what the initial scene requires of it.
+_START_MARGIN = 1.5
+#: Number of uniform numbers per random driver, and the column of the factor on the desired speed.
+_DRAWS, _DESIRED_SPEED = 12, 11
+#: Key of the random drivers' parameters in the memory, which stored training runs hold.
+_PARAMETERS = "traits"
 
 
 class IdmTraffic(TrafficModule):
@@ -37,19 +52,22 @@ class IdmTraffic(TrafficModule):
         super().__init__(road, stream)
         self.idm, self.steering = idm, steering
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """Steering angle 0."""
-        return {"steering": torch.zeros_like(vehicles.x)}
-
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Accelerate, steer, advance."""
+        return self.keep_lanes(vehicles, memory)
+
+    def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
+        """A step without decisions."""
         return self.drive(perceive(vehicles, self.road), vehicles.target_lane, memory)
 
     def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
-        v, acceleration = scene.vehicles, following_acceleration(scene, self.idm)
-        centre = self.road.centre_of(target, v.y.dtype)
-        steering = steer(memory["steering"], v.y, v.heading, v.speed, centre, self.dt, self.steering)
+        centre = self.road.centre_of(target, scene.vehicles.y.dtype)
+        return self._advanced(scene.vehicles, following_acceleration(scene, self.idm), target, centre, memory)
+
+    def _advanced(self, v: Vehicles, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory) -> Moved:
+        """Steered to the lines at ``line`` (m, [N, M])."""
+        steering = steer(memory["steering"], v.y, v.heading, v.speed, line, self.dt, self.steering)
         pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, self.dt)
         return v.with_(target_lane=target, **pose._asdict()), {"steering": steering}
 
@@ -76,17 +94,173 @@ class IdmMobilTraffic(IdmTraffic):
             return self.keep_lanes(vehicles, memory)
         return self.decide(vehicles, memory, due)
 
-    def keep_lanes(self, vehicles: Vehicles, memory: Memory) -> Moved:
-        """A step without decisions."""
-        return self.drive(perceive(vehicles, self.road), vehicles.target_lane, memory)
-
     def decide(self, vehicles: Vehicles, memory: Memory, due: Tensor) -> Moved:
         """A step in which the drivers of the rows ``due`` [N] decide."""
         scene = perceive(vehicles, self.road)
-        change = torch.where(due[:, None], mobil_changes(scene, self.road, self.idm, self.mobil), 0)
+        change = torch.where(due[:, None], self.changes(scene, memory), 0)
         return self.drive(scene, vehicles.target_lane + change, memory)
+
+    def changes(self, scene: Scene, memory: Memory) -> Tensor:
+        """The side that each driver changes to, -1, 0 or 1, [N, M]."""
+        return mobil_changes(scene, self.road, self.idm, self.mobil)
 
     def compile_graphs(self) -> None:
         """One graph for a step with decisions, one for a step without."""
         self.keep_lanes = compiled(self.keep_lanes)  # type: ignore[method-assign]
         self.decide = compiled(self.decide)  # type: ignore[method-assign]
+
+
+class DriverParams(NamedTuple):
+    """Per-driver parameters, tensors [N, M]; names and units as in :class:`RandomDrivers`.
+
+    ``delay`` is the reaction time in physics steps; the last four are angular frequencies (rad/s) and phases (rad) of
+    the two waves that make up a driver's sway.
+    """
+
+    headway: Tensor
+    max_acceleration: Tensor
+    comfortable_deceleration: Tensor
+    strongest_braking: Tensor
+    politeness: Tensor
+    delay: Tensor
+    sway: Tensor
+    frequency_one: Tensor
+    frequency_two: Tensor
+    phase_one: Tensor
+    phase_two: Tensor
+
+    @classmethod
+    def of(cls, memory: Memory) -> DriverParams:
+        """From the memory of :class:`IdmRandomTraffic`."""
+        return cls(*memory[_PARAMETERS].unbind(-1))
+
+    def idm(self, min_gap_m: float, braking: Tensor) -> DriverIdm:
+        """IDM with each driver's parameters; no driver brakes harder than ``braking`` (m/s2, [N, M])."""
+        return DriverIdm(min_gap_m, self.headway, self.comfortable_deceleration, -braking, self.max_acceleration)
+
+    def sway_m(self, time_s: Tensor) -> Tensor:
+        """Offset of each driver's line from its lane's centre at ``time_s`` [N, 1], m, to the left, [N, M]."""
+        one = torch.sin(self.frequency_one * time_s + self.phase_one)
+        return 0.5 * self.sway * (one + torch.sin(self.frequency_two * time_s + self.phase_two))
+
+
+def start_braking(vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m) -> Tensor:
+    """Deceleration (m/s2, [N, M]) with which each driver stays behind all vehicles ahead in its lane.
+
+    These keep their speeds; each vehicle in between takes the longest length and ``min_gap_m``. Braking begins after
+    ``reaction_s`` [N, M].
+    """
+    scene = perceive(vehicles, road)
+    pairs = scene.pairs
+    shares = in_lane(scene, scene.attention.low) | in_lane(scene, scene.attention.high)
+    ahead = shares & (pairs.order > 0)
+    distance = torch.where(ahead, pairs.distance, torch.inf)
+    between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
+    space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
+    speed, leader_speed = vehicles.speed[:, :, None], vehicles.speed[:, None, :]
+    gap = pairs.ahead - between * space - (speed - leader_speed).clamp_min(0.0) * reaction_s[..., None]
+    needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
+    return torch.where(ahead, needed, 0.0).amax(-1)
+
+
+def in_range(u: Tensor, bounds: Range) -> Tensor:
+    """Uniform numbers in [0, 1) scaled to ``bounds``."""
+    return bounds[0] + u * (bounds[1] - bounds[0])
+
+
+class IdmRandomTraffic(IdmMobilTraffic):
+    """``traffic=idm_random``: IDM and MOBIL, each driver with its own parameters for the whole episode.
+
+    In MOBIL a driver predicts the others with its own parameters, since it does not know theirs, and without a limit
+    of braking. Memory: the steering angle, ``traits`` [N, M, 11] (:class:`DriverParams`) and, with reaction times,
+    ``past`` [N, M, D], the accelerations decided in the last D steps, m/s2, oldest first.
+
+    Args:
+        road, stream, steering: as for every rule-driven traffic.
+        idm: minimum gap of all drivers; the hardest braking in MOBIL's predictions.
+        mobil: threshold, safe deceleration, and the weights that the politeness multiplies.
+        drivers: the ranges.
+    """
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        idm: IdmParameters = TABLE_V,
+        steering: SteeringParameters = STEERING,
+        mobil: MobilParameters = TABLE_IV,
+        drivers: RandomDrivers | None = None,
+    ) -> None:
+        super().__init__(road, stream, idm, steering, mobil)
+        self.drivers = drivers or RandomDrivers()
+        self.delay_steps = round(self.drivers.reaction_s[1] / self.dt)
+        past: MemoryFields = {"past": ((self.delay_steps,), None)} if self.delay_steps else {}
+        self.memory_fields = {"steering": ((), None), _PARAMETERS: ((len(DriverParams._fields),), None), **past}
+
+    def _drawn(self, vehicles: Vehicles, key: Tensor) -> list[Tensor]:
+        """Uniform numbers [N, M] of every purpose."""
+        purposes = [Purpose.DRIVER + index for index in range(_DRAWS)]
+        return list(uniform(key, -1, vehicles.x.shape[1], purposes, vehicles.x.dtype).unbind(-1))
+
+    def driver_params(self, vehicles: Vehicles, key: Tensor) -> DriverParams:
+        """The drivers at the start of the episodes with ``key`` [N]."""
+        d, u = self.drivers, self._drawn(vehicles, key)
+        reaction_s = in_range(u[5], d.reaction_s)
+        required = _START_MARGIN * start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
+        room = 0.5 * (self.road.lane_width_m - vehicles.width) - _LANE_MARGIN_M
+        return DriverParams(
+            headway=in_range(u[0], d.headway_s),
+            max_acceleration=in_range(u[1], d.max_acceleration),
+            comfortable_deceleration=in_range(u[2], d.comfortable_deceleration),
+            strongest_braking=torch.maximum(in_range(u[3], d.strongest_braking), required),
+            politeness=in_range(u[4], d.politeness),
+            delay=torch.round(reaction_s / self.dt),
+            sway=torch.minimum(in_range(u[6], d.sway_m), room.clamp_min(0.0)),
+            frequency_one=2.0 * math.pi / in_range(u[7], d.sway_period_s),
+            frequency_two=2.0 * math.pi / in_range(u[8], d.sway_period_s),
+            phase_one=2.0 * math.pi * u[9],
+            phase_two=2.0 * math.pi * u[10],
+        )
+
+    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+        """Gives every driver but the ego its own desired speed."""
+        factor = in_range(self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED], self.drivers.desired_speed)
+        others = torch.arange(vehicles.x.shape[1], device=key.device) != EGO_INDEX
+        desired = torch.where(others, factor * vehicles.desired_speed, vehicles.desired_speed)
+        return super().enter(vehicles.with_(desired_speed=desired), key, episode)
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
+        """Steering angle 0, a constant past acceleration, and the drivers' parameters."""
+        memory = super().fresh_memory(vehicles, key)
+        memory[_PARAMETERS] = torch.stack(self.driver_params(vehicles, key), dim=-1)
+        if self.delay_steps:
+            memory["past"] = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
+        return memory
+
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """As :class:`IdmMobilTraffic`; the memory carries the step, for the sway."""
+        return super().move(vehicles, {**memory, "step": step}, key, step)
+
+    def changes(self, scene: Scene, memory: Memory) -> Tensor:
+        """As :class:`IdmMobilTraffic`, with each driver's parameters."""
+        m, own = self.mobil, DriverParams.of(memory)
+        politeness = own.politeness[..., None]
+        rear, side = politeness * m.politeness_rear, politeness * m.politeness_side
+        mobil = DriverMobil(m.threshold, rear, side, m.safe_deceleration, m.exclusive_m)
+        idm = own.idm(self.idm.min_gap_m, torch.full_like(own.headway, -self.idm.min_acceleration))
+        return mobil_changes(scene, self.road, idm, mobil)
+
+    def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
+        """The vehicles at t + 0.1 s, with each driver's delay and sway."""
+        v, own = scene.vehicles, DriverParams.of(memory)
+        acceleration = following_acceleration(scene, own.idm(self.idm.min_gap_m, own.strongest_braking))
+        kept = {_PARAMETERS: memory[_PARAMETERS]}
+        if self.delay_steps:
+            recent = torch.cat((memory["past"], acceleration[..., None]), dim=-1)
+            index = self.delay_steps - own.delay.long()
+            acceleration = recent.gather(-1, index[..., None])[..., 0]
+            kept["past"] = recent[..., 1:].contiguous()
+        time_s = (memory["step"].to(own.sway.dtype) * self.dt)[:, None]
+        line = self.road.centre_of(target, v.y.dtype) + own.sway_m(time_s)
+        moved, steering = self._advanced(v, acceleration, target, line, memory)
+        return moved, {**steering, **kept}

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from ganlane import keys
 from ganlane.errors import UserError
@@ -18,7 +18,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.sim.lanes import VISIBILITY_OF_EPISODE
 from ganlane.sim.random import Purpose, absorb, uniform
 from ganlane.sim.state import Vehicles
-from ganlane.traffic.base import TrafficModule, key_of, memory_of
+from ganlane.traffic.base import TrafficModule, TrafficParts, key_of, memory_of
 
 #: Compiled graphs get the rows of a part padded, so that there are at most about this many sizes.
 _SIZES = 16
@@ -73,7 +73,7 @@ def _version(tensor: Tensor) -> int | None:
     return None if tensor.is_inference() else tensor._version
 
 
-class MixedTraffic(TrafficModule):
+class MixedTraffic(TrafficParts):
     """``traffic=mixed``: parts and their shares of the episodes.
 
     Episode ``e`` belongs to the part at ``e`` modulo the sum of the shares (:func:`interleaved`). If the batch size
@@ -107,29 +107,21 @@ class MixedTraffic(TrafficModule):
                     f"traffic.shares: {name} plays recordings on roads of its own and cannot be mixed with others; "
                     "leave it out."
                 )
-        first = next(iter(parts.values()))
-        super().__init__(first.road, first.stream)
-        if any(part.stream != first.stream or part.road != first.road for part in parts.values()):
-            raise UserError("traffic.shares: the parts have different roads or streams; build all with the same.")
         # An import path as a name has dots, which separate nested names in a module.
-        self.parts = nn.ModuleDict({name.replace(".", "_"): part for name, part in parts.items()})
+        super().__init__({name.replace(".", "_"): part for name, part in parts.items()})
+        if any(part.stream != self.stream or part.road != self.road for part in parts.values()):
+            raise UserError("traffic.shares: the parts have different roads or streams; build all with the same.")
         self.shares = {name.replace(".", "_"): shares[name] for name in parts}
         kinds = {int(part.visibility) for part in parts.values()}
         self.visibility = kinds.pop() if len(kinds) == 1 else VISIBILITY_OF_EPISODE
-        numbers = {name: number for number, name in enumerate(self.shares)}
-        turns = torch.tensor([numbers[name] for name in interleaved(self.shares)])
+        turns = torch.tensor([list(self.shares).index(name) for name in interleaved(self.shares)])
         self.register_buffer("turns", turns, persistent=False)
-        self.rows_must_stay = any(part.rows_must_stay for part in parts.values())
         self.compiled = False
         self._layout: Layout | None = None
         self._compact: dict[int, Compact] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_layout": None, "_compact": {}}
-
-    def named_parts(self) -> list[tuple[str, TrafficModule]]:
-        """Names and parts, in the order of the shares."""
-        return [(name, cast(TrafficModule, part)) for name, part in self.parts.items()]
 
     def part_of(self, episode: Tensor) -> Tensor:
         """Index of the part that each ``episode`` [N] belongs to."""
@@ -170,10 +162,10 @@ class MixedTraffic(TrafficModule):
                 kept[name] = memory
                 continue
             fields = _pick(vehicles, rows)
-            inputs: dict[str, Any] = {each: value.index_select(0, rows.picked) for each, value in counters.items()}
             exchange = MemoryExchange(rows, self._compact)
-            inputs |= {keys.VEHICLES: _nested(fields.as_dict(), rows), keys.TRAFFIC: exchange.gather(memory)}
-            outputs = part(_nested(inputs, rows))
+            inputs = {each: value.index_select(0, rows.picked) for each, value in counters.items()}
+            nested = {keys.VEHICLES: _nested(fields.as_dict(), rows), keys.TRAFFIC: exchange.gather(memory)}
+            outputs = part(_nested({**inputs, **nested}, rows))
             before.append(fields)
             after.append(Vehicles.of(outputs.get(keys.MOVED)))
             kept[name] = exchange.scatter(memory_of(outputs), compact)
@@ -205,15 +197,10 @@ class MixedTraffic(TrafficModule):
         """Not available: the part follows from the episode's number (:meth:`enter`)."""
         raise UserError("traffic=mixed: its memory begins with an episode's number; call enter() in place of this.")
 
-    def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
-        """The parts' specs, by name."""
-        return {name: part.memory_spec(n, m, dtype) for name, part in self.named_parts()}
-
     def compile_graphs(self) -> None:
         """Compile every part; from now on the rows of a part come in few different numbers."""
         self.compiled, self._layout, self._compact = True, None, {}
-        for _, part in self.named_parts():
-            part.compile_graphs()
+        super().compile_graphs()
 
 
 class MemoryExchange:
@@ -228,13 +215,10 @@ class MemoryExchange:
         self.rows, self.known = rows, known
         self.given: dict[int, Compact] = {}
 
-    def gather(self, memory: TensorDictBase) -> TensorDictBase:
-        """``memory`` of the whole batch in the part's rows."""
-        return _nested({name: self._gather(value) for name, value in memory.items()}, self.rows)
-
-    def _gather(self, whole: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
+    def gather(self, whole: Any) -> Any:
+        """The memory (or a tensor of it) of the ``whole`` batch in the part's rows."""
         if not isinstance(whole, Tensor):
-            return self.gather(whole)
+            return _nested({name: self.gather(value) for name, value in whole.items()}, self.rows)
         found = self.known.get(id(whole))
         same = found is not None and found.whole is whole and found.picked is self.rows.picked
         if found is None or not same or found.version is None or found.version != _version(whole):
@@ -243,14 +227,11 @@ class MemoryExchange:
         self.given[id(found.part)] = found
         return found.part
 
-    def scatter(self, memory: TensorDictBase, compact: dict[int, Compact]) -> TensorDictBase:
-        """The part's ``memory`` in the whole batch, zero elsewhere; ``compact`` collects the pairs."""
-        named = {name: self._scatter(value, compact) for name, value in memory.items()}
-        return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)
-
-    def _scatter(self, part: Tensor | TensorDictBase, compact: dict[int, Compact]) -> Tensor | TensorDictBase:
+    def scatter(self, part: Any, compact: dict[int, Compact]) -> Any:
+        """The ``part``'s memory (or a tensor of it) in the whole batch, else zero; ``compact`` collects pairs."""
         if not isinstance(part, Tensor):
-            return self.scatter(part, compact)
+            named = {name: self.scatter(value, compact) for name, value in part.items()}
+            return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)
         found = self.given.get(id(part))
         if found is None or found.part is not part:
             # All other rows select one row of zeros at the end: a third faster than zeros and then copies.

@@ -10,19 +10,31 @@ from typing import Any
 from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
 from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
-from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.parameters.traffic import CalibratedGanParameters, DriverFaults, GanParameters
+from ganlane.parameters.driving import (
+    CalibratedGanParameters,
+    DriverFaults,
+    GanParameters,
+    IdmParameters,
+    MobilParameters,
+)
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
-from ganlane.traffic.acceleration import AccelerationOverlay, SuddenAccelerations
 from ganlane.traffic.base import TrafficModule, TrafficSequential
 from ganlane.traffic.faults import with_faults
-from ganlane.traffic.guard import Guard, GuardParameters
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
-from ganlane.traffic.lane_change import CalibratedChanges, CalibratedLaneChange, LiteralChanges, LiteralLaneChange
+from ganlane.traffic.overlays import (
+    AccelerationOverlay,
+    CalibratedChanges,
+    CalibratedLaneChange,
+    Guard,
+    GuardParameters,
+    LiteralChanges,
+    LiteralLaneChange,
+    SuddenAccelerations,
+)
 from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
 #: Anchor of the calibrated traffic: the fitted one, with brisker acceleration and lane changes as fast as recorded
@@ -44,8 +56,7 @@ def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralCha
             f"{source}: its recordings hold no complete lane change, so equations 9 to 11 have no numbers; "
             "fit the generator to recordings with lane changes."
         )
-    mean_steps, speed, sd = (float(number) for number in numbers if number is not None)
-    return LiteralChanges(mean_steps, speed, sd)
+    return LiteralChanges(*(float(number) for number in numbers if number is not None))
 
 
 def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
@@ -55,15 +66,11 @@ def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
     return SuddenAccelerations(**known)
 
 
-def fitted_anchor(anchor: AnchorParameters, metadata: Mapping[str, Any], source: object) -> AnchorParameters:
-    """``anchor`` with the washout and the further inputs that the weights were fitted with.
-
-    By default those of :data:`ganlane.generator.ANCHOR`.
+def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParameters:
+    """:data:`SIMULATED_ANCHOR` with the washout and the further inputs of the fit (by default those of ``ANCHOR``).
 
     Args:
-        anchor: the anchor of the simulation.
-        metadata: of the weights (:func:`ganlane.generator.load_generator`).
-        source: their file, for the message.
+        metadata, source: of the weights (:func:`ganlane.generator.load_generator`), and their file for messages.
 
     Raises:
         UserError: fitted without per-driver parameters, which this traffic always draws; or impossible values.
@@ -82,7 +89,7 @@ def fitted_anchor(anchor: AnchorParameters, metadata: Mapping[str, Any], source:
             f"{source}: its config says washout_s={washout_s!r} and further_inputs={further_inputs!r}, expected "
             "seconds above 0 and true or false; fit it again."
         )
-    return replace(anchor, washout_s=float(washout_s), further_inputs=further_inputs)
+    return replace(SIMULATED_ANCHOR, washout_s=float(washout_s), further_inputs=further_inputs)
 
 
 def gan_traffic(
@@ -98,10 +105,7 @@ def gan_traffic(
 
     Args:
         road, stream: as for every traffic module.
-        path: weights of the paper's preset; by default those that ship.
-        guard: whether a guard follows; without it the closed loop drifts off.
-        noise_scale: 1 samples trajectories as fitted, 0 takes the mean prediction.
-        execute_k: predicted steps driven before predicting again (the paper: 1).
+        path, guard, noise_scale, execute_k: see :class:`~ganlane.parameters.driving.GanParameters`.
         idm: of the guard's bounds on acceleration.
 
     Raises:
@@ -133,11 +137,9 @@ def gan_calibrated_traffic(
 
     Args:
         road, stream: as for every traffic module.
-        path: weights of the calibrated preset; by default those that ship.
-        noise_scale: of the latent vectors; 1 as fitted, 0 drives by the mean prediction.
+        path, noise_scale, noise_period_s: see :class:`~ganlane.parameters.driving.CalibratedGanParameters`.
         changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the recorded
             rate, which gives that rate in the simulation.
-        noise_period_s: correlation time of a driver's latent vector.
         idm: of the gap check; the anchor keeps its own (:data:`SIMULATED_ANCHOR`).
 
     Raises:
@@ -148,17 +150,13 @@ def gan_calibrated_traffic(
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
-    options: dict[str, Any] = {
-        "noise_period_s": noise_period_s,
-        "noise_scale": noise_scale,
-        "headway_quantiles_s": headway_quantiles(metadata["driving_statistics"]),
-        "anchor": fitted_anchor(SIMULATED_ANCHOR, metadata, source),
-    }
-    parts: dict[str, TrafficModule] = {
-        "generator": AnchoredGanTraffic(generator, road, stream, **options),
-        "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes), idm),
-    }
-    return TrafficSequential(parts)
+    headways_s, anchor = headway_quantiles(metadata["driving_statistics"]), fitted_anchor(metadata, source)
+    return TrafficSequential(
+        {
+            "generator": AnchoredGanTraffic(generator, road, stream, noise_period_s, noise_scale, headways_s, anchor),
+            "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes), idm),
+        }
+    )
 
 
 def idm_faults_traffic(
@@ -169,10 +167,5 @@ def idm_faults_traffic(
     steering: SteeringParameters = STEERING,
     faults: DriverFaults | None = None,
 ) -> TrafficSequential:
-    """``traffic=idm_faults``: ``idm_mobil`` with drivers' faults.
-
-    Args:
-        road, stream, idm, mobil, steering: as for :class:`ganlane.traffic.IdmMobilTraffic`.
-        faults: rates, durations and sizes.
-    """
+    """``traffic=idm_faults``: :class:`ganlane.traffic.IdmMobilTraffic` with drivers' ``faults``."""
     return with_faults(IdmMobilTraffic(road, stream, idm, steering, mobil), faults)

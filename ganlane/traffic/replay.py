@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -28,8 +27,7 @@ from ganlane.data import (
 )
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX, VEHICLE_FLOATS
-from ganlane.parameters.driving import IdmParameters, Visibility
-from ganlane.parameters.traffic import ReplayParameters
+from ganlane.parameters.driving import IdmParameters, ReplayParameters, Visibility
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, Moved, TrafficModule
@@ -43,7 +41,7 @@ MOST_VEHICLES = 128
 _HALF_WINDOW = 5
 #: A vehicle that moves less than this in the window keeps its heading along the road, m.
 _LEAST_PATH_M = 1.0
-_X, _LENGTH = VEHICLE_FLOATS.index("x"), VEHICLE_FLOATS.index("length")
+_X = VEHICLE_FLOATS.index("x")
 #: Lower bound of a recorded driver's desired speed, m/s (it may be stopped in a jam all the time).
 LEAST_DESIRED_SPEED_MPS = 10.0
 
@@ -77,47 +75,36 @@ class Recordings:
 
     @classmethod
     def of(cls, frame: pl.DataFrame, source: str, least_s: float) -> Recordings:
-        """From a frame in the schema of :mod:`ganlane.data`, sorted by scene, vehicle and frame.
+        """From tracks in the schema of :mod:`ganlane.data`, sorted by scene, vehicle and frame.
 
-        Args:
-            frame: recorded tracks.
-            source: name of the recordings, for messages.
-            least_s: minimum time that the ego of an episode is recorded, s.
+        The ego of an episode is recorded for ``least_s`` at least. ``source`` names the recordings in messages.
 
         Raises:
             UserError: no vehicle is recorded for that time.
         """
         widths, counts, tracks = scene_lane_widths(frame), scene_lane_counts(frame), tracks_of_frame(frame)
-        begin = _starts(frame, tracks, round(least_s / FRAME_S))
-        if len(begin.steps) == 0:
+        starts, steps, names_of_starts = _starts(frame, tracks, round(least_s / FRAME_S))
+        if len(steps) == 0:
             raise UserError(
                 f"{source}: no vehicle is recorded for {least_s:g} s; give longer recordings or a smaller "
                 "traffic.least_s."
             )
         scenes, first, scene, number = np.unique(
-            begin.scene, return_index=True, return_inverse=True, return_counts=True
+            names_of_starts, return_index=True, return_inverse=True, return_counts=True
         )
         names = tuple(str(name) for name in scenes)
         return cls(
             names,
             samples=torch.from_numpy(_motion(frame, tracks)),
             last=torch.from_numpy(tracks.last),
-            starts=torch.from_numpy(begin.starts),
-            steps=torch.from_numpy(begin.steps),
+            starts=torch.from_numpy(starts),
+            steps=torch.from_numpy(steps),
             scene=torch.from_numpy(scene),
             first_start=torch.from_numpy(first),
             starts_in=torch.from_numpy(number),
             lanes=torch.tensor([counts[name] for name in names]),
             lane_width_m=torch.tensor([widths[name] for name in names], dtype=torch.float64),
         )
-
-
-class _Starts(NamedTuple):
-    """Fields of :class:`Recordings`, and the name of each start's scene."""
-
-    starts: Integers
-    steps: Integers
-    scene: NDArray[np.str_]
 
 
 def _motion(frame: pl.DataFrame, tracks: Tracks) -> Floats:
@@ -132,18 +119,20 @@ def _motion(frame: pl.DataFrame, tracks: Tracks) -> Floats:
     return np.stack((x, y, heading, speed, acceleration, length, width, desired), axis=1)
 
 
-def _starts(frame: pl.DataFrame, tracks: Tracks, least: int) -> _Starts:
-    """Every frame with a vehicle that can be replaced; scene by scene, which bounds the memory."""
-    last, offset, parts = tracks.last, 0, []
+def _starts(frame: pl.DataFrame, tracks: Tracks, least: int) -> tuple[Integers, Integers, NDArray[np.str_]]:
+    """``starts`` and ``steps`` of :class:`Recordings`, and the names of their scenes.
+
+    Every frame with a vehicle that can be replaced; scene by scene, which bounds the memory.
+    """
+    offset, parts = 0, []
     for rows in frame.partition_by("scene", maintain_order=True):
-        starts, steps = _starts_of_scene(rows, last[offset : offset + rows.height] - offset, least)
-        parts.append(
-            _Starts(np.where(starts < 0, -1, starts + offset), steps, np.repeat(rows["scene"][0], len(steps)))
-        )
+        starts, steps = _starts_of_scene(rows, tracks.last[offset : offset + rows.height] - offset, least)
+        parts.append((np.where(starts < 0, -1, starts + offset), steps, np.repeat(rows["scene"][0], len(steps))))
         offset += rows.height
-    widest = max(part.starts.shape[1] for part in parts)
-    wide = [np.pad(p.starts, ((0, 0), (0, widest - p.starts.shape[1])), constant_values=-1) for p in parts]
-    return _Starts(np.concatenate(wide), *(np.concatenate(field) for field in list(zip(*parts))[1:]))
+    starts_of, steps_of, scene_of = zip(*parts)
+    widest = max(each.shape[1] for each in starts_of)
+    wide = [np.pad(each, ((0, 0), (0, widest - each.shape[1])), constant_values=-1) for each in starts_of]
+    return np.concatenate(wide), np.concatenate(steps_of), np.concatenate(scene_of)
 
 
 def _starts_of_scene(rows: pl.DataFrame, last: Integers, least: int) -> tuple[Integers, Integers]:
@@ -152,7 +141,12 @@ def _starts_of_scene(rows: pl.DataFrame, last: Integers, least: int) -> tuple[In
     The ego replaces the vehicle nearest the middle of those that are recorded ``least`` frames on. The middle is the
     median position along the road of all that are recorded in the frame.
     """
-    frame, table = _by_frame(rows["frame"].to_numpy())
+    by_frame = rows["frame"].to_numpy().argsort(kind="stable")
+    frame, first, count = np.unique(rows["frame"].to_numpy()[by_frame], return_index=True, return_counts=True)
+    place = np.arange(count.max())
+    # The samples in each frame [F, P], -1 where there are fewer than P.
+    table = by_frame[np.minimum(first[:, None] + place, len(by_frame) - 1)]
+    table = np.where(place < count[:, None], table, -1)
     there = table >= 0
     x, y = (np.where(there, rows[name].to_numpy()[table], np.nan) for name in ("x", "y"))
     stays = there & (last[table] - table >= least)
@@ -163,15 +157,6 @@ def _starts_of_scene(rows: pl.DataFrame, last: Integers, least: int) -> tuple[In
     order = np.where(there, distance, np.inf).argsort(axis=1, kind="stable")[:, :MOST_VEHICLES]
     possible = stays.any(axis=1)
     return np.take_along_axis(table, order, axis=1)[possible], (frame.max() - frame)[possible]
-
-
-def _by_frame(frame: Integers) -> tuple[Integers, Integers]:
-    """The frame numbers of a scene [F], and the samples in each of them [F, P], -1 where there are fewer than P."""
-    order = frame.argsort(kind="stable")
-    numbers, first, count = np.unique(frame[order], return_index=True, return_counts=True)
-    place = np.arange(count.max())
-    table = order[np.minimum(first[:, None] + place, len(order) - 1)]
-    return numbers, np.where(place < count[:, None], table, -1)
 
 
 class ReplayTraffic(TrafficModule):
@@ -187,8 +172,7 @@ class ReplayTraffic(TrafficModule):
 
     Args:
         stream: as for every traffic module.
-        path: input of :func:`ganlane.data.read_scenes`; by default the US-101 scenes of the recordings' folder.
-        least_s: minimum time that the replaced vehicle is recorded from the start on, s.
+        path, least_s: see :class:`~ganlane.parameters.driving.ReplayParameters`.
         recordings: tensors instead of a file.
 
     Raises:
@@ -196,7 +180,6 @@ class ReplayTraffic(TrafficModule):
     """
 
     visibility = Visibility.BODY
-    #: Lanes and lane width come from :meth:`road_of`, row by row.
     own_roads = True
 
     def __init__(
@@ -214,11 +197,6 @@ class ReplayTraffic(TrafficModule):
         for name, value in vars(recorded).items():
             if isinstance(value, Tensor):
                 self.register_buffer(f"_{name}", value, persistent=False)
-
-    @property
-    def longest_m(self) -> float:
-        """Length of the longest recorded vehicle, m."""
-        return float(self._samples[:, _LENGTH].max())
 
     def start_of(self, key: Tensor) -> Tensor:
         """Number of the start, [N] int64, of the episodes with ``key`` [N]."""
@@ -280,12 +258,9 @@ class ReplayTraffic(TrafficModule):
 
 @dataclass(frozen=True)
 class RecordedScenes:
-    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`).
+    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`), M ``vehicles`` with the ego.
 
-    Attributes:
-        traffic: with the recordings.
-        vehicles: M, the ego included.
-        ego_visibility, ego_desired_speed_mps: of the ego; the recorded driver's are not known.
+    What is said of the ego is not known of the recorded driver.
     """
 
     traffic: ReplayTraffic
@@ -296,7 +271,7 @@ class RecordedScenes:
     @property
     def longest_m(self) -> float:
         """Length of the longest vehicle that was recorded, m."""
-        return self.traffic.longest_m
+        return float(self.traffic._samples[:, VEHICLE_FLOATS.index("length")].max())
 
     def check(self, road: Road, idm: IdmParameters) -> None:
         """Recorded scenes are not checked."""

@@ -30,7 +30,7 @@ from ganlane.sim.random import Purpose, Stream, normal, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule
 
-#: Number of purposes for latent dimensions in :class:`ganlane.sim.random.Purpose`.
+#: Latent dimensions that :class:`ganlane.sim.random.Purpose` has room for.
 _MOST_NOISE = int(Purpose.RECYCLE) - int(Purpose.NOISE)
 
 
@@ -42,7 +42,6 @@ class GeneratedTraffic(TrafficModule):
 
     Args:
         generator: the fitted network (:func:`ganlane.generator.load_generator`).
-        road, stream: as for every traffic module.
         noise_period_s: correlation time of a driver's latent vector; 0 draws it anew at every step.
         noise_scale: 1 samples as fitted, 0 drives by the mean prediction (z = 0).
 
@@ -72,13 +71,8 @@ class GeneratedTraffic(TrafficModule):
         self.noise_period_s, self.noise_scale = noise_period_s, noise_scale
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
-
-    @property
-    def memory_fields(self) -> MemoryFields:  # type: ignore[override]
-        """Trailing shapes of the memory."""
-        sizes = self.generator.sizes
         motions: MemoryFields = {name: ((4 * sizes.hidden,), None) for name in self.motions}
-        return {**motions, "displacement": ((2,), None), "noise": ((sizes.noise,), None)}
+        self.memory_fields = {**motions, "displacement": ((2,), None), "noise": ((sizes.noise,), None)}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
@@ -93,19 +87,16 @@ class GeneratedTraffic(TrafficModule):
             self.generator.to(dtype)
         return self.generator
 
-    def history(self, memory: Memory) -> History:
-        """The history of all drivers from the memory."""
-        return History(tuple(memory[name] for name in self.motions), memory["displacement"])
-
     def kept(self, history: History) -> Memory:
         """The history as memory; motions move on by name, without copies."""
         return {**dict(zip(self.motions, history.motions)), "displacement": history.displacement}
 
-    def next_noise(self, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
-        """The latent vectors [N, M, Z] of this step."""
+    def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
+        """The history of all drivers from the memory, and the latent vectors [N, M, Z] of this step."""
         noise = memory["noise"]
         fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
-        return wander(noise, fresh, self.noise_period_s)
+        history = History(tuple(memory[name] for name in self.motions), memory["displacement"])
+        return history, wander(noise, fresh, self.noise_period_s)
 
 
 class SocialGanTraffic(GeneratedTraffic):
@@ -138,13 +129,9 @@ class SocialGanTraffic(GeneratedTraffic):
                 f"{generator.sizes.predicted}."
             )
         self.execute_k = execute_k
-
-    @property
-    def memory_fields(self) -> MemoryFields:  # type: ignore[override]
-        """Trailing shapes of the memory."""
-        if self.execute_k == 1:
-            return super().memory_fields
-        return {**super().memory_fields, "plan": ((self.execute_k, 2), None), "plan_left": ((), torch.int64)}
+        if execute_k > 1:
+            plan: MemoryFields = {"plan": ((execute_k, 2), None), "plan_left": ((), torch.int64)}
+            self.memory_fields = {**self.memory_fields, **plan}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; no plan is left."""
@@ -157,12 +144,9 @@ class SocialGanTraffic(GeneratedTraffic):
     @torch.no_grad()
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Predict, and drive the first displacement (or what is left of the plan)."""
-        noise = self.next_noise(memory, key, step)
+        (history, noise), network = self.before(memory, key, step), self.network(vehicles.x.dtype)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
-        history = self.history(memory)
-        moved, history, plan = paper_step(
-            self.network(vehicles.x.dtype), vehicles, history, self.noise_scale * noise, plan
-        )
+        moved, history, plan = paper_step(network, vehicles, history, self.noise_scale * noise, plan)
         kept = {**self.kept(history), "noise": noise}
         return moved, kept if plan is None else {**kept, "plan": plan.ahead, "plan_left": plan.left}
 
@@ -192,11 +176,7 @@ class AnchoredGanTraffic(GeneratedTraffic):
     ) -> None:
         super().__init__(generator, road, stream, noise_period_s, noise_scale)
         self.headway_quantiles_s, self.anchor = headway_quantiles_s, anchor
-
-    @property
-    def memory_fields(self) -> MemoryFields:  # type: ignore[override]
-        """Trailing shapes of the memory."""
-        return {**super().memory_fields, "residual_mean": ((2,), None), "headway": ((), None)}
+        self.memory_fields = {**self.memory_fields, "residual_mean": ((2,), None), "headway": ((), None)}
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
@@ -209,11 +189,8 @@ class AnchoredGanTraffic(GeneratedTraffic):
     @torch.no_grad()
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
-        noise = self.next_noise(memory, key, step)
-        driver = DriverMemory(self.history(memory), memory["residual_mean"], memory["headway"])
-        scaled = self.noise_scale * noise
-        moved, driver = anchored_step(
-            self.network(vehicles.x.dtype), vehicles, self.road, driver, scaled, self.anchor
-        )
+        (history, noise), network = self.before(memory, key, step), self.network(vehicles.x.dtype)
+        driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
+        moved, driver = anchored_step(network, vehicles, self.road, driver, self.noise_scale * noise, self.anchor)
         kept = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
         return moved, {**self.kept(driver.history), **kept}

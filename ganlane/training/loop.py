@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from ganlane.agents import GreedyPolicy, Rainbow
 from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
-from ganlane.parameters.checks import Count, CountOrZero, NotNegative, Record
+from ganlane.parameters import Count, CountOrZero, NotNegative, Record
 from ganlane.training.checkpoint import Checkpointer, TrainingState
 from ganlane.training.collectors import Collector
 from ganlane.training.logs import Log, Logs

@@ -25,7 +25,7 @@ from ganlane.config.train import MultiCollectorConfig
 from ganlane.errors import UserError
 from ganlane.training.collectors import Collector, pack, unpack
 from ganlane.training.signals import shielded_children
-from ganlane.transforms.sensors import PERCEIVED, SENSORS
+from ganlane.transforms.observation import PERCEIVED, SENSORS
 
 #: Makes the environments of a worker from their number and first episode. It is pickled: a module-level function or
 #: a ``functools.partial`` of one.

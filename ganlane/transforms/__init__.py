@@ -10,9 +10,14 @@ used in the same way::
 """
 
 from ganlane.transforms.mask import MASKS, ActionMaskTransform
-from ganlane.transforms.observation import OBSERVATIONS, ObservationTransform, observation_size
+from ganlane.transforms.observation import (
+    OBSERVATIONS,
+    ObservationTransform,
+    SensorParameters,
+    SensorTransform,
+    observation_size,
+)
 from ganlane.transforms.reward import RewardParameters, RewardTransform
-from ganlane.transforms.sensors import SensorParameters, SensorTransform
 
 __all__ = [
     "MASKS",

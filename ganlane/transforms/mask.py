@@ -29,7 +29,7 @@ from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled
-from ganlane.transforms.sensors import PerceptionTransform
+from ganlane.transforms.observation import PerceptionTransform
 
 
 def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
@@ -42,9 +42,8 @@ def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
 
     During a lane change commands are ignored; with ``abort`` the opposite command turns back.
     """
-    free = change_direction == 0
-    left, right = (free | (change_direction == (-1 if turn > 0 else 1)) if abort else free for turn in (1, -1))
-    return torch.stack((torch.ones_like(free), left, right), dim=1)
+    left, right = (change_direction <= 0, change_direction >= 0) if abort else (change_direction == 0,) * 2
+    return torch.stack((torch.ones_like(left), left, right), dim=1)
 
 
 def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
@@ -72,8 +71,8 @@ class ActionMaskTransform(PerceptionTransform):
     Args:
         road: the environment's.
         form: ``legal`` or ``safe``.
-        safe_deceleration: m/s2, above 0; MOBIL's ``b_safe`` (Table IV: 4).
-        idm: by which braking is judged (Table V).
+        safe_deceleration: m/s2, above 0; MOBIL's ``b_safe``.
+        idm: by which braking is judged.
         abort: whether the ego may turn back during a lane change (``env.ego.abort_lane_change``).
         native_vehicles: M, where the native kernel computes ``safe`` (float32, CPU); None: the tensor code does.
 
@@ -105,10 +104,7 @@ class ActionMaskTransform(PerceptionTransform):
     def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
 
-        Args:
-            vehicles: as the ego perceives them.
-            direction: of its current lane change, [N].
-            road: of every row.
+        ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane change.
         """
         lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
         legal = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes) & obeyed_actions(direction, self.abort)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -12,16 +14,15 @@ from ganlane import keys
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.observation import RewardParameters
 
-SECTION_V_C = RewardParameters()
-
 
 def speed_reward(
-    speed: Tensor, desired_speed: Tensor, mean_acceleration: Tensor, parameters: RewardParameters = SECTION_V_C
+    speed: Tensor, desired_speed: Tensor, mean_acceleration: Tensor, parameters: RewardParameters | None = None
 ) -> Tensor:
     """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard on average over the decision."""
-    reward = (speed - parameters.base_speed_mps) / (desired_speed - parameters.base_speed_mps)
-    punished = -reward if parameters.literal_low_acceleration else -reward.abs()
-    return torch.where(mean_acceleration < parameters.low_acceleration, punished, reward)
+    p = parameters or RewardParameters()
+    reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
+    punished = -reward if p.literal_low_acceleration else -reward.abs()
+    return torch.where(mean_acceleration < p.low_acceleration, punished, reward)
 
 
 class RewardTransform(Transform):
@@ -57,27 +58,20 @@ class RewardTransform(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.terms(next_tensordict)
-        first, *rest = terms.values()
-        total = first
-        for term in rest:
-            total = total + term
-        batch = next_tensordict.batch_size
-        next_tensordict.set(keys.REWARD_TERMS, TensorDict._new_unsafe(terms, batch_size=batch))
-        return next_tensordict.set(keys.REWARD, total)
+        nested = TensorDict._new_unsafe(terms, batch_size=next_tensordict.batch_size)
+        return next_tensordict.set(keys.REWARD_TERMS, nested).set(keys.REWARD, reduce(torch.add, terms.values()))
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
         terms = {name: zero for name in self.parameters.term_names}
-        batch = tensordict_reset.batch_size
-        return tensordict_reset.set(keys.REWARD_TERMS, TensorDict._new_unsafe(terms, batch_size=batch))
+        nested = TensorDict._new_unsafe(terms, batch_size=tensordict_reset.batch_size)
+        return tensordict_reset.set(keys.REWARD_TERMS, nested)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the terms to the observation spec; they are zero after a reset."""
         assert isinstance(observation_spec, Composite)
-        dtype, device = observation_spec[keys.VEHICLES, "x"].dtype, observation_spec.device
-        shape = observation_spec.shape
-        term = Unbounded(shape=(*shape, 1), dtype=dtype, device=device)
-        observation_spec[keys.REWARD_TERMS] = Composite(
-            {name: term.clone() for name in self.parameters.term_names}, shape=shape
-        ).to(device)
+        device, shape = observation_spec.device, observation_spec.shape
+        term = Unbounded(shape=(*shape, 1), dtype=observation_spec[keys.VEHICLES, "x"].dtype, device=device)
+        terms = {name: term.clone() for name in self.parameters.term_names}
+        observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(device)
         return observation_spec

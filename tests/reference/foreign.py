@@ -1,4 +1,4 @@
-"""What the tests of foreign simulators share: episodes with given commands, and every physics step of them."""
+"""Runs for tests of traffic: certain episodes with given commands, and every physics step of them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 
 from ganlane import keys
+from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Vehicles
 
 
@@ -35,6 +36,41 @@ def drive(env, episodes, decisions, command=lambda decision, episode: 0):
             break
     env.recorder = None
     return Vehicles(*(torch.stack(fields) for fields in zip(*steps))), torch.stack(running), state
+
+
+def overlaps(vehicles):
+    """Pairs whose bodies overlap, counted twice, in all steps [T, N, M]."""
+    return pair_overlaps(Vehicles(*(field.flatten(0, 1) for field in vehicles))).sum().item()
+
+
+def overlaps_of_the_others(env, least_km, seconds=None, ego=False):
+    """Steps with overlaps in ``least_km`` of the others' driving, in episodes of ``seconds``; ``ego``: its, too."""
+    km, count, first, decisions = 0.0, 0, 0 if ego else 1, 0
+
+    def record(now, running):
+        nonlocal km, count
+        km += (now.speed * running[:, None])[:, 1:].sum().item() * 1e-4
+        count += pair_overlaps(now)[:, first:, first:].sum().item()
+
+    env.recorder = record
+    state = env.reset()
+    while km < least_km:
+        decisions += 1
+        state = env.step(state.set(keys.ACTION, torch.zeros(env.batch_size, dtype=torch.int64)))["next"]
+        if seconds and decisions % seconds == 0:
+            state[keys.EPISODE] = state[keys.EPISODE] + env.batch_size[0]
+            state = env.reset(state.select(keys.SEED, keys.EPISODE))
+    return count
+
+
+def assert_same_alone(make, traffic, episodes, decisions):
+    """Every episode of a batch is bit for bit the same as by itself in the environment ``make(traffic, 1)``."""
+    together, running, _ = drive(make(traffic, len(episodes)), episodes, decisions, turns)
+    for row, episode in enumerate(episodes):
+        alone, ran, _ = drive(make(traffic, 1), [episode], decisions, turns)
+        count = int(running[:, row].sum())
+        assert count == int(ran[:, 0].sum()) > 0
+        assert all(torch.equal(one[: count + 1, 0], all_[: count + 1, row]) for one, all_ in zip(alone, together))
 
 
 def turns(decision, episode):

@@ -7,13 +7,14 @@ import torch
 
 pytest.importorskip("highway_env", reason="HighwayEnv is not installed: pip install 'ganlane[bench]'")
 
-from reference.foreign import drive, start, turns
+from reference.foreign import assert_same_alone, drive, overlaps, start
+from reference.worlds import vehicles as scene_of
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.random import Purpose, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import HighwayEnvTraffic
 
@@ -28,7 +29,7 @@ def traffic():
 @pytest.fixture(scope="module")
 def driven(traffic):
     """Six egos that keep their lanes, for 40 s: vehicles [401, 6, 9]."""
-    vehicles, running, state = drive(HighwayEnv(traffic, 6), list(range(6)), 40)
+    vehicles, running, state = drive(HighwayEnv(traffic, 6), range(6), 40)
     assert running.all()
     return vehicles, state
 
@@ -36,7 +37,7 @@ def driven(traffic):
 def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(driven):
     vehicles, state = driven
     assert not state[keys.EVENTS]["hard_crash"].any()
-    assert not pair_overlaps(Vehicles(*(field.flatten(0, 1) for field in vehicles))).any()
+    assert overlaps(vehicles) == 0
 
 
 def test_a_step_is_that_of_highway_envs_own_road(traffic):
@@ -54,6 +55,9 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
     env.recorder = lambda vehicles, running: seen.append(vehicles)
     env.step(state.set(keys.ACTION, KEEP))
 
+    # Drivers' exponents, in HighwayEnv's range.
+    key = episode_key(traffic.stream, torch.tensor([0]), torch.tensor([2]))
+    exponent = (3.5 + uniform(key, 0, 9, [Purpose.FOREIGN_DRIVER + 8], torch.float64)[0, :, 0]).tolist()
     road = TheirRoad(RoadNetwork.straight_road_network(3, start=-1000.0, length=9000.0, speed_limit=70.0))
     for i in range(9):
         place = [before.x[0, i].item(), before.y[0, i].item()]
@@ -68,7 +72,7 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
         road.vehicles[0].position = np.array([before.x[0, 0].item(), before.y[0, 0].item()])
         road.vehicles[0].heading, road.vehicles[0].speed = before.heading[0, 0].item(), before.speed[0, 0].item()
         for vehicle in road.vehicles[1:]:
-            vehicle.DELTA = traffic_exponent(traffic, road.vehicles.index(vehicle))
+            vehicle.DELTA = exponent[road.vehicles.index(vehicle)]
         road.act()
         for vehicle in road.vehicles[1:]:
             vehicle.step(0.1)
@@ -76,14 +80,6 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
         ours = torch.stack((after.x, after.y, after.heading, after.speed), dim=-1)[0, 1:]
         torch.testing.assert_close(ours.float(), theirs.float(), rtol=1e-6, atol=1e-4, msg=f"step {count}")
         before = after
-
-
-def traffic_exponent(traffic, index):
-    """The exponent of a driver of episode 2, in HighwayEnv's range."""
-    from ganlane.sim.random import Purpose, episode_key, uniform
-
-    key = episode_key(traffic.stream, torch.tensor([0]), torch.tensor([2]))
-    return 3.5 + uniform(key, 0, 9, [Purpose.FOREIGN_DRIVER + 8], torch.float64)[0, index, 0].item()
 
 
 def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
@@ -108,78 +104,52 @@ def test_a_target_lane_is_where_a_change_ends(driven):
 
 
 def test_an_episode_is_the_same_alone_and_beside_others(traffic):
-    episodes = [1, 3]
-    together, running, _ = drive(HighwayEnv(traffic, 2), episodes, 12, turns)
-    for row, episode in enumerate(episodes):
-        alone, _, _ = drive(HighwayEnv(HighwayEnvTraffic(), 1), [episode], 12, turns)
-        count = int(running[:, row].sum())
-        for one, other in zip(alone, together):
-            assert torch.equal(one[: count + 1, 0], other[: count + 1, row])
+    assert_same_alone(HighwayEnv, traffic, [1, 3], 12)
 
 
 def test_a_state_can_be_branched(traffic):
     env = HighwayEnv(traffic, 1)
     state = env.step(start(env, [0]).set(keys.ACTION, KEEP))["next"].clone()
-    first, second = (env.step(state.clone().set(keys.ACTION, KEEP))["next"] for _ in range(2))
-    for one, other in zip(Vehicles.of(first[keys.VEHICLES]), Vehicles.of(second[keys.VEHICLES])):
-        assert torch.equal(one, other)
+    first, second = (env.step(state.clone().set(keys.ACTION, KEEP))["next", keys.VEHICLES] for _ in range(2))
+    assert (first == second).all()
 
 
-def two(x_ego, ego_visibility=Visibility.BODY):
+def two(x_ego, ego=None, slow=None):
     """A fast driver in lane 0 at x = 0 behind a slow one, and an ego in lane 1 that is beside or behind it."""
-    x = torch.tensor([[x_ego, 0.0, 30.0]])
-    lane = torch.tensor([[1, 0, 0]])
-    zero = torch.zeros_like(x)
-    return Vehicles(
-        x=x, y=lane * 4.0, heading=zero, speed=torch.tensor([[20.0, 20.0, 10.0]]), acceleration=zero,
-        length=zero + 4.5, width=zero + 2.5, desired_speed=torch.tensor([[20.0, 25.0, 10.0]]), target_lane=lane,
-        visibility=torch.full_like(lane, int(ego_visibility)), valid=torch.ones_like(lane, dtype=torch.bool),
-    )  # fmt: skip
+    first = {"x": x_ego, "lane": 1, "desired_speed": 20.0, **(ego or {})}
+    last = {"x": 30.0, "speed": 10.0, "desired_speed": 10.0, **(slow or {})}
+    cars = ({"visibility": int(Visibility.BODY), **car} for car in (first, {"x": 0.0}, last))
+    return scene_of(*cars, dtype=torch.float32)
+
+
+def moved(traffic, scene, timer=0.0):
+    key = torch.zeros(1, dtype=torch.int64)
+    return traffic.move(scene, {"timer": torch.full_like(scene.x, timer)}, key, key)[0]
 
 
 @pytest.mark.parametrize(("x_ego", "changes"), [(-60.0, True), (0.0, False), (-8.0, False)])
 def test_a_driver_changes_lanes_before_an_ego_that_is_far_behind_and_not_before_one_that_is_near(x_ego, changes):
-    traffic = HighwayEnvTraffic(Road(2))
-    vehicles = two(x_ego)
-    memory = {"timer": torch.full_like(vehicles.x, 2.0)}
-    key = torch.zeros(1, dtype=torch.int64)
-    moved, _ = traffic.move(vehicles, memory, key, key)
-    assert bool(moved.target_lane[0, 1] == 1) is changes
+    assert bool(moved(HighwayEnvTraffic(Road(2)), two(x_ego), 2.0).target_lane[0, 1] == 1) is changes
 
 
 def test_a_follower_brakes_for_an_ego_that_stands_in_its_lane(traffic):
-    vehicles = two(20.0)
-    in_front = vehicles.with_(
-        y=torch.tensor([[0.9, 0.0, 0.0]]),
-        speed=torch.tensor([[5.0, 20.0, 20.0]]),
-        x=torch.tensor([[30.0, 0.0, 300.0]]),
-    )
-    beside = in_front.with_(y=torch.tensor([[4.0, 0.0, 0.0]]))
-    memory = {"timer": torch.zeros_like(vehicles.x)}
-    key = torch.zeros(1, dtype=torch.int64)
-    assert traffic.move(in_front, memory, key, key)[0].acceleration[0, 1] < -5.0
     # Seen from 1 m beyond the edge of the lane on, as HighwayEnv has it: y = 0.9 would do by our rule, too.
-    assert traffic.move(beside, memory, key, key)[0].acceleration[0, 1] > 0.0
+    in_front, beside = (two(30.0, {"y": y, "speed": 5.0}, {"x": 300.0, "speed": 20.0}) for y in (0.9, 4.0))
+    assert moved(traffic, in_front).acceleration[0, 1] < -5.0
+    assert moved(traffic, beside).acceleration[0, 1] > 0.0
 
 
 def test_who_is_not_valid_is_nobodys_leader(traffic):
-    vehicles = two(500.0)
-    gone = vehicles.with_(valid=torch.tensor([[True, True, False]]))
-    memory = {"timer": torch.zeros_like(vehicles.x)}
-    key = torch.zeros(1, dtype=torch.int64)
-    assert traffic.move(vehicles, memory, key, key)[0].acceleration[0, 1] < -3.0
-    moved = traffic.move(gone, memory, key, key)[0]
-    assert moved.acceleration[0, 1] > 0.0
-    assert moved.x[0, 2] == 30.0
-    assert not moved.valid[0, 2]
+    assert moved(traffic, two(500.0)).acceleration[0, 1] < -3.0
+    gone = moved(traffic, two(500.0, slow={"valid": False}))
+    assert gone.acceleration[0, 1] > 0.0
+    assert gone.x[0, 2] == 30.0
+    assert not gone.valid[0, 2]
 
 
 def test_a_copy_drives_on(traffic):
     copy = pickle.loads(pickle.dumps(traffic))
-    key = torch.zeros(1, dtype=torch.int64)
-    memory = {"timer": torch.zeros(1, 3)}
-    for one, other in zip(*(made.move(two(-60.0), dict(memory), key, key)[0] for made in (traffic, copy))):
-        assert torch.equal(one, other)
+    assert all(map(torch.equal, moved(traffic, two(-60.0)), moved(copy, two(-60.0))))
 
 
 def test_a_ring_is_refused():

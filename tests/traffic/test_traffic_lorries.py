@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from reference.worlds import vehicles
 
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver
@@ -19,14 +20,12 @@ from ganlane.sim import Road, SpawnParameters, Vehicles, pair_overlaps, perceive
 from ganlane.sim.random import Stream, episode_key
 from ganlane.sim.spawn import RandomScenes
 from ganlane.traffic import IdmTraffic
-from ganlane.traffic.foreign.sumo import LorryScenes
-
-LORRIES = {"truck_share": 0.4}
+from ganlane.traffic.sumo import LorryScenes
 
 
-def drive(traffic, rows: int, decisions: int, **env) -> tuple[float, float, int, int]:
+def drive(traffic, rows: int, decisions: int, recycle: bool) -> tuple[float, float, int, int]:
     """Vehicle-km, those of lorries, steps in which two bodies overlap, and hard crashes, with a keep-lane ego."""
-    config = EnvConfig(**LORRIES, **env)
+    config = EnvConfig(truck_share=0.4, recycle=recycle)
     made = make_env(make_traffic(traffic, config), config, num_envs=rows)
     km = lorries = 0.0
     overlaps = crashes = 0
@@ -48,14 +47,14 @@ def drive(traffic, rows: int, decisions: int, **env) -> tuple[float, float, int,
 
 
 @pytest.mark.parametrize(
-    ("traffic", "rows", "most_s"),
-    [(IdmTrafficConfig(), 32, 40), (IdmMobilTrafficConfig(), 32, 40), (GanCalibratedTrafficConfig(), 8, 40)],
+    ("traffic", "rows"),
+    [(IdmTrafficConfig(), 32), (IdmMobilTrafficConfig(), 32), (GanCalibratedTrafficConfig(), 8)],
     ids=["idm", "idm_mobil", "gan_calibrated"],
 )
 @pytest.mark.parametrize("recycle", [False, True], ids=["", "recycle"])
-def test_nobody_overlaps_a_lorry(traffic, rows, most_s, recycle):
-    km, lorries, overlaps, crashes = drive(traffic, rows, most_s, recycle=recycle)
-    assert km > 0.5 * rows * 9 * 0.015 * most_s
+def test_nobody_overlaps_a_lorry(traffic, rows, recycle):
+    km, lorries, overlaps, crashes = drive(traffic, rows, 40, recycle)
+    assert km > 0.5 * rows * 9 * 0.015 * 40
     three_sigma = 3.0 * (0.4 * 0.6 / (8 * rows)) ** 0.5  # of the share among so many vehicles
     assert lorries == pytest.approx(km * 0.4 * 8 / 9, rel=three_sigma / 0.4)
     assert (overlaps, crashes) == (0, 0)
@@ -72,19 +71,14 @@ def test_nobody_overlaps_a_lorry(traffic, rows, most_s, recycle):
     ids=["idm", "idm_mobil", "gan_calibrated"],
 )
 def test_nobody_overlaps_a_lorry_on_a_road_that_stays_full(traffic, rows, seconds, least_km):
-    km, _, overlaps, crashes = drive(traffic, rows, seconds, recycle=True)
+    km, _, overlaps, crashes = drive(traffic, rows, seconds, True)
     assert km > least_km
     assert (overlaps, crashes) == (0, 0)
 
 
 def test_the_generator_is_told_the_gap_behind_the_lorry():
     """Centres 30 m apart, 21.75 m free; the input is gap / (gap + 20)."""
-    zero = torch.zeros(1, 2)
-    scene = Vehicles(
-        x=torch.tensor([[0.0, 30.0]]), y=zero, heading=zero, speed=zero + 20, acceleration=zero,
-        length=torch.tensor([[4.5, 12.0]]), width=zero + 2.5, desired_speed=zero + 25, target_lane=zero.long(),
-        visibility=zero.long(), valid=zero == 0,
-    )  # fmt: skip
+    scene, zero = vehicles({"x": 0.0}, {"x": 30.0, "length": 12.0}), torch.zeros(1, 2)
     seen = extra_inputs(perceive(scene, Road()), zero, zero)
     assert seen[0, 0, 1].item() == pytest.approx(21.75 / 41.75)
 
@@ -110,12 +104,11 @@ def keys_of(count):
 
 def net_gaps(scene, row):
     """Sorted gaps ahead within each lane of a row, m."""
-    gaps = []
+    x, half, gaps = scene.x[row], 0.5 * scene.length[row], []
     for lane in range(3):
         there = (scene.target_lane[row] == lane).nonzero()[:, 0]
-        order = there[scene.x[row, there].argsort()]
-        front, rear = scene.x[row] + 0.5 * scene.length[row], scene.x[row] - 0.5 * scene.length[row]
-        gaps.append(rear[order[1:]] - front[order[:-1]])
+        order = there[x[there].argsort()]
+        gaps.append((x - half)[order[1:]] - (x + half)[order[:-1]])
     return torch.cat(gaps)
 
 
@@ -138,6 +131,5 @@ def test_net_gaps_are_those_of_the_scene_of_cars():
 
 
 def test_without_lorries_it_is_the_scene_of_cars():
-    episodes = keys_of(20)
-    for one, other in zip(LorryScenes(CARS, share=0.0)(episodes, torch.float32), CARS(episodes, torch.float32)):
-        assert torch.equal(one, other)
+    one, other = (scenes(keys_of(20), torch.float32) for scenes in (LorryScenes(CARS, share=0.0), CARS))
+    assert all(map(torch.equal, one, other))

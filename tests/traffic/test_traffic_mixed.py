@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from reference.worlds import environment, same_bits, step, vehicles
+from reference.worlds import environment, placed, same_bits, step, vehicles
 from scipy.stats import binomtest
 
 from ganlane import keys
@@ -22,28 +22,33 @@ from ganlane.config.traffic import (
     all_traffics,
 )
 from ganlane.errors import UserError
+from ganlane.parameters.driving import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
 from ganlane.sim import Road, Visibility
 from ganlane.traffic import BlindTraffic, IdmMobilTraffic, IdmRandomTraffic, IdmTraffic, MixedTraffic, TrafficModule
 from ganlane.traffic.mixed import interleaved
 from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
 
+#: So many faults that a few decisions hold some.
+OFTEN = DriverFaults(
+    BrakingFaults(per_hour=600.0), ReactionFaults(per_hour=600.0), HesitationFaults(0.5), AbortFaults(0.5)
+)
 RULES = {"idm": 1, "idm_mobil": 2, "idm_random": 1, "idm_faults": 1}
+MAKE = {
+    "idm": IdmTraffic,
+    "idm_mobil": IdmMobilTraffic,
+    "idm_random": IdmRandomTraffic,
+    "idm_faults": lambda: idm_faults_traffic(faults=OFTEN),
+    "gan": gan_traffic,
+}
 
 
-def rules() -> dict[str, TrafficModule]:
-    return {
-        "idm": IdmTraffic(),
-        "idm_mobil": IdmMobilTraffic(),
-        "idm_random": IdmRandomTraffic(),
-        "idm_faults": idm_faults_traffic(),
-    }
+def mixture(**shares: int) -> MixedTraffic:
+    return MixedTraffic({name: MAKE[name]() for name in shares}, shares)
 
 
-def drive(traffic: TrafficModule, rows: int, first: int = 0, decisions: int = 12) -> list:
+def drive(traffic: TrafficModule, rows: int, decisions: int = 12) -> list:
     env = environment(num_envs=rows, traffic=traffic, dtype=torch.float32)
-    asked = env.reset().select(keys.SEED, keys.EPISODE)
-    asked[keys.EPISODE] = first + torch.arange(rows)
-    td, seen = env.reset(asked), []
+    td, seen = env.reset(), []
     for _ in range(decisions):
         td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 5 % 3)
         seen.append(td)
@@ -72,24 +77,24 @@ def test_each_part_has_its_share_of_every_period_and_nobody_waits_long():
 
 
 @pytest.mark.parametrize("rows", [1, 6, pytest.param(64, marks=pytest.mark.slow)])
-def test_an_episode_of_a_mixture_is_the_same_bits_in_every_batch(rows):
-    wide, narrow = drive(MixedTraffic(rules(), RULES), 64), drive(MixedTraffic(rules(), RULES), rows, 0)
+def test_an_episode_is_the_same_bits_in_every_batch_and_in_every_rule_driven_traffic(rows):
+    wide, narrow = drive(mixture(**RULES), 64), drive(mixture(**RULES), rows)
     for all_rows, some in zip(wide, narrow):
         assert same_bits(all_rows[:rows], some) == []
+    faulty = wide[-1][keys.TRAFFIC, "idm_faults"]
+    assert all((faulty[fault, "left"] > 0).any() for fault in ("phantom_braking", "late_reaction"))
 
 
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_a_part_drives_its_episodes_to_the_bit_as_it_does_alone(name):
-    mixed, alone = drive(MixedTraffic(rules(), RULES), 20), drive(rules()[name], 20)
     rows = [row for row in range(20) if interleaved(RULES)[row % 5] == name]
-    for one, other in zip(mixed, alone):
-        memory = one[rows][keys.TRAFFIC, name]
+    for one, other in zip(drive(mixture(**RULES), 20), drive(MAKE[name](), 20)):
         assert same_bits(one[rows].exclude(keys.TRAFFIC), other[rows].exclude(keys.TRAFFIC)) == []
-        assert same_bits(memory, other[rows][keys.TRAFFIC]) == []
+        assert same_bits(one[rows][keys.TRAFFIC, name], other[rows][keys.TRAFFIC]) == []
 
 
 def test_where_a_part_has_no_row_its_memory_stays_zero():
-    traffic = MixedTraffic(rules(), RULES)
+    traffic = mixture(**RULES)
     for td in drive(traffic, 7):
         part = traffic.part_of(td[keys.EPISODE])
         for number, (name, _) in enumerate(traffic.named_parts()):
@@ -98,35 +103,29 @@ def test_where_a_part_has_no_row_its_memory_stays_zero():
 
 
 def test_the_generator_drives_its_rows_as_it_does_alone_to_rounding():
-    parts = {"idm_mobil": IdmMobilTraffic(), "gan": gan_traffic()}
-    mixed, alone = drive(MixedTraffic(parts, {"idm_mobil": 1, "gan": 1}), 8, 0, 3), drive(gan_traffic(), 8, 0, 3)
+    mixed, alone = drive(mixture(idm_mobil=1, gan=1), 8, 3)[-1], drive(gan_traffic(), 8, 3)[-1]
     for name in ("x", "y", "speed"):
-        torch.testing.assert_close(
-            mixed[-1][1::2][keys.VEHICLES, name], alone[-1][1::2][keys.VEHICLES, name], atol=2e-3, rtol=1e-4
-        )
+        one, other = (td[1::2][keys.VEHICLES, name] for td in (mixed, alone))
+        torch.testing.assert_close(one, other, atol=2e-3, rtol=1e-4)
 
 
 def test_vehicles_are_seen_as_their_episodes_traffic_has_it():
-    parts = {"idm_mobil": IdmMobilTraffic(), "gan": gan_traffic()}
-    td = environment(num_envs=6, traffic=MixedTraffic(parts, {"idm_mobil": 2, "gan": 1}), dtype=torch.float32).reset()
+    td = environment(num_envs=6, traffic=mixture(idm_mobil=2, gan=1), dtype=torch.float32).reset()
     seen = td[keys.VEHICLES, "visibility"]
     assert (seen[:, 0] == Visibility.BODY).all()
-    others = seen[:, 1:].float().mean(1).tolist()
-    assert others == [2.0, 1.0, 2.0, 2.0, 1.0, 2.0]
+    assert seen[:, 1:].float().mean(1).tolist() == [2.0, 1.0, 2.0, 2.0, 1.0, 2.0]
 
 
 def test_scenes_set_by_hand_and_faults_laid_over_a_mixture_see_it_too():
-    mixture = MixedTrafficConfig(shares={"gan": 1, "idm": 1})
     scene = CutInEnvConfig()
-    seen = make_env(make_traffic(mixture, scene), scene, num_envs=4).reset()[keys.VEHICLES, "visibility"]
-    assert (seen >= 0).all()
-    mixed = MixedTraffic({"idm": IdmTraffic(), "gan": gan_traffic()}, {"idm": 1, "gan": 1})
-    chain = drive(with_faults(mixed), 4, 0, 2)[-1]
+    traffic = make_traffic(MixedTrafficConfig(shares={"gan": 1, "idm": 1}), scene)
+    assert (make_env(traffic, scene, num_envs=4).reset()[keys.VEHICLES, "visibility"] >= 0).all()
+    chain = drive(with_faults(mixture(idm=1, gan=1)), 4, 2)[-1]
     assert chain[keys.VEHICLES, "visibility"][:, 1].tolist() == [2, 1, 2, 1]
 
 
 def test_rows_keep_their_part_over_automatic_resets_where_the_batch_is_a_multiple_of_the_period():
-    traffic = MixedTraffic(rules(), RULES)
+    traffic = mixture(**RULES)
     env = environment(num_envs=10, traffic=traffic, goal_m=60.0, dtype=torch.float32)
     td, first, numbers = env.reset(), None, set()
     for _ in range(12):
@@ -140,18 +139,16 @@ def test_rows_keep_their_part_over_automatic_resets_where_the_batch_is_a_multipl
 
 
 def test_a_state_written_to_between_two_steps_counts():
-    traffic = MixedTraffic(rules(), RULES)
-    env = environment(num_envs=10, traffic=traffic, dtype=torch.float32)
+    env, other = (environment(num_envs=10, traffic=mixture(**RULES), dtype=torch.float32) for _ in range(2))
     td = step(env, env.reset())
     fresh = td.clone()
     for state in (td, fresh):
         state[keys.TRAFFIC, "idm_mobil", "steering"].mul_(0.0).add_(0.01)
-    other = environment(num_envs=10, traffic=MixedTraffic(rules(), RULES), dtype=torch.float32)
     assert same_bits(step(env, td), step(other, fresh)) == []
 
 
 def test_graphs_meet_few_numbers_of_rows(monkeypatch):
-    traffic = MixedTraffic({"idm": IdmTraffic(), "idm_mobil": IdmMobilTraffic()}, {"idm": 2, "idm_mobil": 1})
+    traffic = mixture(idm=2, idm_mobil=1)
     for _, part in traffic.named_parts():
         monkeypatch.setattr(part, "compile_graphs", lambda: None)
     plain = drive(copy.deepcopy(traffic), 64)
@@ -167,36 +164,36 @@ def test_graphs_meet_few_numbers_of_rows(monkeypatch):
         assert same_bits(one, other) == []
 
 
-def test_what_cannot_be_mixed_is_refused_in_one_sentence():
-    with pytest.raises(UserError, match="replay: it plays recordings"):
-        MixedTrafficConfig(shares={"replay": 1})
-    with pytest.raises(UserError, match="did you mean 'idm_mobil'"):
-        MixedTrafficConfig(shares={"idm_mobli": 1})
-    for shares in ({}, {"idm": 0}, {"idm": 0.5}, {"idm": 2000}, 3):
-        with pytest.raises(UserError, match="whole numbers of at least 1"):
-            MixedTrafficConfig(shares=shares)
-    with pytest.raises(UserError, match="is a mixture itself"):
-        MixedTrafficConfig(shares={"mixed": 1})
-    with pytest.raises(UserError, match="different roads or streams"):
-        MixedTraffic({"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1})
-    with pytest.raises(UserError, match="no ego anyway"):
-        ReplayTrafficConfig(blind_share=0.5)
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: MixedTrafficConfig(shares={"replay": 1}), "replay: it plays recordings"),
+        (lambda: MixedTrafficConfig(shares={"idm_mobli": 1}), "did you mean 'idm_mobil'"),
+        *(
+            (lambda shares=shares: MixedTrafficConfig(shares=shares), "whole numbers of at least 1")
+            for shares in ({}, {"idm": 0}, {"idm": 0.5}, {"idm": 2000}, 3)
+        ),
+        (lambda: MixedTrafficConfig(shares={"mixed": 1}), "is a mixture itself"),
+        (
+            lambda: MixedTraffic({"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1}),
+            "different roads or streams",
+        ),
+        (lambda: ReplayTrafficConfig(blind_share=0.5), "no ego anyway"),
+        (lambda: BlindTraffic(IdmTraffic(), 1.5), "from 0 to 1"),
+        (lambda: IdmTrafficConfig(blind_share=-1.0), r"blind_share=-1"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_sentence(make, told):
+    with pytest.raises(UserError, match=told):
+        make()
 
 
 def test_a_model_of_ones_own_is_mixed_by_its_import_path():
-    config = MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1})
-    traffic = make_traffic(config, EnvConfig())
+    traffic = make_traffic(MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}), EnvConfig())
     assert isinstance(traffic, MixedTraffic)
     assert [name for name, _ in traffic.named_parts()] == ["ganlane_traffic_IdmTraffic", "idm_mobil"]
-    assert (
-        same_bits(
-            drive(traffic, 4)[-1].exclude(keys.TRAFFIC),
-            drive(MixedTraffic({"a": IdmTraffic(), "b": IdmMobilTraffic()}, {"a": 1, "b": 1}), 4)[-1].exclude(
-                keys.TRAFFIC
-            ),
-        )
-        == []
-    )
+    one, other = (drive(each, 4)[-1].exclude(keys.TRAFFIC) for each in (traffic, mixture(idm=1, idm_mobil=1)))
+    assert same_bits(one, other) == []
 
 
 def test_a_description_holds_the_parts_that_have_a_share():
@@ -210,29 +207,17 @@ def test_a_description_holds_the_parts_that_have_a_share():
 CHASE = vehicles({"x": 0.0, "speed": 10.0, "desired_speed": 10.0}, {"x": -60.0, "speed": 25.0, "desired_speed": 25.0})
 
 
-def chased(share: float) -> tuple[list[float], bool]:
-    """Speeds of a fast driver behind a slow ego, second by second, and whether they crashed."""
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environment_says_so(share):
+    """A fast driver behind a slow ego, second by second."""
     env = environment(vehicles=2, traffic=BlindTraffic(IdmTraffic(), share))
-    td = env.reset()
-    td[keys.VEHICLES].update(CHASE.as_dict())
-    speeds, crash = [], False
+    td, speeds, crashes = placed(env, CHASE), [], []
     for _ in range(8):
         td = step(env, td)
         speeds.append(td[keys.VEHICLES, "speed"][0, 1].item())
-        crash = crash or bool(td[keys.EVENTS, "hard_crash"])
-    return speeds, crash
-
-
-def test_a_follower_brakes_for_an_ego_that_it_sees():
-    speeds, crash = chased(0.0)
-    assert min(speeds) < 15.0
-    assert not crash
-
-
-def test_a_follower_drives_into_an_ego_that_it_does_not_see_and_the_environment_says_so():
-    speeds, crash = chased(1.0)
-    assert min(speeds) > 24.9
-    assert crash
+        crashes.append(bool(td[keys.EVENTS, "hard_crash"]))
+    assert any(crashes) == (share == 1.0)
+    assert min(speeds) > 24.9 if share else min(speeds) < 15.0
 
 
 @pytest.mark.parametrize("traffic", [IdmMobilTraffic, idm_faults_traffic])
@@ -257,8 +242,7 @@ def test_the_ego_stays_where_the_environment_has_it():
 
 
 def test_as_many_episodes_are_blind_as_asked_for_whatever_the_batch_and_the_part():
-    parts = {"idm": IdmTraffic(), "idm_mobil": IdmMobilTraffic()}
-    traffic = BlindTraffic(MixedTraffic(parts, {"idm": 1, "idm_mobil": 1}), 0.3)
+    traffic = BlindTraffic(mixture(idm=1, idm_mobil=1), 0.3)
     wide, narrow = (environment(num_envs=n, traffic=traffic).reset()[keys.TRAFFIC, "unseen"] for n in (4000, 7))
     assert torch.equal(wide[:7], narrow)
     assert not wide[:, 1:].any()
@@ -267,15 +251,5 @@ def test_as_many_episodes_are_blind_as_asked_for_whatever_the_batch_and_the_part
 
 
 def test_generated_drivers_may_be_blind_too():
-    env = environment(num_envs=4, traffic=BlindTraffic(gan_traffic(), 1.0), dtype=torch.float32)
-    td = env.reset()
-    for _ in range(5):
-        td = step(env, td)
-    assert all(value.isfinite().all() for value in (td[keys.VEHICLES, name] for name in ("x", "y", "speed")))
-
-
-def test_a_share_out_of_range_is_refused():
-    with pytest.raises(UserError, match="from 0 to 1"):
-        BlindTraffic(IdmTraffic(), 1.5)
-    with pytest.raises(UserError, match=r"blind_share=-1"):
-        IdmTrafficConfig(blind_share=-1.0)
+    td = drive(BlindTraffic(gan_traffic(), 1.0), 4, 5)[-1]
+    assert all(td[keys.VEHICLES, name].isfinite().all() for name in ("x", "y", "speed"))

@@ -7,7 +7,8 @@ import torch
 
 pytest.importorskip("libsumo", reason="SUMO is not installed: pip install 'ganlane[sumo]'")
 
-from reference.foreign import drive, start, turns
+from reference.foreign import assert_same_alone, drive, overlaps, start, turns
+from reference.worlds import vehicles as scene_of
 
 from ganlane import keys
 from ganlane.agents.drivers import DRIVERS
@@ -15,12 +16,13 @@ from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import body_lanes
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic import IdmTraffic, SumoTraffic
+from ganlane.traffic.sumo_roads import ORIGIN_M
 
 LEFT, RIGHT = 1, 2
+KEEP = torch.zeros(1, dtype=torch.int64)
 
 
 @pytest.fixture(scope="module")
@@ -31,31 +33,19 @@ def traffic():
 @pytest.fixture(scope="module")
 def driven(traffic):
     """Twenty egos that keep their lanes, for a minute: vehicles [601, 20, 9]."""
-    vehicles, running, state = drive(HighwayEnv(traffic, 20), list(range(20)), 60)
+    vehicles, running, state = drive(HighwayEnv(traffic, 20), range(20), 60)
     assert running.all()
     return vehicles, state
 
 
-def car(x, lane, speed, desired=20.0, length=4.5):
-    return {"x": x, "lane": lane, "speed": speed, "desired_speed": desired, "length": length}
-
-
-def scene_of(*cars, width=2.5, lane_width=4.0):
-    """A scene [1, M] set by hand; the first car is the ego."""
-    number = {name: torch.tensor([[float(one[name]) for one in cars]]) for name in cars[0]}
-    lane, zero = number["lane"].long(), torch.zeros_like(number["x"])
-    return Vehicles(
-        x=number["x"], y=lane * lane_width, heading=zero, speed=number["speed"], acceleration=zero,
-        length=number["length"], width=zero + width, desired_speed=number["desired_speed"], target_lane=lane,
-        visibility=torch.full_like(lane, int(Visibility.BODY)), valid=torch.ones_like(lane, dtype=torch.bool),
-    )  # fmt: skip
-
-
 class Scene:
-    """Always the same first scene."""
+    """Always the same first scene; the first of ``cars`` (x, lane, speed, desired speed, length) is the ego."""
 
-    def __init__(self, scene):
-        self.scene, self.vehicles = scene, scene.x.shape[1]
+    def __init__(self, *cars):
+        names = ("x", "lane", "speed", "desired_speed", "length")
+        body = {"visibility": int(Visibility.BODY)}
+        self.scene = scene_of(*({**body, **dict(zip(names, car))} for car in cars), dtype=torch.float32)
+        self.vehicles = len(cars)
 
     def check(self, road, idm):
         pass
@@ -67,13 +57,12 @@ class Scene:
 def test_an_ego_that_keeps_its_lane_crashes_with_nobody_and_nobody_with_another(driven):
     vehicles, state = driven
     assert not state[keys.EVENTS]["hard_crash"].any()
-    flat = Vehicles(*(field.flatten(0, 1) for field in vehicles))
-    assert not pair_overlaps(flat).any()
+    assert overlaps(vehicles) == 0
 
 
 def test_the_goal_is_reached_without_a_crash(traffic):
     env = HighwayEnv(traffic, 20, episode=EpisodeParameters(goal_m=1500.0))
-    state, goals = start(env, list(range(100, 120))), 0
+    state, goals = start(env, range(100, 120)), 0
     for _ in range(150):
         state[keys.ACTION] = torch.zeros(20, dtype=torch.int64)
         stepped, state = env.step_and_maybe_reset(state)
@@ -110,32 +99,18 @@ def test_a_target_lane_is_where_a_change_ends_or_turns_back_from(driven):
     assert (target[1:-40][begins] != target[:-41][begins]).all()
 
 
-def test_the_others_signal_and_are_all_there(driven):
+def test_the_others_signal_and_are_all_there_and_some_are_lorries_who_keep_their_length(driven):
     vehicles, _ = driven
     assert vehicles.valid.all()
     assert (vehicles.visibility[..., 1:] == int(Visibility.SIGNALLED)).all()
-
-
-def test_some_are_lorries_who_keep_their_length(driven):
-    vehicles, _ = driven
-    share = (vehicles.length[0, :, 1:] == 12.0).float().mean()
-    assert 0.05 < share < 0.3
+    assert 0.05 < (vehicles.length[0, :, 1:] == 12.0).float().mean() < 0.3
     assert (vehicles.length == vehicles.length[0]).all()
 
 
 def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(traffic):
-    episodes = [1, 3, 4, 6]
-    env = HighwayEnv(traffic, 4)
     # In the middle of this the same roads have to be cleared, vehicles on their way across lanes among them.
-    drive(env, [11, 12, 13, 14], 17, turns)
-    together, running, _ = drive(env, episodes, 40, turns)
-    for row, episode in enumerate(episodes):
-        alone, ran, _ = drive(HighwayEnv(traffic, 1), [episode], 40, turns)
-        count = int(running[:, row].sum())
-        assert count == int(ran[:, 0].sum())
-        assert count > 0
-        for one, other in zip(alone, together):
-            assert torch.equal(one[: count + 1, 0], other[: count + 1, row])
+    drive(HighwayEnv(traffic, 4), [11, 12, 13, 14], 17, turns)
+    assert_same_alone(HighwayEnv, traffic, [1, 3, 4, 6], 40)
 
 
 def test_stand_ins_are_where_the_ego_is(traffic):
@@ -144,7 +119,9 @@ def test_stand_ins_are_where_the_ego_is(traffic):
 
     def compare(vehicles, running):
         x = float(vehicles.x[0, 0] + 0.5 * vehicles.length[0, 0])
-        stand_ins = traffic._roads.stand_ins(0)
+        roads = traffic._simulation.roads
+        place = roads.libsumo.vehicle.getLanePosition
+        stand_ins = {lane: place(name) - ORIGIN_M for lane, name in roads._stand_ins[0].items()}
         lanes_seen.add(tuple(sorted(stand_ins)))
         wrong.extend(abs(place - x) for place in stand_ins.values())
         y = float(vehicles.y[0, 0])
@@ -165,12 +142,12 @@ def test_stand_ins_are_where_the_ego_is(traffic):
 def follower_of(traffic, lane_of_ego, action):
     """Speeds of a fast driver 30 m behind a slow ego's place in lane 1, over 6 s."""
     # Somebody slow ahead keeps the ego slow, far enough away for the driver behind not to mind.
-    scene = scene_of(car(0.0, lane_of_ego, 12.0, 12.0), car(-32.0, 1, 20.0, 20.0), car(2000.0, 2, 20.0))
-    vehicles, running, _ = drive(
-        HighwayEnv(traffic, 1, scenes=Scene(scene)), [0], 6, lambda decision, _: action if decision == 0 else 0
+    scene = Scene((0.0, lane_of_ego, 12.0, 12.0), (-32.0, 1, 20.0, 20.0), (2000.0, 2, 20.0, 20.0))
+    driven, running, _ = drive(
+        HighwayEnv(traffic, 1, scenes=scene), [0], 6, lambda decision, _: action if decision == 0 else 0
     )
     assert running.all()
-    return vehicles
+    return driven
 
 
 def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
@@ -189,11 +166,11 @@ def test_a_follower_brakes_for_an_ego_that_moves_in_front_and_only_then():
 def test_the_ego_is_followed_when_it_brakes_to_a_stand():
     # A parked lorry ahead of the ego; the driver behind has nowhere to go on a road of one lane.
     one_lane = SumoTraffic(Road(1), speed_wander=0.0)
-    scene = scene_of(car(0.0, 0, 15.0), car(-25.0, 0, 15.0), car(120.0, 0, 0.0, 0.1, 12.0))
-    vehicles, running, _ = drive(HighwayEnv(one_lane, 1, scenes=Scene(scene)), [0], 40)
+    scene = Scene((0.0, 0, 15.0, 20.0), (-25.0, 0, 15.0, 20.0), (120.0, 0, 0.0, 0.1, 12.0))
+    driven, running, _ = drive(HighwayEnv(one_lane, 1, scenes=scene), [0], 40)
     assert running.all()
-    assert vehicles.speed[-1, 0, 0] < 0.5
-    gap = vehicles.x[-1, 0, 0] - vehicles.x[-1, 0, 1] - 4.5
+    assert driven.speed[-1, 0, 0] < 0.5
+    gap = driven.x[-1, 0, 0] - driven.x[-1, 0, 1] - 4.5
     assert 0.5 < gap < 8.0
 
 
@@ -225,7 +202,7 @@ def test_our_driver_does_here_what_it_does_in_our_own_traffic(traffic):
 
 def test_vehicles_that_return_in_front_of_the_ego_are_followed(traffic):
     env = HighwayEnv(traffic, 8, recycle=True)
-    vehicles, running, _ = drive(env, list(range(8)), 60)
+    vehicles, running, _ = drive(env, range(8), 60)
     away = (vehicles.x[1:] - vehicles.x[:-1] - 0.1 * vehicles.speed[1:])[..., 1:].abs() > 100.0
     assert away.any()
     assert running.all(), "somebody crashed"
@@ -234,24 +211,20 @@ def test_vehicles_that_return_in_front_of_the_ego_are_followed(traffic):
 
 def test_a_state_that_sumo_did_not_leave_is_refused(traffic):
     env = HighwayEnv(traffic, 1)
-    state = start(env, [0])
-    state[keys.ACTION] = torch.zeros(1, dtype=torch.int64)
-    first = env.step(state)["next"].clone()
-    first[keys.ACTION] = torch.zeros(1, dtype=torch.int64)
+    first = env.step(start(env, [0]).set(keys.ACTION, KEEP))["next"].clone().set(keys.ACTION, KEEP)
     second = env.step(first.clone())["next"].clone()
-    env.step(second.set(keys.ACTION, torch.zeros(1, dtype=torch.int64)))
+    env.step(second.set(keys.ACTION, KEEP))
     with pytest.raises(UserError, match="not the one that SUMO left"):
         env.step(first)
 
 
 def test_two_environments_cannot_take_turns_but_may_follow_each_other():
     one, other = HighwayEnv(SumoTraffic(), 1), HighwayEnv(SumoTraffic(), 1)
-    keep = torch.zeros(1, dtype=torch.int64)
-    first = one.step(start(one, [0]).set(keys.ACTION, keep))["next"]
-    other.step(start(other, [0]).set(keys.ACTION, keep))
+    first = one.step(start(one, [0]).set(keys.ACTION, KEEP))["next"]
+    other.step(start(other, [0]).set(keys.ACTION, KEEP))
     with pytest.raises(UserError, match="a process has one SUMO"):
-        one.step(first.set(keys.ACTION, keep))
-    one.step(start(one, [0]).set(keys.ACTION, keep))
+        one.step(first.set(keys.ACTION, KEEP))
+    one.step(start(one, [0]).set(keys.ACTION, KEEP))
 
 
 def test_a_copy_starts_a_simulation_of_its_own(traffic):

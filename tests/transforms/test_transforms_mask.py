@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from reference.worlds import environment, vehicles
@@ -45,16 +43,18 @@ def idm(speed, desired, gap, leader_speed):
 
 # --- what is allowed
 
+LEFT_ONLY, RIGHT_ONLY = [True, True, False], [True, False, True]
+BESIDE = [{"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0}]
 
-@pytest.mark.parametrize(("lane", "expected"), [(0, [True, True, False]), (1, ALL), (2, [True, False, True])])
+
+@pytest.mark.parametrize(("lane", "expected"), [(0, LEFT_ONLY), (1, ALL), (2, RIGHT_ONLY)])
 def test_commands_off_the_road_are_never_allowed(lane, expected):
     assert allowed({"x": 0.0, "lane": lane}, {"x": 500.0, "lane": 0}, form="legal")[0] == expected
     assert on_road_actions(torch.tensor([lane]), 3)[0].tolist() == expected
 
 
 def test_every_row_has_the_lanes_of_its_own_road():
-    mask = on_road_actions(torch.tensor([1, 1]), torch.tensor([2, 3]))
-    assert mask.tolist() == [[True, False, True], ALL]
+    assert on_road_actions(torch.tensor([1, 1]), torch.tensor([2, 3])).tolist() == [RIGHT_ONLY, ALL]
 
 
 @pytest.mark.parametrize("form", ["legal", "safe"])
@@ -63,56 +63,48 @@ def test_during_a_lane_change_nothing_but_keeping_is_allowed(form):
 
 
 def test_who_may_turn_back_may_give_the_opposite_command_alone():
-    assert obeyed_actions(torch.tensor([0, 1, -1]), abort=True).tolist() == [
-        ALL,
-        [True, False, True],
-        [True, True, False],
-    ]
+    assert obeyed_actions(torch.tensor([0, 1, -1]), abort=True).tolist() == [ALL, RIGHT_ONLY, LEFT_ONLY]
 
 
 def test_turning_back_must_be_safe_too():
     """On its way from lane 0 to lane 1; somebody fast has come up in lane 0 meanwhile."""
     ego = {"x": 0.0, "y": 3.0, "target_lane": 1, "speed": 15.0}
     back = {"abort": True, "direction": 1}
-    assert allowed(ego, {"x": -200.0, "lane": 0}, **back)[0] == [True, False, True]
+    assert allowed(ego, {"x": -200.0, "lane": 0}, **back)[0] == RIGHT_ONLY
     assert allowed(ego, {"x": -15.0, "lane": 0, "speed": 30.0}, **back)[0] == KEEP_ONLY
 
 
-def test_a_change_is_allowed_up_to_the_braking_that_it_asks_of_the_new_follower():
-    """The follower's deceleration is worked out by hand; a limit a little above it allows, a little below forbids."""
-    ego, follower = {"x": 0.0, "lane": 0, "speed": 15.0}, {"x": -60.0, "lane": 1, "speed": 24.0}
-    braking = -idm(24.0, 25.0, 60.0 - 4.5, 15.0)
+@pytest.mark.parametrize(
+    ("ego", "other", "braking", "with_it", "without"),
+    [
+        # Of the new follower, and of the ego behind its new leader.
+        ((0, 15.0), {"x": -60.0, "lane": 1, "speed": 24.0}, -idm(24.0, 25.0, 60.0 - 4.5, 15.0), LEFT_ONLY, KEEP_ONLY),
+        ((1, 25.0), {"x": 65.0, "lane": 2, "speed": 15.0}, -idm(25.0, 25.0, 65.0 - 4.5, 15.0), ALL, RIGHT_ONLY),
+    ],
+)
+def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(ego, other, braking, with_it, without):
+    """The deceleration is worked out by hand; a limit a little above it allows, a little below forbids."""
+    car = {"x": 0.0, "lane": ego[0], "speed": ego[1]}
     assert 4.0 < braking < 20.0
-    assert allowed(ego, follower, limit=braking + 1e-6)[0] == [True, True, False]
-    assert allowed(ego, follower, limit=braking - 1e-6)[0] == KEEP_ONLY
-
-
-def test_a_change_is_allowed_up_to_the_braking_that_it_asks_of_the_ego():
-    ego, leader = {"x": 0.0, "lane": 1, "speed": 25.0}, {"x": 65.0, "lane": 2, "speed": 15.0}
-    braking = -idm(25.0, 25.0, 65.0 - 4.5, 15.0)
-    assert allowed(ego, leader, limit=braking + 1e-6)[0] == ALL
-    assert allowed(ego, leader, limit=braking - 1e-6)[0] == [True, False, True]
-
-
-def test_nobody_changes_into_a_vehicle_alongside():
-    assert allowed({"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0})[0] == KEEP_ONLY
+    assert allowed(car, other, limit=braking + 1e-6)[0] == with_it
+    assert allowed(car, other, limit=braking - 1e-6)[0] == without
 
 
 def test_a_lorry_reaches_farther_than_a_car():
     ego, behind = {"x": 0.0, "lane": 0, "speed": 20.0}, {"x": -13.0, "lane": 1, "speed": 16.0}
-    assert allowed(ego, behind)[0] == [True, True, False]
+    assert allowed(ego, behind)[0] == LEFT_ONLY
     assert allowed(ego, {**behind, "length": 25.0})[0] == KEEP_ONLY
 
 
-def test_a_vehicle_that_is_not_there_forbids_nothing():
+def test_nobody_changes_into_a_vehicle_alongside_but_where_it_is_not_there():
+    assert allowed(*BESIDE)[0] == KEEP_ONLY
     assert allowed({"x": 0.0, "lane": 1}, {"x": 0.0, "lane": 2, "valid": False})[0] == ALL
 
 
 def test_keeping_the_lane_is_allowed_when_nothing_is_safe_and_that_is_reported():
     """A standing car ahead, cars alongside: no change is possible, and braking harder than 4 m/s2 is all there is."""
-    boxed_in = [{"x": 0.0, "lane": 1}, {"x": 1.0, "lane": 2}, {"x": -1.0, "lane": 0}]
-    assert allowed(*boxed_in, {"x": 25.0, "lane": 1, "speed": 0.0}) == (KEEP_ONLY, True)
-    assert allowed(*boxed_in, {"x": 500.0, "lane": 1}) == (KEEP_ONLY, False)
+    assert allowed(*BESIDE, {"x": 25.0, "lane": 1, "speed": 0.0}) == (KEEP_ONLY, True)
+    assert allowed(*BESIDE, {"x": 500.0, "lane": 1}) == (KEEP_ONLY, False)
 
 
 # --- in the environment
@@ -146,28 +138,20 @@ def test_a_random_driver_behind_the_legal_mask_never_leaves_the_road():
 def test_no_follower_brakes_harder_than_the_limit_in_the_step_after_an_allowed_change():
     """Measured in rule-driven traffic, where everybody drives by the IDM that the mask judges by."""
     env = masked(num_envs=32, stream=2)
-    state, hardest = env.reset(), []
-    policy = MaskedPolicy(RandomDriver(env.base_env.road, 2))
-    for _ in range(40):
-        before = state
-        state = env.step(policy(state))["next"]
-        started = state["ego", "started_change"]
-        accelerations = before["vehicles"], state["vehicles", "acceleration"][:, 1:]
-        hardest.append(torch.where(started, accelerations[1].amin(1), 0.0).amin())
-        state = env.step_mdp(TensorDict({"next": state}, state.batch_size))
-        if bool(state["done"].any()):
-            state = env.reset(state.set("_reset", state["done"]))
-    assert -6.0 < float(torch.stack(hardest).amin()) < 0.0
+    rollout = env.rollout(40, MaskedPolicy(RandomDriver(env.base_env.road, 2)), break_when_any_done=False)["next"]
+    hardest = rollout["vehicles", "acceleration"][..., 1:].amin(-1)[rollout["ego", "started_change"]].amin()
+    assert -6.0 < hardest.item() < 0.0
 
 
 def test_the_mask_sees_what_the_ego_perceives_and_not_the_truth():
     """Sensors that never see anybody: every change looks safe."""
     blind = {"name": "lane_view_overlap", "sensors": {"dropout": 1.0}}
-    env = ganlane.make_env("idm_mobil", 64, mask="safe", observation=blind, spread_m=60, min_spacing_m=18)
-    seeing = ganlane.make_env("idm_mobil", 64, mask="safe", spread_m=60, min_spacing_m=18)
-    legal = ganlane.make_env("idm_mobil", 64, mask="legal", spread_m=60, min_spacing_m=18)
-    assert torch.equal(env.reset()["action_mask"], legal.reset()["action_mask"])
-    assert not torch.equal(seeing.reset()["action_mask"], legal.reset()["action_mask"])
+    unseeing, seeing, legal = (
+        ganlane.make_env("idm_mobil", 64, spread_m=60, min_spacing_m=18, **options).reset()["action_mask"]
+        for options in ({"mask": "safe", "observation": blind}, {"mask": "safe"}, {"mask": "legal"})
+    )
+    assert torch.equal(unseeing, legal)
+    assert not torch.equal(seeing, legal)
 
 
 # --- who obeys it
@@ -180,7 +164,7 @@ class Values(torch.nn.Module):
         return torch.tensor([[0.0, 1.0, 2.0]]).expand(observation.shape[0], 3)
 
 
-@pytest.mark.parametrize(("mask", "chosen"), [(ALL, 2), ([True, True, False], 1), (KEEP_ONLY, 0)])
+@pytest.mark.parametrize(("mask", "chosen"), [(ALL, 2), (LEFT_ONLY, 1), (KEEP_ONLY, 0)])
 def test_a_greedy_agent_takes_the_best_of_the_allowed_actions(mask, chosen):
     state = TensorDict({"observation": torch.zeros(1, 4), "action_mask": torch.tensor([mask])}, [1])
     assert GreedyPolicy(Values())(state)["action"].tolist() == [chosen]
@@ -189,9 +173,8 @@ def test_a_greedy_agent_takes_the_best_of_the_allowed_actions(mask, chosen):
 def test_exploration_draws_allowed_actions_alone():
     policy = ExploringPolicy(Values(), torch.Generator().manual_seed(0), legal=lambda state: 1 / 0)
     policy.epsilon = 1.0
-    rows = 300
-    mask = torch.tensor([[True, True, False]]).expand(rows, 3)
-    drawn = policy(TensorDict({"observation": torch.zeros(rows, 4), "action_mask": mask}, [rows]))["action"]
+    mask = torch.tensor([LEFT_ONLY]).expand(300, 3)
+    drawn = policy(TensorDict({"observation": torch.zeros(300, 4), "action_mask": mask}, [300]))["action"]
     assert set(drawn.tolist()) == {0, 1}
 
 
@@ -208,35 +191,27 @@ def test_a_masked_driver_in_an_environment_without_a_mask_is_refused():
 
 def test_the_next_state_brings_its_mask_to_the_transition_it_ends():
     """n = 2; row 0 ends after the first step, so its mask is that step's."""
-    window, masks = NStepWindow(2, 0.9), [torch.tensor([KEEP_ONLY, ALL]), torch.tensor([ALL, [True, False, True]])]
-    made = None
-    for number, mask in enumerate(masks):
-        after = {
-            "observation": torch.zeros(2, 1),
-            "reward": torch.zeros(2, 1),
-            "terminated": torch.zeros(2, 1, dtype=torch.bool),
-            "done": torch.tensor([[number == 0], [False]]),
-            "action_mask": mask,
+    window, made, zero = NStepWindow(2, 0.9), None, torch.zeros(2, 1)
+    for mask, done in (([KEEP_ONLY, ALL], True), ([ALL, RIGHT_ONLY], False)):
+        flags = {"terminated": zero > 0, "done": torch.tensor([[done], [False]]), "action_mask": torch.tensor(mask)}
+        step = {
+            "observation": zero,
+            "action": zero[:, 0].long(),
+            "next": {"observation": zero, "reward": zero, **flags},
         }
-        step = {"observation": torch.zeros(2, 1), "action": torch.zeros(2, dtype=torch.int64), "next": after}
         made = window.push(TensorDict(step, [2]))
-    assert made["next", "action_mask"].tolist() == [KEEP_ONLY, [True, False, True]]
+    assert made["next", "action_mask"].tolist() == [KEEP_ONLY, RIGHT_ONLY]
 
 
 # --- names on the command line
 
 
-def test_a_suffix_puts_any_driver_behind_a_mask():
+def test_a_suffix_puts_any_driver_behind_a_mask_or_takes_it_away():
     driver = make_driver("mobil_egoistic+safe", EnvConfig())
     assert (driver.name, driver.mask) == ("mobil_egoistic+safe", MaskParameters("safe"))
     mask, policy = driver.behind(None)
     assert mask.form == "safe"
     assert isinstance(policy, MaskedPolicy)
-
-
-def test_the_suffix_none_takes_the_mask_away():
-    driver = replace(make_driver("mobil", EnvConfig()), mask=MaskParameters("safe"))
-    assert driver.behind(None)[0].form == "safe"
     assert make_driver("mobil+none", EnvConfig()).behind(MaskParameters("safe"))[0].form == "none"
 
 

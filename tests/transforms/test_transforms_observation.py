@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from reference.worlds import vehicles
+from reference.worlds import DOUBLE, vehicles
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -23,68 +23,66 @@ from ganlane.transforms import (
     SensorParameters,
     observation_size,
 )
-from ganlane.transforms.sensors import Measurement, measure
+from ganlane.transforms.observation import measure
 
 EGO = (0.0, 1, 20.0, 25.0)
-EMPTY = [1.0, 0.0, 0.0]
+NOBODY = [1.0, 0.0, 0.0]
 LORRY = {"length": 12.0}
 
 
-def scene(rows, valid=None):
-    """One environment from (x, lane, speed, desired speed, 25 m/s if left out) per vehicle, the ego first."""
+def observed(scene, form, lanes=3, progress=0.0, direction=0, seen=None):
+    """The observation [D] of a scene of one row."""
+    transform, own = ObservationTransform(Road(lanes), scene.x.shape[1], form), torch.tensor([progress], dtype=DOUBLE)
+    return transform.observe(scene, own, torch.tensor([direction]), transform.road, seen)[0]
+
+
+def observe(form, rows, valid=None, sideways=0.0, **options):
+    """The same of (x, lane, speed, desired speed, 25 m/s if left out) per vehicle, the ego first."""
     names = ("x", "lane", "speed", "desired_speed")
-    return vehicles(*({**dict(zip(names, row)), "valid": valid is None or valid[i]} for i, row in enumerate(rows)))
+    cars = [{**dict(zip(names, row)), "valid": valid is None or valid[i]} for i, row in enumerate(rows)]
+    scene = vehicles(*cars)
+    return observed(scene.with_(y=scene.y + sideways), form, **options)
 
 
-def observe(form, rows, valid=None, lanes=3, progress=0.0, direction=0, sideways=0.0):
-    transform = ObservationTransform(Road(lanes), len(rows), form)
-    ones = torch.ones(1, dtype=torch.float64)
-    cars = scene(rows, valid)
-    cars = cars.with_(y=cars.y + sideways)
-    return transform.observe(cars, progress * ones, torch.tensor([direction]), transform.road)[0]
+def view_of(*others: dict, ego_length: float = 4.5, form: str = "lane_view_drift") -> torch.Tensor:
+    """Left, own, right x ahead, behind: (gap in m, nearness, relative speed, drift), of an ego in the middle lane."""
+    view = observed(vehicles({"x": 0.0, "lane": 1, "length": ego_length}, *others), form)[3:-2].reshape(6, 4)
+    return view * view.new_tensor([200.0, 1.0, 1.0, 1.0])
 
 
-def test_the_ego_reports_its_speed_over_its_desired_speed_and_the_lanes_beside_it():
-    middle = observe("table3", [EGO, (50.0, 1, 20.0, 20.0)])
-    assert middle[:3].tolist() == [0.8, 1.0, 1.0]
-    leftmost = observe("table3", [(0.0, 2, 20.0, 25.0), (50.0, 1, 20.0, 20.0)])
-    assert leftmost[1:3].tolist() == [0.0, 1.0]
-    rightmost = observe("table3", [(0.0, 0, 20.0, 25.0), (50.0, 1, 20.0, 20.0)])
-    assert rightmost[1:3].tolist() == [1.0, 0.0]
+FAR = [EGO, (900.0, 1, 60.0, 20.0), (-900.0, 1, 0.0, 20.0)]
+ONE_LANE = [(0.0, 0, 20.0, 25.0), (50.0, 0, 20.0, 20.0)]
 
 
-def test_its_own_speed_ratio_is_not_clipped():
-    assert observe("table3", [(0.0, 1, 30.0, 25.0), (50.0, 1, 20.0, 20.0)])[0] == pytest.approx(1.2)
-
-
-def test_another_vehicle_gives_position_over_200_m_speed_over_30_and_half_a_unit_per_lane():
-    values = observe("table3", [EGO, (50.0, 2, 26.0, 20.0)])
-    assert values[3:].tolist() == pytest.approx([0.25, 0.2, 0.5])
-    values = observe("table3", [(0.0, 2, 20.0, 25.0), (-20.0, 0, 14.0, 20.0)])
-    assert values[3:].tolist() == pytest.approx([-0.1, -0.2, -1.0])
-
-
-def test_the_others_come_nearest_first_whatever_their_index():
-    values = observe("table3", [EGO, (90.0, 1, 20.0, 20.0), (-30.0, 1, 20.0, 20.0), (60.0, 1, 20.0, 20.0)])
-    assert values[3::3].tolist() == pytest.approx([-0.15, 0.3, 0.45])
-
-
-def test_far_vehicles_are_clipped_to_one():
-    values = observe("table3", [EGO, (900.0, 1, 60.0, 20.0), (-900.0, 1, 0.0, 20.0)])
-    assert values[3::3].tolist() == [1.0, -1.0]
-    assert values[4].item() == 1.0
-
-
-def test_a_vehicle_that_is_not_valid_reads_far_ahead_and_comes_last():
-    rows = [EGO, (10.0, 1, 26.0, 20.0), (50.0, 1, 26.0, 20.0)]
-    values = observe("table3", rows, valid=[True, False, True])
-    assert values[3:].tolist() == pytest.approx([0.25, 0.2, 0.0, 1.0, 0.0, 0.0])
-
-
-def test_on_a_road_of_one_lane_the_lane_difference_is_zero():
-    values = observe("table3", [(0.0, 0, 20.0, 25.0), (50.0, 0, 20.0, 20.0)], lanes=1)
-    assert values[1:3].tolist() == [0.0, 0.0]
-    assert values[5].item() == 0.0
+@pytest.mark.parametrize(
+    ("rows", "options", "where", "expected"),
+    [
+        # The ego's speed over its desired speed, not clipped, and the lanes beside it.
+        ([EGO, (50.0, 1, 20.0, 20.0)], {}, slice(3), [0.8, 1.0, 1.0]),
+        ([(0.0, 2, 20.0, 25.0), (50.0, 1, 20.0, 20.0)], {}, slice(3), [0.8, 0.0, 1.0]),
+        ([(0.0, 0, 20.0, 25.0), (50.0, 1, 20.0, 20.0)], {}, slice(3), [0.8, 1.0, 0.0]),
+        ([(0.0, 1, 30.0, 25.0), (50.0, 1, 20.0, 20.0)], {}, slice(1), [1.2]),
+        # Another vehicle: position over 200 m, speed over 30 m/s, half a unit per lane.
+        ([EGO, (50.0, 2, 26.0, 20.0)], {}, slice(3, None), [0.25, 0.2, 0.5]),
+        ([(0.0, 2, 20.0, 25.0), (-20.0, 0, 14.0, 20.0)], {}, slice(3, None), [-0.1, -0.2, -1.0]),
+        # The nearest first, whatever their index; far ones are clipped to one.
+        ([EGO, (90.0, 1, 20.0), (-30.0, 1, 20.0), (60.0, 1, 20.0)], {}, slice(3, None, 3), [-0.15, 0.3, 0.45]),
+        (FAR, {}, slice(3, None, 3), [1.0, -1.0]),
+        (FAR, {}, slice(4, 5), [1.0]),
+        # One that is not valid reads far ahead and comes last.
+        (
+            [EGO, (10.0, 1, 26.0, 20.0), (50.0, 1, 26.0, 20.0)],
+            {"valid": [True, False, True]},
+            slice(3, None),
+            [0.25, 0.2, 0.0, 1.0, 0.0, 0.0],
+        ),
+        # On a road of one lane there is none beside the ego, and the lane difference is zero.
+        (ONE_LANE, {"lanes": 1}, slice(1, 3), [0.0, 0.0]),
+        (ONE_LANE, {"lanes": 1}, slice(5, 6), [0.0]),
+    ],
+)
+def test_table_3(rows, options, where, expected):
+    assert observe("table3", rows, **options)[where].tolist() == pytest.approx(expected)
 
 
 def test_progress_adds_the_egos_own_lane_change():
@@ -95,18 +93,15 @@ def test_progress_adds_the_egos_own_lane_change():
 def test_the_lane_view_holds_the_nearest_ahead_and_behind_in_three_lanes():
     rows = [EGO, (50.0, 2, 26.0, 20.0), (90.0, 2, 20.0, 20.0), (-34.5, 1, 14.0, 20.0)]
     view = observe("lane_view", rows)[3:-2].reshape(6, 3)
-    nothing = [1.0, 0.0, 0.0]
     gap = 45.5
-    assert view[0].tolist() == pytest.approx([gap / 200, torch.exp(torch.tensor(-gap / 15.0)).item(), 0.2])
-    assert view[3].tolist() == pytest.approx([30.0 / 200, torch.exp(torch.tensor(-2.0)).item(), -0.2])
-    for index in (1, 2, 4, 5):
-        assert view[index].tolist() == nothing
+    assert view[0].tolist() == pytest.approx([gap / 200, np.exp(-gap / 15.0), 0.2])
+    assert view[3].tolist() == pytest.approx([30.0 / 200, np.exp(-2.0), -0.2])
+    assert view[[1, 2, 4, 5]].tolist() == [NOBODY] * 4
 
 
 def test_a_lane_change_shows_in_the_drift_before_its_middle():
     rows = [EGO, (50.0, 2, 26.0, 20.0), (-34.5, 1, 14.0, 20.0)]
-    sideways = torch.tensor([[0.0, -1.2, 0.5]])
-    view = observe("lane_view_drift", rows, sideways=sideways)[3:-2].reshape(6, 4)
+    view = observe("lane_view_drift", rows, sideways=torch.tensor([[0.0, -1.2, 0.5]]))[3:-2].reshape(6, 4)
     assert view[:, 3].tolist() == pytest.approx([-0.6, 0.0, 0.0, 0.25, 0.0, 0.0])
     assert torch.equal(view[:, :3].flatten(), observe("lane_view", rows)[3:-2])
 
@@ -118,9 +113,8 @@ def test_gaps_below_zero_tell_how_far_beside_somebody_is(ahead_m, gap_m, way):
     row = 0 if way * ahead_m > 0 else 1
     view = observe("lane_view_overlap", rows)[3:-2].reshape(6, 4)
     assert view[row, 0].item() == pytest.approx(gap_m / 200)
-    nearness = 1 - gap_m if gap_m <= 0 else torch.exp(torch.tensor(-gap_m / 15)).item()
-    assert view[row, 1].item() == pytest.approx(nearness)
-    assert view[1 - row].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert view[row, 1].item() == pytest.approx(1 - gap_m if gap_m <= 0 else np.exp(-gap_m / 15))
+    assert view[1 - row].tolist() == [*NOBODY, 0.0]
     flat = observe("lane_view_drift", rows)[3:-2].reshape(6, 4)
     assert flat[row, 0].item() == pytest.approx(max(gap_m, 0.0) / 200)
 
@@ -152,17 +146,6 @@ def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form):
 
 
 # Lengths
-
-
-def view_of(*others: dict, ego_length: float = 4.5, form: str = "lane_view_drift") -> torch.Tensor:
-    """Left, own, right x ahead, behind: (gap in m, nearness, relative speed, drift), of an ego in the middle lane."""
-    scene = vehicles({"x": 0.0, "lane": 1, "length": ego_length}, *others)
-    nothing = torch.zeros(1, dtype=torch.float64)
-    observation = ObservationTransform(Road(3), len(others) + 1, form).observe(
-        scene, nothing, nothing.long(), Road(3)
-    )
-    view = observation[0, 3:-2].reshape(6, 4)
-    return view * view.new_tensor([200.0, 1.0, 1.0, 1.0])
 
 
 @pytest.mark.parametrize(("row", "x_m", "lane"), [(0, 30.0, 2), (3, -30.0, 1), (4, 30.0, 0), (5, -30.0, 0)])
@@ -198,12 +181,10 @@ def test_beside_a_lorry_the_overlap_is_as_long_as_the_two_bodies(x_m, overlap_m)
 def test_lengths_are_known_without_error_whatever_the_sensors_measure():
     scene = vehicles({"x": 0.0, "lane": 1}, {"x": 30.0, "lane": 2, **LORRY}, {"x": -50.0, "lane": 1})
     errors = SensorParameters(position_noise_m=2.0, speed_noise_mps=1.0)
-    seen: Measurement = measure(scene, torch.tensor([5]), torch.tensor([0]), errors)
+    seen = measure(scene, torch.tensor([5]), torch.tensor([0]), errors)
     assert seen.x[0, 1] != 30.0
-    nothing = torch.zeros(1, dtype=torch.float64)
-    transform = ObservationTransform(Road(3), 3, "lane_view_overlap")
-    observation = transform.observe(scene, nothing, nothing.long(), Road(3), scene.with_(**seen._asdict()))
-    gaps = 200.0 * observation[0, 3:-2].reshape(6, 4)[:, 0]
+    observation = observed(scene, "lane_view_overlap", seen=scene.with_(**seen._asdict()))
+    gaps = 200.0 * observation[3:-2].reshape(6, 4)[:, 0]
     assert gaps[0].item() == pytest.approx(seen.x[0, 1].item() - 8.25)
     assert gaps[3].item() == pytest.approx(-seen.x[0, 2].item() - 4.5)
 

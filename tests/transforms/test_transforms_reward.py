@@ -28,20 +28,25 @@ def terms(parameters=None, period=1.0, **what):
     return {k: v.item() for k, v in RewardTransform(period, parameters).terms(outcome(**what)).items()}
 
 
-@pytest.mark.parametrize(("speed", "reward"), [(15.0, 0.0), (20.0, 0.5), (25.0, 1.0), (10.0, -0.5), (0.0, -1.5)])
-def test_the_speed_reward_is_0_at_15_and_1_at_the_desired_speed(speed, reward):
-    assert terms(speed=speed)["speed"] == pytest.approx(reward)
-
-
-def test_hard_braking_turns_the_speed_reward_negative_and_never_pays_for_crawling():
-    assert terms(speed=20.0, mean_acceleration=-2.5)["speed"] == pytest.approx(-0.5)
-    assert terms(speed=10.0, mean_acceleration=-2.5)["speed"] == pytest.approx(-0.5)
-    assert terms(speed=20.0, mean_acceleration=-1.5)["speed"] == pytest.approx(0.5)
-
-
-def test_the_papers_literal_sign_pays_for_crawling_and_is_an_option():
-    literal = RewardParameters(literal_low_acceleration=True)
-    assert terms(literal, speed=10.0, mean_acceleration=-2.5)["speed"] == pytest.approx(0.5)
+@pytest.mark.parametrize(
+    ("speed", "mean_acceleration", "literal", "reward"),
+    [
+        # 0 at 15 m/s and 1 at the desired speed.
+        (15.0, 0.0, False, 0.0),
+        (20.0, 0.0, False, 0.5),
+        (25.0, 0.0, False, 1.0),
+        (10.0, 0.0, False, -0.5),
+        (0.0, 0.0, False, -1.5),
+        # Hard braking turns it negative and never pays for crawling; the paper's literal sign does.
+        (20.0, -1.5, False, 0.5),
+        (20.0, -2.5, False, -0.5),
+        (10.0, -2.5, False, -0.5),
+        (10.0, -2.5, True, 0.5),
+    ],
+)
+def test_the_speed_reward(speed, mean_acceleration, literal, reward):
+    parameters = RewardParameters(literal_low_acceleration=literal)
+    assert terms(parameters, speed=speed, mean_acceleration=mean_acceleration)["speed"] == pytest.approx(reward)
 
 
 @pytest.mark.parametrize(
@@ -95,13 +100,12 @@ def test_considerate_charges_per_onset_behind_and_is_the_paper_otherwise():
     assert terms(CONSIDERATE)["soft_crash_behind"] == 0.0
 
 
-def changes_left(behind_m, behind_mps, parameters=None, decisions=4):
-    """The rewards of an ego at 15 m/s that goes left at once, ``behind_m`` in front of a faster driver there."""
-    scene = FixedScene((SceneVehicle(0.0, 0, 15.0), SceneVehicle(-behind_m, 1, behind_mps, behind_mps)))
+def changes_left(behind_m, parameters=None):
+    """The rewards of an ego at 15 m/s that goes left at once, ``behind_m`` in front of a driver at 25 m/s there."""
+    scene = FixedScene((SceneVehicle(0.0, 0, 15.0), SceneVehicle(-behind_m, 1, 25.0, 25.0)))
     env = TransformedEnv(HighwayEnv(IdmTraffic(), scenes=scene), RewardTransform(1.0, parameters))
     state, rewards = env.reset(), []
-    for number in range(decisions):
-        action = keys.LEFT if number == 0 else keys.KEEP
+    for action in (keys.LEFT, keys.KEEP, keys.KEEP, keys.KEEP):
         after = env.step(state.set("action", torch.full((1,), action)))["next"]
         rewards.append(after.select("reward", keys.REWARD_TERMS, keys.EVENTS))
         state = after.exclude("reward")
@@ -110,23 +114,21 @@ def changes_left(behind_m, behind_mps, parameters=None, decisions=4):
 
 def test_who_cuts_in_before_a_fast_driver_pays_and_who_leaves_room_does_not():
     """The other, 15.5 m behind the rear bumper, closes in at 10 m/s: it is 1.55 s away, and nearer at every step."""
-    cut_in = changes_left(20.0, 25.0, CONSIDERATE)
+    cut_in = changes_left(20.0, CONSIDERATE)
     onsets = cut_in[keys.EVENTS, "soft_crash_behind"]
     assert onsets.sum() >= 1
     assert torch.equal(cut_in[keys.REWARD_TERMS, "soft_crash_behind"], -10.0 * onsets)
     assert not cut_in[keys.EVENTS, "hard_crash"].any()
-    room = changes_left(90.0, 25.0, CONSIDERATE)
+    room = changes_left(90.0, CONSIDERATE)
     assert (room[keys.REWARD_TERMS, "soft_crash_behind"] == 0).all()
 
 
 def test_the_papers_reward_is_bit_for_bit_what_it_is_without_the_term():
-    paper, considerate = changes_left(20.0, 25.0), changes_left(20.0, 25.0, CONSIDERATE)
+    paper, considerate = changes_left(20.0), changes_left(20.0, CONSIDERATE)
     assert set(paper[keys.REWARD_TERMS].keys()) == set(keys.REWARD_TERM_NAMES)
     for name in keys.REWARD_TERM_NAMES:
         assert torch.equal(paper[keys.REWARD_TERMS, name], considerate[keys.REWARD_TERMS, name])
-    total = torch.zeros_like(paper["reward"])
-    for name in keys.REWARD_TERM_NAMES:
-        total = total + paper[keys.REWARD_TERMS, name]
+    total = sum(paper[keys.REWARD_TERMS, name] for name in keys.REWARD_TERM_NAMES)
     assert torch.equal(paper["reward"], total)
     assert torch.equal(considerate["reward"], total + considerate[keys.REWARD_TERMS, "soft_crash_behind"])
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.worlds import same_bits
+from reference.worlds import same_bits, vehicles
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs.utils import check_env_specs
 
 from ganlane import keys
 from ganlane.agents import read_agent
 from ganlane.build import make_env, make_traffic, observation_of
 from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.config.traffic import IdmTrafficConfig
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluate import main as evaluate
@@ -29,7 +30,7 @@ from ganlane.traffic import IdmMobilTraffic
 from ganlane.train import main as train
 from ganlane.training.collectors import pack, unpack
 from ganlane.transforms import ObservationTransform, RewardTransform, SensorTransform
-from ganlane.transforms.sensors import measure
+from ganlane.transforms.observation import measure
 
 EVERYTHING = SensorParameters(1.0, 0.5, 2.0, dropout=0.2, delay_s=2.0)
 #: Own speed and lanes, which no sensor error touches.
@@ -52,18 +53,17 @@ def action(td):
 
 
 def drive(env, decisions, td=None):
-    """The states of a run without resets, the first one included."""
+    """The states of a run without resets, the first one included, and the rewards that led to the others."""
     states = [env.reset() if td is None else td]
     for _ in range(decisions):
-        states.append(step_mdp(env.step(states[-1].clone().set("action", action(states[-1])))))
+        states.append(env.step(states[-1].clone().set("action", action(states[-1])))["next"])
     return states
 
 
 def scene(rows, count):
     """``rows`` copies of a row of cars, 10 m from each other on the middle lane, at 20 m/s."""
-    x = 10.0 * torch.arange(count, dtype=torch.float64).expand(rows, count)
-    zero, valid = torch.zeros_like(x), torch.ones_like(x, dtype=torch.bool)
-    return Vehicles(x, zero + 4, zero, zero + 20, zero, zero, zero, zero, zero.long(), zero.long(), valid)
+    one = vehicles(*({"x": 10.0 * i, "lane": 1} for i in range(count)))
+    return Vehicles(*(field.expand(rows, count) for field in one))
 
 
 def many(sensors, rows=5000, count=5):
@@ -126,10 +126,12 @@ def test_nobody_is_seen_at_a_dropout_of_one_and_a_vehicle_that_is_not_there_neve
         assert td[keys.VEHICLES, "valid"].all()
     true = scene(4, 3)
     absent = true.with_(valid=torch.tensor([[True, False, True]]).expand(4, 3))
-    seen = measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), NOISY)
-    assert torch.equal(seen.valid, absent.valid)
-    lossy = SensorParameters(dropout=0.5)
-    assert not measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), lossy).valid[:, 1].any()
+    noisy, lossy = (
+        measure(absent, torch.arange(4), torch.zeros(4, dtype=torch.int64), sensors).valid
+        for sensors in (NOISY, SensorParameters(dropout=0.5))
+    )
+    assert torch.equal(noisy, absent.valid)
+    assert not lossy[:, 1].any()
 
 
 def test_perfect_sensors_show_the_present_observation_bit_for_bit():
@@ -147,15 +149,6 @@ def test_the_true_state_reward_and_own_part_of_the_observation_are_untouched(alo
         assert same_bits(one.exclude("observation"), bare) == []
         assert torch.equal(one["observation"][:, :OWN], other["observation"][:, :OWN])
         assert (other["observation"][:, OWN:].abs() <= 1).all()
-
-
-def test_the_reward_is_paid_on_the_true_state():
-    plain, blurred = world(None), world(EVERYTHING)
-    one, other = plain.reset(), blurred.reset()
-    for _ in range(6):
-        one, other = (env.step(td.set("action", action(td))) for env, td in ((plain, one), (blurred, other)))
-        assert torch.equal(one["next", "reward"], other["next", "reward"])
-        one, other = step_mdp(one), step_mdp(other)
 
 
 @pytest.mark.parametrize(("form", "k"), [("table3", 1), ("lane_view", 3), ("table3_lane_view", 2)])
@@ -253,29 +246,18 @@ def test_a_saved_state_is_resumed_with_what_was_still_to_be_delivered():
         assert same_bits(one, other) == []
 
 
-def built(sensors):
+LATE = SensorParameters(delay_s=1.0, dropout=0.1)
+
+
+@pytest.mark.parametrize(("sensors", "first"), [(None, []), (SensorParameters(), []), (LATE, ["SensorTransform"])])
+def test_a_transform_with_the_traffics_stream_is_inserted_where_there_are_errors(sensors, first):
     road = EnvConfig()
-    return make_env(make_traffic(IdmTrafficConfig(), road), road, ObservationConfig(sensors=sensors), num_envs=2)
-
-
-def transforms_of(env):
-    return [type(transform).__name__ for transform in env.transform.transforms]
-
-
-def test_no_transform_is_inserted_without_errors_and_one_with_any():
-    for sensors in (None, SensorParameters()):
-        assert transforms_of(built(sensors)) == ["ObservationTransform", "RewardTransform"]
-    env = built(SensorParameters(delay_s=1.0, dropout=0.1))
-    assert transforms_of(env) == ["SensorTransform", "ObservationTransform", "RewardTransform"]
-    assert env.transform[0].parameters == SensorParameters(delay_s=1.0, dropout=0.1)
-    check_env_specs(env, seed=0)
-
-
-def test_the_errors_are_those_of_the_traffics_stream():
-    road = EnvConfig()
-    traffic = make_traffic(IdmMobilTrafficConfig(), road, Stream.REPORT)
-    env = make_env(traffic, road, ObservationConfig(sensors=SensorParameters(position_noise_m=1.0)))
-    assert env.transform[0].stream == Stream.REPORT
+    traffic = make_traffic(IdmTrafficConfig(), road, Stream.REPORT)
+    env = make_env(traffic, road, ObservationConfig(sensors=sensors), num_envs=2)
+    names = [type(transform).__name__ for transform in env.transform.transforms]
+    assert names == [*first, "ObservationTransform", "RewardTransform"]
+    if first:
+        assert (env.transform[0].parameters, env.transform[0].stream) == (LATE, Stream.REPORT)
 
 
 def test_metadata_that_know_nothing_of_sensors_go_on_naming_an_observation():
@@ -288,9 +270,7 @@ def test_an_agent_keeps_its_form_and_scale_and_gets_the_sensors_of_the_command()
     command = ObservationConfig(form="table3", sensors=SensorParameters(delay_s=1.0))
     assert command.read_by(None) == command
     agents = ObservationConfig(form="lane_view", range_m=150.0)
-    assert command.read_by(agents) == ObservationConfig(
-        form="lane_view", range_m=150.0, sensors=SensorParameters(delay_s=1.0)
-    )
+    assert command.read_by(agents) == replace(agents, sensors=SensorParameters(delay_s=1.0))
 
 
 ERRORS = ["observation.sensors.delay_s=1", "observation.sensors.position_noise_m=0.5"]

@@ -9,17 +9,19 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.traffic.foreign.packages import require
+from ganlane.traffic.base import require
 
 Array = NDArray[np.float64]
 
+#: Arguments of :func:`ganlane.traffic.base.require`.
+LIBSUMO = ("libsumo", "sumo", "libsumo", "sumo")
 #: Where x = 0 lies on SUMO's edges, m, and how far they go on from there: 1000 s at 35 m/s and more.
 ORIGIN_M, LENGTH_M = 2_000.0, 60_000.0
 #: Speed limit of every lane, m/s. Drivers have a speed factor: their desired speed is a multiple of it.
@@ -64,10 +66,10 @@ class SumoRoads:
     _current: SumoRoads | None = None
 
     def __init__(self, rows: int, lanes: int, lane_width_m: float, change_s: float, keep_right: float) -> None:
-        self.rows, self.lanes, self.lane_width_m = rows, lanes, lane_width_m
-        self.libsumo = require_libsumo()
+        self.libsumo = require(*LIBSUMO)
         if SumoRoads._current is not None:
-            SumoRoads._current.close()
+            SumoRoads._current = None
+            self.libsumo.close()
         elif self.libsumo.isLoaded():
             raise UserError(
                 "traffic sumo: libsumo already runs a simulation that is not ours, and a process has one; close it "
@@ -90,12 +92,6 @@ class SumoRoads:
     def is_open(self) -> bool:
         """Whether libsumo still holds this simulation."""
         return SumoRoads._current is self
-
-    def close(self) -> None:
-        """End the simulation."""
-        if self.is_open:
-            SumoRoads._current = None
-            self.libsumo.close()
 
     def clear(self, row: int) -> None:
         """Take everybody off a highway."""
@@ -161,11 +157,6 @@ class SumoRoads:
             vehicle.setPreviousSpeed(name, place.speed)
             vehicle.setSpeed(name, max(2.0 * (next_x - now) / PHYSICS_STEP_S - place.speed, 0.0))
 
-    def stand_ins(self, row: int) -> dict[int, float]:
-        """Lane to position (m, of the front bumper) of the ego's stand-ins on a highway."""
-        position = self.libsumo.vehicle.getLanePosition
-        return {lane: position(name) - ORIGIN_M for lane, name in self._stand_ins[row].items()}
-
     def step(self) -> None:
         """Drive on by 0.1 s; who has come to the end of the road is gone."""
         self.libsumo.simulationStep()
@@ -186,15 +177,6 @@ class SumoRoads:
         xy = np.array([position(name) for name in names], dtype=np.float64).reshape(-1, 2)
         xy[:, 0] -= ORIGIN_M
         return rows, index, xy, np.array([speed(name) for name in names], dtype=np.float64)
-
-
-def require_libsumo() -> Any:
-    """The module libsumo.
-
-    Raises:
-        UserError: it is not installed.
-    """
-    return require("libsumo", "sumo", "libsumo", "sumo")
 
 
 def _edge(row: int) -> str:
@@ -226,12 +208,10 @@ def _network(rows: int, lanes: int, width: float) -> str:
 
 def _routes(rows: int, keep_right: float) -> str:
     """The route file: one route per highway, one type of driver, whose numbers are set vehicle by vehicle."""
-    kind = (
-        '<vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" speedDev="0" maxSpeed="70" '
-        f'lcKeepRight="{keep_right}"/>'
-    )
+    routes = "".join(f'<route id="{_edge(row)}" edges="{_edge(row)}"/>' for row in range(rows))
     return (
-        "<routes>" + kind + "".join(f'<route id="{_edge(r)}" edges="{_edge(r)}"/>' for r in range(rows)) + "</routes>"
+        '<routes><vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" speedDev="0" '
+        f'maxSpeed="70" lcKeepRight="{keep_right}"/>{routes}</routes>'
     )
 
 

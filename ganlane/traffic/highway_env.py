@@ -13,8 +13,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.state import Road, Vehicles
-from ganlane.traffic.base import TrafficModule
-from ganlane.traffic.foreign.packages import require
+from ganlane.traffic.base import Memory, Moved, TrafficModule, require
 
 #: Fields of a vehicle that HighwayEnv moves, in the order in which they are handed over.
 _MOVING = ("x", "y", "heading", "speed")
@@ -27,12 +26,7 @@ _FROM_M, _TO_M, _LIMIT_MPS = -10_000.0, 200_000.0, 70.0
 
 
 def _module(name: str) -> Any:
-    """A module of HighwayEnv.
-
-    Raises:
-        UserError: highway-env is not installed.
-    """
-    return require(name, "highway_env", "highway-env", "bench")
+    return require(f"highway_env.{name}", "highway_env", "highway-env", "bench")
 
 
 class HighwayEnvTraffic(TrafficModule):
@@ -57,13 +51,11 @@ class HighwayEnvTraffic(TrafficModule):
 
     def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN) -> None:
         super().__init__(road, stream)
-        _module("highway_env")
         if self.road.ring_m is not None:
             raise UserError(
                 f"traffic highway_env: a ring of {self.road.ring_m:g} m; HighwayEnv's roads here are straight."
             )
-        assert isinstance(self.road.lanes, int)
-        self._highway = _Highway(self.road.lanes, float(self.road.lane_width_m))
+        self._highway = _Highway(self.road)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without HighwayEnv's objects, whose class is made at run time."""
@@ -72,17 +64,16 @@ class HighwayEnvTraffic(TrafficModule):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """With new ones."""
         super().__setstate__(state)
-        assert isinstance(self.road.lanes, int)
-        self._highway = _Highway(self.road.lanes, float(self.road.lane_width_m))
+        self._highway = _Highway(self.road)
 
     def compile_graphs(self) -> None:
         """Nothing can be compiled."""
 
-    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """HighwayEnv's staggering of drivers by their initial positions."""
         return {"timer": torch.remainder((vehicles.x + vehicles.y) * torch.pi, 1.0)}
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+    def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Row by row: write HighwayEnv's objects, let it act and step, read them."""
         m, like = vehicles.x.shape[1], vehicles.x
         fields = torch.stack([getattr(vehicles, name) for name in _MOVING], dim=-1).double().cpu().numpy()
@@ -98,48 +89,46 @@ class HighwayEnvTraffic(TrafficModule):
             mine = (fields[row], size[row], driver[row], target[row])
             self._highway.drive(present, *mine, bool(signals[row]), self.dt)
         moving = torch.as_tensor(fields).to(like.device, like.dtype)
-        named = dict(zip(_MOVING, moving.unbind(-1)))
-        named["acceleration"] = (named["speed"] - vehicles.speed) / self.dt
-        moved = vehicles.with_(**named, target_lane=torch.as_tensor(target).to(like.device))
+        moved = vehicles.with_(**dict(zip(_MOVING, moving.unbind(-1))))
+        acceleration = (moved.speed - vehicles.speed) / self.dt
+        moved = moved.with_(acceleration=acceleration, target_lane=torch.as_tensor(target).to(like.device))
         return moved.with_first(vehicles.at(EGO_INDEX)), {"timer": torch.as_tensor(timer).to(like.device, like.dtype)}
 
 
 class _Highway:
     """One road of HighwayEnv whose objects are filled with one row after another."""
 
-    def __init__(self, lanes: int, lane_width_m: float) -> None:
-        road = _module("highway_env.road.road")
+    def __init__(self, ours: Road) -> None:
+        assert isinstance(ours.lanes, int)
+        road, width = _module("road.road"), float(ours.lane_width_m)
 
-        class Lane(_module("highway_env.road.lane").StraightLane):  # type: ignore[misc]
+        class Lane(_module("road.lane").StraightLane):  # type: ignore[misc]
             """A straight lane along x; the same numbers as its base class's, without arrays."""
 
             def local_coordinates(self, position: Any) -> tuple[float, float]:
                 return float(position[0]) - _FROM_M, float(position[1]) - self.offset
 
         network = road.RoadNetwork()
-        for k in range(lanes):
-            y = k * lane_width_m
-            lane = Lane([_FROM_M, y], [_TO_M, y], width=lane_width_m, speed_limit=_LIMIT_MPS)
+        for k in range(ours.lanes):
+            y = k * width
+            lane = Lane([_FROM_M, y], [_TO_M, y], width=width, speed_limit=_LIMIT_MPS)
             lane.offset = y
             network.add_lane("a", "b", lane)
         self.road = road.Road(network, np_random=np.random.RandomState(0))
-        self._driver = _module("highway_env.vehicle.behavior").IDMVehicle
+        self._driver = _module("vehicle.behavior").IDMVehicle
         # A ControlledVehicle as in HighwayEnv's own environments: the others' MOBIL asks for its target speed.
-        ego = _module("highway_env.vehicle.controller").ControlledVehicle
+        ego = _module("vehicle.controller").ControlledVehicle
         self._cars = [ego(self.road, [0.0, 0.0])]
 
     def drive(
         self, present: Any, fields: Any, size: Any, driver: Any, target: Any, ego_signals: bool, dt: float
     ) -> None:
-        """Move the vehicles ``present`` of one row by ``dt`` seconds, in place.
+        """Move the vehicles with the indices ``present`` of one row by ``dt`` seconds, in place.
 
         Args:
-            present: their indices.
-            fields: x, y, heading, speed, [M, 4] float64.
-            size: length, width, [M, 2].
-            driver: desired speed, exponent, timer, [M, 3].
-            target: lanes, [M] int64.
-            ego_signals: whether the others see the ego's target lane.
+            present, fields: indices; x, y, heading, speed, [M, 4] float64.
+            size, driver: length, width, [M, 2]; desired speed, exponent, timer, [M, 3].
+            target, ego_signals: lanes, [M] int64; whether the others see the ego's target lane.
             dt: s.
         """
         while len(self._cars) < len(fields):

@@ -1,0 +1,308 @@
+"""Laid over a traffic model: lane changes (literal and calibrated), sudden accelerations, and the guard.
+
+The first are what the paper adds to its generated traffic, and a calibrated form of it. The guard keeps generated
+vehicles on the road, in their lanes and off their leaders' bumpers: a network with relative positions as its only
+input drifts off the road within a minute, and to any speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ganlane.parameters.driving import IdmParameters, MobilParameters
+from ganlane.sim.idm import TABLE_V, acceleration_behind
+from ganlane.sim.lanes import lane_change_done, spanned
+from ganlane.sim.mobil import one_at_a_time, safe_change, without_ego
+from ganlane.sim.neighbours import Scene, leader, perceive
+from ganlane.sim.random import Purpose, Stream, normal, uniform
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.base import Memory, Moved, Overlay
+
+
+def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
+    """Equation 10: probability ``t / t_m`` per step of a change, ``clock`` steps after the last one ended.
+
+    Read literally the probability grows until a change is certain at ``t = t_m``, so the mean waiting time is about
+    ``sqrt(pi t_m / 2)`` steps, not ``t_m``.
+    """
+    return (clock / mean_steps).clamp(0.0, 1.0)
+
+
+def distance_hazard(speed: Tensor, changes_per_km: float, dt: float) -> Tensor:
+    """Probability per step of ``dt`` s of starting a change, at a constant rate per kilometre driven."""
+    return 1.0 - torch.exp(-speed * (dt * changes_per_km / 1000.0))
+
+
+def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
+    """A random side with a lane: -1 right, +1 left, 0 on a single-lane road; ``u`` uniform, ``lane`` int64."""
+    left, right = lane < lanes - 1, lane > 0
+    both = torch.where(u < 0.5, 1, -1)
+    return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))
+
+
+def _hazard_and_side(vehicles: Vehicles, key: Tensor, step: Tensor) -> tuple[Tensor, ...]:
+    """Uniform numbers [N, M] for whether a change starts, and to which side."""
+    purposes: list[int] = [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE]
+    return uniform(key, step, vehicles.x.shape[1], purposes, vehicles.x.dtype).unbind(-1)
+
+
+@dataclass(frozen=True)
+class LiteralChanges:
+    """Equations 9 to 11 as printed.
+
+    Attributes:
+        mean_steps: ``t_m``, in steps of 0.1 s.
+        lateral_speed_mps, lateral_speed_sd_mps: mean and standard deviation of the Gaussian of lateral speeds, m/s.
+        slowest_mps: lower bound of a drawn speed, so that every change ends, m/s.
+    """
+
+    mean_steps: float = 2218.0
+    lateral_speed_mps: float = 0.81
+    lateral_speed_sd_mps: float = 0.33
+    slowest_mps: float = 0.3
+
+
+class LiteralLaneChange(Overlay):
+    """The paper's lane changes: hazard ``t / t_m`` per step, blind, at a lateral speed drawn per change.
+
+    Memory: ``clock``, steps since the last change ended (0 at the start, too), and ``lateral_speed`` of the current
+    change (m/s, positive to the left, 0 without one).
+    """
+
+    memory_fields = {"clock": ((), torch.int64), "lateral_speed": ((), None)}  # noqa: RUF012
+
+    def __init__(
+        self, road: Road | None = None, stream: int = Stream.TRAIN, changes: LiteralChanges | None = None
+    ) -> None:
+        super().__init__(road, stream)
+        self.changes = changes or LiteralChanges()
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Start changes, and move current ones sideways at their own speed until they arrive.
+
+        A vehicle whose target lane was set back (:class:`ganlane.traffic.AbortedLaneChange`) returns at that speed.
+        """
+        c, dtype = self.changes, vehicles.x.dtype
+        u, u_side = _hazard_and_side(vehicles, key, step)
+        gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
+        idle = memory["lateral_speed"] == 0
+        starts = idle & vehicles.valid & (u < literal_hazard(memory["clock"].to(dtype), c.mean_steps))
+        side = torch.where(starts, random_side(u_side, vehicles.target_lane, self.road.lanes), 0)
+        drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
+        target = vehicles.target_lane + side
+        pace = torch.where(side != 0, drawn, memory["lateral_speed"].abs())
+        changing = pace != 0
+        remaining = self.road.centre_of(target, vehicles.y.dtype) - vehicles.y
+        lateral = torch.copysign(pace, remaining)
+        stride = lateral * self.dt
+        arrives = changing & (remaining.abs() <= stride.abs())
+        y = vehicles.y + torch.where(arrives, remaining, stride)
+        heading = torch.atan(lateral / vehicles.speed.clamp_min(1.0))
+        y, heading = torch.where(changing, y, moved.y), torch.where(changing, heading, moved.heading)
+        moved = moved.with_(target_lane=target, y=y, heading=heading)
+        clock = torch.where(changing, 0, memory["clock"] + 1)
+        return moved, {"clock": clock, "lateral_speed": torch.where(arrives, 0.0, lateral)}
+
+
+@dataclass(frozen=True)
+class CalibratedChanges:
+    """A rate per kilometre driven, and what makes a gap good enough.
+
+    Attributes:
+        per_km: hazard of *wishing* for a change, set so that the rate *measured in the simulation* is that of the
+            data; waiting for a gap makes the two differ.
+        patience_s: a wish that finds no gap for this long is given up, s.
+        safe_deceleration: no vehicle has to brake harder, by IDM, m/s2.
+        exclusive_m: a change does not start while another vehicle is moving into the same lane within this distance;
+            of several that would start at once only the foremost does, m.
+    """
+
+    per_km: float = 0.92
+    patience_s: float = 20.0
+    safe_deceleration: float = 2.0
+    exclusive_m: float = 60.0
+
+
+class CalibratedLaneChange(Overlay):
+    """Lane changes at the recorded rate, after a gap check that considers closing speeds.
+
+    Only the target lane is set: the model below drives there. Memory: ``wish``, the desired side (-1, 0, 1), and
+    ``waited``, the number of steps since it began.
+    """
+
+    memory_fields = {"wish": ((), torch.int64), "waited": ((), torch.int64)}  # noqa: RUF012
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        changes: CalibratedChanges | None = None,
+        idm: IdmParameters = TABLE_V,
+    ) -> None:
+        super().__init__(road, stream)
+        self.changes, self.idm = changes or CalibratedChanges(), idm
+        self._limits = MobilParameters(
+            safe_deceleration=self.changes.safe_deceleration, exclusive_m=self.changes.exclusive_m
+        )
+
+    def _wishes(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Tensor:
+        """The current wish, or a new one."""
+        u, u_side = _hazard_and_side(vehicles, key, step)
+        comes = u < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
+        side = random_side(u_side, vehicles.target_lane, self.road.lanes)
+        free = lane_change_done(vehicles, self.road) & vehicles.valid
+        return without_ego(torch.where(memory["wish"] != 0, memory["wish"], torch.where(comes & free, side, 0)))
+
+    def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
+        """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
+        vehicles, pairs = scene.vehicles, scene.pairs
+        target = vehicles.target_lane.to(lane.dtype)
+        changing = without_ego((self.road.lane_of(vehicles.y) != target) & vehicles.valid)
+        near = torch.minimum(pairs.ahead, pairs.behind) < self.changes.exclusive_m
+        return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Set the target lane of those whose wish finds a gap."""
+        wish = self._wishes(vehicles, memory, key, step)
+        scene = perceive(vehicles, self.road)
+        lane = (vehicles.target_lane + wish).to(vehicles.x.dtype)
+        safe = safe_change(scene, lane, self.idm, self._limits)
+        wanted = torch.where(safe & ~self._contested(scene, lane), wish, 0)
+        starts = one_at_a_time(scene, wanted, self.idm, self._limits)
+        waited = torch.where(wish != 0, memory["waited"] + 1, 0)
+        given_up = waited >= round(self.changes.patience_s / self.dt)
+        rest = torch.where((starts != 0) | given_up, 0, wish)
+        moved = moved.with_(target_lane=vehicles.target_lane + starts)
+        return moved, {"wish": rest, "waited": torch.where(rest == 0, 0, waited)}
+
+
+def _accelerated(vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float) -> Vehicles:
+    """``moved`` with another speed and position along the road for ``who`` [N, M]: at ``acceleration``, m/s2."""
+    speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
+    return moved.with_(
+        speed=torch.where(who, speed, moved.speed),
+        acceleration=torch.where(who, (speed - vehicles.speed) / dt, moved.acceleration),
+        x=torch.where(who, vehicles.x + 0.5 * (vehicles.speed + speed) * dt, moved.x),
+    )
+
+
+@dataclass(frozen=True)
+class SuddenAccelerations:
+    """Mean time between two (s), duration (s), mean and standard deviation of their Gaussian (m/s2)."""
+
+    every_s: float = 10.0
+    lasts_s: float = 1.0
+    mean: float = 0.0
+    sd: float = 0.8
+
+
+class AccelerationOverlay(Overlay):
+    """The paper's 'instant-acceleration or instant-slowing', drawn from the recorded accelerations.
+
+    The paper says that accelerations 'were added manually' and no more. Here they come at a constant hazard and
+    replace the base model's acceleration for a second. Memory: the acceleration (m/s2) and its remaining steps.
+    """
+
+    memory_fields = {"acceleration": ((), None), "left": ((), torch.int64)}  # noqa: RUF012
+
+    def __init__(
+        self, road: Road | None = None, stream: int = Stream.TRAIN, sudden: SuddenAccelerations | None = None
+    ) -> None:
+        super().__init__(road, stream)
+        self.sudden = sudden or SuddenAccelerations()
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Replace speed and position along the road during a sudden acceleration."""
+        s, m, dtype = self.sudden, vehicles.x.shape[1], vehicles.x.dtype
+        u = uniform(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        gauss = normal(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
+        starts = (memory["left"] == 0) & (u < self.dt / s.every_s) & vehicles.valid
+        acceleration = torch.where(starts, s.mean + s.sd * gauss, memory["acceleration"])
+        left = torch.where(starts, round(s.lasts_s / self.dt), memory["left"])
+        moved = _accelerated(vehicles, moved, left > 0, acceleration, self.dt)
+        return moved, {"acceleration": acceleration, "left": (left - 1).clamp_min(0)}
+
+
+@dataclass(frozen=True)
+class GuardParameters:
+    """Limits of the guard.
+
+    Attributes:
+        headway_s: time headway of the IDM acceleration that is the upper bound.
+        slack: the lower bound is IDM's acceleration minus this, m/s2, times speed over desired speed, so that a
+            network that always slows ends at a crawl instead of standing still on a free road.
+        hardest_braking: lowest acceleration, m/s2.
+        centring_per_s: rate at which the offset from the target lane's centre is reduced (the P of the PD).
+        damping: share of the network's lateral motion that is kept (the D).
+        edge_margin_m: minimum distance of the turned body from the edge of the road.
+        steepest_rad: largest angle to the road.
+    """
+
+    headway_s: float = 0.8
+    slack: float = 1.5
+    hardest_braking: float = -8.0
+    centring_per_s: float = 0.5
+    damping: float = 0.8
+    edge_margin_m: float = 0.1
+    steepest_rad: float = 0.2
+
+
+#: Called with the vehicles at t, as the chain moved them, and as the guard moves them.
+Observer = Callable[[Vehicles, Vehicles, Vehicles], None]
+
+
+class Guard(Overlay):
+    """Bound the acceleration, pull towards the target lane, keep the body on the road.
+
+    :attr:`observer`, if set, is called with every correction.
+    """
+
+    def __init__(
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        guard: GuardParameters | None = None,
+        idm: IdmParameters = TABLE_V,
+    ) -> None:
+        super().__init__(road, stream)
+        self.guard, self.idm = guard or GuardParameters(), idm
+        self.observer: Observer | None = None
+
+    def along(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
+        """``moved`` with its acceleration between the bounds by IDM."""
+        g, scene = self.guard, perceive(vehicles.with_(target_lane=moved.target_lane), self.road)
+        ahead = leader(scene, spanned(scene.attention))
+        close = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
+        usual = acceleration_behind(scene, ahead, self.idm).amin(-1)
+        highest = close.clamp_min(g.hardest_braking)
+        lowest = (usual - g.slack * vehicles.speed / vehicles.desired_speed).clamp_min(g.hardest_braking)
+        wanted = (moved.speed - vehicles.speed) / self.dt
+        acceleration = torch.minimum(torch.maximum(wanted, torch.minimum(lowest, highest)), highest)
+        return _accelerated(vehicles, moved, acceleration != wanted, acceleration, self.dt)
+
+    def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
+        """``moved`` pulled towards its lane's centre where it keeps a lane, and inside the edges everywhere."""
+        g = self.guard
+        offset = self.road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
+        pulled = vehicles.y + g.damping * (moved.y - vehicles.y) + g.centring_per_s * self.dt * offset
+        y = torch.where(offset.abs() < 0.5 * self.road.lane_width_m, pulled, moved.y)
+        half = 0.5 * moved.width
+        left, right = self.road.left_edge_m() - g.edge_margin_m, self.road.right_edge_m() + g.edge_margin_m
+        y = torch.minimum(torch.maximum(y, right + half), left - half)
+        heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
+        heading = torch.where(y == moved.y, moved.heading, heading)
+        # A turned body is wider by half its length times the sine, which the angle exceeds.
+        room = torch.minimum(left - y, y - right) - half
+        steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)
+        return moved.with_(y=y, heading=torch.minimum(torch.maximum(heading, -steepest), steepest))
+
+    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+        """Along the road, then across it."""
+        guarded = self.across(vehicles, self.along(vehicles, moved))
+        if self.observer is not None:
+            self.observer(vehicles, moved, guarded)
+        return guarded, memory

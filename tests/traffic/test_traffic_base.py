@@ -1,0 +1,74 @@
+"""The contract of all traffic models: what is written, in which shapes, and what is not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from reference.worlds import environment, same_bits
+from tensordict import TensorDict
+
+from ganlane import keys
+from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
+from ganlane.errors import UserError
+from ganlane.sim import Vehicles
+from ganlane.traffic import (
+    BlindTraffic,
+    IdmMobilTraffic,
+    IdmRandomTraffic,
+    IdmTraffic,
+    MixedTraffic,
+    Recordings,
+    ReplayTraffic,
+    TrafficSequential,
+)
+from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_faults_traffic
+
+
+def replay() -> ReplayTraffic:
+    scenes = sort(synthetic_scenes(SyntheticTraffic(scenes=2, lanes=3, seconds=8.0)))
+    return ReplayTraffic(recordings=Recordings.of(scenes, "synthetic", 4.0))
+
+
+MAKE = {
+    "idm": IdmTraffic,
+    "idm_mobil": IdmMobilTraffic,
+    "idm_random": IdmRandomTraffic,
+    "idm_faults": idm_faults_traffic,
+    "gan": gan_traffic,
+    "gan_planning": lambda: gan_traffic(execute_k=3),
+    "gan_calibrated": gan_calibrated_traffic,
+    "mixed": lambda: MixedTraffic({"idm": IdmTraffic(), "faults": idm_faults_traffic()}, {"idm": 1, "faults": 1}),
+    "blind": lambda: BlindTraffic(IdmMobilTraffic(), 0.5),
+    "replay": replay,
+}
+
+
+def shapes(memory: TensorDict) -> dict:
+    """As :meth:`TrafficModule.memory_spec`."""
+    return {
+        name: shapes(value) if isinstance(value, TensorDict) else (tuple(value.shape), value.dtype)
+        for name, value in memory.items()
+    }
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(name):
+    traffic = MAKE[name]()
+    state = environment(num_envs=4, traffic=traffic, dtype=torch.float32).reset()
+    for step in range(2):
+        kept = state.clone()
+        assert shapes(state.get(keys.TRAFFIC, TensorDict({}))) == traffic.memory_spec(4, 9)
+        after = traffic(state.clone(recurse=False))
+        assert same_bits(state.select(keys.VEHICLES, keys.TRAFFIC), kept.select(keys.VEHICLES, keys.TRAFFIC)) == []
+        moved = after[keys.MOVED]
+        assert shapes(moved) == shapes(kept[keys.VEHICLES])
+        assert tuple(Vehicles.of(moved)._fields) == keys.VEHICLE_FIELDS
+        others = kept[keys.VEHICLES, "valid"] & (torch.arange(9) > 0)
+        assert (moved["x"] > kept[keys.VEHICLES, "x"])[others].all()
+        state[keys.VEHICLES], state[keys.STEP] = moved, torch.full((4,), step + 1)
+        state[keys.TRAFFIC] = after.get(keys.TRAFFIC, TensorDict({}, [4]))
+
+
+def test_a_chain_begins_with_a_model_that_reacts():
+    with pytest.raises(UserError, match="overlays behind replayed traffic"):
+        TrafficSequential({"base": replay()})

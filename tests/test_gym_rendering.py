@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from reference.gym_env import ID, KEEP, make, make_vec, until_the_end
 
 from ganlane.errors import UserError
-from ganlane.gym.rendering import FilmWindow
+from ganlane.gym.single import FilmWindow
 
 
 def test_frames_show_the_road_and_change_as_the_ego_drives():
@@ -73,7 +73,7 @@ def test_videos_are_recorded_decision_by_decision_or_ten_times_a_second(tmp_path
 
 def test_a_window_shows_every_physics_step(monkeypatch):
     window = Mock(spec=FilmWindow)
-    monkeypatch.setattr("ganlane.gym.rendering.FilmWindow", lambda title: window)
+    monkeypatch.setattr("ganlane.gym.single.FilmWindow", lambda: window)
     monkeypatch.setattr("ganlane.gym.single.has_display", lambda: True)
     env = make(render_mode="human")
     assert env.unwrapped.metadata["render_modes"] == ["human", "rgb_array", "rgb_array_list"]
@@ -96,7 +96,7 @@ def dummy_display(monkeypatch):
 
 def test_the_window_shows_the_picture_until_it_is_closed(dummy_display):
     pygame = dummy_display
-    window, picture = FilmWindow("test"), np.zeros((40, 60, 3), np.uint8)
+    window, picture = FilmWindow(), np.zeros((40, 60, 3), np.uint8)
     picture[10, 20] = (1, 2, 3)
     window.show(picture)
     assert pygame.display.get_surface().get_size() == (60, 40)

@@ -118,8 +118,8 @@ def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehi
 class EnvironmentRunner:
     """Steps a TorchRL environment with automatic resets; each turn continues where the last one ended.
 
-    ``actions`` [decisions, N] are those of consecutive decisions, again and again. Physics steps are counted as they
-    are simulated: an episode that ends within a decision is not simulated further, one that leaves the road not at all.
+    ``actions`` [decisions, N] are those of consecutive decisions, again and again. Physics steps are counted as
+    simulated: an episode that ends within a decision is not simulated further, one that leaves the road not at all.
     """
 
     def __init__(self, env: Any, actions: Tensor) -> None:

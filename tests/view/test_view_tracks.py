@@ -19,7 +19,7 @@ from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
-from ganlane.view.tracks import scene_names
+from ganlane.view.record import scene_names
 
 
 @pytest.fixture(scope="module")

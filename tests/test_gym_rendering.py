@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import warnings
 from unittest.mock import Mock
 
 import gymnasium
@@ -108,11 +107,10 @@ def test_the_window_shows_the_picture_until_it_is_closed(dummy_display):
     window.close()
 
 
+@pytest.mark.filterwarnings("error")
 def test_gymnasiums_own_check_opens_the_window_too(dummy_display):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make(ID, decision_period_s=0.1, render_mode="human")
-        check_env(env.unwrapped)
+    env = gymnasium.make(ID, decision_period_s=0.1, render_mode="human")
+    check_env(env.unwrapped)
     env.close()
     assert "human" in env.metadata["render_modes"]
 

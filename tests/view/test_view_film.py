@@ -103,7 +103,14 @@ def test_an_mp4_has_all_frames(film, tmp_path):
     assert np.abs(shown - at_half_size(film[3])).mean() < 6.0
 
 
-def test_half_an_mp4_on_a_full_disk_is_none(film, tmp_path):
+@pytest.fixture
+def empty(tmp_path):
+    """A folder that the test leaves empty."""
+    yield tmp_path
+    assert not list(tmp_path.iterdir())
+
+
+def test_half_an_mp4_on_a_full_disk_is_none(film, empty):
     """ffmpeg fails, and only its exit status says so."""
     pytest.importorskip("imageio_ffmpeg")
     resource = pytest.importorskip("resource")
@@ -111,29 +118,26 @@ def test_half_an_mp4_on_a_full_disk_is_none(film, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**12, before[1]))
     try:
         with pytest.raises(OSError, match="File too large") as caught:
-            write_film(first(film, 10), tmp_path / "a.mp4", fps=10, scale=0.5)
+            write_film(first(film, 10), empty / "a.mp4", fps=10, scale=0.5)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert caught.value.filename == str(tmp_path / "a.mp4")
-    assert list(tmp_path.iterdir()) == []
+    assert caught.value.filename == str(empty / "a.mp4")
 
 
-def test_an_ffmpeg_that_refuses_is_quoted(film, tmp_path, monkeypatch):
+def test_an_ffmpeg_that_refuses_is_quoted(film, empty, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr(film_module, "_H264", "-c:v no_such_codec -f mp4")
     with pytest.raises(UserError, match=r"a\.mp4: ffmpeg cannot write it \(.*choose format=gif"):
-        write_film(first(film, 2), tmp_path / "a.mp4", fps=10)
-    assert list(tmp_path.iterdir()) == []
+        write_film(first(film, 2), empty / "a.mp4", fps=10)
 
 
-def test_without_the_extra_video_the_message_names_it(film, tmp_path, monkeypatch):
+def test_without_the_extra_video_the_message_names_it(film, empty, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match=r"ganlane\[video\]"):
-        write_film(film, tmp_path / "a.mp4")
-    assert not list(tmp_path.iterdir())
+        write_film(film, empty / "a.mp4")
 
 
-def test_a_failure_half_way_leaves_nothing(film, tmp_path):
+def test_a_failure_half_way_leaves_nothing(film, empty):
     class Broken(list):
         def __getitem__(self, index):
             if index == 3:
@@ -143,5 +147,4 @@ def test_a_failure_half_way_leaves_nothing(film, tmp_path):
     names = ["a.gif", "a.mp4"] if find_spec("imageio_ffmpeg") else ["a.gif"]
     for name in names:
         with pytest.raises(RuntimeError):
-            write_film(Broken([0] * 6), tmp_path / name, scale=0.25)
-    assert not list(tmp_path.iterdir())
+            write_film(Broken([0] * 6), empty / name, scale=0.25)

@@ -185,15 +185,20 @@ class NativeRows(Rows):
     def info(self) -> dict[str, Any]:
         batch, state = self.batch, self.batch.state
         lane = np.rint(state["y"][:, 0] / np.float32(batch.lane_width_m)).astype(np.int64)
-        plain = ("seed", "decisions", "lane_changes", "goal", "hard_crash", "out_of_road", "timeout")
         return {
-            **{name: state[name] for name in plain},
+            "seed": state["seed"],
             "episode_number": state["episode"],
             "time_s": state["step"] * keys.PHYSICS_STEP_S,
             "distance_m": state["distance"],
             "speed_mps": state["speed"][:, 0],
             "lane": np.minimum(np.maximum(lane, 0), batch.lanes - 1),
+            "decisions": state["decisions"],
+            "lane_changes": state["lane_changes"],
             "action_mask": batch.mask.view(np.int8),
+            "goal": state["goal"],
+            "hard_crash": state["hard_crash"],
+            "out_of_road": state["out_of_road"],
+            "timeout": state["timeout"],
             "scene_end": self._never,
             keys.SOFT_CRASH: state["soft_crashes"],
             keys.SOFT_CRASH_BEHIND: state["soft_crashes_behind"],

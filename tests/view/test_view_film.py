@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 from view_scenes import straight
 
 from ganlane.errors import UserError
@@ -37,10 +37,8 @@ def test_a_film_lasts_as_long_as_the_episode_and_holds_its_end(film):
 
 def test_speedup_and_part_choose_frames_by_time():
     painter = FramePainter(straight([0], [1], frames=101))
-    fast = Film(painter, fps=10, speedup=2.0, start_s=2.0, end_s=6.0, hold_s=0.1)
-    assert fast._frames == [*range(20, 61, 2), 60]
-    smooth = Film(painter, fps=20, end_s=0.3, hold_s=0.05)
-    assert smooth._frames == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert Film(painter, 10, 2.0, start_s=2.0, end_s=6.0, hold_s=0.1)._frames == [*range(20, 61, 2), 60]
+    assert Film(painter, 20, end_s=0.3, hold_s=0.05)._frames == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_impossible_and_empty_films_and_unknown_formats_are_refused(tmp_path):
@@ -59,11 +57,7 @@ def test_a_gif_comes_back_frame_by_frame(film, tmp_path):
     with Image.open(path) as gif:
         assert gif.size == (640, 160)
         # Equal frames at the end are stored as one that lasts longer.
-        durations = []
-        for index in range(gif.n_frames):
-            gif.seek(index)
-            durations.append(gif.info["duration"])
-        assert sum(durations) == 100 * len(film)
+        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif)) == 100 * len(film)
         assert gif.info["loop"] == 0
         gif.seek(20)
         shown = np.asarray(gif.convert("RGB")).astype(int)
@@ -144,7 +138,6 @@ def test_a_failure_half_way_leaves_nothing(film, empty):
                 raise RuntimeError("no")
             return film[0]
 
-    names = ["a.gif", "a.mp4"] if find_spec("imageio_ffmpeg") else ["a.gif"]
-    for name in names:
+    for name in ["a.gif", "a.mp4"] if find_spec("imageio_ffmpeg") else ["a.gif"]:
         with pytest.raises(RuntimeError):
             write_film(Broken([0] * 6), empty / name, scale=0.25)

@@ -140,7 +140,7 @@ class LiveView:
     def before_step(self, action: int) -> None:
         """Record the action of the next step."""
         self._recorder.current_action = action
-        self._recorder.keep_last(_KEPT)
+        del self._recorder.frames[:-_KEPT]
         self._before = len(self._recorder.frames)
 
     def after_step(self, reward: float) -> None:
@@ -198,6 +198,5 @@ class BatchView:
 
     def _picture(self, row: int) -> Picture:
         recorder = Recorder(row, current_action=int(self._actions[row]), current_return=float(self._returns[row]))
-        recorder.add(self.rows.state.get(keys.VEHICLES), 0.0)
-        recorder.time_s[0] = float(self.rows.state.get(keys.STEP)[row]) * PHYSICS_STEP_S
+        recorder.add(self.rows.state.get(keys.VEHICLES), float(self.rows.state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
         return FramePainter(recorder.trajectory(_label(self.rows, row, self.traffic))).draw(0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -164,39 +164,31 @@ class Recorder:
     """Collects frames of one row; the environment calls it after each physics step."""
 
     row: int = 0
-    frames: list[dict[str, np.ndarray]] = field(default_factory=list)
-    time_s: list[float] = field(default_factory=list)
-    action: list[int] = field(default_factory=list)
-    returns: list[float] = field(default_factory=list)
-    action_values: list[np.ndarray] = field(default_factory=list)
+    #: What a trajectory keeps of a frame, by its name there.
+    frames: list[dict[str, Any]] = field(default_factory=list)
     #: Frames recorded by the end of each decision, and its reward; empty if rewards are not recorded.
     decisions: list[tuple[int, float]] = field(default_factory=list)
     #: Ends of the decisions with a soft crash, s.
     soft_crash_s: list[float] = field(default_factory=list)
     current_action: int = -1
     current_return: float = 0.0
-    current_values: np.ndarray = field(default_factory=lambda: np.empty(0))
+    current_values: FloatArray = field(default_factory=lambda: np.empty(0))
 
-    def __call__(self, vehicles: Vehicles | TensorDictBase, running: Tensor) -> None:
+    @property
+    def time_s(self) -> float:
+        """Time of the last frame, s."""
+        return self.frames[-1]["time_s"]
+
+    def __call__(self, vehicles: Vehicles, running: Tensor) -> None:
         """Hook of the environment: vehicles [N, M] after a physics step, ``running`` [N] the rows that took it."""
         if bool(running[self.row]):
-            self.add(vehicles, keys.PHYSICS_STEP_S)
+            self.add(vehicles.as_dict(), self.time_s + keys.PHYSICS_STEP_S)
 
-    def add(self, vehicles: Vehicles | TensorDictBase, elapsed_s: float) -> None:
-        """Append a frame, ``elapsed_s`` after the one before."""
-        state = vehicles.as_dict() if isinstance(vehicles, Vehicles) else vehicles
-        self.frames.append(
-            {name: state[name][self.row].detach().cpu().numpy().astype(kind) for name, kind in _FIELDS.items()}
-        )
-        self.time_s.append(self.time_s[-1] + elapsed_s if self.time_s else 0.0)
-        self.action.append(self.current_action)
-        self.returns.append(self.current_return)
-        self.action_values.append(self.current_values)
-
-    def keep_last(self, count: int) -> None:
-        """Forget all frames but the last ``count``."""
-        for kept in (self.frames, self.time_s, self.action, self.returns, self.action_values):
-            del kept[:-count]
+    def add(self, vehicles: Mapping[str, Tensor] | TensorDictBase, time_s: float) -> None:
+        """Append a frame."""
+        now = {"time_s": time_s, "action": self.current_action, "returns": self.current_return}
+        kept = {name: vehicles[name][self.row].detach().cpu().numpy().astype(kind) for name, kind in _FIELDS.items()}
+        self.frames.append({**kept, **now, "action_values": self.current_values})
 
     def trajectory(self, label: EpisodeLabel, outcome: str = "") -> Trajectory:
         """The frames so far; the last one shows the return after the last decision."""
@@ -204,16 +196,19 @@ class Recorder:
         begin = 1
         for end, paid in self.decisions:
             reward[begin:end], begin = paid, end
-        width = max(len(values) for values in self.action_values)
-        values = [values if len(values) else np.full(width, np.nan) for values in self.action_values]
+        arrays = {name: np.stack([frame[name] for frame in self.frames]) for name in (*_FIELDS, "action", "returns")}
+        arrays["returns"][-1] = self.current_return
+        values = [frame["action_values"] for frame in self.frames]
+        width = max(map(len, values))
+        unknown = np.full(width, np.nan)
         return Trajectory(
             label=label,
-            time_s=np.array(self.time_s).round(6),
-            **{name: np.stack([frame[name] for frame in self.frames]) for name in _FIELDS},
-            action=np.array(self.action),
-            returns=np.array([*self.returns[:-1], self.current_return]),
+            time_s=np.array([frame["time_s"] for frame in self.frames]).round(6),
+            **arrays,
             outcome=outcome,
-            action_values=np.stack(values) if width else np.empty((0, 0)),
+            action_values=np.stack([each if len(each) else unknown for each in values])
+            if width
+            else np.empty((0, 0)),
             reward=reward,
             soft_crash_s=np.array(self.soft_crash_s),
         )
@@ -264,7 +259,7 @@ def record_episode(
             state = env.reset(start_of(env, [episode], seed))
             label = EpisodeLabel(agent, traffic, seed, episode, *road_of_row(state, base.road, 0))
             recorder.add(state[keys.VEHICLES], 0.0)
-            while not state["done"][0] and recorder.time_s[-1] < max_time_s - 1e-6:
+            while not state["done"][0] and recorder.time_s < max_time_s - 1e-6:
                 state = _decide(env, policy, policy(state), recorder)
     finally:
         base.recorder = before
@@ -284,7 +279,7 @@ def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, r
     recorder.current_return += reward
     recorder.decisions.append((len(recorder.frames), reward))
     if int(stepped["next", keys.EVENTS, keys.SOFT_CRASH][0]) > 0:
-        recorder.soft_crash_s.append(recorder.time_s[-1])
+        recorder.soft_crash_s.append(recorder.time_s)
     return env.step_mdp(stepped)
 
 

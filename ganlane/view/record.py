@@ -186,9 +186,10 @@ class Recorder:
 
     def add(self, vehicles: Mapping[str, Tensor] | TensorDictBase, time_s: float) -> None:
         """Append a frame."""
-        now = {"time_s": time_s, "action": self.current_action, "returns": self.current_return}
-        kept = {name: vehicles[name][self.row].detach().cpu().numpy().astype(kind) for name, kind in _FIELDS.items()}
-        self.frames.append({**kept, **now, "action_values": self.current_values})
+        frame: dict[str, Any] = {"time_s": time_s, "action": self.current_action, "returns": self.current_return}
+        for name, kind in _FIELDS.items():
+            frame[name] = vehicles[name][self.row].detach().cpu().numpy().astype(kind)
+        self.frames.append({**frame, "action_values": self.current_values})
 
     def trajectory(self, label: EpisodeLabel, outcome: str = "") -> Trajectory:
         """The frames so far; the last one shows the return after the last decision."""
@@ -200,15 +201,13 @@ class Recorder:
         arrays["returns"][-1] = self.current_return
         values = [frame["action_values"] for frame in self.frames]
         width = max(map(len, values))
-        unknown = np.full(width, np.nan)
+        values = [each if len(each) else np.full(width, np.nan) for each in values]
         return Trajectory(
             label=label,
             time_s=np.array([frame["time_s"] for frame in self.frames]).round(6),
             **arrays,
             outcome=outcome,
-            action_values=np.stack([each if len(each) else unknown for each in values])
-            if width
-            else np.empty((0, 0)),
+            action_values=np.stack(values) if width else np.empty((0, 0)),
             reward=reward,
             soft_crash_s=np.array(self.soft_crash_s),
         )

@@ -27,7 +27,6 @@ from ganlane.bench.systems import (
     HighwayEnvRunner,
     Scenario,
     Training,
-    highway_env_settings,
     installed_version,
     start_environment,
     start_envpool,
@@ -90,9 +89,9 @@ class SimSuite(Suite):
 
     def peer(self) -> Case:
         """HighwayEnv on the suite's road; it does not use torch, so one thread is all it has."""
-        name, settings = f"HighwayEnv {installed_version('highway-env')}", highway_env_settings(self.config.env)
+        name = f"HighwayEnv {installed_version('highway-env')}"
         labels = self.labels(name, _THEIR_TRAFFIC, EAGER, 1, 1, dtype="float64")
-        return Case(labels, partial(HighwayEnvRunner, settings, self.config.seed))
+        return Case(labels, partial(HighwayEnvRunner, self.config.env, self.config.seed))
 
     def _envpool(self, threads: int, batch: int) -> Case:
         """HighwayEnv in C++ on the suite's road."""
@@ -273,8 +272,7 @@ class TrainSuite(Suite):
         learner, simulator = installed_version("stable-baselines3"), installed_version("highway-env")
         name = f"stable-baselines3 {learner} DQN on HighwayEnv {simulator}"
         labels = self.labels(name, _THEIR_TRAFFIC, EAGER, threads, 1)
-        start = partial(BaselinesRunner, highway_env_settings(config.env), config.agent.for_phase(1), config.seed)
-        return Case(labels, start)
+        return Case(labels, partial(BaselinesRunner, config.env, config.agent.for_phase(1), config.seed))
 
     def findings(self, rows: Sequence[Row]) -> dict[str, Any]:
         """``speeds``: per device and traffic the row with the most decisions per second.

@@ -265,7 +265,7 @@ def installed_version(package: str) -> str | None:
         return None
 
 
-def highway_env_settings(env: EnvConfig) -> dict[str, Any]:
+def _highway_env_settings(env: EnvConfig) -> dict[str, Any]:
     """``config`` of ``highway-v0`` for the same road; what is not named here keeps HighwayEnv's default.
 
     ``vehicles_count`` counts the others. Episodes end with a crash or after ``duration`` seconds.
@@ -284,9 +284,10 @@ def highway_env_settings(env: EnvConfig) -> dict[str, Any]:
 class HighwayEnvRunner:
     """``highway-v0`` without rendering and gymnasium's checks: random actions, a reset after every end."""
 
-    def __init__(self, settings: dict[str, Any], seed: int) -> None:
+    def __init__(self, env: EnvConfig, seed: int) -> None:
         import highway_env
 
+        settings = _highway_env_settings(env)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # In some releases the import registers the environments, in others this function; both do no harm.
@@ -310,7 +311,7 @@ def start_envpool(env: EnvConfig, batch: int, threads: int, seed: int) -> Runner
     """HighwayEnv in EnvPool's C++: random actions; an episode that has ended begins anew in the next step."""
     import envpool
 
-    settings = highway_env_settings(env)
+    settings = _highway_env_settings(env)
     for each in ("observation", "action"):
         del settings[each]
     # Its rates are whole numbers.
@@ -337,10 +338,10 @@ class BaselinesRunner:
     """
 
     @torch.random.fork_rng(devices=[])
-    def __init__(self, settings: dict[str, Any], agent: RainbowConfig, seed: int) -> None:
+    def __init__(self, env: EnvConfig, agent: RainbowConfig, seed: int) -> None:
         from stable_baselines3 import DQN
 
-        road = HighwayEnvRunner(settings, seed)
+        road = HighwayEnvRunner(env, seed)
         self.steps_per_decision, self.every, self.pending = road.steps_per_decision, agent.decisions_per_update, 0
         self.model: Any = DQN(
             "MlpPolicy",

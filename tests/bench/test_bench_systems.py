@@ -19,7 +19,6 @@ from ganlane.bench.systems import (
     advance,
     bare_steps,
     filled_run,
-    highway_env_settings,
     start_environment,
     start_envpool,
     start_physics,
@@ -132,7 +131,7 @@ def _peer():
 
 @pytest.mark.usefixtures("_peer")
 def test_vehicles_lanes_and_time_of_the_peer_are_ours():
-    run = HighwayEnvRunner(highway_env_settings(EnvConfig()), seed=0)
+    run = HighwayEnvRunner(EnvConfig(), seed=0)
     assert (len(run.env.road.vehicles), len(run.env.road.network.lanes_list())) == (9, 3)
     before, steps, step = run.env.time, [], run.env.road.step
     run.env.road.step = lambda dt: (steps.append(dt), step(dt))[1]
@@ -143,7 +142,7 @@ def test_vehicles_lanes_and_time_of_the_peer_are_ours():
 
 @pytest.mark.usefixtures("_peer")
 def test_an_episode_of_the_peer_that_ends_is_followed_by_another(monkeypatch):
-    run = HighwayEnvRunner(highway_env_settings(EnvConfig(timeout_s=2.0)), seed=0)
+    run = HighwayEnvRunner(EnvConfig(timeout_s=2.0), seed=0)
     resets, reset = [], run.env.reset
     monkeypatch.setattr(run.env, "reset", lambda **k: (resets.append(k), reset(**k))[1])
     assert run(6) == 60
@@ -163,7 +162,7 @@ LEARNER = RainbowConfig(hidden=(12, 8), batch_size=16, decisions_per_update=8, c
 def baseline():
     pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed; extra 'bench'")
     pytest.importorskip("highway_env", reason="highway-env is not installed; extra 'bench'")
-    return BaselinesRunner(highway_env_settings(ROAD), LEARNER, seed=0)
+    return BaselinesRunner(ROAD, LEARNER, seed=0)
 
 
 def test_the_baseline_has_our_network_road_and_batch(baseline):

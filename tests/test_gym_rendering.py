@@ -16,18 +16,16 @@ from ganlane.gym.single import FilmWindow
 
 
 def test_frames_show_the_road_and_change_as_the_ego_drives():
-    env = make(render_mode="rgb_array")
+    env, envs = make(render_mode="rgb_array"), make_vec(2, render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
-    assert first.shape == (320, 1280, 3)
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, env.render())
     env.step(KEEP)
     assert not np.array_equal(first, env.render())
-    envs = make_vec(2, render_mode="rgb_array")
     envs.reset(seed=0)
     one, other = envs.render()
-    assert one.shape == other.shape == (320, 1280, 3)
+    assert first.shape == one.shape == other.shape == (320, 1280, 3)
     assert not np.array_equal(one, other)
 
 
@@ -52,7 +50,7 @@ def test_a_list_of_frames_has_ten_for_every_second_of_driving():
     env.step(KEEP)
     frames = env.render()
     assert len(frames) == 20
-    assert all(not np.array_equal(one, other) for one, other in itertools.pairwise(frames))
+    assert not any(np.array_equal(*two) for two in itertools.pairwise(frames))
 
 
 @pytest.mark.parametrize("smooth", [True, False])
@@ -87,14 +85,13 @@ def test_a_window_shows_every_physics_step(monkeypatch):
 
 
 @pytest.fixture
-def dummy_display(monkeypatch):
-    """pygame with SDL's driver that shows nothing."""
+def pygame(monkeypatch):
+    """With SDL's driver that shows nothing."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     return pytest.importorskip("pygame", reason="pygame is not installed")
 
 
-def test_the_window_shows_the_picture_until_it_is_closed(dummy_display):
-    pygame = dummy_display
+def test_the_window_shows_the_picture_until_it_is_closed(pygame):
     window, picture = FilmWindow(), np.zeros((40, 60, 3), np.uint8)
     picture[10, 20] = (1, 2, 3)
     window.show(picture)
@@ -108,7 +105,8 @@ def test_the_window_shows_the_picture_until_it_is_closed(dummy_display):
 
 
 @pytest.mark.filterwarnings("error")
-def test_gymnasiums_own_check_opens_the_window_too(dummy_display):
+@pytest.mark.usefixtures("pygame")
+def test_gymnasiums_own_check_opens_the_window_too():
     env = gymnasium.make(ID, decision_period_s=0.1, render_mode="human")
     check_env(env.unwrapped)
     env.close()

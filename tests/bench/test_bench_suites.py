@@ -10,18 +10,7 @@ import torch
 
 from ganlane.bench import suites
 from ganlane.bench.measure import measure
-from ganlane.bench.suites import (
-    ENVIRONMENT,
-    GYMNASIUM,
-    PHYSICS,
-    TRAFFIC,
-    TRAINING,
-    SimSuite,
-    TrafficSuite,
-    TrainSuite,
-    exponent,
-    scaling,
-)
+from ganlane.bench.suites import ENVIRONMENT, PHYSICS, TRAFFIC, TRAINING, SimSuite, TrafficSuite, TrainSuite
 from ganlane.config.bench import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmTrafficConfig, TrafficConfig
@@ -112,7 +101,7 @@ def test_what_cannot_be_compiled_is_left_out_with_the_reason(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(suites, "_START", {PHYSICS: start, ENVIRONMENT: start, GYMNASIUM: start})
+    monkeypatch.setattr(suites, "_START", dict.fromkeys((PHYSICS, ENVIRONMENT, suites.GYMNASIUM), start))
     measured = suite(batches=[1, 2], vehicle_counts=[9], modes=["eager", "compiled"], linear_from=4)
     rows = measure(measured, **SHORT)["rows"]
     assert {row["mode"] for row in rows} == {"eager"}
@@ -125,11 +114,11 @@ def test_cost_that_doubles_with_the_size_grows_linearly():
         {"part": "batch", "system": PHYSICS, "batch": batch, "wall_s": batch / 1024, "decisions": 20 * batch}
         for batch in (1024, 2048, 4096)
     ]
-    (growth,) = scaling(rows)
+    (growth,) = suites.scaling(rows)
     assert growth["milliseconds"] == pytest.approx([50, 100, 200])
     assert growth["exponent"] == pytest.approx(1)
-    assert exponent([9, 15, 30], [0.3 * size**1.7 for size in (9, 15, 30)]) == pytest.approx(1.7)
-    assert exponent([9, 9], [1.0, 2.0]) is None
+    assert suites.exponent([9, 15, 30], [0.3 * size**1.7 for size in (9, 15, 30)]) == pytest.approx(1.7)
+    assert suites.exponent([9, 9], [1.0, 2.0]) is None
 
 
 def test_without_the_peer_a_sentence_says_what_to_install(monkeypatch):

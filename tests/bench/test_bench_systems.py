@@ -47,10 +47,11 @@ def test_bare_physics_moves_everybody_as_the_environment_does():
         assert torch.equal(getattr(vehicles, name), state[keys.VEHICLES, name]), name
 
 
-def test_bare_physics_goes_on_past_goal_and_time_out():
-    run = start_physics(scenario(goal_m=20.0, timeout_s=2.0), "eager", "cpu", 4)
+@pytest.mark.parametrize("mode", ["eager", "native"])
+def test_bare_physics_goes_on_past_goal_and_time_out(mode):
+    run = start_physics(scenario(goal_m=20.0, timeout_s=2.0), mode, "cpu", 4)
     assert run(5) == run(5) == 4 * 5 * 10
-    assert start_physics(scenario(decision_period_s=0.2), "eager", "cpu", 3)(4) == 3 * 4 * 2
+    assert start_physics(scenario(decision_period_s=0.2), mode, "cpu", 3)(4) == 3 * 4 * 2
 
 
 def test_only_simulated_steps_are_counted():

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.bench.measure import EAGER, Case, Row, Runner, measure
-from ganlane.bench.traffic import SYSTEM, TrafficSuite
+from ganlane.bench.suites import TRAFFIC, TrafficSuite
 from ganlane.config.commands import BenchConfig
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, significant
@@ -260,7 +260,7 @@ def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """
 
     def ratio(rate: str, traffic: str, baseline: str) -> float:
-        ours = max(row[rate] for row in rows if (row["system"], row["traffic"]) == (SYSTEM, traffic))
+        ours = max(row[rate] for row in rows if (row["system"], row["traffic"]) == (TRAFFIC, traffic))
         return ours / max(row[rate] for row in rows if row["system"] == baseline)
 
     return [
@@ -270,7 +270,7 @@ def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:
             "ratio": ratio("physics_steps_per_s", traffic, baseline),
             "ratio_cpu": ratio("physics_steps_per_cpu_s", traffic, baseline),
         }
-        for traffic in dict.fromkeys(row["traffic"] for row in rows if row["system"] == SYSTEM)
+        for traffic in dict.fromkeys(row["traffic"] for row in rows if row["system"] == TRAFFIC)
         for baseline in BASELINES
     ]
 

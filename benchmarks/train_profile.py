@@ -28,8 +28,8 @@ from torchrl.objectives import DistributionalDQNLoss
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.agents import Rainbow, rainbow
 from ganlane.bench.measure import EAGER, Case, Runner, take_turns, torch_threads
-from ganlane.bench.systems import Scenario
-from ganlane.bench.train import Training, TrainSuite, advance, filled_run, make_agent, repeat, with_gradients
+from ganlane.bench.suites import TrainSuite
+from ganlane.bench.systems import Scenario, Training, advance, filled_run, make_agent, repeat
 from ganlane.config.commands import BenchConfig
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import Table, count, percent
@@ -166,6 +166,7 @@ def start_loss(training: Training, theirs: bool) -> Runner:
     if theirs:
         forward = partial(DistributionalDQNLoss.forward, agent.loss)
 
+    @torch.inference_mode(False)  # in which cases are timed
     def run(updates: int) -> int:
         for _ in range(updates):
             agent.optimizer.zero_grad(set_to_none=True)
@@ -173,7 +174,7 @@ def start_loss(training: Training, theirs: bool) -> Runner:
             agent.optimizer.step()
         return 0
 
-    return with_gradients(run)
+    return run
 
 
 def start_update(training: Training) -> Runner:
@@ -181,12 +182,13 @@ def start_update(training: Training) -> Runner:
     agent = make_agent(training)
     repeat(agent, random_transitions(agent, min(training.stored, 10_000)), training.stored)
 
+    @torch.inference_mode(False)  # in which cases are timed
     def run(updates: int) -> int:
         for _ in range(updates):
             agent.update()
         return 0
 
-    return with_gradients(run)
+    return run
 
 
 def random_transitions(agent: Rainbow, rows: int) -> TensorDict:

@@ -56,23 +56,21 @@ def train(envs, iterations):
     weights = [*critic.parameters(), *actor.parameters()]
     first = [weight.detach().clone() for weight in weights]
     optimiser = torch.optim.Adam(weights, lr=2.5e-4, eps=1e-5)
-    obs = torch.zeros(STEPS, ROWS, *shape)
-    actions, logprobs, rewards, dones, values = torch.zeros(5, STEPS, ROWS)
     losses, returns = [], []
     next_obs, _ = envs.reset(seed=1)
     next_obs, next_done = torch.Tensor(next_obs), torch.zeros(ROWS)
     for _ in range(iterations):
-        for step in range(STEPS):
-            obs[step], dones[step] = next_obs, next_done
+        steps = []
+        for _ in range(STEPS):
             with torch.no_grad():
                 chosen = Categorical(logits=actor(next_obs))
                 action = chosen.sample()
-                values[step] = critic(next_obs).flatten()
-            actions[step], logprobs[step] = action, chosen.log_prob(action)
+                before = next_obs, next_done, action, chosen.log_prob(action), critic(next_obs).flatten()
             next_obs, reward, terminations, truncations, infos = envs.step(action.cpu().numpy())
-            rewards[step] = torch.tensor(reward).view(-1)
+            steps.append((*before, torch.tensor(reward).view(-1).float()))
             next_obs, next_done = torch.Tensor(next_obs), torch.Tensor(np.logical_or(terminations, truncations))
             returns += ended_returns(infos)
+        obs, dones, actions, logprobs, values, rewards = map(torch.stack, zip(*steps))
         advantages, last = torch.zeros_like(rewards), 0.0
         with torch.no_grad():
             following = torch.cat((values[1:], critic(next_obs).reshape(1, -1)))

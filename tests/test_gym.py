@@ -6,7 +6,6 @@ import copy
 import pickle
 import subprocess
 import sys
-import warnings
 
 import gymnasium
 import numpy as np
@@ -36,19 +35,13 @@ def decisions_until_cut_off(env):
     return info["decisions"]
 
 
-@pytest.mark.parametrize(
-    ("options", "decisions"),
-    [
-        ({"timeout_s": 7.0}, 7),
-        ({"timeout_s": 7.0, "decision_period_s": 0.5}, 14),
-        ({"timeout_s": 7.2, "decision_period_s": 2.0}, 4),
-    ],
-)
-def test_the_spec_says_when_an_episode_is_cut_off_and_nothing_else_cuts_it(options, decisions):
-    env = make(goal_m=5000.0, **options)
+@pytest.mark.parametrize(("timeout_s", "period_s", "decisions"), [(7.0, 1.0, 7), (7.0, 0.5, 14), (7.2, 2.0, 4)])
+def test_the_spec_says_when_an_episode_is_cut_off_and_nothing_else_cuts_it(timeout_s, period_s, decisions):
+    options = {"goal_m": 5000.0, "timeout_s": timeout_s, "decision_period_s": period_s}
+    env = make(**options)
     assert env.spec.max_episode_steps == decisions_until_cut_off(env) == decisions
     assert decisions_until_cut_off(gymnasium.make(env.spec)) == decisions
-    envs = make_vec(2, goal_m=5000.0, **options)
+    envs = make_vec(2, **options)
     assert envs.spec.max_episode_steps == gymnasium.make_vec(envs.spec).spec.max_episode_steps == decisions
     assert gymnasium.make(ID).spec.max_episode_steps == 1000
 
@@ -69,50 +62,43 @@ def test_a_shorter_time_limit_is_gymnasiums_own_and_refused_for_a_batch():
         {"traffic": "idm", "env": "cut_in", "observation": "table3_lane_view", "render_mode": "rgb_array"},
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_gymnasiums_own_check_finds_nothing_to_say(options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(gymnasium.make(ID, **options).unwrapped)
+    check_env(gymnasium.make(ID, **options).unwrapped)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("traffic", "mode"), [("gan", AutoresetMode.SAME_STEP), *(("idm", mode) for mode in AutoresetMode)]
 )
 def test_neither_making_nor_running_a_batch_warns(traffic, mode):
     """gymnasium has no checker for batches: this is what its one for single environments looks at."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        envs = gymnasium.make_vec(ID, num_envs=3, traffic=traffic, goal_m=60.0, autoreset_mode=mode)
-        first, info = envs.reset(seed=0)
-        assert data_equivalence(envs.reset(seed=0), (first, info), exact=True)
-        for _ in range(6):
-            observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
-            assert envs.observation_space.contains(observation)
-            kept = copy.deepcopy((observation, reward, info))
-            ended = terminated | truncated
-            if mode is AutoresetMode.DISABLED and ended.any():
-                envs.reset(options={"reset_mask": ended})
-            else:
-                envs.step(np.zeros(3, int))
-                envs.reset()
-            assert data_equivalence(kept, (observation, reward, info), exact=True)
-        envs.close()
-        envs.close()
+    envs = gymnasium.make_vec(ID, num_envs=3, traffic=traffic, goal_m=60.0, autoreset_mode=mode)
+    first, info = envs.reset(seed=0)
+    assert data_equivalence(envs.reset(seed=0), (first, info), exact=True)
+    for _ in range(6):
+        observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
+        assert envs.observation_space.contains(observation)
+        kept = copy.deepcopy((observation, reward, info))
+        ended = terminated | truncated
+        if mode is AutoresetMode.DISABLED and ended.any():
+            envs.reset(options={"reset_mask": ended})
+        else:
+            envs.step(np.zeros(3, int))
+            envs.reset()
+        assert data_equivalence(kept, (observation, reward, info), exact=True)
+    envs.close()
+    envs.close()
     assert envs.metadata["autoreset_mode"] is mode
     assert reward.shape == terminated.shape == truncated.shape == (3,)
     assert terminated.dtype == truncated.dtype == np.bool_
 
 
-@pytest.mark.parametrize(
-    ("code", "printed"),
-    [
-        ("import gymnasium; print(gymnasium.make('ganlane:ganlane/Highway-v0').action_space)", "Discrete(3)\n"),
-        ("import sys, ganlane; print({'torch', 'hydra', 'polars', 'PIL'} & sys.modules.keys())", "set()\n"),
-    ],
-)
-def test_the_id_imports_the_package_which_imports_neither_torch_nor_hydra(code, printed):
-    command = [sys.executable, "-c", code]
-    assert subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True).stdout == printed
+def test_the_id_imports_the_package_which_imports_neither_torch_nor_hydra():
+    made = "import gymnasium; print(gymnasium.make('ganlane:ganlane/Highway-v0').action_space)"
+    slow = "import sys, ganlane; print({'torch', 'hydra', 'polars', 'PIL'} & sys.modules.keys())"
+    for code, printed in ((made, "Discrete(3)\n"), (slow, "set()\n")):
+        assert subprocess.check_output([sys.executable, "-c", code], text=True, cwd=ROOT) == printed
 
 
 def test_episodes_follow_from_seed_and_number():
@@ -165,9 +151,7 @@ def test_the_facade_gives_what_the_torchrl_environment_gives():
 
 def test_the_goal_terminates_and_a_time_out_truncates():
     for options, is_goal in (({"goal_m": 30.0}, True), ({"goal_m": 5000.0, "timeout_s": 3.0}, False)):
-        env = make(**options)
-        env.reset(seed=0)
-        *_, terminated, truncated, info = until_the_end(env)
+        *_, terminated, truncated, info = until_the_end(begun(make(**options)))
         assert (terminated, truncated, info["goal"], info["timeout"]) == (is_goal, not is_goal, is_goal, not is_goal)
     assert info["time_s"] == pytest.approx(3.0)
 
@@ -180,6 +164,47 @@ def test_leaving_the_road_terminates_and_the_mask_says_so_beforehand():
     assert terminated
     assert info["out_of_road"]
     assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-6)
+
+
+def returns_by_episode(mode, kernel):
+    """Return of every finished episode by its number, rows in ``mode``; all rows keep their lanes."""
+    envs = make_vec(3, kernel=kernel, autoreset_mode=mode, goal_m=120.0)
+    assert envs.metadata["autoreset_mode"] is mode
+    _, info = envs.reset(seed=4)
+    running, numbers, ended, returns = np.zeros(3), info["episode_number"], np.zeros(3, bool), {}
+    for _ in range(40):
+        before = ended
+        _, reward, terminated, truncated, info = envs.step(np.zeros(3, int))
+        if mode is AutoresetMode.NEXT_STEP:
+            assert not reward[before].any()
+            assert not info["time_s"][before].any()
+        running += reward
+        ended = terminated | truncated
+        returns |= {int(numbers[row]): running[row] for row in np.flatnonzero(ended)}
+        if mode is AutoresetMode.DISABLED and ended.any():
+            _, info = envs.reset(options={"reset_mask": ended})
+        running[ended], numbers = 0.0, info["episode_number"]
+    return returns
+
+
+@pytest.mark.parametrize("kernel", ["auto", "torch"])
+def test_episodes_are_the_same_in_every_autoreset_mode(kernel):
+    same = returns_by_episode(AutoresetMode.SAME_STEP, kernel)
+    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
+        other = returns_by_episode(mode, kernel)
+        shared = same.keys() & other.keys()
+        assert len(shared) >= 9
+        assert {number: other[number] for number in shared} == pytest.approx({n: same[n] for n in shared}, abs=1e-3)
+
+
+def test_a_row_that_is_over_is_not_stepped_where_resets_are_left_to_the_user():
+    envs = make_vec(2, lanes=1, autoreset_mode="disabled")
+    envs.reset(seed=0)
+    envs.step(np.array([LEFT, KEEP]))
+    with pytest.raises(UserError, match=r"rows \[0\] are over; call reset"):
+        envs.step(np.array([KEEP, KEEP]))
+    with pytest.raises(UserError, match="expected one of next_step, same_step, disabled"):
+        make_vec(2, autoreset_mode="never")
 
 
 def test_a_row_that_ends_is_reset_in_the_same_step_and_tells_how_it_ended():

@@ -12,6 +12,7 @@ import pytest
 import torch
 from reference.gym_env import ID, KEEP, LEFT, ROOT, make, make_vec
 
+VECTOR = gymnasium.wrappers.vector
 MASKS_MAY_BE_ABSENT = tuple(map(int, re.findall(r"\d+", gymnasium.__version__)[:3])) >= (1, 2, 2)
 
 
@@ -28,19 +29,25 @@ def test_episode_statistics_are_recorded():
     env = gymnasium.wrappers.RecordEpisodeStatistics(make(goal_m=30.0))
     env.reset(seed=0)
     total, info = 0.0, {}
-    for _ in range(100):
-        if "episode" in info:
-            break
+    while "episode" not in info:
         _, reward, *_, info = env.step(KEEP)
         total += reward
     assert info["episode"]["r"] == pytest.approx(total)
-    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(make_vec(2, goal_m=30.0))
+
+
+@pytest.mark.parametrize("mode", ["same_step", "next_step"])
+def test_gymnasiums_own_vector_wrappers_take_the_batch(mode):
+    envs = VECTOR.RecordEpisodeStatistics(make_vec(4, goal_m=40.0, autoreset_mode=mode))
+    if mode == "next_step":  # which the normalisation demands
+        envs = VECTOR.NormalizeObservation(envs)
     envs.reset(seed=0)
-    for _ in range(100):
-        *_, info = envs.step(np.zeros(2, int))
+    lengths = []
+    for _ in range(12):
+        *_, info = envs.step(np.zeros(4, int))
         if "episode" in info:
-            break
-    assert info["episode"]["l"][info["_episode"]].min() > 0
+            lengths += info["episode"]["l"][info["_episode"]].tolist()
+    assert len(lengths) >= 4
+    assert all(1 <= length <= 6 for length in lengths)
 
 
 def test_gymnasiums_own_vectorisation_works_too():
@@ -53,7 +60,7 @@ def test_gymnasiums_own_vectorisation_works_too():
 
 @pytest.mark.skipif(not MASKS_MAY_BE_ABSENT, reason="DictInfoToList needs gymnasium 1.2.2 or newer")
 def test_infos_of_a_batch_can_be_had_row_by_row():
-    envs = gymnasium.wrappers.vector.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))
+    envs = VECTOR.DictInfoToList(make_vec(2, lanes=1, goal_m=500.0))
     envs.reset(seed=0)
     *_, infos = envs.step(np.array([KEEP, LEFT]))
     assert "final_info" not in infos[0]

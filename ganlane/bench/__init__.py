@@ -13,8 +13,8 @@ A suite (:class:`~ganlane.bench.measure.Suite`) lists groups of cases. The cases
 so that other work on the machine slows all of them alike; each case gives one row of medians and ratios.
 
 - :mod:`~ganlane.bench.measure`: cases, groups and suites; timing, memory, rows.
-- :mod:`~ganlane.bench.systems`: the simulator and HighwayEnv as cases.
-- :mod:`~ganlane.bench.sim`, :mod:`~ganlane.bench.traffic`, :mod:`~ganlane.bench.train`: the three suites.
+- :mod:`~ganlane.bench.systems`: the simulator, a training, and their peers, ready to run.
+- :mod:`~ganlane.bench.suites`: the three suites.
 """
 
 from __future__ import annotations

@@ -30,8 +30,6 @@ Row = dict[str, Any]
 EAGER, COMPILED, NATIVE = "eager", "compiled", "native"
 #: Upper limit of the decisions in a turn.
 _MOST_DECISIONS = 2**20
-#: Decisions after which every buffer that a case needs is allocated.
-_DECISIONS_FOR_MEMORY = 3
 
 
 @dataclass(frozen=True)
@@ -71,16 +69,18 @@ class Group(NamedTuple):
 
 
 class Suite(ABC):
-    """What the command measures under one name."""
+    """What the command measures under one name.
+
+    ``notes`` has a sentence for everything that cannot be measured here; with ``memory`` the peak memory of every
+    case of the part ``speed`` is measured, too.
+    """
 
     name: ClassVar[str]
+    memory = False
 
     def __init__(self, config: BenchConfig) -> None:
         self.config = config
-        #: One sentence for everything that cannot be measured here.
         self.notes: list[str] = []
-        #: Whether to measure the peak memory of every case of the part ``speed``.
-        self.memory = False
 
     @abstractmethod
     def groups(self) -> Sequence[Group]:
@@ -103,13 +103,8 @@ class Suite(ABC):
     def labels(self, system: str, traffic: str, mode: str, threads: int, batch: int, **others: Any) -> Labels:
         """Labels of a case on the configured road; ``others`` overrides the defaults."""
         env = self.config.env
-        defaults = Labels(
-            self.name, "speed", system, traffic, mode, "float32", "cpu", threads, env.vehicles, env.lanes, batch
-        )
-        return replace(defaults, **others)
-
-
-# Time
+        road = (threads, env.vehicles, env.lanes, batch)
+        return replace(Labels(self.name, "speed", system, traffic, mode, "float32", "cpu", *road), **others)
 
 
 class Sample(NamedTuple):
@@ -121,14 +116,9 @@ class Sample(NamedTuple):
     physics_steps: int
 
     @property
-    def steps_per_s(self) -> float:
-        """Physics steps per second."""
-        return self.physics_steps / self.wall_s
-
-    @property
-    def steps_per_cpu_s(self) -> float:
-        """Physics steps per CPU second; the CPU clock is coarse on some systems and may not have moved."""
-        return self.physics_steps / max(self.cpu_s, 1e-6)
+    def rates(self) -> tuple[float, float]:
+        """Physics steps per second of wall and of CPU time; a coarse CPU clock may not have moved."""
+        return self.physics_steps / self.wall_s, self.physics_steps / max(self.cpu_s, 1e-6)
 
 
 @contextmanager
@@ -180,17 +170,11 @@ def take_turns(
     return samples
 
 
-# Memory
-
-
 def _peak_here(case: Case) -> int | None:
     """Peak bytes: of this process on a CPU, of torch's allocations on a GPU."""
     with torch_threads(case.labels.threads):
-        run = case.start()
-        run(_DECISIONS_FOR_MEMORY)
-    if case.labels.device == "cuda":
-        return torch.cuda.max_memory_allocated()
-    return peak_resident_bytes()
+        case.start()(3)  # after so many decisions every buffer is allocated
+    return torch.cuda.max_memory_allocated() if case.labels.device == "cuda" else peak_resident_bytes()
 
 
 def peak_bytes(case: Case) -> int | None:
@@ -207,11 +191,6 @@ def growth_per_environment(small: Case, large: Case) -> float | None:
     return (high - low) / (large.labels.batch - small.labels.batch)
 
 
-# Rows
-
-_RATES = ("steps_per_s", "steps_per_cpu_s")
-
-
 def make_row(
     labels: Labels, samples: Sequence[Sample], reference: Sequence[Sample] = (), peak_memory_mb: float | None = None
 ) -> Row:
@@ -226,40 +205,37 @@ def make_row(
         median); ``ratio`` and ``ratio_cpu`` (physics steps per second of wall and CPU time over the reference's turn
         of the same round, median of the rounds; or None); ``peak_memory_mb``.
     """
-    wall, cpu = ([getattr(sample, name) for sample in samples] for name in _RATES)
+    per_s, per_cpu_s = map(median, zip(*(sample.rates for sample in samples)))
+    ratio = ratio_cpu = None
+    if reference:
+        compared = np.divide([sample.rates for sample in samples], [sample.rates for sample in reference])
+        ratio, ratio_cpu = np.median(compared, axis=0).tolist()
     walls_s = [sample.wall_s for sample in samples]
-    ratios = [
-        median(getattr(one, name) / getattr(other, name) for one, other in zip(samples, reference))
-        if reference
-        else None
-        for name in _RATES
-    ]
     return {
         **asdict(labels),
-        "physics_steps_per_s": median(wall),
+        "physics_steps_per_s": per_s,
         "decisions_per_s": median(sample.decisions / sample.wall_s for sample in samples),
-        "vehicle_steps_per_s": median(wall) * labels.vehicles,
-        "physics_steps_per_cpu_s": median(cpu),
+        "vehicle_steps_per_s": per_s * labels.vehicles,
+        "physics_steps_per_cpu_s": per_cpu_s,
         "wall_s": median(walls_s),
         "cpu_s": median(sample.cpu_s for sample in samples),
         "decisions": samples[0].decisions,
         "repetitions": len(samples),
         "spread": float(np.subtract(*np.quantile(walls_s, [0.75, 0.25])) / median(walls_s)),
-        "ratio": ratios[0],
-        "ratio_cpu": ratios[1],
+        "ratio": ratio,
+        "ratio_cpu": ratio_cpu,
         "peak_memory_mb": peak_memory_mb,
     }
 
 
+def _words(name: str) -> Callable[[Row], str]:
+    return lambda row: str(row[name])
+
+
 #: Heading to cell of the columns that the suites' tables of speed choose from.
 COLUMNS: dict[str, Callable[[Row], str]] = {
-    "system": lambda row: row["system"],
-    "traffic": lambda row: row["traffic"],
-    "mode": lambda row: row["mode"],
-    "device": lambda row: row["device"],
-    "threads": lambda row: str(row["threads"]),
-    "batch": lambda row: str(row["batch"]),
-    "environments": lambda row: str(row["batch"]),
+    **{name: _words(name) for name in ("system", "traffic", "mode", "device", "threads", "batch")},
+    "environments": _words("batch"),
     "physics steps/s": lambda row: count(row["physics_steps_per_s"]),
     "decisions/s": lambda row: count(row["decisions_per_s"]),
     "vehicle-steps/s": lambda row: count(row["vehicle_steps_per_s"]),
@@ -270,14 +246,14 @@ COLUMNS: dict[str, Callable[[Row], str]] = {
     "spread": lambda row: percent(row["spread"]),
     "peak memory, MB": lambda row: NOTHING if row["peak_memory_mb"] is None else f"{row['peak_memory_mb']:.0f}",
 }
-_SPREAD = "Medians; spread is the interquartile range of the repetitions' wall time over its median."
 
 
 def speed_table(title: str, rows: Sequence[Row], headings: Sequence[str], names: int) -> Table:
     """The rows with these of the :data:`COLUMNS`; the title names vehicles and lanes."""
     where = f", {rows[0]['vehicles']} vehicles on {rows[0]['lanes']} lanes" if rows else ""
-    columns = {name: COLUMNS[name] for name in headings}
-    return Table.of(f"{title}{where}", rows, columns, names, [_SPREAD] if "spread" in columns else [])
+    spread = "Medians; spread is the interquartile range of the repetitions' wall time over its median."
+    notes = [spread] if "spread" in headings else []
+    return Table.of(f"{title}{where}", rows, {name: COLUMNS[name] for name in headings}, names, notes)
 
 
 def best_rows(rows: Sequence[Row], figure: str) -> list[Row]:
@@ -285,12 +261,8 @@ def best_rows(rows: Sequence[Row], figure: str) -> list[Row]:
     best: dict[tuple[str, str, str], Row] = {}
     for row in rows:
         key = row["device"], row["system"], row["traffic"]
-        if key not in best or row[figure] > best[key][figure]:
-            best[key] = row
+        best[key] = max(best.get(key, row), row, key=lambda each: each[figure])
     return list(best.values())
-
-
-# A whole suite
 
 
 def measure(suite: Suite, repetitions: int, seconds: float) -> dict[str, Any]:
@@ -305,8 +277,7 @@ def measure(suite: Suite, repetitions: int, seconds: float) -> dict[str, Any]:
     def peak_mb(case: Case) -> float | None:
         if not suite.memory or case.labels.part != "speed":
             return None
-        # The number of threads does not change it.
-        same = replace(case.labels, threads=1)
+        same = replace(case.labels, threads=1)  # whose number does not change it
         if same not in peaks:
             peak = peak_bytes(case)
             peaks[same] = None if peak is None else peak / 1e6

@@ -1,4 +1,4 @@
-"""Systems as cases: bare physics, the whole environment, and HighwayEnv on the same road."""
+"""Systems as runners: the simulator bare and whole, behind gymnasium, in training; and the peers on the same road."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from ganlane import keys
-from ganlane.bench.measure import COMPILED, NATIVE, Case, Runner, Suite
-from ganlane.build import make_env, make_traffic
+from ganlane.agents import Rainbow, RainbowConfig
+from ganlane.agents.drivers import legal_actions
+from ganlane.agents.replay import TRANSITION_KEYS
+from ganlane.bench.measure import COMPILED, EAGER, NATIVE, Runner
+from ganlane.build import make_env, make_road, make_traffic
 from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
@@ -28,14 +31,19 @@ from ganlane.env.physics import run_decision
 from ganlane.parameters.observation import ObservationConfig, RewardParameters
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Vehicles
+from ganlane.training import loop
+from ganlane.training.checkpoint import TrainingState
+from ganlane.transforms import observation_size
 
 #: Random actions are drawn before the clock starts and used again after so many decisions.
 _DRAWN = 64
+#: Priorities set at once.
+_CHUNK = 2**16
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Configuration of an environment except batch, device and mode; can be pickled."""
+    """Configuration of an environment except batch, device and mode."""
 
     env: EnvConfig
     traffic: TrafficConfig
@@ -51,8 +59,10 @@ class Scenario:
     def build(self, mode: str, device: str, batch: int) -> TransformedEnv:
         """The environment."""
         env = replace(self.env, compile=mode == COMPILED, kernel="native" if mode == NATIVE else "torch")
-        traffic = make_traffic(self.traffic, env)
-        return make_env(traffic, env, self.observation, self.reward, batch, self.seed, device)
+        return make_env(make_traffic(self.traffic, env), env, self.observation, self.reward, batch, self.seed, device)
+
+
+# The simulator
 
 
 def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Runner:
@@ -62,7 +72,7 @@ def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Run
     every step moves every environment.
     """
     if mode == NATIVE:
-        return start_native_physics(scenario, batch)
+        return _start_native_physics(scenario, batch)
     env = scenario.build(mode, device, batch)
     state, base = env.reset(), env.base_env
     substeps = base.rules.episode.substeps()
@@ -74,8 +84,8 @@ def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Run
     return run
 
 
-def start_native_physics(scenario: Scenario, batch: int) -> Runner:
-    """The kernel alone, on the tensors of :func:`start_physics`."""
+def _start_native_physics(scenario: Scenario, batch: int) -> Runner:
+    """The kernel alone."""
     endless = replace(scenario, env=replace(scenario.env, goal_m=1e9, timeout_s=1e8))
     env = endless.build(NATIVE, "cpu", batch)
     first, keep = env.reset(), torch.full((batch,), keys.KEEP)
@@ -108,12 +118,8 @@ def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehi
 class EnvironmentRunner:
     """Steps a TorchRL environment with automatic resets; each turn continues where the last one ended.
 
-    Physics steps are counted as they are simulated: an episode that ends within a decision is not simulated further,
-    and one that leaves the road not at all.
-
-    Args:
-        env: what is stepped.
-        actions: of consecutive decisions, used again from the first one on, [decisions, N].
+    ``actions`` [decisions, N] are those of consecutive decisions, again and again. Physics steps are counted as
+    simulated: an episode that ends within a decision is not simulated further, one that leaves the road not at all.
     """
 
     def __init__(self, env: Any, actions: Tensor) -> None:
@@ -135,9 +141,13 @@ class EnvironmentRunner:
 
 def start_environment(scenario: Scenario, mode: str, device: str, batch: int) -> Runner:
     """The environment with observation, reward and automatic resets, driven by uniformly random actions."""
-    generator = torch.Generator().manual_seed(scenario.seed)
-    actions = torch.randint(3, (_DRAWN, batch), generator=generator)
+    actions = torch.randint(3, (_DRAWN, batch), generator=torch.Generator().manual_seed(scenario.seed))
     return EnvironmentRunner(scenario.build(mode, device, batch), actions)
+
+
+def start_traffic(scenario: Scenario, mode: str, batch: int) -> Runner:
+    """The environment without observation and reward, its ego keeping its lane; ended episodes start anew."""
+    return EnvironmentRunner(scenario.build(mode, "cpu", batch).base_env, torch.full((1, batch), keys.KEEP))
 
 
 class GymnasiumRunner:
@@ -154,7 +164,7 @@ class GymnasiumRunner:
         )
         self.env.reset()
         self.decisions = 0
-        self.time_s = np.zeros(batch)
+        self.time_s: Any = 0.0
 
     def __call__(self, decisions: int) -> int:
         """Drive; the physics steps."""
@@ -171,12 +181,80 @@ class GymnasiumRunner:
                 self.time_s = info["time_s"]
             else:
                 *_, terminated, truncated, info = self.env.step(int(actions[0]))
-                driven_s += info["time_s"] - float(self.time_s[0])
-                self.time_s[0] = info["time_s"]
+                driven_s += info["time_s"] - self.time_s
+                self.time_s = info["time_s"]
                 if terminated or truncated:
                     self.env.reset()
-                    self.time_s[0] = 0.0
+                    self.time_s = 0.0
         return round(driven_s / keys.PHYSICS_STEP_S)
+
+
+# Training
+
+
+@dataclass(frozen=True)
+class Training:
+    """Scenario and agent of a training; ``stored`` transitions are in the buffer when the clock starts."""
+
+    scenario: Scenario
+    agent: RainbowConfig
+    stored: int
+
+
+def start_training(training: Training, mode: str, device: str, batch: int) -> Runner:
+    """Decisions of ``batch`` environments and the updates that go with them; no logs, no checkpoints."""
+    return partial(advance, filled_run(training, mode, device, batch)[0])
+
+
+def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[TrainingState, TransformedEnv]:
+    """A run that learns from its next decision on, and the environment that it steps.
+
+    Driven transitions are stored until the agent is warm, and the same again until there are ``training.stored``:
+    most of a long run has a full buffer, with all of its memory in use.
+    """
+    env = training.scenario.build(mode, device, batch)
+    run = TrainingState(env, make_agent(training, device, mode))
+    while not run.agent.ready:
+        run.agent.store(run.window.push(loop.collect(run)))
+    repeat(run.agent, run.agent.replay[:].select(*TRANSITION_KEYS), training.stored)
+    return run, env
+
+
+def make_agent(training: Training, device: str = "cpu", mode: str = EAGER) -> Rainbow:
+    """An agent with random weights, ready to learn as soon as ``stored`` transitions are there."""
+    env, config = training.scenario.env, training.agent
+    return Rainbow(
+        replace(config, warmup=min(config.warmup, training.stored)),
+        observation_size(training.scenario.observation.form, env.vehicles),
+        seed=training.scenario.seed,
+        device=device,
+        legal=partial(legal_actions, road=make_road(env)),
+        compile=mode != EAGER,
+    )
+
+
+def repeat(agent: Rainbow, transitions: TensorDict, stored: int) -> None:
+    """Store ``transitions`` again and again until there are ``stored``; priorities are uniform in 0 to 1."""
+    known = transitions.clone()
+    while (missing := stored - len(agent.replay)) > 0:
+        agent.store(known[:missing])
+    if agent.config.prioritised:
+        for index in torch.arange(len(agent.replay), device=agent.device).split(_CHUNK):
+            priority = torch.rand(index.shape, generator=agent.generators["replay"], device=agent.device)
+            agent.replay.update_priority(index, priority)
+
+
+@torch.inference_mode(False)  # in which cases are timed
+def advance(run: TrainingState, decisions: int) -> int:
+    """The body of :func:`ganlane.training.train`, so many times; the physics steps simulated."""
+    simulated = torch.zeros((), dtype=torch.int64, device=run.agent.device)
+    for _ in range(decisions):
+        step = loop.advance(run)
+        simulated += (step["next", keys.STEP] - step[keys.STEP]).sum()
+    return int(simulated)
+
+
+# Peers
 
 
 def installed_version(package: str) -> str | None:
@@ -187,7 +265,7 @@ def installed_version(package: str) -> str | None:
         return None
 
 
-def highway_env_settings(env: EnvConfig) -> dict[str, Any]:
+def _highway_env_settings(env: EnvConfig) -> dict[str, Any]:
     """``config`` of ``highway-v0`` for the same road; what is not named here keeps HighwayEnv's default.
 
     ``vehicles_count`` counts the others. Episodes end with a crash or after ``duration`` seconds.
@@ -206,9 +284,10 @@ def highway_env_settings(env: EnvConfig) -> dict[str, Any]:
 class HighwayEnvRunner:
     """``highway-v0`` without rendering and gymnasium's checks: random actions, a reset after every end."""
 
-    def __init__(self, settings: dict[str, Any], seed: int) -> None:
+    def __init__(self, env: EnvConfig, seed: int) -> None:
         import highway_env
 
+        settings = _highway_env_settings(env)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # In some releases the import registers the environments, in others this function; both do no harm.
@@ -232,7 +311,7 @@ def start_envpool(env: EnvConfig, batch: int, threads: int, seed: int) -> Runner
     """HighwayEnv in EnvPool's C++: random actions; an episode that has ended begins anew in the next step."""
     import envpool
 
-    settings = highway_env_settings(env)
+    settings = _highway_env_settings(env)
     for each in ("observation", "action"):
         del settings[each]
     # Its rates are whole numbers.
@@ -251,10 +330,49 @@ def start_envpool(env: EnvConfig, batch: int, threads: int, seed: int) -> Runner
     return run
 
 
-def highway_env_case(suite: Suite) -> Case:
-    """HighwayEnv on the suite's road; it does not use torch, so one thread is all it has."""
-    config = suite.config
-    labels = suite.labels(
-        f"HighwayEnv {installed_version('highway-env')}", "its IDM and MOBIL", "eager", 1, 1, dtype="float64"
-    )
-    return Case(labels, partial(HighwayEnvRunner, highway_env_settings(config.env), config.seed))
+class BaselinesRunner:
+    """stable-baselines3's DQN on ``highway-v0``, with the agent's network, batch and rate of updates.
+
+    Its loop can be stopped at any decision: ``learn`` itself would end every turn with a whole rollout of
+    ``decisions_per_update``. A batch is in the buffer when the clock starts.
+    """
+
+    @torch.random.fork_rng(devices=[])
+    def __init__(self, env: EnvConfig, agent: RainbowConfig, seed: int) -> None:
+        from stable_baselines3 import DQN
+
+        road = HighwayEnvRunner(env, seed)
+        self.steps_per_decision, self.every, self.pending = road.steps_per_decision, agent.decisions_per_update, 0
+        self.model: Any = DQN(
+            "MlpPolicy",
+            road.env,
+            buffer_size=agent.capacity,
+            batch_size=agent.batch_size,
+            train_freq=agent.decisions_per_update,
+            gradient_steps=1,
+            exploration_initial_eps=0.05,
+            policy_kwargs={"net_arch": list(agent.hidden)},
+            seed=seed,
+            device="cpu",
+        )
+        _, self.callback = self.model._setup_learn(10**9)
+        self._collect(agent.batch_size)
+
+    @torch.inference_mode(False)
+    def __call__(self, decisions: int) -> int:
+        """Collect and learn; the physics steps."""
+        missing = decisions
+        while missing:
+            taken = min(missing, self.every - self.pending)
+            self._collect(taken)
+            missing, self.pending = missing - taken, self.pending + taken
+            if self.pending == self.every:
+                self.model.train(gradient_steps=1, batch_size=self.model.batch_size)
+                self.pending = 0
+        return decisions * self.steps_per_decision
+
+    def _collect(self, decisions: int) -> None:
+        from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+        model, rollout = self.model, TrainFreq(decisions, TrainFrequencyUnit.STEP)
+        model.collect_rollouts(model.env, self.callback, rollout, model.replay_buffer, learning_starts=0)

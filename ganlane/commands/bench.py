@@ -8,9 +8,7 @@ from datetime import date
 from pathlib import Path
 
 from ganlane.bench.measure import Suite, measure
-from ganlane.bench.sim import SimSuite
-from ganlane.bench.traffic import TrafficSuite
-from ganlane.bench.train import TrainSuite
+from ganlane.bench.suites import SimSuite, TrafficSuite, TrainSuite
 from ganlane.config.commands import BenchConfig
 from ganlane.config.runs import stored_command
 from ganlane.evaluation import machine_sentence, write_results

@@ -11,8 +11,8 @@
 Further ids (:data:`ENV_IDS`) have other traffic: ``ganlane/HighwayDense-v0``, ``ganlane/HighwayGAN-v0``, ...
 Importing ganlane registers them (gymnasium 1 has no plugins); ``gymnasium.make("ganlane:ganlane/Highway-v0")``
 imports and makes in one call. :mod:`~ganlane.gym.single` and :mod:`~ganlane.gym.vector` are the two environments on
-top of :mod:`~ganlane.gym.rows`; :mod:`~ganlane.gym.rendering` draws. torch is imported where it is needed: for
-pictures, and for traffic that the native kernel does not drive.
+top of :mod:`~ganlane.gym.rows`. torch is imported where it is needed (:mod:`~ganlane.gym.tensor_rows`): for pictures,
+and for traffic that the native kernel does not drive.
 """
 
 from __future__ import annotations

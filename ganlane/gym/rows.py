@@ -1,9 +1,10 @@
 """Basis of the single and the vector environment: N highways behind NumPy arrays, and checks of arguments.
 
-:class:`Rows` is the interface. :mod:`~ganlane.gym.native_rows` implements it for rule-driven traffic, by the native
-kernel and without torch; :mod:`~ganlane.gym.tensor_rows` for everything else, by the TorchRL environment.
+:class:`Rows` is the interface. :class:`NativeRows` implements it for rule-driven traffic, by the native kernel and
+without torch; :class:`ganlane.gym.tensor_rows.TensorRows` for everything else, by the TorchRL environment.
 """
 
+# ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
 import copy
@@ -16,17 +17,23 @@ import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
+from ganlane import keys
+from ganlane.config.commands import RunConfig
+from ganlane.config.env import EnvConfig, check_reward
+from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
-from ganlane.keys import ACTIONS
-from ganlane.native.batch import SPEED_RATIO_LIMIT, Stepped
+from ganlane.native.batch import SPEED_RATIO_LIMIT, NativeBatch, Stepped
 from ganlane.native.library import why_not
-from ganlane.options import Option
-from ganlane.parameters.episode import EpisodeParameters
+from ganlane.native.settings import NATIVE_FORMS
+from ganlane.options import Option, option
+from ganlane.parameters.episode import EpisodeParameters, Stream
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 #: Exclusive upper bound of the seeds that unseeded environments draw.
 SEEDS: Final = 2**31
+#: Traffic that the kernel implements, and whether it changes lanes.
+_NATIVE_TRAFFICS = {"ganlane.traffic.IdmTraffic": False, "ganlane.traffic.IdmMobilTraffic": True}
 
 
 class Rows(ABC):
@@ -79,6 +86,13 @@ class Rows(ABC):
         """Gymnasium's info (docs/gymnasium.md) as arrays [N] by name; valid until the next call."""
 
 
+def observation_space(size: int, largest: float) -> Box:
+    """Bounds of an observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
+    low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
+    low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
+    return Box(low, high, dtype=np.float32)
+
+
 def make_rows(traffic: Option, count: int, render_mode: str | None, options: Mapping[str, Any]) -> Rows:
     """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
 
@@ -89,8 +103,6 @@ def make_rows(traffic: Option, count: int, render_mode: str | None, options: Map
         UserError: a wrong value.
     """
     if render_mode is None and why_not() is None:
-        from ganlane.gym.native_rows import native_rows  # Hydra's config classes take a tenth of a second
-
         rows = native_rows(traffic, count, dict(options))
         if rows is not None:
             return rows
@@ -99,15 +111,103 @@ def make_rows(traffic: Option, count: int, render_mode: str | None, options: Map
     return TensorRows(traffic, count, options)
 
 
-def observation_space(size: int, largest: float) -> Box:
-    """Bounds of an observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
-    low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
-    low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
-    return Box(low, high, dtype=np.float32)
+def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeRows | None:
+    """N highways by the kernel; None where it does not implement these options, or one of them is wrong."""
+    groups = ("env", "observation", "reward", "mask", "stream", "device", "transforms")
+    given = {name: options.pop(name) for name in groups if name in options}
+    try:
+        config: TrafficConfig = option("traffic", traffic)
+        env: EnvConfig = option("env", given.get("env"), options)
+        observation, reward, mask = (option(group, given.get(group)) for group in ("observation", "reward", "mask"))
+        check_reward(env, reward)
+        device = RunConfig(device=given.get("device", "cpu")).device
+        stream = Stream.named(str(given.get("stream", "train")))
+    except UserError:
+        return None  # TensorRows reports the mistake
+    implemented = (
+        config._target_ in _NATIVE_TRAFFICS and not config.blind_share and not config.parameters
+        and observation.form in NATIVE_FORMS and observation.sensors is None
+        and type(env).scenes is EnvConfig.scenes and env.kernel != "torch"
+        and isinstance(count, int) and 1 <= count <= 65536
+        and device == "cpu" and not len(given.get("transforms", ()))
+    )  # fmt: skip
+    if not implemented:
+        return None
+    batch = NativeBatch(
+        count,
+        env.lanes,
+        env.lane_width_m,
+        env.vehicles,
+        env.spawn_parameters(),
+        env.ego,
+        env.episode_parameters(),
+        env.idm,
+        env.mobil if _NATIVE_TRAFFICS[config._target_] else None,
+        env.recycle_share if env.recycle else None,
+        observation,
+        reward,
+        mask,
+        int(stream),
+    )
+    return NativeRows(batch, env.episode_parameters())
+
+
+class NativeRows(Rows):
+    """N highways by the native kernel."""
+
+    def __init__(self, batch: NativeBatch, episode: EpisodeParameters) -> None:
+        self.batch, self.count, self.episode = batch, batch.rows, episode
+        self.space = observation_space(batch.observation.shape[1], batch.bounds[1])
+        self._started = False
+        self._never = np.zeros(batch.rows, np.bool_)
+
+    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
+        self._started = True
+        self.batch.start(seed, episode)
+
+    def restart(self, rows: Flags) -> None:
+        state = self.batch.state
+        self.batch.start(state["seed"], state["episode"] + self.count, rows)
+
+    def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
+        return self.batch.step(actions)
+
+    def observation(self) -> Floats:
+        return self.batch.observation
+
+    def mask(self) -> Flags:
+        return self.batch.mask
+
+    def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+        state = self.batch.state
+        return (state["seed"], state["episode"]) if self._started else None
+
+    def info(self) -> dict[str, Any]:
+        batch, state = self.batch, self.batch.state
+        lane = np.rint(state["y"][:, 0] / np.float32(batch.lane_width_m)).astype(np.int64)
+        return {
+            "seed": state["seed"],
+            "episode_number": state["episode"],
+            "time_s": state["step"] * keys.PHYSICS_STEP_S,
+            "distance_m": state["distance"],
+            "speed_mps": state["speed"][:, 0],
+            "lane": np.minimum(np.maximum(lane, 0), batch.lanes - 1),
+            "decisions": state["decisions"],
+            "lane_changes": state["lane_changes"],
+            "action_mask": batch.mask.view(np.int8),
+            "goal": state["goal"],
+            "hard_crash": state["hard_crash"],
+            "out_of_road": state["out_of_road"],
+            "timeout": state["timeout"],
+            "scene_end": self._never,
+            keys.SOFT_CRASH: state["soft_crashes"],
+            keys.SOFT_CRASH_BEHIND: state["soft_crashes_behind"],
+            keys.REWARD_TERMS: batch.reward_terms(),
+        }
 
 
 class OnRows:
-    """Base of the environments on :class:`Rows`; their ``spec`` has their own time limit."""
+    """Base of the environments on :class:`Rows`."""
 
     _rows: Rows
     _spec: EnvSpec | None = None
@@ -124,20 +224,11 @@ class OnRows:
             self._spec.max_episode_steps = self._rows.episode.most_decisions()
 
 
-def copied(info: dict[str, Any]) -> dict[str, Any]:
-    """A copy of an info, which the caller may keep."""
-    return {name: copied(value) if isinstance(value, dict) else value.copy() for name, value in info.items()}
-
-
-def row_of(info: dict[str, Any], row: int) -> dict[str, Any]:
-    """One row of :meth:`Rows.info`, numbers as Python's."""
-    return {name: _item(value, row) for name, value in info.items()}
-
-
-def _item(value: Any, row: int) -> Any:
-    if isinstance(value, dict):
-        return row_of(value, row)
-    return value[row].copy() if value.ndim > 1 else value.item(row)
+def row_of(info: Any, row: int) -> Any:
+    """One row of :meth:`Rows.info`, or of one of its values, numbers as Python's."""
+    if isinstance(info, dict):
+        return {name: row_of(value, row) for name, value in info.items()}
+    return info[row].copy() if info.ndim > 1 else info.item(row)
 
 
 def array_of(given: Any) -> npt.NDArray[Any]:
@@ -156,7 +247,7 @@ def actions_of(given: Any, rows: int) -> npt.NDArray[np.int64]:
     """
     array = array_of(given)
     whole = array.shape == (rows,) and array.dtype.kind in "iu"
-    if not whole or not 0 <= array.min() <= array.max() < ACTIONS:
+    if not whole or not 0 <= array.min() <= array.max() < keys.ACTIONS:
         raise UserError(
             f"action {given!r:.80}: expected {rows} whole number(s), 0 (keep), 1 (left) or 2 (right); give one "
             "for every environment."
@@ -172,22 +263,3 @@ def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dic
     if unknown:
         raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")
     return dict(options or {})
-
-
-def episode_numbers(episode: Any) -> npt.NDArray[np.int64]:
-    """The option ``episode``, checked: whole numbers from 0, one or several."""
-    array = array_of(episode)
-    numbers = array.astype(np.int64) if array.dtype.kind in "iu" else np.asarray(-1)
-    if (numbers < 0).any():
-        raise UserError(f"options: episode={episode!r:.80}: expected whole numbers from 0; give for instance 3.")
-    return numbers
-
-
-def row_mask(mask: Any, rows: int) -> Flags:
-    """The option ``reset_mask``, checked: a boolean array [rows]."""
-    array = array_of(mask)
-    if array.shape != (rows,) or array.dtype != np.bool_:
-        raise UserError(
-            f"options: reset_mask: expected a boolean array of shape ({rows},); give one flag for every row."
-        )
-    return array

@@ -1,7 +1,9 @@
-"""One highway as a ``gymnasium.Env``."""
+"""One highway as a ``gymnasium.Env``, and the window that shows it."""
 
 from __future__ import annotations
 
+import os
+import time
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -13,7 +15,7 @@ from ganlane.errors import UserError
 from ganlane.gym import has_display
 from ganlane.gym.rows import SEEDS, Floats, OnRows, actions_of, array_of, known_options, make_rows, row_of
 from ganlane.keys import ACTIONS, PHYSICS_STEP_S
-from ganlane.options import Option, option
+from ganlane.options import Option
 
 if TYPE_CHECKING:
     from gymnasium.wrappers import RecordVideo
@@ -69,10 +71,9 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._pictures: list[Any] = []
         self._video: RecordVideo | None = None
         if render_mode is not None:
-            from ganlane.gym.rendering import FilmWindow, LiveView  # with torch, which takes seconds
+            from ganlane.gym.tensor_rows import LiveView  # with torch, which takes seconds
 
-            window = FilmWindow("ganlane") if render_mode == "human" else None
-            self._view = LiveView(self._rows.env, option("traffic", traffic).label(), window)
+            self._view = LiveView(self._rows, traffic, FilmWindow() if render_mode == "human" else None)
         self._seed = None if seed is None else seed_number(seed)
         self._episode = -1
         self._running = False
@@ -92,7 +93,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self._rows.start(self._seed, self._episode)
         self._running = True
         if self._view is not None:
-            self._view.start(self._rows.state)
+            self._view.start()
             self._pictures.clear()
             self._collect()
         return self._rows.observation()[0].copy(), row_of(self._rows.info(), 0)
@@ -109,7 +110,7 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         terminated, truncated = bool(stepped.terminated[0]), bool(stepped.truncated[0])
         self._running = not (terminated or truncated)
         if self._view is not None:
-            self._view.after_step(self._rows.state, reward)
+            self._view.after_step(reward)
             self._collect()
         return stepped.observation[0].copy(), reward, terminated, truncated, row_of(self._rows.info(), 0)
 
@@ -146,3 +147,58 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         """Close the window, if there is one."""
         if self._view is not None:
             self._view.close()
+
+
+class FilmWindow:
+    """A pygame window that shows pictures until the user closes it.
+
+    Raises:
+        UserError: pygame is missing, or there is no display.
+    """
+
+    def __init__(self) -> None:
+        if not has_display():
+            raise UserError(
+                "render_mode=human: needs pygame (pip install 'ganlane[human]') and a display, and one of them is "
+                "missing here; use render_mode=rgb_array, or ganlane render for a film."
+            )
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame  # an extra
+
+        self._pygame: Any = pygame
+        self._screen: Any = None
+        try:
+            pygame.display.init()
+        except pygame.error as error:
+            raise UserError(
+                f"render_mode=human: no window can be opened ({error}); use render_mode=rgb_array."
+            ) from error
+        pygame.display.set_caption("ganlane")
+
+    def show(self, picture: npt.NDArray[np.uint8]) -> None:
+        """Put a picture [height, width, 3] uint8 into the window."""
+        pygame = self._pygame
+        if pygame is None:
+            return
+        size = picture.shape[1::-1]
+        try:
+            if self._screen is None:
+                self._screen = pygame.display.set_mode(size)
+            self._screen.blit(pygame.image.frombuffer(picture.tobytes(), size, "RGB"), (0, 0))
+            pygame.display.flip()
+            if pygame.event.get(pygame.QUIT):
+                self.close()
+            pygame.event.pump()
+        except pygame.error:  # closed by other code: pygame has one window per process
+            self._pygame = None
+
+    def wait(self, seconds: float) -> None:
+        """Wait, if the window is open."""
+        if self._pygame is not None:
+            time.sleep(seconds)
+
+    def close(self) -> None:
+        """Close the window; may be called again."""
+        pygame, self._pygame, self._screen = self._pygame, None, None
+        if pygame is not None:
+            pygame.display.quit()

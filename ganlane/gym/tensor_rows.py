@@ -1,9 +1,10 @@
-"""Every traffic for gymnasium: the TorchRL environment behind NumPy arrays."""
+"""Every traffic for gymnasium, by the TorchRL environment behind NumPy arrays; and its pictures."""
 
 # ruff: noqa: D102 - Rows has the docstrings of the methods
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,19 +20,20 @@ from ganlane.api import make_env
 from ganlane.gym.rows import Flags, Floats, Rows, observation_space
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
 from ganlane.native.batch import Stepped
-from ganlane.options import Option
+from ganlane.options import Option, option
 from ganlane.parameters.observation import largest_number
 from ganlane.sim.state import road_in
 from ganlane.transforms import ObservationTransform
+from ganlane.view import DrawingParameters, EpisodeLabel, FramePainter, Recorder
+from ganlane.view.frames import Picture
+from ganlane.view.record import outcome_of, road_of_row
+
+#: Recorded physics steps that are kept: as many as the trails show.
+_KEPT = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
 
 
 class TensorRows(Rows):
-    """N highways by the TorchRL environment.
-
-    Args:
-        traffic: as in :func:`ganlane.api.make_env`, as are ``options``.
-        count: N.
-    """
+    """N highways by the TorchRL environment, which :func:`ganlane.api.make_env` makes of the arguments."""
 
     env: TransformedEnv
 
@@ -44,10 +46,9 @@ class TensorRows(Rows):
 
     @torch.no_grad()
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
-        numbers = {keys.SEED: seed, keys.EPISODE: episode}
         counters = {
             name: torch.as_tensor(np.broadcast_to(value, self.count).astype(np.int64), device=self.env.device)
-            for name, value in numbers.items()
+            for name, value in ((keys.SEED, seed), (keys.EPISODE, episode))
         }
         self.state = self.env.reset(TensorDict(counters, [self.count], device=self.env.device))
 
@@ -103,3 +104,99 @@ class TensorRows(Rows):
 
 def _array(tensor: Tensor) -> npt.NDArray[Any]:
     return tensor.cpu().numpy()
+
+
+# Gymnasium's render modes: frames of :mod:`ganlane.view`, drawn while episodes run
+
+
+def _label(rows: Rows, row: int, traffic: str) -> EpisodeLabel:
+    """The header's text for a row."""
+    seed, episode = (int(rows.state.get(name)[row]) for name in (keys.SEED, keys.EPISODE))
+    return EpisodeLabel("ego", traffic, seed, episode, *road_of_row(rows.state, rows.env.base_env.road, row))
+
+
+class LiveView:
+    """Records every physics step of one row.
+
+    Args:
+        rows: the row; the recorder of its environment is replaced.
+        traffic: as the rows have it, for the header.
+        window: shows every physics step in real time; None: pictures on request.
+    """
+
+    def __init__(self, rows: Rows, traffic: Option, window: Any = None) -> None:
+        self.rows, self.traffic, self.window = rows, option("traffic", traffic).label(), window
+
+    def start(self) -> None:
+        """A new episode has begun."""
+        self._recorder, self._outcome = Recorder(), ""
+        #: Frames recorded before the present decision.
+        self._before = 0
+        self._label = _label(self.rows, 0, self.traffic)
+        self._recorder.add(self.rows.state.get(keys.VEHICLES), 0.0)
+        self.rows.env.base_env.recorder = self._recorder
+        self._show()
+
+    def before_step(self, action: int) -> None:
+        """Record the action of the next step."""
+        self._recorder.current_action = action
+        del self._recorder.frames[:-_KEPT]
+        self._before = len(self._recorder.frames)
+
+    def after_step(self, reward: float) -> None:
+        """Record the outcome of the step, and show its frames."""
+        self._recorder.current_return += reward
+        self._outcome = outcome_of(self.rows.state)
+        self._show()
+
+    def picture(self) -> Picture:
+        """The last frame, [height, width, 3]."""
+        return self._painter().draw(len(self._recorder.frames) - 1)
+
+    def pictures(self) -> Iterator[Picture]:
+        """The frames of the last decision, ten per second; after a reset, the only one."""
+        return map(self._painter().draw, range(self._before, len(self._recorder.frames)))
+
+    def close(self) -> None:
+        """Close the window."""
+        if self.window is not None:
+            self.window.close()
+
+    def _painter(self) -> FramePainter:
+        return FramePainter(self._recorder.trajectory(self._label, self._outcome))
+
+    def _show(self) -> None:
+        """Show the frames of the last decision in the window, in real time."""
+        if self.window is None:
+            return
+        due = time.monotonic() + PHYSICS_STEP_S
+        for picture in self.pictures():
+            self.window.show(picture)
+            self.window.wait(max(0.0, due - time.monotonic()))
+            due = time.monotonic() + PHYSICS_STEP_S
+
+
+class BatchView:
+    """Draws the present state of every row, without trails; the header names the ``traffic``."""
+
+    def __init__(self, rows: Rows, traffic: Option) -> None:
+        self.rows, self.traffic = rows, option("traffic", traffic).label()
+        self._returns, self._actions = np.zeros(rows.count), np.full(rows.count, -1)
+
+    def start(self, fresh: Flags) -> None:
+        """New episodes begin in the rows where ``fresh`` [N] is true."""
+        self._returns[fresh], self._actions[fresh] = 0.0, -1
+
+    def after_step(self, actions: npt.ArrayLike, reward: npt.NDArray[np.float64]) -> None:
+        """Record actions and rewards [N] of a step."""
+        self._returns += reward
+        self._actions[:] = actions
+
+    def pictures(self) -> tuple[Picture, ...]:
+        """One of every row."""
+        return tuple(map(self._picture, range(self.rows.count)))
+
+    def _picture(self, row: int) -> Picture:
+        recorder = Recorder(row, current_action=int(self._actions[row]), current_return=float(self._returns[row]))
+        recorder.add(self.rows.state.get(keys.VEHICLES), float(self.rows.state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
+        return FramePainter(recorder.trajectory(_label(self.rows, row, self.traffic))).draw(0)

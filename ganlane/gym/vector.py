@@ -13,21 +13,9 @@ from gymnasium.vector.utils import batch_space
 
 from ganlane.arguments import checked_arguments, seed_number
 from ganlane.errors import UserError
-from ganlane.gym.rows import (
-    SEEDS,
-    Flags,
-    Floats,
-    OnRows,
-    actions_of,
-    array_of,
-    copied,
-    episode_numbers,
-    known_options,
-    make_rows,
-    row_mask,
-)
+from ganlane.gym.rows import SEEDS, Flags, Floats, OnRows, actions_of, array_of, known_options, make_rows
 from ganlane.keys import ACTIONS
-from ganlane.options import Option, option
+from ganlane.options import Option
 
 
 class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDArray[Any]]):
@@ -91,9 +79,9 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         self._view: Any = None
         if render_mode is not None:
-            from ganlane.gym.rendering import BatchView  # with torch, which takes seconds
+            from ganlane.gym.tensor_rows import BatchView  # with torch, which takes seconds
 
-            self._view = BatchView(self._rows.env, option("traffic", traffic).label())
+            self._view = BatchView(self._rows, traffic)
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -101,22 +89,25 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         """Begin episodes in all rows, or with ``reset_mask`` in some; see the class for which."""
         given = known_options(options, ("episode", "reset_mask"))
         if "reset_mask" in given:
-            fresh = row_mask(given["reset_mask"], self.num_envs)
+            fresh = array_of(given["reset_mask"])
+            if fresh.shape != (self.num_envs,) or fresh.dtype != np.bool_:
+                raise UserError(
+                    f"options: reset_mask: expected a boolean array of shape ({self.num_envs},); "
+                    "give one flag for every row."
+                )
             self._rows.check_started()
-            self._restart(fresh)
+            self._rows.restart(fresh)
         else:
             fresh = np.ones(self.num_envs, dtype=np.bool_)
             self._start(seed, given.get("episode"))
-            self._ended[:] = False
-            if self._view is not None:
-                self._view.start(fresh)
-        return self._rows.observation().copy(), copied(self._rows.info())
+        self._begun(fresh)
+        return self._rows.observation().copy(), _copied(self._rows.info())
 
-    def _restart(self, rows: Flags) -> None:
-        self._rows.restart(rows)
-        self._ended = self._ended & ~rows
+    def _begun(self, fresh: Flags) -> None:
+        """New episodes have begun in the rows where ``fresh`` [N] is true."""
+        self._ended = self._ended & ~fresh
         if self._view is not None:
-            self._view.start(rows)
+            self._view.start(fresh)
 
     def _start(self, seed: int | Sequence[int] | None, episode: Any) -> None:
         each = np.arange(self.num_envs)
@@ -129,7 +120,12 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         else:
             seeds, first = int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed, each
         if episode is not None:
-            first = episode_numbers(episode)
+            first = array_of(episode)
+            first = first.astype(np.int64) if first.dtype.kind in "iu" else np.asarray(-1)
+            if (first < 0).any():
+                raise UserError(
+                    f"options: episode={episode!r:.80}: expected whole numbers from 0; give for instance 3."
+                )
             first = first + each if first.ndim == 0 else first
         if first.shape != (self.num_envs,) or np.size(seeds) not in (1, self.num_envs):
             raise UserError(f"reset(): expected one seed and one episode, or {self.num_envs} of each.")
@@ -151,14 +147,16 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             self._view.after_step(actions, reward)
         if waiting.any():  # discard the step of these rows after their ends
             reward[waiting], terminated[waiting], truncated[waiting] = 0.0, False, False
-            self._restart(waiting)
+            self._rows.restart(waiting)
+            self._begun(waiting)
         ended = self._ended = terminated | truncated
         final: dict[str, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
             final = {"final_obs": _where(ended, self._rows.observation()), "_final_obs": ended}
-            final |= {"final_info": copied(self._rows.info()), "_final_info": ended}
-            self._restart(ended)
-        return self._rows.observation().copy(), reward, terminated, truncated, copied(self._rows.info()) | final
+            final |= {"final_info": _copied(self._rows.info()), "_final_info": ended}
+            self._rows.restart(ended)
+            self._begun(ended)
+        return self._rows.observation().copy(), reward, terminated, truncated, _copied(self._rows.info()) | final
 
     def action_masks(self) -> Flags:
         """Which actions are allowed now, bool [N, 3]."""
@@ -169,7 +167,7 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         if self._view is None:
             raise UserError("render(): made without render_mode; give render_mode='rgb_array' to make_vec().")
         self._rows.check_started()
-        return self._view.pictures(self._rows.state)
+        return self._view.pictures()
 
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
@@ -187,3 +185,8 @@ def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
     for row in np.flatnonzero(rows):
         final[row] = observations[row].copy()
     return final
+
+
+def _copied(info: dict[str, Any]) -> dict[str, Any]:
+    """A copy of an info, which the caller may keep."""
+    return {name: _copied(value) if isinstance(value, dict) else value.copy() for name, value in info.items()}

@@ -7,12 +7,11 @@ episodes side by side, :func:`write_tracks` a file in the form of recorded traff
 Charts are in :mod:`ganlane.view.figures` (learning curves, recordings), which alone loads matplotlib.
 """
 
+from ganlane.view.canvas import WindowParameters
 from ganlane.view.film import Film, film_strip, write_film
 from ganlane.view.frames import DrawingParameters, FramePainter
 from ganlane.view.player import player_page, write_player
-from ganlane.view.record import EpisodeLabel, Recorder, Trajectory, record_episode
-from ganlane.view.tracks import to_tracks, write_tracks
-from ganlane.view.window import WindowParameters
+from ganlane.view.record import EpisodeLabel, Recorder, Trajectory, record_episode, to_tracks, write_tracks
 
 __all__ = [
     "DrawingParameters",

@@ -40,9 +40,6 @@ X_COLUMN = "decisions"
 #: Prefix of the columns of ``evaluation.csv``.
 EVALUATION = "evaluation_"
 
-#: Matplotlib cannot scale an axis for much larger numbers.
-_LARGEST = 1e100
-
 INK, FAINT, GRID = "#262a30", "#6e747c", "#e2e5e9"
 #: Okabe and Ito's palette, which colour-blind readers tell apart, with grey for its yellow (too pale on white).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#7f7f7f")
@@ -78,8 +75,6 @@ STYLE: Any = {
 }
 #: File formats, and the metadata that would make two files of the same figure differ.
 FORMATS: dict[str, dict[str, None]] = {"png": {}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-#: Bins of a drawn density; the histograms' own are finer.
-_DRAWN_BINS = 80
 
 
 @dataclass(frozen=True)
@@ -178,7 +173,8 @@ def read_metrics(path: str | Path) -> pl.DataFrame:
     for column in frame.iter_columns():
         wrong = column.drop_nulls()
         if column.dtype.is_numeric():
-            wrong = wrong.filter(wrong.is_finite() & (wrong.abs() > _LARGEST))
+            # Matplotlib cannot scale an axis for much larger numbers.
+            wrong = wrong.filter(wrong.is_finite() & (wrong.abs() > 1e100))
         if wrong.len():
             found = str(wrong[0])[:40]
             raise UserError(
@@ -268,9 +264,6 @@ def draw_runs(runs: Mapping[str, Runs], columns: Sequence[str] | None = None, sm
         wanted = ", ".join(panel.column for panel in PANELS)
         raise UserError(f"run={','.join(runs)}: no numbers in any of {wanted}; give the folder of a training run.")
     figure, grid = panel_grid(len(drawn))
-    labels = {
-        name: name if len(each) == 1 else f"{name} ({len(each)} seeds: mean, range)" for name, each in seeds.items()
-    }
     colours = palette(list(runs))
     for axes, panel in zip(grid, drawn):
         axes.set(title=panel.title, ylabel=panel.label, xlabel=X_COLUMN)
@@ -278,7 +271,8 @@ def draw_runs(runs: Mapping[str, Runs], columns: Sequence[str] | None = None, sm
         for name, frames in seeds.items():
             _plot_column(axes, frames, panel.column, smooth, color=colours[name])
             _plot_column(axes, frames, panel.dashed, smooth, raw=False, color=colours[name], ls="--", lw=1.2)
-    add_legend(figure, {labels[name]: colour for name, colour in colours.items()})
+    counts = {name: f" ({len(each)} seeds: mean, range)" if len(each) > 1 else "" for name, each in seeds.items()}
+    add_legend(figure, {f"{name}{counts[name]}": colour for name, colour in colours.items()})
     return figure
 
 
@@ -307,15 +301,10 @@ def _plot_column(
 
 
 def binned_density(histogram: Histogram, low: float, high: float) -> tuple[FloatArray, FloatArray]:
-    """Middles of about 80 bins between ``low`` and ``high``, and the probability density there.
-
-    Args:
-        histogram: of the quantity; it must reach as far as ``low`` and ``high``.
-        low, high: of the drawn range, in the quantity's unit.
-    """
+    """Middles of about 80 bins (the histogram's own are finer) from ``low`` to ``high``, and the density there."""
     edges = histogram.bins.edges
     first, last = np.searchsorted(edges, (low - 1e-9, high - 1e-9))
-    merged = max(1, int(last - first) // _DRAWN_BINS)
+    merged = max(1, int(last - first) // 80)
     number = int(last - first) // merged
     counts = histogram.counts[first : first + number * merged].reshape(number, merged).sum(axis=1)
     width = merged * float(edges[1] - edges[0])

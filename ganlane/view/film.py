@@ -19,12 +19,9 @@ from ganlane.view.frames import FramePainter, Picture
 Format = Literal["mp4", "gif", "png"]
 #: Frames of a film strip, as in the paper's Figure 3.
 STRIP_FRAMES = 4
-_STRIP_GAP = 4
 _H264 = "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -preset medium -movflags +faststart -f mp4"
 #: Frames from which a GIF's palette is taken, and colours of large flat areas, which are kept as they are.
 _PALETTE_FRAMES, _FLAT_COLOURS = 8, 8
-
-
 #: Tried in turn to make a GIF fit: share of the picture's size, colours, and every how many frames one is kept.
 _GIF_SIZES = (
     *((1.0, 128, 1), (0.85, 96, 1), (0.75, 64, 1)),
@@ -82,11 +79,10 @@ def film_format(path: str | Path, wanted: str | None = None) -> Format:
     Raises:
         UserError: it is none of mp4, gif and png.
     """
-    name = (wanted or Path(path).suffix.removeprefix(".")).lower()
-    for known in get_args(Format):
-        if name == known:
-            return known
-    raise UserError(f"format={name or 'none'}: expected mp4, gif or png; choose one of them.")
+    name: Any = (wanted or Path(path).suffix.removeprefix(".")).lower()
+    if name not in get_args(Format):
+        raise UserError(f"format={name or 'none'}: expected mp4, gif or png; choose one of them.")
+    return name
 
 
 def write_film(
@@ -135,7 +131,7 @@ def write_film(
 def film_strip(frames: Film | Sequence[Picture], count: int = STRIP_FRAMES) -> Picture:
     """``count`` frames, spread evenly from the first to the last, one below the other."""
     chosen = [frames[index] for index in _spread(len(frames), count)]
-    gap = np.full((_STRIP_GAP, chosen[0].shape[1], 3), 255, np.uint8)
+    gap = np.full((4, chosen[0].shape[1], 3), 255, np.uint8)
     rows = [row for picture in chosen for row in (picture, gap)]
     return np.concatenate(rows[:-1])
 

@@ -16,6 +16,7 @@ import html
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -27,22 +28,10 @@ from ganlane.errors import UserError
 from ganlane.files import write_bytes
 from ganlane.view.record import ACTION_NAMES, Trajectory
 
-#: Joined in this order.
-_SCRIPTS = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
 #: Three episodes stay under 2 MB.
 MAX_BYTES_PER_EPISODE = 660_000
-#: Frames from one sample to the next; the first that fits is taken.
-_STRIDES = (1, 2, 3, 5, 10)
 #: Units of series: s, m, m, rad, m/s, m/s2, m/s3.
-UNITS = {
-    "time": 0.01,
-    "x": 0.01,
-    "y": 0.01,
-    "heading": 0.001,
-    "speed": 0.01,
-    "acceleration": 0.01,
-    "jerk": 0.1,
-}
+UNITS = dict(time=0.01, x=0.01, y=0.01, heading=0.001, speed=0.01, acceleration=0.01, jerk=0.1)
 
 
 def write_player(trajectories: Sequence[Trajectory], path: str | Path, max_bytes: int | None = None) -> Path:
@@ -64,8 +53,7 @@ def player_page(trajectories: Sequence[Trajectory], max_bytes: int | None = None
         raise UserError("format=html: no episode to play; record at least one.")
     limit = max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
     title = ", ".join(dict.fromkeys(f"{each.label.agent} on {each.label.traffic}" for each in trajectories))
-    size = 0
-    for stride in _STRIDES:
+    for stride in (1, 2, 3, 5, 10):
         page = _fill(title, {"units": UNITS, "episodes": [episode_data(each, stride) for each in trajectories]})
         size = len(page.encode())
         if size <= limit:
@@ -84,7 +72,8 @@ def _fill(title: str, data: dict[str, Any]) -> str:
         return (folder / name).read_text(encoding="utf-8")
 
     style = text("style.css")
-    script = "(() => {\n'use strict';\n" + "\n".join(map(text, _SCRIPTS)) + "})();\n"
+    scripts = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")  # in this order
+    script = "(() => {\n'use strict';\n" + "\n".join(map(text, scripts)) + "})();\n"
     parts = {
         "title": html.escape(title),
         "policy": f"default-src 'none'; img-src data:; style-src {_hash(style)}; script-src {_hash(script)}",
@@ -139,7 +128,7 @@ def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:
         (steps per action; empty if unknown) with ``action_names``; ``comfort`` (:meth:`Trajectory.comfort`);
         ``soft_crash``, the ends of the decisions with any, s.
     """
-    t, label = trajectory, trajectory.label
+    t = trajectory
     kept = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
     under_way = np.minimum(kept + 1, len(t) - 1)
 
@@ -147,12 +136,7 @@ def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:
         return getattr(t, name)[kept].T
 
     return {
-        "agent": label.agent,
-        "traffic": label.traffic,
-        "seed": label.seed,
-        "episode": label.episode,
-        "lanes": label.lanes,
-        "lane_width_m": label.lane_width_m,
+        **asdict(t.label),
         "outcome": t.outcome,
         "time": series(t.time_s[kept], UNITS["time"]),
         **{name: [series(row, UNITS[name]) for row in per_vehicle(name)] for name in ("x", "y", "heading", "speed")},

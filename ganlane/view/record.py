@@ -1,14 +1,15 @@
-"""A recorded episode, frame by frame as plain arrays, and recording one while it runs, at every physics step."""
+"""Episodes recorded at every physics step: as plain arrays, while they run, and as tracks of recorded traffic."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import polars as pl
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -18,8 +19,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
 from ganlane.agents.policy import GreedyPolicy
+from ganlane.data.recordings import scene_csv, write_prepared
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
+from ganlane.files import atomic_path
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Road, Vehicles, road_in
 
@@ -30,6 +34,12 @@ BoolArray = npt.NDArray[np.bool_]
 ACTION_NAMES = ("keep", "left", "right")
 #: A vehicle that moves further than this in a physics step was recycled (placed elsewhere), m.
 JUMP_M = 30.0
+#: Fields of ``vehicles`` that a trajectory keeps, with their types.
+_FIELDS = {
+    **dict.fromkeys(("x", "y", "heading", "speed", "acceleration", "length", "width"), np.float64),
+    "target_lane": np.int64,
+    "valid": np.bool_,
+}
 
 
 @dataclass(frozen=True)
@@ -78,7 +88,6 @@ class Trajectory:
     reward: FloatArray = field(default_factory=lambda: np.empty(0))
     #: Jerk, m/s3, [T, M], where frames before these were left out (:meth:`since`); empty otherwise.
     driven_jerk: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-
     #: Ends of the decisions with a soft crash, s; empty if unknown.
     soft_crash_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
@@ -134,31 +143,20 @@ class Trajectory:
         first = int(np.searchsorted(self.time_s, start_s - 1e-9))
         if first == len(self):
             raise UserError(f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it.")
-        arrays = {each.name: getattr(self, each.name) for each in fields(self)} | {"driven_jerk": self.jerk()}
-        later: dict[str, Any] = {
-            name: value[first:]
-            for name, value in arrays.items()
-            if isinstance(value, np.ndarray) and value.size and name != "soft_crash_s"
-        }
-        return replace(self, **later)
+        whole = replace(self, driven_jerk=self.jerk())
+        frames = [each.name for each in fields(self) if each.name not in ("label", "outcome", "soft_crash_s")]
+        later: dict[str, Any] = {name: getattr(whole, name)[first:] for name in frames}
+        return replace(whole, **later)
 
     def overlapping(self) -> BoolArray:
         """Whether a vehicle's box overlaps another's, [T, M]."""
-        fields = {name: torch.as_tensor(getattr(self, name)) for name in ("x", "y", "heading", "length", "width")}
-        unused = torch.zeros_like(fields["x"])
-        others = {name: unused for name in keys.VEHICLE_FIELDS if name not in fields}
-        everybody = Vehicles(**{**others, **fields, "valid": torch.as_tensor(self.valid)})
-        return pair_overlaps(everybody).any(-1).numpy()
+        unused = dict.fromkeys(keys.VEHICLE_FIELDS, torch.zeros(self.x.shape, dtype=torch.float64))
+        boxes = ("x", "y", "heading", "length", "width", "valid")
+        used = {name: torch.as_tensor(getattr(self, name)) for name in boxes}
+        return pair_overlaps(Vehicles(**(unused | used))).any(-1).numpy()
 
 
 # Recording
-
-#: Fields of ``vehicles`` that a trajectory keeps, with their types.
-_FIELDS = {
-    **dict.fromkeys(("x", "y", "heading", "speed", "acceleration", "length", "width"), np.float64),
-    "target_lane": np.int64,
-    "valid": np.bool_,
-}
 
 
 @dataclass
@@ -166,39 +164,32 @@ class Recorder:
     """Collects frames of one row; the environment calls it after each physics step."""
 
     row: int = 0
-    frames: list[dict[str, np.ndarray]] = field(default_factory=list)
-    time_s: list[float] = field(default_factory=list)
-    action: list[int] = field(default_factory=list)
-    returns: list[float] = field(default_factory=list)
-    action_values: list[np.ndarray] = field(default_factory=list)
+    #: What a trajectory keeps of a frame, by its name there.
+    frames: list[dict[str, Any]] = field(default_factory=list)
     #: Frames recorded by the end of each decision, and its reward; empty if rewards are not recorded.
     decisions: list[tuple[int, float]] = field(default_factory=list)
     #: Ends of the decisions with a soft crash, s.
     soft_crash_s: list[float] = field(default_factory=list)
     current_action: int = -1
     current_return: float = 0.0
-    current_values: np.ndarray = field(default_factory=lambda: np.empty(0))
+    current_values: FloatArray = field(default_factory=lambda: np.empty(0))
 
-    def __call__(self, vehicles: Vehicles | TensorDictBase | Any, running: Tensor) -> None:
+    @property
+    def time_s(self) -> float:
+        """Time of the last frame, s."""
+        return self.frames[-1]["time_s"]
+
+    def __call__(self, vehicles: Vehicles, running: Tensor) -> None:
         """Hook of the environment: vehicles [N, M] after a physics step, ``running`` [N] the rows that took it."""
         if bool(running[self.row]):
-            self.add(vehicles, keys.PHYSICS_STEP_S)
+            self.add(vehicles.as_dict(), self.time_s + keys.PHYSICS_STEP_S)
 
-    def add(self, vehicles: Vehicles | TensorDictBase | Any, elapsed_s: float) -> None:
-        """Append a frame, ``elapsed_s`` after the one before."""
-        state = vehicles.as_dict() if isinstance(vehicles, Vehicles) else vehicles
-        self.frames.append(
-            {name: state[name][self.row].detach().cpu().numpy().astype(kind) for name, kind in _FIELDS.items()}
-        )
-        self.time_s.append(self.time_s[-1] + elapsed_s if self.time_s else 0.0)
-        self.action.append(self.current_action)
-        self.returns.append(self.current_return)
-        self.action_values.append(self.current_values)
-
-    def keep_last(self, count: int) -> None:
-        """Forget all frames but the last ``count``."""
-        for kept in (self.frames, self.time_s, self.action, self.returns, self.action_values):
-            del kept[:-count]
+    def add(self, vehicles: Mapping[str, Tensor] | TensorDictBase, time_s: float) -> None:
+        """Append a frame."""
+        frame: dict[str, Any] = {"time_s": time_s, "action": self.current_action, "returns": self.current_return}
+        for name, kind in _FIELDS.items():
+            frame[name] = vehicles[name][self.row].detach().cpu().numpy().astype(kind)
+        self.frames.append({**frame, "action_values": self.current_values})
 
     def trajectory(self, label: EpisodeLabel, outcome: str = "") -> Trajectory:
         """The frames so far; the last one shows the return after the last decision."""
@@ -206,14 +197,15 @@ class Recorder:
         begin = 1
         for end, paid in self.decisions:
             reward[begin:end], begin = paid, end
-        width = max(len(values) for values in self.action_values)
-        values = [values if len(values) else np.full(width, np.nan) for values in self.action_values]
+        arrays = {name: np.stack([frame[name] for frame in self.frames]) for name in (*_FIELDS, "action", "returns")}
+        arrays["returns"][-1] = self.current_return
+        values = [frame["action_values"] for frame in self.frames]
+        width = max(map(len, values))
+        values = [each if len(each) else np.full(width, np.nan) for each in values]
         return Trajectory(
             label=label,
-            time_s=np.array(self.time_s).round(6),
-            **{name: np.stack([frame[name] for frame in self.frames]) for name in _FIELDS},
-            action=np.array(self.action),
-            returns=np.array([*self.returns[:-1], self.current_return]),
+            time_s=np.array([frame["time_s"] for frame in self.frames]).round(6),
+            **arrays,
             outcome=outcome,
             action_values=np.stack(values) if width else np.empty((0, 0)),
             reward=reward,
@@ -232,18 +224,6 @@ def outcome_of(state: TensorDictBase, row: int = 0) -> str:
     """The event that ended the episode of a row; empty where none did."""
     events = state[keys.EVENTS]
     return next((name for name in keys.END_EVENTS if bool(events[name][row])), "")
-
-
-@contextmanager
-def _recording(base: Any, recorder: Recorder) -> Iterator[None]:
-    """Install the recorder in the environment for a while."""
-    if not hasattr(base, "recorder"):
-        raise UserError(f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this process.")
-    before, base.recorder = base.recorder, recorder
-    try:
-        yield
-    finally:
-        base.recorder = before
 
 
 def record_episode(
@@ -270,17 +250,19 @@ def record_episode(
     base: Any = env
     while hasattr(base, "base_env"):
         base = base.base_env
-    recorder = Recorder()
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC), _recording(base, recorder):
-        state = env.reset(start_of(env, [episode], seed))
-        label = EpisodeLabel(agent, traffic, seed, episode, *road_of_row(state, base.road, 0))
-        recorder.add(state[keys.VEHICLES], 0.0)
-        outcome, done = "", False
-        while not done and recorder.time_s[-1] < max_time_s - 1e-6:
-            state = _decide(env, policy, policy(state), recorder)
-            done = bool(state["done"][0])
-            outcome = outcome_of(state) if done else ""
-    return recorder.trajectory(label, outcome)
+    if not hasattr(base, "recorder"):
+        raise UserError(f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this process.")
+    before, base.recorder = base.recorder, (recorder := Recorder())
+    try:
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            state = env.reset(start_of(env, [episode], seed))
+            label = EpisodeLabel(agent, traffic, seed, episode, *road_of_row(state, base.road, 0))
+            recorder.add(state[keys.VEHICLES], 0.0)
+            while not state["done"][0] and recorder.time_s < max_time_s - 1e-6:
+                state = _decide(env, policy, policy(state), recorder)
+    finally:
+        base.recorder = before
+    return recorder.trajectory(label, outcome_of(state))
 
 
 def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder) -> TensorDictBase:
@@ -296,5 +278,65 @@ def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, r
     recorder.current_return += reward
     recorder.decisions.append((len(recorder.frames), reward))
     if int(stepped["next", keys.EVENTS, keys.SOFT_CRASH][0]) > 0:
-        recorder.soft_crash_s.append(recorder.time_s[-1])
+        recorder.soft_crash_s.append(recorder.time_s)
     return env.step_mdp(stepped)
+
+
+# Tracks
+
+
+def write_tracks(trajectories: Sequence[Trajectory], path: str | Path, format: Literal["csv", "parquet"]) -> Path:
+    """Write episodes, a scene each, atomically, as a file that :func:`ganlane.data.read_scenes` reads back.
+
+    Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings from elsewhere, the
+    speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is 0 at the centre of lane 1. It has no
+    lane width, and a rightmost lane without vehicles is lost.
+
+    Raises:
+        UserError: there is no episode, or one whose frames are not 0.1 s apart.
+    """
+    if not trajectories:
+        raise UserError(f"format={format}: no episode to write; record at least one.")
+    labels = [each.label for each in trajectories]
+    tables = [to_tracks(each, name) for each, name in zip(trajectories, scene_names(labels))]
+    if format == "parquet":
+        write_prepared(sort(pl.concat(tables)), path)
+        return Path(path)
+    for number, label in enumerate(labels):
+        tables[number] = scene_csv(tables[number], pl.lit(label.lanes - 1), label.lane_width_m)
+    with atomic_path(path) as part:
+        pl.concat(tables).write_csv(part)
+    return Path(path)
+
+
+def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
+    """The trajectory as a table in the schema of recordings; a recycled vehicle begins a new track.
+
+    Raises:
+        UserError: the frames are not 0.1 s apart.
+    """
+    if len(trajectory) > 1 and abs(trajectory.frame_s - keys.PHYSICS_STEP_S) > 1e-6:
+        raise UserError(
+            f"trajectory: its frames are {trajectory.frame_s:g} s apart, tracks need {keys.PHYSICS_STEP_S} s; "
+            "record it at every physics step."
+        )
+    frames, vehicles = trajectory.x.shape
+    columns = {
+        "vehicle": np.arange(vehicles) + TRACK_STRIDE * np.cumsum(trajectory.jumped(), axis=0),
+        "frame": np.broadcast_to(np.arange(frames)[:, None], (frames, vehicles)),
+        **{name: getattr(trajectory, name) for name in ("x", "y", "speed", "length", "width")},
+        "lane": trajectory.lane(),
+    }
+    shown = trajectory.valid
+    table = pl.DataFrame({"scene": [scene] * int(shown.sum()), **{k: v[shown] for k, v in columns.items()}})
+    return table.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items()).sort("scene", "vehicle", "frame")
+
+
+def scene_names(labels: Sequence[EpisodeLabel]) -> list[str]:
+    """A name for each episode's scene, ``AGENT_TRAFFIC_SEED_EPISODE``; a number follows where two would be alike."""
+    names: list[str] = []
+    for label in labels:
+        name = f"{Path(label.agent).stem}_{label.traffic}_{label.seed}_{label.episode}"
+        again = sum(other == name or other.startswith(f"{name}-") for other in names)
+        names.append(f"{name}-{again + 1}" if again else name)
+    return names

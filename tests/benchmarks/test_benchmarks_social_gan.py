@@ -5,7 +5,7 @@ import torch
 
 from benchmarks import social_gan
 from benchmarks.social_gan import BASELINES, PaddedGenerator, SceneLoopGenerator, ratios
-from ganlane.bench.traffic import SYSTEM
+from ganlane.bench.suites import TRAFFIC
 from ganlane.generator import GeneratorSizes
 
 SMALL = GeneratorSizes(embedding=6, hidden=5, pooling=4, pooled=3, context=6, noise=2)
@@ -63,6 +63,6 @@ def test_each_counts_at_its_best():
             "physics_steps_per_cpu_s": cpu,
         }
 
-    rows = [row(SYSTEM, 900, 400, "gan"), row(SYSTEM, 600, 600, "gan")]
+    rows = [row(TRAFFIC, 900, 400, "gan"), row(TRAFFIC, 600, 600, "gan")]
     rows += [row(name, rate, 10) for name in BASELINES for rate in (20, 30)]
     assert [(found["ratio"], found["ratio_cpu"]) for found in ratios(rows)] == [(30, 60)] * 3

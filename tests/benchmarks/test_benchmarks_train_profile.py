@@ -18,8 +18,8 @@ from benchmarks.train_profile import (
     take_shares,
     timed_calls,
 )
-from ganlane.bench.systems import Scenario
-from ganlane.bench.train import Training, TrainSuite, filled_run
+from ganlane.bench.suites import TrainSuite
+from ganlane.bench.systems import Scenario, Training, filled_run
 from ganlane.config.commands import BenchConfig
 from ganlane.parameters.agent import RainbowConfig
 

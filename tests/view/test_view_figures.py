@@ -24,7 +24,6 @@ from ganlane.view.figures import (
     palette,
     panel_grid,
     plot_line,
-    read_metrics,
     read_run,
     read_runs,
     running_mean,
@@ -32,12 +31,12 @@ from ganlane.view.figures import (
 )
 
 
-def panels(figure: Figure) -> dict:
+def panels(figure):
     return {axes.get_title("left"): axes for axes in figure.axes}
 
 
-def legend(figure: Figure) -> list[str]:
-    return [text.get_text() for text in figure.legends[0].get_texts()]
+def words(texts):
+    return [text.get_text() for text in texts]
 
 
 @pytest.fixture
@@ -55,19 +54,15 @@ def test_a_line_is_the_metric_over_the_decisions(runs):
 def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(runs):
     figure = draw_runs(runs)
     drawn = {title: [to_hex(line.get_color()) for line in axes.lines] for title, axes in panels(figure).items()}
-    assert legend(figure) == ["a", "b"]
+    assert words(figure.legends[0].get_texts()) == ["a", "b"]
+    a, b, *_ = COLOURS
     assert drawn == {
-        "mean return": [*COLOURS[:2]],
-        "crash rate": [*COLOURS[:2]],
-        "lane changes": [*COLOURS[:2]],
-        "mean Q (replayed); dashed: discounted return": [COLOURS[0]] * 2 + [COLOURS[1]] * 2,
-        "evaluation: mean return": [COLOURS[0]],
-        "evaluation: crash rate": [COLOURS[0]],
+        **{title: [a, b] for title in ("mean return", "crash rate", "lane changes")},
+        "mean Q (replayed); dashed: discounted return": [a, a, b, b],
+        **{title: [a] for title in ("evaluation: mean return", "evaluation: crash rate")},
     }
-
-
-def test_axes_say_what_they_measure(runs):
-    drawn = panels(draw_runs(runs))
+    # Axes say what they measure.
+    drawn = panels(figure)
     assert {axes.get_xlabel() for axes in drawn.values()} == {"decisions"}
     assert drawn["lane changes"].get_ylabel() == "per km"
     assert drawn["evaluation: crash rate"].get_ylabel() == "share of episodes"
@@ -131,19 +126,12 @@ def measured(**traffic):
 
 def test_recordings_are_drawn_in_six_panels_with_their_units():
     drawn = panels(draw_recordings(measured(lanes=1, seconds=3.0)))
-    assert {title: axes.get_xlabel() for title, axes in drawn.items()} == {
-        "speed": "m/s",
-        "acceleration": "m/s²",
-        "time to change lanes": "s",
-        "followers' headway: median (gap - 2 m) / speed": "s",
-        "time headway: gap / speed": "s",
-        "gap to the leader": "m",
-    }
-    durations = drawn.pop("time to change lanes")
-    assert [text.get_text() for text in durations.texts] == ["none recorded from start to end"]
+    times = ("time to change lanes", "followers' headway: median (gap - 2 m) / speed", "time headway: gap / speed")
+    units = {"speed": "m/s", "acceleration": "m/s²", **dict.fromkeys(times, "s"), "gap to the leader": "m"}
+    assert {title: axes.get_xlabel() for title, axes in drawn.items()} == units
+    assert words(drawn.pop("time to change lanes").texts) == ["none recorded from start to end"]
     assert all(line.get_ydata().sum() > 0 for axes in drawn.values() for line in axes.lines)
-    labels = [text.get_text() for text in drawn["acceleration"].get_legend().get_texts()]
-    assert labels == ["as recorded", "over 1 s"]
+    assert words(drawn["acceleration"].get_legend().get_texts()) == ["as recorded", "over 1 s"]
 
 
 def test_lane_changes_are_drawn_as_the_share_that_lasts_longer():
@@ -214,7 +202,7 @@ def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
     runs = read_runs([sweep_folder(tmp_path, *lines)])
     assert {name: len(frames) for name, frames in runs.items()} == {"traffic=gan": 2, "traffic=idm": 2}
     figure = draw_runs(runs)
-    assert legend(figure)[0] == "traffic=gan (2 seeds: mean, range)"
+    assert words(figure.legends[0].get_texts())[0] == "traffic=gan (2 seeds: mean, range)"
     axes = panels(figure)["mean return"]
     assert axes.lines[0].get_ydata() == pytest.approx(1.5 * np.arange(1.0, 31.0))
     assert axes.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(60.0)
@@ -234,18 +222,20 @@ def test_the_running_mean_skips_gaps():
     assert running_mean(values, 2) == pytest.approx([1.0, 2.0, np.nan, 5.0, 7.0], nan_ok=True)
 
 
-def test_what_is_no_metrics_file_is_named(tmp_path):
-    with pytest.raises(UserError, match="no such file"):
-        read_metrics(tmp_path)
-    for content, message in ((b"step,loss\n1,2\n", "decisions"), (b"\xff\xfe\x00broken", r"metrics\.csv")):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "no such file"),
+        (b"step,loss\n1,2\n", "decisions"),
+        (b"\xff\xfe\x00broken", r"metrics\.csv"),
+        *(
+            (b"decisions,mean_return\n5,2\n" + row, r"metrics\.csv: column '.*' holds .*; repair it\.")
+            for row in (b"many,1\n", b"10,text\n", b"10,1e300\n")
+        ),
+    ],
+)
+def test_what_is_no_metrics_file_is_named(content, message, tmp_path):
+    if content is not None:
         (tmp_path / "metrics.csv").write_bytes(content)
-        with pytest.raises(UserError, match=message):
-            read_metrics(tmp_path)
-
-
-@pytest.mark.parametrize("row", ["many,1", "10,text", "10,1e300"])
-def test_what_is_no_number_in_a_runs_figures_is_named(row, tmp_path):
-    run_folder(tmp_path / "run")
-    (tmp_path / "run" / "metrics.csv").write_text(f"decisions,mean_return\n5,2\n{row}\n")
-    with pytest.raises(UserError, match=r"metrics\.csv: column '.*' holds .*; repair it\."):
-        read_runs([tmp_path / "run"])
+    with pytest.raises(UserError, match=message):
+        read_run(tmp_path)

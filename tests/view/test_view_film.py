@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 from view_scenes import straight
 
 from ganlane.errors import UserError
@@ -37,10 +37,8 @@ def test_a_film_lasts_as_long_as_the_episode_and_holds_its_end(film):
 
 def test_speedup_and_part_choose_frames_by_time():
     painter = FramePainter(straight([0], [1], frames=101))
-    fast = Film(painter, fps=10, speedup=2.0, start_s=2.0, end_s=6.0, hold_s=0.1)
-    assert fast._frames == [*range(20, 61, 2), 60]
-    smooth = Film(painter, fps=20, end_s=0.3, hold_s=0.05)
-    assert smooth._frames == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert Film(painter, 10, 2.0, start_s=2.0, end_s=6.0, hold_s=0.1)._frames == [*range(20, 61, 2), 60]
+    assert Film(painter, 20, end_s=0.3, hold_s=0.05)._frames == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_impossible_and_empty_films_and_unknown_formats_are_refused(tmp_path):
@@ -59,11 +57,7 @@ def test_a_gif_comes_back_frame_by_frame(film, tmp_path):
     with Image.open(path) as gif:
         assert gif.size == (640, 160)
         # Equal frames at the end are stored as one that lasts longer.
-        durations = []
-        for index in range(gif.n_frames):
-            gif.seek(index)
-            durations.append(gif.info["duration"])
-        assert sum(durations) == 100 * len(film)
+        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif)) == 100 * len(film)
         assert gif.info["loop"] == 0
         gif.seek(20)
         shown = np.asarray(gif.convert("RGB")).astype(int)
@@ -103,7 +97,14 @@ def test_an_mp4_has_all_frames(film, tmp_path):
     assert np.abs(shown - at_half_size(film[3])).mean() < 6.0
 
 
-def test_half_an_mp4_on_a_full_disk_is_none(film, tmp_path):
+@pytest.fixture
+def empty(tmp_path):
+    """A folder that the test leaves empty."""
+    yield tmp_path
+    assert not list(tmp_path.iterdir())
+
+
+def test_half_an_mp4_on_a_full_disk_is_none(film, empty):
     """ffmpeg fails, and only its exit status says so."""
     pytest.importorskip("imageio_ffmpeg")
     resource = pytest.importorskip("resource")
@@ -111,37 +112,32 @@ def test_half_an_mp4_on_a_full_disk_is_none(film, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**12, before[1]))
     try:
         with pytest.raises(OSError, match="File too large") as caught:
-            write_film(first(film, 10), tmp_path / "a.mp4", fps=10, scale=0.5)
+            write_film(first(film, 10), empty / "a.mp4", fps=10, scale=0.5)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert caught.value.filename == str(tmp_path / "a.mp4")
-    assert list(tmp_path.iterdir()) == []
+    assert caught.value.filename == str(empty / "a.mp4")
 
 
-def test_an_ffmpeg_that_refuses_is_quoted(film, tmp_path, monkeypatch):
+def test_an_ffmpeg_that_refuses_is_quoted(film, empty, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr(film_module, "_H264", "-c:v no_such_codec -f mp4")
     with pytest.raises(UserError, match=r"a\.mp4: ffmpeg cannot write it \(.*choose format=gif"):
-        write_film(first(film, 2), tmp_path / "a.mp4", fps=10)
-    assert list(tmp_path.iterdir()) == []
+        write_film(first(film, 2), empty / "a.mp4", fps=10)
 
 
-def test_without_the_extra_video_the_message_names_it(film, tmp_path, monkeypatch):
+def test_without_the_extra_video_the_message_names_it(film, empty, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match=r"ganlane\[video\]"):
-        write_film(film, tmp_path / "a.mp4")
-    assert not list(tmp_path.iterdir())
+        write_film(film, empty / "a.mp4")
 
 
-def test_a_failure_half_way_leaves_nothing(film, tmp_path):
+def test_a_failure_half_way_leaves_nothing(film, empty):
     class Broken(list):
         def __getitem__(self, index):
             if index == 3:
                 raise RuntimeError("no")
             return film[0]
 
-    names = ["a.gif", "a.mp4"] if find_spec("imageio_ffmpeg") else ["a.gif"]
-    for name in names:
+    for name in ["a.gif", "a.mp4"] if find_spec("imageio_ffmpeg") else ["a.gif"]:
         with pytest.raises(RuntimeError):
-            write_film(Broken([0] * 6), tmp_path / name, scale=0.25)
-    assert not list(tmp_path.iterdir())
+            write_film(Broken([0] * 6), empty / name, scale=0.25)

@@ -11,8 +11,8 @@ from view_scenes import area, place, straight
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.view import DrawingParameters, FramePainter, WindowParameters, style
-from ganlane.view.window import HEADER_HEIGHT, Window
+from ganlane.view import DrawingParameters, FramePainter, WindowParameters, canvas
+from ganlane.view.canvas import HEADER_HEIGHT, Window
 
 BARE = DrawingParameters(trail_s=0.0, speeds=False)
 
@@ -20,6 +20,10 @@ BARE = DrawingParameters(trail_s=0.0, speeds=False)
 def road_of(picture):
     """The picture below the header."""
     return picture[HEADER_HEIGHT:]
+
+
+def bare(scene, frame=0):
+    return FramePainter(scene, drawing=BARE).draw(frame)
 
 
 def test_a_frame_is_a_picture_of_the_asked_size():
@@ -33,11 +37,11 @@ def test_a_frame_is_a_picture_of_the_asked_size():
 
 
 def test_the_ego_stays_at_its_column_and_others_stand_at_their_distance():
-    tint = style.speed_tint(20.0)
+    tint = canvas.speed_tint(20.0)
     painter = FramePainter(straight([0, 40], [1, 2], frames=50), drawing=BARE)
     for frame in (0, 17, 49):
         picture = road_of(painter.draw(frame))
-        ego, other = place(picture, style.EGO), place(picture, tint)
+        ego, other = place(picture, canvas.EGO), place(picture, tint)
         assert ego[0] == pytest.approx(0.38 * 1280, abs=2)
         assert other[0] - ego[0] == pytest.approx(40 * 1280 / 160, abs=2)
         # One lane further left is further up, by the exaggerated width of a lane.
@@ -47,10 +51,9 @@ def test_the_ego_stays_at_its_column_and_others_stand_at_their_distance():
 @pytest.mark.parametrize("length_m", [4.5, 12.0])
 def test_a_lorry_is_drawn_at_its_length(length_m):
     trajectory = straight([0, 30], [1, 2])
-    length = trajectory.length.copy()
-    length[:, 1] = length_m
-    picture = road_of(FramePainter(replace(trajectory, length=length), drawing=BARE).draw(0))
-    columns = np.nonzero(np.abs(picture.astype(int) - style.speed_tint(20.0)).max(axis=-1) <= 6)[1]
+    trajectory.length[:, 1] = length_m
+    picture = road_of(bare(trajectory))
+    columns = np.nonzero(np.abs(picture.astype(int) - canvas.speed_tint(20.0)).max(axis=-1) <= 6)[1]
     # 8 pixels a metre, less the dark edge of the body.
     assert columns.max() - columns.min() == pytest.approx(0.93 * 8 * length_m, abs=3)
 
@@ -66,9 +69,9 @@ def test_the_road_moves_past_the_ego():
 
 
 def test_overlapping_vehicles_have_a_red_edge():
-    apart, together = (FramePainter(straight([0, x], [1, 1]), drawing=BARE).draw(0) for x in (30, 3))
-    assert area(apart, style.CRASH) == 0
-    assert area(together, style.CRASH) > 50
+    apart, together = (bare(straight([0, x], [1, 1])) for x in (30, 3))
+    assert area(apart, canvas.CRASH) == 0
+    assert area(together, canvas.CRASH) > 50
 
 
 def test_every_end_is_written_on_the_last_frame_only_and_a_crash_has_a_ring():
@@ -76,27 +79,26 @@ def test_every_end_is_written_on_the_last_frame_only_and_a_crash_has_a_ring():
     ended = {end: FramePainter(straight([0], [1], outcome=end)) for end in keys.END_EVENTS}
     assert len({painter.draw(19).tobytes() for painter in (cut_off, *ended.values())}) == 1 + len(keys.END_EVENTS)
     assert {painter.draw(18).tobytes() for painter in ended.values()} == {cut_off.draw(18).tobytes()}
-    assert area(road_of(ended["hard_crash"].draw(19))[60:], style.CRASH) > 500
+    assert area(road_of(ended["hard_crash"].draw(19))[60:], canvas.CRASH) > 500
 
 
 def test_lights_show_braking_and_the_lane_to_be_entered():
     calm = straight([0], [1])
     braking = replace(calm, acceleration=calm.acceleration - 3.0)
     signalling = replace(calm, target_lane=calm.target_lane + 1)
-    assert area(road_of(FramePainter(calm, drawing=BARE).draw(0)), style.BRAKE) == 0
-    assert area(road_of(FramePainter(braking, drawing=BARE).draw(0)), style.BRAKE) > 5
-    lit = road_of(FramePainter(signalling, drawing=BARE).draw(0))
-    assert area(lit, style.AMBER, 12) > 5
-    assert place(lit, style.AMBER, 12)[1] < place(lit, style.EGO)[1]
+    assert area(road_of(bare(calm)), canvas.BRAKE) == 0
+    assert area(road_of(bare(braking)), canvas.BRAKE) > 5
+    lit = road_of(bare(signalling))
+    assert area(lit, canvas.AMBER, 12) > 5
+    assert place(lit, canvas.AMBER, 12)[1] < place(lit, canvas.EGO)[1]
     # Indicators blink: dark half a second later.
-    assert area(road_of(FramePainter(signalling, drawing=BARE).draw(5)), style.AMBER, 12) == 0
+    assert area(road_of(bare(signalling, 5)), canvas.AMBER, 12) == 0
 
 
 def test_trails_lead_to_where_a_vehicle_came_from():
     scene = straight([0], [1], frames=40)
-    bare = FramePainter(scene, drawing=BARE).draw(39)
     trailed = FramePainter(scene, drawing=DrawingParameters(trail_s=2.0, speeds=False)).draw(39)
-    rows, columns = np.nonzero((bare != trailed).any(axis=-1))
+    rows, columns = np.nonzero((bare(scene, 39) != trailed).any(axis=-1))
     start = 0.38 * 1280 - 2.0 * 20.0 * 8
     assert columns.min() == pytest.approx(start, abs=4)
     assert columns.max() < 0.38 * 1280
@@ -105,32 +107,26 @@ def test_trails_lead_to_where_a_vehicle_came_from():
 
 def test_a_vehicle_that_was_put_elsewhere_leaves_no_trail_across_the_road():
     scene = straight([0, -50], [1, 2], frames=40)
-    x = scene.x.copy()
-    x[30:, 1] += 60.0
-    scene = replace(scene, x=x)
+    scene.x[30:, 1] += 60.0
     painter = FramePainter(scene, drawing=DrawingParameters(trail_s=3.0, speeds=False))
-    trailed, bare = painter.draw(39), FramePainter(scene, drawing=BARE).draw(39)
     left_lane = round(float(painter.window.row(8.0)))
-    upper_lane = slice(left_lane - 10, left_lane + 10)
-    changed = np.nonzero((trailed[upper_lane] != bare[upper_lane]).any(axis=(0, 2)))[0]
+    changed = (painter.draw(39) != bare(scene, 39))[left_lane - 10 : left_lane + 10].any(axis=(0, 2)).nonzero()[0]
     # Only what it drove in the nine frames since the jump, less half its own length.
     assert len(changed) == pytest.approx((9 * 2.0 - 2.25) * 8, abs=6)
 
 
 def test_padding_is_not_drawn():
-    scene = straight([0, 20], [1, 1])
-    hidden = scene.valid.copy()
-    hidden[:, 1] = False
-    tint = style.speed_tint(20.0)
-    assert area(road_of(FramePainter(scene, drawing=BARE).draw(0)), tint) > 200
-    assert area(road_of(FramePainter(replace(scene, valid=hidden), drawing=BARE).draw(0)), tint) == 0
+    scene, tint = straight([0, 20], [1, 1]), canvas.speed_tint(20.0)
+    assert area(road_of(bare(scene)), tint) > 200
+    scene.valid[:, 1] = False
+    assert area(road_of(bare(scene)), tint) == 0
 
 
 def test_the_leader_line_ends_at_the_leader():
     scene = straight([0, 50, 20], [1, 1, 2])
     painter = FramePainter(scene, drawing=DrawingParameters(0.0, False, leader_line=True))
     drawn, row = painter.draw(0), round(float(painter.window.row(4.0)))
-    columns = np.nonzero(np.abs(drawn[row].astype(int) - style.LEADER).max(axis=-1) < 3)[0]
+    columns = np.nonzero(np.abs(drawn[row].astype(int) - canvas.LEADER).max(axis=-1) < 3)[0]
     # From the ego's front to the rear of the leader: 45.5 m, the vehicle in the other lane is none.
     assert len(columns) == pytest.approx(45.5 * 8, abs=4)
 
@@ -140,10 +136,9 @@ def test_any_number_of_lanes_fits_between_header_and_footer(lanes):
     window = Window(WindowParameters(), lanes, 4.0)
     upper, lower = window.edges
     assert HEADER_HEIGHT < upper < lower < 320 - 20
-    vehicles = list(range(lanes))
-    picture = FramePainter(straight([15.0 * v for v in vehicles], vehicles, lanes=lanes)).draw(0)
+    picture = FramePainter(straight(15.0 * np.arange(lanes), range(lanes), lanes=lanes)).draw(0)
     # lanes - 1 broken marks and two edges: rows of the picture that are bright over at least a tenth of it.
-    bright = (np.abs(picture.astype(int) - style.MARK).max(axis=-1) < 6).mean(axis=1) > 0.15
+    bright = (np.abs(picture.astype(int) - canvas.MARK).max(axis=-1) < 6).mean(axis=1) > 0.15
     runs = np.sum(np.diff(np.concatenate([[0], bright[HEADER_HEIGHT:].astype(int)])) == 1)
     assert runs == lanes + 1
 

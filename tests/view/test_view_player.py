@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 import re
-from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
@@ -58,10 +57,8 @@ def test_reward_and_values_belong_to_the_decision_that_begins():
 
 def test_comfort_is_of_the_ego():
     time = np.arange(30) * 0.1
-    episode = straight([0, 50], [1, 1], frames=30)
     acceleration = np.stack([-2.0 * time, 9.0 * np.ones(30)], axis=1)
-    episode = replace(episode, acceleration=acceleration)
-    comfort = episode.comfort()
+    comfort = straight([0, 50], [1, 1], frames=30, acceleration=acceleration).comfort()
     assert comfort["hardest_braking"] == pytest.approx(-5.8)
     assert comfort["rms_acceleration"] == pytest.approx(np.sqrt(np.mean((2 * time) ** 2)), abs=1e-3)
     # 28 of 30 frames have a jerk of -2 m/s3.
@@ -73,11 +70,10 @@ def test_comfort_is_of_the_ego():
     ["</script><script>alert(1)</script>", "<!-- {{script}}", "a & b \"c\" 'd' \u2028", "<img src=x onerror=y>"],
 )
 def test_a_name_cannot_become_part_of_the_page(name):
-    episode = replace(straight([0], [1]), label=EpisodeLabel(name, "{{style}}"))
     plain = player_page([straight([0], [1])])
-    page = player_page([episode])
-    assert data_of(page)["episodes"][0]["agent"] == name
-    assert data_of(page)["episodes"][0]["traffic"] == "{{style}}"
+    page = player_page([straight([0], [1], label=EpisodeLabel(name, "{{style}}"))])
+    (shown,) = data_of(page)["episodes"]
+    assert (shown["agent"], shown["traffic"]) == (name, "{{style}}")
     for mark in ("<script", "</script", "<!--", "<img"):
         assert page.count(mark) == plain.count(mark), mark
 
@@ -96,15 +92,10 @@ def test_only_the_pages_own_scripts_may_run_and_nothing_may_be_loaded():
 def noisy(frames, vehicles=9):
     """Driving that does not compress: accelerations, headings and lateral positions of noise."""
     generator = np.random.default_rng(0)
-    episode = straight(np.arange(vehicles) * 30.0, [k % 3 for k in range(vehicles)], frames=frames)
-    shape = episode.x.shape
-    return replace(
-        episode,
-        y=episode.y + generator.normal(0, 0.05, shape),
-        heading=generator.normal(0, 0.01, shape),
-        speed=episode.speed + generator.normal(0, 0.3, shape),
-        acceleration=generator.normal(0, 1.0, shape),
-    )
+    episode = straight(np.arange(vehicles) * 30.0, np.arange(vehicles) % 3, frames=frames)
+    for name, spread in {"y": 0.05, "heading": 0.01, "speed": 0.3, "acceleration": 1.0}.items():
+        getattr(episode, name)[:] += generator.normal(0, spread, episode.x.shape)
+    return episode
 
 
 def test_three_episodes_of_four_minutes_stay_under_two_megabytes():

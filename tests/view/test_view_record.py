@@ -1,4 +1,4 @@
-"""A recorded episode is the episode that the environment drove."""
+"""A recorded episode is the episode that was driven, and written to a file it reads back like recorded traffic."""
 
 from __future__ import annotations
 
@@ -10,37 +10,43 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
+from view_scenes import straight
 
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmMobilTrafficConfig
-from ganlane.data import SyntheticTraffic, sort, synthetic_scenes
+from ganlane.data import SyntheticTraffic, read_scenes, scene_lane_widths, sort, synthetic_scenes
+from ganlane.data.schema import SCHEMA, TRACK_STRIDE, validate
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic import Recordings, ReplayTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
-from ganlane.view import record_episode
+from ganlane.view import EpisodeLabel, record_episode, to_tracks, write_tracks
+from ganlane.view.record import scene_names
 
 
-def always(action):
-    return TensorDictModule(lambda step: torch.full_like(step, action), in_keys=["step"], out_keys=["action"])
+def highway(goal_m=150.0, rows=1, lanes=3, vehicles=5):
+    episode = EpisodeParameters(goal_m=goal_m)
+    traffic = IdmMobilTraffic(Road(lanes=lanes))
+    return HighwayEnv(traffic, rows, vehicles=vehicles, episode=episode, stream=Stream.TRAIN)
 
 
-def highway(rows=1, goal_m=150.0, lanes=3, vehicles=5):
-    return HighwayEnv(
-        IdmMobilTraffic(Road(lanes=lanes)),
-        rows,
-        vehicles=vehicles,
-        episode=EpisodeParameters(goal_m=goal_m),
-        stream=Stream.TRAIN,
-    )
+def recorded(env, action=0, **options):
+    """The ego gives always the same command."""
+    always = TensorDictModule(lambda step: torch.full_like(step, action), in_keys=["step"], out_keys=["action"])
+    return record_episode(env, always, **{"seed": 0, "episode": 0, **options})
+
+
+@pytest.fixture(scope="module")
+def short():
+    return recorded(highway(goal_m=60.0))
 
 
 def test_the_recording_has_a_frame_per_physics_step():
     env = highway()
-    trajectory = record_episode(env, always(0), seed=4, episode=7, agent="keep_lane", traffic="idm_mobil")
+    trajectory = recorded(env, seed=4, episode=7, agent="keep_lane", traffic="idm_mobil")
     state = env.reset(env.reset().update({"seed": torch.tensor([4]), "episode": torch.tensor([7])}))
     assert trajectory.x[0] == pytest.approx(state["vehicles", "x"][0].double().numpy())
     while not state["done"].any():
@@ -56,34 +62,30 @@ def test_the_recording_has_a_frame_per_physics_step():
 
 def test_the_label_has_the_road_of_the_replayed_scene():
     """Three scenes of 2, 3 and 4 lanes: the environment's own road has the lanes of the widest."""
-    parts = [
-        synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=7.0), seed=k).with_columns(
-            scene=pl.lit(f"{2 + k} lanes")
+    scenes = pl.concat(
+        synthetic_scenes(SyntheticTraffic(scenes=1, lanes=lanes, seconds=7.0), seed=lanes - 2).with_columns(
+            scene=pl.lit(f"{lanes} lanes")
         )
-        for k in range(3)
-    ]
-    traffic = ReplayTraffic(recordings=Recordings.of(sort(pl.concat(parts)), "synthetic", 5.0))
-    env = HighwayEnv(traffic, 1, vehicles=5)
+        for lanes in (2, 3, 4)
+    )
+    traffic = ReplayTraffic(recordings=Recordings.of(sort(scenes), "synthetic", 5.0))
     names = traffic.scenes_of_episodes(0, range(10))
     for lanes in (2, 3, 4):
         episode = names.index(f"{lanes} lanes")
-        label = record_episode(env, always(0), seed=0, episode=episode, max_time_s=1.0).label
-        assert label.lanes == lanes
+        assert recorded(HighwayEnv(traffic, 1, vehicles=5), episode=episode, max_time_s=1.0).label.lanes == lanes
 
 
-def test_frames_are_one_step_of_driving_apart():
-    trajectory = record_episode(highway(goal_m=60.0), always(0), seed=0, episode=0)
-    moved = np.diff(trajectory.x, axis=0)
-    assert np.abs(moved - 0.1 * trajectory.speed[:-1]).max() < 0.05
-    assert trajectory.frame_s == pytest.approx(0.1)
-    assert not trajectory.overlapping().any()
-    assert not trajectory.jumped().any()
+def test_frames_are_one_step_of_driving_apart(short):
+    moved = np.diff(short.x, axis=0)
+    assert np.abs(moved - 0.1 * short.speed[:-1]).max() < 0.05
+    assert short.frame_s == pytest.approx(0.1)
+    assert not short.overlapping().any()
+    assert not short.jumped().any()
 
 
 def test_frames_a_second_apart_hold_no_jumps_of_who_just_drives():
-    whole = record_episode(highway(goal_m=200.0), always(0), seed=0, episode=0)
-    fields = {name: getattr(whole, name)[::10] for name in ("time_s", "x")}
-    coarse = replace(whole, **fields)
+    whole = recorded(highway(goal_m=200.0))
+    coarse = replace(whole, time_s=whole.time_s[::10], x=whole.x[::10])
     assert np.abs(np.diff(coarse.x, axis=0)).max() > 10.0
     assert not coarse.jumped().any()
     coarse.x[-1] += 301.0
@@ -93,31 +95,29 @@ def test_frames_a_second_apart_hold_no_jumps_of_who_just_drives():
 
 
 def test_a_command_off_the_road_ends_the_recording_at_once():
-    trajectory = record_episode(highway(lanes=1), always(1), seed=0, episode=0)
+    trajectory = recorded(highway(lanes=1), action=1)
     assert trajectory.outcome == "out_of_road"
     assert len(trajectory) == 1
 
 
-def test_the_batch_makes_no_difference_and_the_hook_is_taken_out_again():
-    env = highway(rows=3, goal_m=60.0)
-    trajectory = record_episode(env, always(0), seed=1, episode=5)
-    alone = record_episode(highway(goal_m=60.0), always(0), seed=1, episode=5)
-    assert np.array_equal(trajectory.x, alone.x)
+def test_the_batch_makes_no_difference_and_the_hook_is_taken_out_again(short):
+    env = highway(goal_m=60.0, rows=3)
+    assert np.array_equal(recorded(env).x, short.x)
     assert env.recorder is None
 
 
 def test_a_recording_can_be_cut_off():
-    trajectory = record_episode(highway(goal_m=5000.0), always(0), seed=0, episode=0, max_time_s=3.0)
+    trajectory = recorded(highway(goal_m=5000.0), max_time_s=3.0)
     assert trajectory.outcome == ""
     assert trajectory.time_s[-1] == pytest.approx(3.0)
 
 
 def test_an_environment_without_the_hook_cannot_be_recorded():
     with pytest.raises(UserError, match="HighwayEnv"):
-        record_episode(GymEnv("CartPole-v1"), always(0), seed=0, episode=0)
+        recorded(GymEnv("CartPole-v1"))
 
 
-def test_a_network_tells_its_values_and_the_rewards_add_up():
+def test_a_network_tells_its_values_and_the_rewards_add_up(short):
     """A policy of a Q-network leaves what it expected at each decision; others leave nothing."""
     config = EnvConfig(goal_m=60.0)
     driver = make_driver("agent_idm", config)
@@ -132,17 +132,91 @@ def test_a_network_tells_its_values_and_the_rewards_add_up():
     assert np.array_equal(reward[1:], np.repeat(reward[1::10], 10)[: len(reward) - 1])
     assert trajectory.returns[-1] == pytest.approx(reward[1::10].sum())
     assert len(np.unique(reward[1:])) > 1
-    assert record_episode(highway(goal_m=60.0), always(0), seed=0, episode=0).action_values.size == 0
+    assert short.action_values.size == 0
 
 
-def test_a_part_of_a_recording_keeps_its_numbers():
-    trajectory = record_episode(highway(goal_m=60.0), always(0), seed=0, episode=0)
-    later = trajectory.since(1.0)
+def test_a_part_of_a_recording_keeps_its_numbers(short):
+    later = short.since(1.0)
     assert later.time_s[0] == pytest.approx(1.0)
-    assert np.array_equal(later.x, trajectory.x[10:])
-    assert np.array_equal(later.reward, trajectory.reward[10:])
-    assert np.array_equal(later.since(1.5).jerk(), trajectory.jerk()[15:])
+    assert np.array_equal(later.x, short.x[10:])
+    assert np.array_equal(later.reward, short.reward[10:])
+    assert np.array_equal(later.since(1.5).jerk(), short.jerk()[15:])
     assert later.jerk()[:2].any()
-    assert later.outcome == trajectory.outcome
+    assert later.outcome == short.outcome
     with pytest.raises(UserError, match="choose a part"):
-        trajectory.since(1000.0)
+        short.since(1000.0)
+
+
+# Tracks
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    """Two episodes of a dozen seconds, in which MOBIL changes lanes."""
+    env = highway(goal_m=200.0, vehicles=9)
+    return [recorded(env, episode=number, agent="keep_lane") for number in (0, 1)]
+
+
+def test_parquet_comes_back_exactly(episodes, tmp_path):
+    read = read_scenes(write_tracks(episodes, tmp_path / "simulated.parquet", "parquet"))
+    assert read.schema == SCHEMA
+    assert read["scene"].unique().sort().to_list() == ["keep_lane_traffic_0_0", "keep_lane_traffic_0_1"]
+    for episode, (_, scene) in zip(episodes, read.group_by("scene", maintain_order=True)):
+        assert scene.equals(to_tracks(episode, scene["scene"][0]))
+        one = scene.filter(pl.col("vehicle") == 3)
+        assert one["x"].to_numpy() == pytest.approx(episode.x[:, 3])
+        assert one["speed"].to_numpy() == pytest.approx(episode.speed[:, 3])
+
+
+def test_csv_comes_back_through_the_reader_of_recordings(episodes, tmp_path):
+    read, exact = (read_scenes(write_tracks(episodes, tmp_path / f"a.{kind}", kind)) for kind in ("csv", "parquet"))
+    same = ["scene", "vehicle", "frame", "x", "speed", "lane", "length", "width"]
+    assert read.select(same).equals(exact.select(same))
+    # The reader works out the width of the lanes from the positions.
+    assert (read["y"] - exact["y"]).abs().max() < 0.05
+    assert list(scene_lane_widths(read).values()) == pytest.approx([4.0, 4.0], abs=0.02)
+
+
+def test_csv_counts_lanes_from_the_left(tmp_path):
+    path = write_tracks([straight([0, 30], [0, 2], frames=12)], tmp_path / "a.csv", "csv")
+    right, left = (pl.read_csv(path).filter(pl.col("vehicle") == vehicle) for vehicle in (0, 1))
+    assert set(right["lane"]) == {3}
+    assert set(left["lane"]) == {1}
+    assert right["y"].to_numpy() == pytest.approx(np.full(12, -8.0))
+    assert left["y"].to_numpy() == pytest.approx(np.zeros(12))
+    assert left["v"].to_numpy() == pytest.approx(np.full(12, 20.0))
+
+
+def test_episodes_that_would_share_a_name_are_numbered():
+    labels = [EpisodeLabel(f"{folder}/agent.safetensors", "idm", 0, 3) for folder in "ab"]
+    names = scene_names([*labels, EpisodeLabel("mobil", "idm", 0, 3)])
+    assert names == ["agent_idm_0_3", "agent_idm_0_3-2", "mobil_idm_0_3"]
+
+
+def test_what_cannot_be_tracks_leaves_no_file(tmp_path):
+    scene = straight([0], [0])
+    with pytest.raises(UserError, match="no episode"):
+        write_tracks([], tmp_path / "a.csv", "csv")
+    with pytest.raises(UserError, match="physics step"):
+        write_tracks([replace(scene, time_s=10 * scene.time_s)], tmp_path / "a.parquet", "parquet")
+    assert not list(tmp_path.iterdir())
+
+
+def test_tracks_have_the_form_of_recorded_traffic():
+    trajectory = straight([0, 30], [0, 2], frames=12)
+    tracks = to_tracks(trajectory, "film")
+    assert tracks.schema == SCHEMA
+    assert validate(tracks, "film").height == 24
+    second = tracks.filter(tracks["vehicle"] == 1)
+    assert second["x"].to_list() == pytest.approx(trajectory.x[:, 1].tolist())
+    assert second["frame"].to_list() == list(range(12))
+    assert set(second["lane"]) == {2}
+
+
+def test_a_recycled_vehicle_begins_a_new_track_and_padding_is_left_out():
+    trajectory = straight([0, 30, 60], [0, 1, 2], frames=12)
+    trajectory.x[5:, 1] += 300.0
+    trajectory.valid[:, 2] = False
+    tracks = to_tracks(trajectory)
+    assert set(tracks["vehicle"]) == {0, 1, 1 + TRACK_STRIDE}
+    assert tracks.filter(tracks["vehicle"] == 1).height == 5

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import select
@@ -13,15 +12,8 @@ from contextlib import contextmanager
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-dev-shm-usage",
-    "--disable-extensions",
-    "--disable-background-networking",
-    "--no-first-run",
-    "--mute-audio",
-    "--remote-debugging-pipe",
+    *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-extensions"),
+    *("--disable-background-networking", "--no-first-run", "--mute-audio", "--remote-debugging-pipe"),
     "--window-size=1200,900",
 )
 _PATIENCE_S = 60.0
@@ -67,10 +59,6 @@ class Page:
         self._send(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
         )
-
-    def screenshot(self):
-        """The picture of what is to be seen, PNG."""
-        return base64.b64decode(self._send("Page.captureScreenshot", format="png")["data"])
 
     def click(self, selector, share=0.5):
         """A real click into an element, at this share of its width."""
@@ -144,9 +132,7 @@ def browser_page(browser, profile):
 
     process = subprocess.Popen(
         [browser, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+        **dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL),
         preexec_fn=as_three_and_four,
         pass_fds=(3, 4),
         start_new_session=True,

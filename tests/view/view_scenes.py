@@ -11,25 +11,20 @@ from ganlane.view import EpisodeLabel, Trajectory
 def straight(positions, lanes_of, frames=20, lanes=3, speed=20.0, outcome="", **changed):
     """Vehicles that start at ``positions`` (m) in ``lanes_of`` and all drive at ``speed`` for ``frames`` frames."""
     time = np.arange(frames) * 0.1
-    m = len(positions)
-    full = np.ones((frames, m))
+    full = np.ones((frames, len(positions)))
+    constant = {"heading": 0.0, "speed": speed, "acceleration": 0.0, "length": 4.5, "width": 2.5}
     fields = {
         "label": EpisodeLabel("mobil", "idm", 1, 2, lanes, 4.0),
         "time_s": time,
-        "x": np.asarray(positions, float) + np.outer(time, np.full(m, speed)),
+        "x": np.asarray(positions, float) + speed * time[:, None],
         "y": full * np.asarray(lanes_of, float) * 4.0,
-        "heading": 0.0 * full,
-        "speed": speed * full,
-        "acceleration": 0.0 * full,
-        "length": 4.5 * full,
-        "width": 2.5 * full,
+        **{name: value * full for name, value in constant.items()},
         "target_lane": (full * np.asarray(lanes_of)).astype(np.int64),
         "valid": full.astype(bool),
         "action": np.zeros(frames, np.int64),
         "returns": np.zeros(frames),
-        "outcome": outcome,
     }
-    return Trajectory(**{**fields, **changed})
+    return Trajectory(**{**fields, "outcome": outcome, **changed})
 
 
 def area(picture, colour, tolerance=6):

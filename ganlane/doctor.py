@@ -262,7 +262,7 @@ def _weights(path: Path) -> Finding:
 
 def recordings() -> Finding:
     """The recordings used with ``data.path=null``; needed for fitting and realism, not for training or driving."""
-    from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
+    from ganlane.data.sources import DATA_VARIABLE, SCENES, default_scenes
 
     try:
         path = default_scenes()

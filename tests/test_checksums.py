@@ -14,8 +14,7 @@ from safetensors.torch import save_file
 
 from ganlane.agents import read_agent
 from ganlane.checksums import PLACE, has_checksum, sealed, sealed_archive
-from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes
-from ganlane.data.scenes import write_prepared
+from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes, write_prepared
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator

@@ -9,9 +9,8 @@ new one during the 0.5 s after, without interruption. A vehicle that only touche
 starts at the first sample at which the vehicle is within 0.3 m of the old lane's centre or moves towards the new
 lane at less than 0.1 m/s; ``tau_s`` is the time in between. ``tau_e`` is the time from the crossing to the first
 sample within 0.3 m of the new lane's centre or slower than 0.1 m/s. The lateral speed is the mean over 1 s,
-centred, since recorded positions are noisy. The offset alone is not enough: a fitted road is accurate to a few
-decimetres, and drivers keep an offset from the centre. Where the track ends first, the change is censored on that
-side: its time is a lower bound.
+centred, since recorded positions are noisy; the offset alone is not enough, since a fitted road is accurate to a few
+decimetres and drivers keep an offset. Where the track ends first, the change is censored on that side.
 """
 
 from __future__ import annotations
@@ -35,16 +34,11 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-#: Minimum time in the old lane before the change, and in the new lane after it, s.
-HOLD_S: Final = 0.5
-#: Offset from the lane's centre below which the change has not begun or is over, m.
-CENTRED_M: Final = 0.3
-#: Lateral speed towards the new lane below which the change has not begun or is over, m/s.
-STILL_MPS: Final = 0.1
-#: Half the window of the mean lateral speed, s.
-SPEED_HALF_WINDOW_S: Final = 0.5
-#: Longest search for start and end, before and after the crossing, s.
-SEARCH_S: Final = 20.0
+#: Samples, 0.1 s each: least in the old lane before a change and in the new one after it; half the window of the mean
+#: lateral speed; longest search for start and end, before and after the crossing.
+_HOLD, _HALF_WINDOW, _REACH = 5, 5, 200
+#: Offset from the lane's centre and lateral speed below which the change has not begun or is over, m and m/s.
+_CENTRED_M, _STILL_MPS = 0.3, 0.1
 
 
 def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
@@ -57,8 +51,7 @@ def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
 
 def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
     """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
-    counts = frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1)
-    return {str(scene): int(lanes) for scene, lanes in counts.iter_rows()}
+    return dict(frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows())
 
 
 def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
@@ -76,7 +69,7 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
     Raises:
         UserError: the estimate is below 2 m or above 6 m.
     """
-    guess = _median_spacing(y, lane)
+    guess = _median_spacing(*_centres(y, lane))
     if guess is None:
         return STANDARD_LANE_WIDTH_M
     if not _PLAUSIBLE_M[0] <= guess <= _PLAUSIBLE_M[1]:
@@ -94,11 +87,9 @@ def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
     Each lane's median position gives an estimate of the centre; their median is returned.
     """
     numbers, centres = _centres(y, lane)
-    spacing = _median_spacing(y, lane)
-    if spacing is None:
-        centre = float(np.median(y - lane * STANDARD_LANE_WIDTH_M))
-    else:
-        centre = float(np.median(centres - numbers * spacing))
+    spacing = _median_spacing(numbers, centres)
+    from_0 = y - lane * STANDARD_LANE_WIDTH_M if spacing is None else centres - numbers * spacing
+    centre = float(np.median(from_0))
     return lane_width(y - centre, lane, scene), centre
 
 
@@ -116,9 +107,8 @@ def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
     return float(edges[nearest]), float(edges[nearest + 1])
 
 
-def _median_spacing(y: Floats, lane: Integers) -> float | None:
+def _median_spacing(numbers: Integers, centres: Floats) -> float | None:
     """Median slope between the lanes' median positions; None with fewer than two lanes."""
-    numbers, centres = _centres(y, lane)
     if len(numbers) < 2:
         return None
     one, other = np.triu_indices(len(numbers), 1)
@@ -242,7 +232,7 @@ def _crossings(lane: Integers, tracks: Tracks) -> Integers:
     """[C] last samples in an old lane, where both the old and the new lane are kept long enough."""
     starts_run = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
     lengths = np.diff(np.flatnonzero(starts_run), append=len(lane))
-    long_enough = lengths >= round(HOLD_S / FRAME_S)
+    long_enough = lengths >= _HOLD
     run = np.cumsum(starts_run) - 1
     after = np.flatnonzero(starts_run & ~tracks.begins)
     return after[long_enough[run[after]] & long_enough[run[after - 1]]] - 1
@@ -256,13 +246,12 @@ def _find_end(
     Returns:
         [C] the samples, or the first or last samples of their tracks; and [C] whether the end lies within the track.
     """
-    reach = round(SEARCH_S / FRAME_S)
     limit = (tracks.first if direction < 0 else tracks.last)[sample]
-    path = sample[:, None] + direction * np.arange(reach + 1)
+    path = sample[:, None] + direction * np.arange(_REACH + 1)
     inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
     path = np.where(inside, path, limit[:, None])
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    done = (np.abs(offset) < CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < STILL_MPS)
+    done = (np.abs(offset) < _CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < _STILL_MPS)
     done &= inside
     found = done.any(axis=1)
     at = np.where(found, done.argmax(axis=1), inside.sum(axis=1) - 1)
@@ -271,7 +260,6 @@ def _find_end(
 
 def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
     """Mean lateral speed over 1 s, centred at the samples ``at``, m/s; the window is shorter at a track's ends."""
-    half = round(SPEED_HALF_WINDOW_S / FRAME_S)
-    before = np.maximum(at - half, tracks.first[at])
-    after = np.minimum(at + half, tracks.last[at])
+    before = np.maximum(at - _HALF_WINDOW, tracks.first[at])
+    after = np.minimum(at + _HALF_WINDOW, tracks.last[at])
     return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * FRAME_S)

@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from ganlane import keys
-from ganlane.data.scenes import scene_csv, write_prepared
+from ganlane.data.recordings import scene_csv, write_prepared
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError
 from ganlane.files import atomic_path

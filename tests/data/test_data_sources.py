@@ -1,4 +1,4 @@
-"""Where recordings are, and downloads from a server that breaks off, ignores Range or changes its file."""
+"""Where recordings are, downloads from a server in trouble, and synthetic recordings, in which nobody overlaps."""
 
 from __future__ import annotations
 
@@ -6,10 +6,23 @@ import errno
 import sys
 from pathlib import Path
 
+import polars as pl
 import pytest
 from reference.file_server import CONTENT, SHA256, Server
 
-from ganlane.data import byte_progress, data_folder, default_scenes, download
+from ganlane.data import (
+    SyntheticTraffic,
+    byte_progress,
+    data_folder,
+    default_scenes,
+    download,
+    find_lane_changes,
+    leader_gaps,
+    scene_lane_counts,
+    synthetic_scenes,
+    tracks_of_frame,
+    validate,
+)
 from ganlane.errors import UserError
 
 QUICK = {"timeout_s": 5.0, "attempts": 3, "wait_s": 0.01}
@@ -39,8 +52,9 @@ def test_a_file_arrives_whole_with_progress(tmp_path):
         ({"breaks": [300_000, 500_000]}, [None, "bytes=300000-", "bytes=800000-"]),
         ({"breaks": [300_000], "ranges": False}, [None, "bytes=300000-"]),
         ({"breaks": [300_000], "etag": None}, [None, None]),
+        *(({"length": length}, [None]) for length in ("abc", "-5", "", "1e3")),
     ],
-    ids=["resumed", "server ignores Range", "no version"],
+    ids=["resumed", "server ignores Range", "no version", *(["invalid length"] * 4)],
 )
 def test_a_broken_transfer_resumes_only_where_server_and_version_allow(server, ranges, tmp_path):
     with Server(**server) as running:
@@ -108,20 +122,22 @@ def test_a_failing_server_is_tried_again_and_an_absent_one_is_named(tmp_path):
         fetch(server, tmp_path / "f")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-def test_a_full_disk_is_reported_at_once_and_not_as_a_network_error(tmp_path):
-    (tmp_path / ".f.part").symlink_to("/dev/full")
-    with Server() as server, pytest.raises(OSError, match="No space left") as caught:
+@pytest.mark.parametrize(
+    ("spoil", "number"),
+    [
+        pytest.param(
+            lambda part: part.symlink_to("/dev/full"),
+            errno.ENOSPC,
+            marks=pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full"),
+        ),
+        (Path.mkdir, errno.EISDIR),
+    ],
+)
+def test_an_error_of_the_disk_is_reported_at_once_and_not_as_a_network_error(spoil, number, tmp_path):
+    spoil(tmp_path / ".f.part")
+    with Server() as server, pytest.raises(OSError) as caught:  # noqa: PT011
         fetch(server, tmp_path / "f", SHA256)
-    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "f"))
-    assert len(server.asked) == 1
-
-
-def test_a_disk_error_of_the_part_names_the_file(tmp_path):
-    (tmp_path / ".f.part").mkdir()
-    with Server() as server, pytest.raises(IsADirectoryError) as caught:
-        fetch(server, tmp_path / "f", SHA256)
-    assert caught.value.filename == str(tmp_path / "f")
+    assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "f"))
     assert len(server.asked) == 1
 
 
@@ -150,20 +166,14 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
 
 def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("GANLANE_DATA", raising=False)
-    module = sys.modules["ganlane.data.download"]
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "download.py"))
+    module = sys.modules["ganlane.data.sources"]
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "sources.py"))
     work = tmp_path / "work"
     work.mkdir()
     monkeypatch.chdir(work)
     assert data_folder() is None
     (tmp_path / "shared" / "data").mkdir(parents=True)
     assert data_folder() == tmp_path / "shared" / "data"
-
-
-@pytest.mark.parametrize("length", ["abc", "-5", "", "1e3"])
-def test_an_invalid_content_length_is_ignored(length, tmp_path):
-    with Server(length=length) as server:
-        assert fetch(server, tmp_path / "f", SHA256).read_bytes() == CONTENT
 
 
 @pytest.mark.parametrize("length", [True, False, "9" * 5000])
@@ -183,3 +193,31 @@ def test_no_redirection_leads_away_from_http(place, tmp_path):
 def test_a_redirection_on_http_is_followed(tmp_path):
     with Server() as server, Server(sends_to=server.url) as first:
         assert fetch(first, tmp_path / "f", SHA256).read_bytes() == CONTENT
+
+
+def test_a_seed_makes_one_recording_and_another_seed_another():
+    assert synthetic_scenes(seed=1).equals(synthetic_scenes(seed=1))
+    assert not synthetic_scenes(seed=1).equals(synthetic_scenes(seed=2))
+    one, other = synthetic_scenes(seed=1).partition_by("scene", include_key=False)
+    assert not one.equals(other)
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 5])
+def test_it_fits_the_schema_and_uses_every_lane(lanes):
+    made = synthetic_scenes(SyntheticTraffic(lanes=lanes))
+    assert validate(made, "made").equals(made)
+    assert set(scene_lane_counts(made).values()) == {lanes}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nobody_comes_near_another_along_the_road(seed):
+    # All put into one lane, the smallest gap is still that between slots less the sway of both.
+    one_lane = synthetic_scenes(seed=seed).with_columns(lane=pl.lit(0, pl.Int64))
+    assert leader_gaps(one_lane)["gap"].min() > 2.0
+
+
+def test_the_share_of_changing_vehicles_is_found_by_the_detector():
+    for changing, wander_m in ((40, 0.0), (0, SyntheticTraffic.wander_m)):
+        traffic = SyntheticTraffic(scenes=1, vehicles=40, changing_share=changing / 40, wander_m=wander_m)
+        tracks = tracks_of_frame(synthetic_scenes(traffic), {"synthetic-0": 3.5})
+        assert len(find_lane_changes(tracks)) == changing

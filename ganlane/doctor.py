@@ -274,7 +274,7 @@ def recordings() -> Finding:
 
 def cache() -> Finding:
     """The folder in which groups of windows are kept between fits."""
-    from ganlane.generator.windows import CACHE_VARIABLE, cache_folder
+    from ganlane.generator.checkpoint import CACHE_VARIABLE, cache_folder
 
     folder = cache_folder()
     if folder is None:

@@ -18,8 +18,8 @@ from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes, write_
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
-from ganlane.generator.fit import FitLoop
-from ganlane.generator.windows import cached, load_arrays, save_arrays
+from ganlane.generator.checkpoint import cached, load_arrays, save_arrays
+from ganlane.generator.tasks import FitLoop
 from ganlane.parameters.generator import LoopConfig, PaperConfig
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 from ganlane.weights import load_weights, save_weights

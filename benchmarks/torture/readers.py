@@ -28,8 +28,7 @@ from ganlane.data import (
 )
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.windows import CACHE_VARIABLE, cached
+from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
 from ganlane.parameters.data import NgsimParameters
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 from ganlane.sim.scene_files import read_scene

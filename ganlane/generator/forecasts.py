@@ -20,17 +20,27 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
-from ganlane.generator.closed_loop import displacement_of, moved_by
-from ganlane.generator.networks import Generator
-from ganlane.generator.rollout import (
+from ganlane.generator.checkpoint import Metrics
+from ganlane.generator.closed_loop import (
     common_driver_params,
+    displacement_of,
     driven_positions,
     evaluation_params,
-    rollout_as_fitted,
+    moved_by,
+    rollout,
     typical_driver_params,
 )
-from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks, Segments, segment_batches
-from ganlane.generator.windows import Groups, Windows, cut_windows
+from ganlane.generator.networks import Generator
+from ganlane.generator.windows import (
+    OBSERVED_POSITIONS,
+    PRESENT,
+    Groups,
+    SceneTracks,
+    Segments,
+    Windows,
+    cut_windows,
+    segment_batches,
+)
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V, following_acceleration
@@ -47,8 +57,6 @@ TRUCK_M = 6.0
 SIDEWAYS_M = 0.1
 #: Keeps the gradient of a distance of 0 finite; 0.1 mm.
 _SMALLEST_DISTANCE_M = 1e-4
-#: ``{"all" or scene: {"ERROR/KIND": value}}``.
-Metrics = dict[str, dict[str, float]]
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
 Forecasts = dict[str, np.ndarray]
 Row = dict[str, Any]
@@ -205,10 +213,9 @@ def paper_forecasts(
 def driven_windows(
     driver: Callable[[Segments], Tensor], scenes: list[SceneTracks], horizon: int, stride: int, samples: int = 1
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames.
+    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames: the vehicles recorded throughout a segment.
 
-    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K = ``samples``
-    samples. The vehicles that were recorded throughout a segment are the windows.
+    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K = ``samples``.
     """
     forecasts = []
     for scene in scenes:
@@ -235,7 +242,7 @@ def calibrated_forecasts(
         shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        return rollout_as_fitted(generator, segments, evaluation_params(segments, config), noise, config)
+        return rollout(generator, segments, evaluation_params(segments, config), noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]

@@ -1,4 +1,4 @@
-"""What is fitted: the losses, updates and scores of both presets.
+"""What is fitted: the losses, updates and scores of both presets, and the loop that runs them.
 
 **paper**, open loop: adversarial, variety, single-sample and mean terms on k-means groups of windows. Losses after
 Gupta et al. (2018), with the changes that the fit needs here.
@@ -9,22 +9,44 @@ two samples, whose loss is the energy score; both are divided, step by step, by 
 
 from __future__ import annotations
 
+import io
+import math
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ganlane.generator.forecasts import BASELINE, Metrics, distance, paper_forecasts, repeated, scene_metrics
-from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
-from ganlane.generator.rollout import (
+from ganlane.checksums import has_checksum, note_without_checksum, sealed_archive
+from ganlane.errors import UserError
+from ganlane.files import write_bytes
+from ganlane.generator.checkpoint import Metrics
+from ganlane.generator.closed_loop import (
     common_driver_params,
     evaluation_params,
-    rollout_as_fitted,
+    rollout,
     sampled_driver_params,
 )
-from ganlane.generator.segments import SceneTracks, Segments, cut_segments, segment_batches, segment_starts
-from ganlane.generator.windows import PREDICTED_STEPS, Groups, Windows, cut_windows, group_windows
-from ganlane.parameters.generator import CalibratedConfig, PaperConfig
+from ganlane.generator.forecasts import BASELINE, distance, paper_forecasts, repeated, scene_metrics
+from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
+from ganlane.generator.windows import (
+    PREDICTED_STEPS,
+    Groups,
+    SceneTracks,
+    Segments,
+    Windows,
+    cut_segments,
+    cut_windows,
+    group_windows,
+    segment_batches,
+    segment_starts,
+)
+from ganlane.parameters.generator import CalibratedConfig, LoopConfig, PaperConfig
 
 #: Segments in one forward pass of an evaluation; bounds the memory.
 _SEGMENTS = 16
@@ -99,19 +121,19 @@ class PaperTask(_Networks):
         if config.mirror:
             groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         recorded = groups.displacements[groups.mask]
-        generated = self._samples(groups, self.config.history_noise)
+        generated = self._samples(groups, config.history_noise)
         losses = {}
-        if self.config.weights.adversarial > 0:
+        if config.weights.adversarial > 0:
             loss = discriminator_loss(self.discriminator(recorded), self.discriminator(generated[0].detach()))
-            descend(self.optimisers["discriminator"], loss, self.config.loop.largest_gradient)
+            descend(self.optimisers["discriminator"], loss, config.loop.largest_gradient)
             losses["discriminator"] = float(loss.detach())
-        observed = self.config.sizes.observed
+        observed = config.sizes.observed
         errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
         terms = {"variety": variety_loss(errors[:-1]), "single": errors[:-1].mean(), "mean": errors[-1].mean()}
-        if self.config.weights.adversarial > 0:
+        if config.weights.adversarial > 0:
             terms["adversarial"] = adversarial_loss(self.discriminator(generated[0]))
-        weighted = [getattr(self.config.weights, name) * term for name, term in terms.items()]
-        descend(self.optimisers["generator"], torch.stack(weighted).sum(), self.config.loop.largest_gradient)
+        weighted = [getattr(config.weights, name) * term for name, term in terms.items()]
+        descend(self.optimisers["generator"], torch.stack(weighted).sum(), config.loop.largest_gradient)
         return losses | {name: float(term.detach()) for name, term in terms.items()}
 
     def evaluate(self) -> float:
@@ -193,9 +215,8 @@ def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: Cali
             segments = batch.without_intentions()
             fresh = torch.randn(1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            drivers = evaluation_params(segments, config)
-            mean, one, other = rollout_as_fitted(generator, segments, drivers, noise, config)
-            future = segments.future
+            drivers, future = evaluation_params(segments, config), segments.future
+            mean, one, other = rollout(generator, segments, drivers, noise, config)
             errors = {
                 "mean": distance(mean, future),
                 "single": distance(one, future),
@@ -250,7 +271,7 @@ class CalibratedTask(_Networks):
         sampled = number % 2 == 1
         shape = (1 + segments.future.shape[1], 2 if sampled else 1, *segments.length.shape, config.sizes.noise)
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
-        positions = rollout_as_fitted(self.generator, segments, drivers, noise, config)
+        positions = rollout(self.generator, segments, drivers, noise, config)
         if sampled:
             name, losses = "energy", energy_score(positions[0], positions[1], segments.future)
         else:
@@ -278,3 +299,117 @@ class CalibratedTask(_Networks):
         segments = cut_segments([self.cuts[row] for row in rows.tolist()], horizon)
         flip = self.config.mirror and float(torch.rand((), generator=self.random)) < 0.5
         return segments.mirrored() if flip else segments
+
+
+Config = PaperConfig | CalibratedConfig
+Task = PaperTask | CalibratedTask
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State of a fit after ``update`` of at most ``updates``, ``seconds`` after the start of this run.
+
+    ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best`` the lowest.
+    """
+
+    update: int
+    updates: int
+    losses: dict[str, float]
+    score: float | None
+    best: float
+    seconds: float
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class FitLoop:
+    """Runs a task until it stops improving: updates, evaluations on validation scenes, early stopping.
+
+    ``path`` keeps the state after every evaluation; the fit resumes from it if it exists. ``seconds`` is the time of
+    the updates, those in earlier runs of the same fit too.
+    """
+
+    def __init__(self, task: Task, path: str | Path | None = None):
+        self.task, self.config = task, task.config.loop
+        self.path = None if path is None else Path(path)
+        self.done, self.waited, self.best_update, self.best = 0, 0, 0, math.inf
+        self.seconds = 0.0
+        self.best_weights: dict[str, dict[str, Tensor]] = {}
+        if self.path is not None and self.path.exists():
+            self._resume(self.path)
+
+    def run(self, on_progress: OnProgress | None = None) -> None:
+        """Fit, then put the best weights into the task's networks."""
+        begun, earlier, score = time.monotonic(), self.seconds, None
+        while self.done < self.config.updates and self.waited < self.config.patience:
+            for optimiser in self.task.optimisers.values():
+                optimiser.param_groups[0]["lr"] = learning_rate(self.config, self.done)
+            losses = self.task.update(self.done)
+            self.done += 1
+            seconds = time.monotonic() - begun
+            self.seconds = earlier + seconds
+            late = self.config.max_seconds is not None and seconds > self.config.max_seconds
+            if self.done % self.config.evaluate_every == 0 or self.done == self.config.updates or late:
+                score = self._evaluate()
+            if on_progress is not None:
+                on_progress(Progress(self.done, self.config.updates, losses, score, self.best, seconds))
+            if late:
+                break
+        for name, weights in self.best_weights.items():
+            self.task.modules[name].load_state_dict(weights)
+
+    def _evaluate(self) -> float:
+        score = self.task.evaluate()
+        self.waited += 1
+        if score < self.best:
+            self.best, self.best_update, self.waited = score, self.done, 0
+            self.best_weights = {name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()}
+        if self.path is not None:
+            # Tensors and plain data only.
+            state = {
+                "counters": [self.done, self.waited, self.best_update],
+                "best": self.best,
+                "seconds": self.seconds,
+                "best_weights": self.best_weights,
+                "modules": {name: module.state_dict() for name, module in self.task.modules.items()},
+                "optimisers": {name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()},
+                "random": self.task.random.get_state(),
+            }
+            file = io.BytesIO()
+            torch.save(state, file)
+            write_bytes(self.path, sealed_archive(file.getvalue()))
+        return score
+
+    def _resume(self, path: Path) -> None:
+        """Continue from a stored state; reading it never executes code."""
+        content = path.read_bytes()
+        whole = has_checksum(content, path)
+        try:
+            state = torch.load(io.BytesIO(content), weights_only=True)
+            if "counters" not in state:
+                raise ValueError("no counters")
+        except Exception as error:
+            raise UserError(
+                f"{path}: not the state of a fit; give the file that a fit keeps, or remove it."
+            ) from error
+        try:
+            for name, module in self.task.modules.items():
+                module.load_state_dict(state["modules"][name])
+            for name, optimiser in self.task.optimisers.items():
+                optimiser.load_state_dict(state["optimisers"][name])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise UserError(
+                f"{path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
+            ) from error
+        self.done, self.waited, self.best_update = state["counters"]
+        self.best, self.best_weights, self.seconds = state["best"], state["best_weights"], state["seconds"]
+        self.task.random.set_state(state["random"])
+        if not whole:
+            note_without_checksum(path)
+
+
+def learning_rate(config: LoopConfig, number: int) -> float:
+    """Linear warm-up, then a half cosine to 0."""
+    rise = min(1.0, (number + 1) / max(1, config.warmup))
+    return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))

@@ -1,28 +1,34 @@
-"""One step of each preset in closed loop."""
+"""One step of each preset in closed loop, and joint rollouts of recorded scenes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import silenced, small_generator
+from reference.small_networks import recorded_scenes, silenced, small_generator
 from reference.worlds import vehicles as placed
 
 from ganlane.generator.closed_loop import (
     ANCHOR,
+    HEADWAY_QUANTILES_S,
     STEEPEST,
     DriverMemory,
     Plan,
     anchored_step,
     displacement_of,
+    headway_from_uniform,
     inside_lane,
     moved_by,
     paper_step,
+    rollout,
+    sampled_driver_params,
     start,
+    typical_driver_params,
     wander,
 )
 from ganlane.generator.networks import Generator
-from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
-from ganlane.parameters.generator import EXTRA_INPUTS
+from ganlane.generator.windows import cut_segments
+from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.state import Road
@@ -108,10 +114,8 @@ def test_only_what_pushes_outwards_is_left_out():
 def test_nobody_rolls_back_or_slides_sideways():
     state = vehicles([0.0, 0.0], speed=0.0)
     after = moved_by(state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double())
-    assert after.x[0, 0].item() == 0.0
-    assert after.y[0, 0].item() == 0.0
-    assert after.y[0, 1].item() == pytest.approx(STEEPEST * 1.0)
-    assert after.heading[0, 1].item() == pytest.approx(math.atan(STEEPEST))
+    assert (after.x[0, 0].item(), after.y[0, 0].item()) == (0.0, 0.0)
+    assert (after.y[0, 1].item(), after.heading[0, 1].item()) == pytest.approx((STEEPEST, math.atan(STEEPEST)))
 
 
 def test_speed_and_heading_carry_the_whole_displacement():
@@ -133,11 +137,9 @@ def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
 
 
 def test_headways_have_the_quantiles_asked_for():
-    u = (torch.arange(100000) + 0.5) / 100000
-    levels = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
-    torch.testing.assert_close(
-        headway_from_uniform(u).quantile(levels), torch.tensor(HEADWAY_QUANTILES_S), atol=1e-3, rtol=0
-    )
+    headways = headway_from_uniform((torch.arange(100000) + 0.5) / 100000)
+    quantiles = headways.quantile(torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95]))
+    torch.testing.assert_close(quantiles, torch.tensor(HEADWAY_QUANTILES_S), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("execute_k", [1, 3])
@@ -153,3 +155,76 @@ def test_the_paper_drives_the_first_k_predictions_before_planning_anew(execute_k
         moved = torch.stack([state.x - before.x, state.y - before.y], -1)
         torch.testing.assert_close(moved, predicted[..., step, :])
     assert plan is None or (plan.left == 0).all()
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return recorded_scenes()
+
+
+@pytest.fixture
+def segments(scenes):
+    """The first scene from its start, for half a second."""
+    return cut_segments([(scenes[0], 0)], horizon=5)
+
+
+@pytest.fixture
+def generator():
+    return small_generator(EXTRA_INPUTS)
+
+
+def typical_rollout(generator, segments):
+    """Positions when every driver is typical and z = 0."""
+    drivers = typical_driver_params(segments)
+    noise = torch.zeros(1 + segments.future.shape[1], 1, *segments.length.shape, 4)
+    return rollout(generator, segments, drivers, noise, CalibratedConfig())[0]
+
+
+def test_a_rollout_is_the_same_with_more_padding(segments, generator):
+    pad = torch.nn.functional.pad
+    wide = replace(
+        segments,
+        positions=pad(segments.positions, (0, 0, 0, 4)),
+        present=pad(segments.present, (0, 4)),
+        target_lane=pad(segments.target_lane, (0, 4)),
+        length=pad(segments.length, (0, 4), value=1.0),
+        width=pad(segments.width, (0, 4), value=1.0),
+    )
+    torch.testing.assert_close(typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments))
+
+
+def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(scenes, generator):
+    segments = cut_segments([(scenes[0], 0)], horizon=9)
+    segments.present[:, :12, 2] = False
+    positions = typical_rollout(generator, segments)
+    torch.testing.assert_close(positions[:, :4, 2], segments.future[:, :4, 2])
+    assert not torch.allclose(positions[:, 4:, 2], segments.future[:, 4:, 2], atol=1e-5)
+    assert not segments.scored[0, :, 2].any()
+    # Where it goes later does not matter.
+    segments.positions[:, 14:, 2] += 5.0
+    torch.testing.assert_close(typical_rollout(generator, segments), positions)
+
+
+def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(scenes, generator):
+    segments = cut_segments([(scenes[0], 0), (scenes[1], 9)], horizon=6)
+    noise = torch.randn(7, 3, 2, 7, 4)
+    positions = rollout(generator, segments, typical_driver_params(segments), noise, CalibratedConfig())
+    (positions - segments.future).abs()[:, segments.scored].sum().backward()
+    for name, parameter in generator.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
+    before = typical_rollout(generator, segments.without_intentions())
+    segments.positions[:, 9:] += 7.0
+    segments.target_lane[:, 9:] = 0
+    torch.testing.assert_close(typical_rollout(generator, segments.without_intentions()), before)
+
+
+def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(segments):
+    one, other = (sampled_driver_params(segments, torch.Generator().manual_seed(4)) for _ in range(2))
+    assert all((a == b).all() for a, b in zip(one, other))
+    speed = (segments.positions[:, 8] - segments.positions[:, 7]).norm(dim=-1) * 10
+    assert (one[1] > speed + 0.99).all()

@@ -24,16 +24,16 @@ from ganlane.generator.forecasts import (
     scene_metrics,
     side_classifier_share,
 )
-from ganlane.generator.segments import scene_tracks
-from ganlane.generator.windows import Windows, cut_windows, group_windows
+from ganlane.generator.windows import Windows, cut_windows, group_windows, scene_tracks
 from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 
 
-def windows_in_lanes(lanes, lengths, future) -> Windows:
-    count = len(lanes)
-    positions = np.concatenate([np.zeros((count, 9, 2)), future], axis=1)
-    zero, scene = np.zeros(count, dtype=np.int64), np.arange(count) % 2
-    return Windows(positions, scene, zero, zero, zero, np.array(lanes), np.array(lengths, float), ("a", "b"))
+def windows_of(positions: np.ndarray, lanes=0, lengths=4) -> Windows:
+    """Windows at ``positions`` [W, T, 2] or, where they stand still before, with that future; scenes a, b in turn."""
+    if positions.shape[1] == 8:
+        positions = np.concatenate([np.zeros((len(positions), 9, 2)), positions], axis=1)
+    zero, scene = np.zeros(len(positions), dtype=np.int64), np.arange(len(positions)) % 2
+    return Windows(positions, scene, zero, zero, zero, zero + lanes, zero + np.array(lengths, float), ("a", "b"))
 
 
 def test_errors_by_hand():
@@ -57,25 +57,29 @@ def test_root_mean_square_after_whole_seconds():
     assert rmse["2 s"] == pytest.approx(np.sqrt(50.0))
 
 
+def sideways(*moves_m: float) -> np.ndarray:
+    """Positions [W, 8, 2] with these lateral positions at the end."""
+    positions = np.zeros((len(moves_m), 8, 2))
+    positions[:, -1, 1] = moves_m
+    return positions
+
+
 def test_direction_counts_only_who_moves_sideways():
-    recorded = np.zeros((4, 8, 2))
-    recorded[:, -1, 1] = [0.2, -0.2, 0.05, -0.3]
-    course = np.zeros((4, 8, 2))
-    course[:, -1, 1] = [0.01, 0.4, -1.0, -0.1]
+    recorded, course = sideways(0.2, -0.2, 0.05, -0.3), sideways(0.01, 0.4, -1.0, -0.1)
     scores = direction_scores({"own": course, "still": 0 * course}, recorded)
     assert scores["windows"] == 3
     assert scores["share_right"] == {"own": pytest.approx(2 / 3), "still": 0.0}
 
 
 def test_parts_are_lanes_and_classes_with_enough_windows():
-    windows = windows_in_lanes([1, 1, 1, 2, 2, 3], [4, 4, 4, 7, 7, 4], np.zeros((6, 8, 2)))
+    windows = windows_of(np.zeros((6, 8, 2)), [1, 1, 1, 2, 2, 3], [4, 4, 4, 7, 7, 4])
     parts = parts_of(windows, 2)
     assert {name: int(rows.sum()) for name, rows in parts.items()} == {"lane 1": 3, "lane 2": 2, "car": 4, "truck": 2}
 
 
 def test_every_part_is_held_against_the_baseline():
     future = np.ones((4, 8, 2))
-    windows = windows_in_lanes([1, 1, 2, 2], [4, 4, 4, 4], future)
+    windows = windows_of(future, [1, 1, 2, 2])
     forecasts = {"constant_velocity": future + 1.0, "mean": future + np.array([0.1, 0.1, 3.0, 3.0])[:, None, None]}
     scores = open_loop_scores(windows, forecasts, np.array([0, 0, 1, 1]), least_part=1)
     change = {name: row["ade_change_percent"]["mean"] for name, row in scores["parts"].items()}
@@ -87,10 +91,7 @@ def test_every_part_is_held_against_the_baseline():
 
 
 def test_over_the_whole_window_the_observed_move_counts_too():
-    recorded = np.zeros((2, 8, 2))
-    recorded[:, -1, 1] = [-0.05, 0.3]
-    course = np.zeros((2, 8, 2))
-    course[:, -1, 1] = [0.0, -0.1]
+    recorded, course = sideways(-0.05, 0.3), sideways(0.0, -0.1)
     scores = direction_scores({"own": course}, recorded, observed=np.array([0.4, 0.02]))
     assert scores == {"windows": 2, "share_right": {"own": 0.5}}
     assert direction_scores({"own": course}, recorded) == {"windows": 1, "share_right": {"own": 0.0}}
@@ -103,9 +104,7 @@ def test_the_side_classifier_finds_what_the_history_tells_and_no_more():
     fold = np.arange(count) % 2
     shares = []
     for source in (past, luck):
-        future = np.zeros((count, 8, 2))
-        future[:, -1, 1] = np.sign(source) * 0.3
-        windows = windows_in_lanes([1] * count, [4] * count, future)
+        windows = windows_of(sideways(*(np.sign(source) * 0.3)), 1)
         windows.positions[:, :9, 1] = past[:, None] * np.linspace(-1, 0, 9)
         shares.append(side_classifier_share(windows, fold))
     assert shares[0] > 0.98
@@ -113,7 +112,7 @@ def test_the_side_classifier_finds_what_the_history_tells_and_no_more():
 
 
 def test_nobody_moving_sideways_has_no_side():
-    windows = windows_in_lanes([1, 2], [4, 4], np.zeros((2, 8, 2)))
+    windows = windows_of(np.zeros((2, 8, 2)), [1, 2])
     assert side_classifier_share(windows, np.array([0, 1])) is None
     assert direction_scores({"own": windows.future}, windows.future)["share_right"] == {"own": None}
 
@@ -178,11 +177,6 @@ def test_idm_keeps_the_lateral_position(scenes):
 RANDOM = np.random.default_rng(0)
 
 
-def windows_of(positions: np.ndarray) -> Windows:
-    none = np.zeros(len(positions), dtype=np.int64)
-    return Windows(positions, none, none, none, none, none, none.astype(float), ("scene",))
-
-
 def course(start_mps: float, acceleration: float, frames: int = 17) -> np.ndarray:
     """Positions [1, frames, 2] of a vehicle whose displacement per 0.1 s changes by ``acceleration / 100`` m."""
     steps = start_mps * 0.1 + 0.01 * acceleration * np.arange(frames - 1)
@@ -192,11 +186,8 @@ def course(start_mps: float, acceleration: float, frames: int = 17) -> np.ndarra
 
 def test_steady_driving_is_foreseen_by_all():
     windows = windows_of(course(20.0, 0.0))
-    for positions in (
-        repeated(windows.past[:, -1], 8),
-        repeated(windows.past.mean(1), 8),
-        constant_acceleration(windows.past, 8),
-    ):
+    past = windows.past
+    for positions in (repeated(past[:, -1], 8), repeated(past.mean(1), 8), constant_acceleration(past, 8)):
         np.testing.assert_allclose(positions, windows.future, atol=1e-9)
     np.testing.assert_allclose(windows.future[0, :, 0], 2.0 * np.arange(1, 9))
 

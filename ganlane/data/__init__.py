@@ -33,6 +33,7 @@ from ganlane.data.sources import (
     data_folder,
     default_scenes,
     download,
+    recordings_path,
     synthetic_scenes,
 )
 from ganlane.data.statistics import (
@@ -74,6 +75,7 @@ __all__ = [
     "prepare_recordings",
     "read_recordings",
     "read_scenes",
+    "recordings_path",
     "scene_lane_counts",
     "scene_lane_widths",
     "sort",

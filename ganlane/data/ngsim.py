@@ -221,10 +221,10 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
     again = (pl.col("vehicle_id").diff() == 0) & (pl.col("global_time").diff() == 0)
     values = [name for name in COLUMNS if name not in ("vehicle_id", "global_time")]
     equal = pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in values)
-    again, equal = rows.select(again=again.fill_null(False), equal=equal.fill_null(False)).get_columns()
-    count.drop("duplicate", (again & equal).sum())
-    count.drop("same vehicle and time, other values", (again & ~equal).sum())
-    return rows.filter(~again)
+    repeated, same = rows.select(again.fill_null(False).alias("again"), equal.fill_null(False)).get_columns()
+    count.drop("duplicate", (repeated & same).sum())
+    count.drop("same vehicle and time, other values", (repeated & ~same).sum())
+    return rows.filter(~repeated)
 
 
 def _check_order(rows: pl.DataFrame, path: Path) -> None:

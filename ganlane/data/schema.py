@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, SupportsInt
 
 import polars as pl
 
@@ -78,9 +78,9 @@ class RowCount:
         """Rows read and not dropped."""
         return self.read - self.dropped.total()
 
-    def drop(self, reason: str, rows: int) -> None:
+    def drop(self, reason: str, rows: SupportsInt) -> None:
         """Count ``rows`` dropped for ``reason``."""
-        if rows:
+        if int(rows):
             self.dropped[reason] += int(rows)
 
 

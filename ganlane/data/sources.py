@@ -35,6 +35,7 @@ from tqdm import tqdm
 from ganlane.data.schema import FRAME_S, SCHEMA, OnProgress, sort
 from ganlane.errors import UserError
 from ganlane.files import write_json
+from ganlane.parameters.data import DataConfig, NgsimDataConfig
 
 #: Environment variable with the folder of the recordings.
 DATA_VARIABLE: Final = "GANLANE_DATA"
@@ -79,6 +80,21 @@ def default_scenes() -> Path:
         f"no recordings found (looked for {looked}); give data.path=FILE with a scene CSV, "
         f"or set {DATA_VARIABLE} to a folder that holds {SCENES}."
     )
+
+
+def recordings_path(data: DataConfig) -> Path:
+    """Path of the recordings that the group ``data`` names, downloaded first if asked for.
+
+    Raises:
+        UserError: there is no path and no default, or an error of :func:`download`.
+    """
+    if data.format != "scenes" and data.path is None:
+        raise UserError(f"data={data.format}: which file is missing; give data.path=FILE.")
+    path = Path(data.path) if data.path else default_scenes()
+    if isinstance(data, NgsimDataConfig) and data.download:
+        with byte_progress("download") as progress:
+            download(data.url, path, data.sha256, progress)
+    return path
 
 
 class _BrokenConnection(Exception):

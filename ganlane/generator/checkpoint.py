@@ -40,11 +40,10 @@ _ADDED_LATER = {"differences"}
 
 @dataclass(frozen=True)
 class FitResult:
-    """A fitted generator and what it was fitted with.
+    """A fitted generator (``module``) and what it was fitted with.
 
     Attributes:
-        module: the generator with the weights that were best on the validation scenes.
-        metrics: of these weights on the held-out scenes, for ``"all"`` and each scene; the paper's preset also has
+        metrics: on the held-out scenes, for ``"all"`` and each scene; the paper's preset also has
             ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored together.
         config: settings of the fit, as plain data.
         data: file, rows and tracks, and the names of the fitted, validation and held-out scenes.
@@ -103,11 +102,13 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         raise UserError(
             f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one."
         )
-    sizes = metadata.get("sizes")
+    sizes: Any = metadata.get("sizes")
     kinds = {field.name: type(field.default) for field in fields(GeneratorSizes)}
     complete = isinstance(sizes, dict) and set(kinds) - _ADDED_LATER <= set(sizes) <= set(kinds)
     # The bound keeps a damaged file from requesting all memory.
-    if not complete or not all(type(value) is kinds[name] and 0 <= value <= 4096 for name, value in sizes.items()):
+    if not complete or not all(
+        isinstance(value, int) and 0 <= value <= 4096 and type(value) is kinds[name] for name, value in sizes.items()
+    ):
         raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(kinds)}); fit it again.")
     try:
         with torch.random.fork_rng(devices=[]):
@@ -153,12 +154,11 @@ def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) ->
     if folder is None:
         return compute()
     path = folder / f"{name}_{key}.npz"
-    kept = load_arrays(path)
-    if kept is not None:
-        return kept
-    arrays = compute()
-    with suppress(OSError):
-        save_arrays(path, arrays)
+    arrays = load_arrays(path)
+    if arrays is None:
+        arrays = compute()
+        with suppress(OSError):
+            save_arrays(path, arrays)
     return arrays
 
 

@@ -39,9 +39,6 @@ from ganlane.sim.state import Road, Vehicles
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3
-_SLOWEST_MPS = 1e-3
-#: Keeps the gradient of a speed of 0 finite, m/s.
-_TINY = 1e-6
 #: The body keeps this distance from the lane's edge; outward residuals fade over the distance before it, m.
 _MARGIN_M, _FADE_M = 0.1, 0.3
 #: Levels of the headway quantiles.
@@ -61,10 +58,9 @@ _SCATTER = 0.25
 class History(NamedTuple):
     """Past motions of [N, M] vehicles.
 
-    Attributes:
-        motions: observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest first. Separate
-            tensors, because a single one would be copied whole at every step.
-        displacement: [N, M, 2], the newest motion's displacement, m per 0.1 s.
+    ``motions`` are observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest first; separate
+    ones, because a single one would be copied whole at every step. ``displacement`` [N, M, 2] is the newest motion's,
+    m per 0.1 s.
     """
 
     motions: tuple[Tensor, ...]
@@ -114,12 +110,13 @@ def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehi
     forward = velocity_x.clamp_min(0.0)
     limit = STEEPEST * forward
     lateral = torch.maximum(torch.minimum(velocity_y, limit), -limit)
-    speed = torch.sqrt(forward * forward + lateral * lateral + _TINY * _TINY)
+    # The small terms keep the gradient at a speed of 0 finite.
+    speed = torch.sqrt(forward * forward + lateral * lateral + 1e-6 * 1e-6)
     return vehicles.with_(
         x=vehicles.x + forward * PHYSICS_STEP_S,
         y=vehicles.y + lateral * PHYSICS_STEP_S,
         speed=speed,
-        heading=torch.atan(lateral / forward.clamp_min(_SLOWEST_MPS)),
+        heading=torch.atan(lateral / forward.clamp_min(1e-3)),
         acceleration=(speed - vehicles.speed) / PHYSICS_STEP_S,
     )
 
@@ -223,12 +220,10 @@ def anchored_step(
     noise: Tensor,
     parameters: AnchorParameters = ANCHOR,
 ) -> tuple[Vehicles, DriverMemory]:
-    """One step of the calibrated preset: vehicles 0.1 s later and their new memory.
+    """One step of the calibrated preset: vehicles [N, M] 0.1 s later and their new memory.
 
-    Args:
-        vehicles: [N, M]; ``target_lane`` is the lane to keep or to change to, ``desired_speed`` is the driver's own.
-        road: one per row in recorded scenes.
-        noise: latent vectors [N, M, Z]; zeros give the mean driver.
+    The vehicles' ``target_lane`` is the lane to keep or to change to, ``desired_speed`` the driver's own; ``road`` is
+    one per row in recorded scenes; latent vectors ``noise`` [N, M, Z] of zeros give the mean driver.
     """
     p = parameters
     displacement = displacement_of(vehicles)
@@ -258,16 +253,14 @@ def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> 
     Each occupies the lane of its centre only, with a small width: recorded lanes are narrow and straightened to some
     decimetres, so by its body one vehicle in ten would occupy two lanes and make others brake.
     """
-    position = segments.positions[:, frame]
+    position, target = segments.positions[:, frame], segments.target_lane[:, frame]
     velocity = (position - segments.positions[:, frame - 1]) / PHYSICS_STEP_S
-    speed = torch.sqrt((velocity * velocity).sum(-1))
     x, y = position.unbind(-1)
-    target = segments.target_lane[:, frame]
     return Vehicles(
         x=x,
         y=y,
         heading=torch.atan(velocity[..., 1] / velocity[..., 0].clamp_min(0.1)),
-        speed=speed,
+        speed=torch.sqrt((velocity * velocity).sum(-1)),
         acceleration=torch.zeros_like(x),
         length=segments.length,
         width=torch.full_like(x, 2.0 * ENTRY_M),

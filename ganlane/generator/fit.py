@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,16 +53,8 @@ VALIDATION_SHARE = 1 / 12
 STRIDE = 3
 #: Steps of the long rollouts (5 s), and frames between their starts.
 LONG_STEPS, LONG_STRIDE = 50, 5
-#: An ablation has this fraction of the updates: 1 / BUDGET.
-BUDGET = 4
-#: History noise that is tried, in units of a typical difference.
-_NOISE = 0.5
-#: Steps at which predictions of any length can be compared (0.4 s).
-_COMMON_STEPS = 4
 #: Called with the name of the next fit.
 OnFit = Callable[[str], None]
-#: Called with each fold's number, from 1, and its generator.
-OnFold = Callable[[int, FitResult], None]
 _CONFIGS: dict[str, type[Config]] = {"paper": PaperConfig, "calibrated": CalibratedConfig}
 
 
@@ -115,8 +107,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
             f"recordings of one scene, {', '.join(names)}: one has to be fitted to and another held out; cut it into "
             "several with ganlane prepare ... scene_s=30."
         )
-    unknown = sorted(set(held_out) - set(names))
-    if unknown:
+    if unknown := sorted(set(held_out) - set(names)):
         raise UserError(f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these.")
     others = [scene for scene in scenes if scene.name not in held_out]
     reported = [scene for scene in scenes if scene.name in held_out]
@@ -174,8 +165,7 @@ def fit_generator(
 
     Args:
         preset: ``"paper"`` (positions only, open loop) or ``"calibrated"`` (anchored, closed-loop rollouts).
-        held_out: names of the scenes that are reported, used for neither fitting nor early stopping.
-        config: of this preset; its defaults if None.
+        held_out: names of the scenes that are reported.
         source: name of the recordings' file, for the metadata.
         resume_path: file that keeps the state; the fit resumes from it if it exists.
         on_progress: called after every update.
@@ -202,18 +192,13 @@ def fit_result(
     loop: FitLoop, split: Split, frame: pl.DataFrame, source: str, metrics: Metrics, others: pl.DataFrame
 ) -> FitResult:
     """The result of a finished ``loop``; ``others`` are the recordings of the driving statistics."""
-    task = loop.task
+    task, tracks = loop.task, frame.select(TRACK).n_unique()
     return FitResult(
         preset=task.config.preset,
         module=task.generator.eval().requires_grad_(False),
         metrics=metrics,
         config=asdict(task.config),
-        data={
-            "file": Path(source).name,
-            "rows": frame.height,
-            "tracks": frame.select(TRACK).n_unique(),
-            **split.names,
-        },
+        data={"file": Path(source).name, "rows": frame.height, "tracks": tracks, **split.names},
         statistics=driving_statistics(others).to_dict(),
         updates=loop.best_update,
         seconds=loop.seconds,
@@ -227,8 +212,7 @@ class HeldOut(NamedTuple):
     forecasts: Forecasts
 
 
-@dataclass(frozen=True)
-class ScoredFit:
+class ScoredFit(NamedTuple):
     """A finished fit and forecasts of its held-out scenes: ``short`` as far as the preset predicts, ``long`` for 5 s.
 
     Long forecasts are made by the calibrated preset only, and only if a vehicle was recorded for long enough.
@@ -285,18 +269,17 @@ def cross_validate(
     folder: Path,
     on_fit: OnFit | None = None,
     on_progress: OnProgress | None = None,
-    on_fold: OnFold | None = None,
+    on_fold: Callable[[int, FitResult], None] | None = None,
     source: str = "",
 ) -> dict[str, Any]:
     """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
 
-    ``on_fold`` gets each fold's generator, with driving statistics of its other scenes only; ``source`` names the
-    recordings in its metadata.
+    ``on_fold`` gets each fold's number, from 1, and its generator, with driving statistics of its other scenes only;
+    ``source`` names the recordings in its metadata.
 
     Returns:
-        ``open_loop`` (:func:`ganlane.generator.forecasts.open_loop_scores`), ``splits`` (names of the scenes of each
-        fold's parts), and for the calibrated preset ``rollout``
-        (:func:`ganlane.generator.forecasts.long_rollout_scores`).
+        ``open_loop`` (:func:`open_loop_scores`), ``splits`` (names of the scenes of each fold's parts), and for the
+        calibrated preset ``rollout`` (:func:`long_rollout_scores`).
 
     Raises:
         UserError: too many folds for the recordings.
@@ -312,12 +295,9 @@ def cross_validate(
         if on_fold is not None:
             others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
             on_fold(number, fit_result(fit.loop, split, frame, source, {}, others))
-    scores: dict[str, Any] = {
-        "splits": [split.names for split in splits],
-        "open_loop": open_loop_scores(*pooled([fit.short for fit in fits])),
-    }
-    long = [fit.long for fit in fits if fit.long is not None]
-    if long:
+    open_loop = open_loop_scores(*pooled([fit.short for fit in fits]))
+    scores: dict[str, Any] = {"splits": [split.names for split in splits], "open_loop": open_loop}
+    if long := [fit.long for fit in fits if fit.long is not None]:
         windows, forecasts, _ = pooled(long)
         scores["rollout"] = long_rollout_scores(windows, forecasts)
     return scores
@@ -326,13 +306,8 @@ def cross_validate(
 def variants(config: Config) -> dict[str, Config]:
     """Settings of the ablations by name, with a quarter of the updates; the first is the preset itself."""
     loop = config.loop
-    shorter = replace(
-        loop,
-        updates=max(1, loop.updates // BUDGET),
-        evaluate_every=max(1, loop.evaluate_every // BUDGET),
-        warmup=max(1, loop.warmup // BUDGET),
-    )
-    config = replace(config, loop=shorter)
+    quarter = {name: max(1, getattr(loop, name) // 4) for name in ("updates", "evaluate_every", "warmup")}
+    config = replace(config, loop=replace(loop, **quarter))
     if isinstance(config, CalibratedConfig):
         return {
             "as it is": config,
@@ -350,7 +325,7 @@ def variants(config: Config) -> dict[str, Config]:
         "without adversarial term": replace(config, weights=replace(weights, adversarial=0.0)),
         "without single-sample term": replace(config, weights=replace(weights, single=0.0)),
         "variety term alone": replace(config, weights=replace(weights, single=0.0, mean=0.0, adversarial=0.0)),
-        f"with history noise of {_NOISE}": replace(config, history_noise=_NOISE),
+        "with history noise of 0.5": replace(config, history_noise=0.5),
     }
 
 
@@ -382,12 +357,10 @@ def _ablation_row(fit: ScoredFit) -> dict[str, Any]:
     kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
     errors = errors_of({kind: fit.short.forecasts[kind] for kind in kinds}, fit.short.windows.future)
     all_steps = displacement_errors(errors)
-    early = displacement_errors({kind: values[:, :_COMMON_STEPS] for kind, values in errors.items()})
-    row = {
-        "windows": all_steps["windows"],
-        "ade_change_percent": all_steps["ade_change_percent"],
-        "ade_change_percent_0.4_s": early["ade_change_percent"],
-    }
+    # Predictions of any length can be compared over 0.4 s.
+    early = displacement_errors({kind: values[:, :4] for kind, values in errors.items()})
+    row = {name: all_steps[name] for name in ("windows", "ade_change_percent")}
+    row["ade_change_percent_0.4_s"] = early["ade_change_percent"]
     if fit.long is not None:
         ratio = long_rollout_scores(fit.long.windows, fit.long.forecasts)["ratio_to_constant_velocity"]
         row["rmse_5_s_ratio"] = {kind: ratio[kind] for kind in ("mean", "single")}

@@ -26,16 +26,19 @@ from ganlane.checksums import has_checksum, note_without_checksum, sealed_archiv
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
 from ganlane.generator.checkpoint import Metrics
-from ganlane.generator.closed_loop import (
-    common_driver_params,
-    evaluation_params,
-    rollout,
-    sampled_driver_params,
+from ganlane.generator.closed_loop import common_driver_params, rollout, sampled_driver_params
+from ganlane.generator.forecasts import (
+    BASELINE,
+    distance,
+    energy_score,
+    mean_by_step,
+    paper_forecasts,
+    repeated,
+    rollout_errors,
+    scene_metrics,
 )
-from ganlane.generator.forecasts import BASELINE, distance, paper_forecasts, repeated, scene_metrics
 from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
 from ganlane.generator.windows import (
-    PREDICTED_STEPS,
     Groups,
     SceneTracks,
     Segments,
@@ -43,21 +46,11 @@ from ganlane.generator.windows import (
     cut_segments,
     cut_windows,
     group_windows,
-    segment_batches,
     segment_starts,
 )
 from ganlane.parameters.generator import CalibratedConfig, LoopConfig, PaperConfig
 
-#: Segments in one forward pass of an evaluation; bounds the memory.
-_SEGMENTS = 16
-
-
-def descend(optimiser: torch.optim.Optimizer, loss: Tensor, largest: float) -> None:
-    """One step of ``optimiser`` down ``loss``, with the norm of its parameters' gradient clipped at ``largest``."""
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], largest)
-    optimiser.step()
+Config = PaperConfig | CalibratedConfig
 
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
@@ -87,20 +80,35 @@ def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
     return 0.5 * ((recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean())
 
 
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
+    kept = mask.expand_as(values).to(values.dtype)
+    return (values * kept).sum() / kept.sum().clamp_min(1.0)
+
+
 class _Networks:
     """A generator with its optimiser and random numbers, to which a task adds other networks."""
 
-    def __init__(self, config: PaperConfig | CalibratedConfig):
+    def __init__(self, config: Config):
         torch.manual_seed(config.seed)
         self.generator = Generator(config.sizes)
         self.modules: dict[str, nn.Module] = {}
         self.optimisers: dict[str, torch.optim.Optimizer] = {}
         self.add("generator", self.generator)
         self.random = torch.Generator().manual_seed(config.seed)
+        self.largest_gradient = config.loop.largest_gradient
 
     def add(self, name: str, module: nn.Module) -> None:
         """One more network to fit, with an optimiser of its own."""
         self.modules[name], self.optimisers[name] = module, torch.optim.Adam(module.parameters())
+
+    def descend(self, name: str, loss: Tensor) -> float:
+        """One step of a network down its ``loss``, whose value is returned, with the gradient's norm clipped."""
+        self.optimisers[name].zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.modules[name].parameters(), self.largest_gradient)
+        self.optimisers[name].step()
+        return float(loss.detach())
 
 
 class PaperTask(_Networks):
@@ -125,15 +133,14 @@ class PaperTask(_Networks):
         losses = {}
         if config.weights.adversarial > 0:
             loss = discriminator_loss(self.discriminator(recorded), self.discriminator(generated[0].detach()))
-            descend(self.optimisers["discriminator"], loss, config.loop.largest_gradient)
-            losses["discriminator"] = float(loss.detach())
+            losses["discriminator"] = self.descend("discriminator", loss)
         observed = config.sizes.observed
         errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
         terms = {"variety": variety_loss(errors[:-1]), "single": errors[:-1].mean(), "mean": errors[-1].mean()}
         if config.weights.adversarial > 0:
             terms["adversarial"] = adversarial_loss(self.discriminator(generated[0]))
         weighted = [getattr(config.weights, name) * term for name, term in terms.items()]
-        descend(self.optimisers["generator"], torch.stack(weighted).sum(), config.loop.largest_gradient)
+        self.descend("generator", torch.stack(weighted).sum())
         return losses | {name: float(term.detach()) for name, term in terms.items()}
 
     def evaluate(self) -> float:
@@ -180,75 +187,6 @@ class PaperTask(_Networks):
         return torch.cat([past[mask].expand(len(future), -1, -1, -1), future], dim=-2)
 
 
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
-    kept = mask.expand_as(values).to(values.dtype)
-    return (values * kept).sum() / kept.sum().clamp_min(1.0)
-
-
-def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
-    """Energy score of two samples, in the unit of the positions: mean error minus half their distance.
-
-    All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from the distribution
-    of the recordings (Gneiting and Raftery 2007).
-    """
-    mean_error = 0.5 * (distance(one, recorded) + distance(other, recorded))
-    return mean_error - 0.5 * distance(one, other)
-
-
-@torch.no_grad()
-def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: CalibratedConfig) -> Metrics:
-    """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.
-
-    Target lanes and driver parameters are those of the present, so no information of the future is used. Unlike
-    forecasts of windows, these count a vehicle for as long as it is recorded.
-
-    Returns:
-        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
-        "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``, ``single``,
-        ``constant_velocity`` and ``energy`` (the energy score of two samples).
-    """
-    random, horizon = torch.Generator().manual_seed(0), config.held_out_horizon
-    parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
-    for scene in scenes:
-        for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
-            segments = batch.without_intentions()
-            fresh = torch.randn(1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random)
-            noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            drivers, future = evaluation_params(segments, config), segments.future
-            mean, one, other = rollout(generator, segments, drivers, noise, config)
-            errors = {
-                "mean": distance(mean, future),
-                "single": distance(one, future),
-                "energy": energy_score(one, other, future),
-                BASELINE: distance(segments.constant_velocity, future),
-            }
-            for name in ("all", scene.name):
-                parts.setdefault(name, []).append((errors, segments.scored))
-    return {name: _step_means(errors, horizon) for name, errors in parts.items()}
-
-
-def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
-    count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
-    return torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0) / count
-
-
-def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dict[str, float]:
-    """Means over the vehicles that are still recorded at the step in question."""
-    means = {kind: mean_by_step([(errors[kind], scored) for errors, scored in parts]) for kind in parts[0][0]}
-    short = min(PREDICTED_STEPS, horizon)
-    metrics = {}
-    for kind, errors in means.items():
-        metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
-        metrics[f"fde_m/{kind}"] = float(errors[short - 1])
-        metrics[f"end_m/{kind}"] = float(errors[-1])
-    for kind in ("mean", "energy"):
-        metrics[f"relative_{kind}"] = float((means[kind] / means[BASELINE].clamp_min(1e-6)).mean())
-    windows = max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts)))
-    return metrics | {"end_s": 0.1 * horizon, "windows": windows}
-
-
 class CalibratedTask(_Networks):
     """The anchored generator on whole scenes."""
 
@@ -277,8 +215,7 @@ class CalibratedTask(_Networks):
         else:
             name, losses = "mean", distance(positions[0], segments.future)
         loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
-        descend(self.optimisers["generator"], loss, config.loop.largest_gradient)
-        return {name: float(loss.detach())}
+        return {name: self.descend("generator", loss)}
 
     def evaluate(self) -> float:
         """Mean of the error for z = 0 and the energy score on validation scenes, relative to constant velocity."""
@@ -301,7 +238,6 @@ class CalibratedTask(_Networks):
         return segments.mirrored() if flip else segments
 
 
-Config = PaperConfig | CalibratedConfig
 Task = PaperTask | CalibratedTask
 
 

@@ -43,8 +43,7 @@ class SceneTracks:
     Attributes:
         vehicles: [V] vehicle numbers.
         positions: [T, V, 2] float64, centre of the body, m; x along the road, y to the left.
-        lane: [T, V] int64, 0 is the rightmost.
-        present: [T, V] bool.
+        lane, present: [T, V] int64, 0 is the rightmost, and bool.
         length, width: [V] float64, m.
     """
 
@@ -228,8 +227,7 @@ class Windows:
         positions: [W, frames, 2] float64, m.
         scene: [W] int64, index into ``scene_names``.
         start, vehicle: [W] int64, row of the scene at which the window starts, and column of its vehicle.
-        lane: [W] int64, its lane at the last observed position, 0 the rightmost.
-        lane_from_left: [W] int64, the same counted from the scene's leftmost lane, which is 1.
+        lane, lane_from_left: [W] int64, at the last observed position; 0 is the rightmost, 1 from left the leftmost.
         length: [W] float64, m.
     """
 
@@ -277,7 +275,7 @@ def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
     """Whether each vehicle is present in all ``frames`` frames that start at each row; bool [S, V]."""
     if len(scene.present) < frames:
         return np.zeros((0, scene.present.shape[1]), dtype=bool)
-    return sliding_window_view(scene.present, frames, axis=0).all(-1)
+    return np.all(sliding_window_view(scene.present, frames, axis=0), axis=-1)
 
 
 def count_windows(scene: SceneTracks) -> int:
@@ -291,28 +289,28 @@ def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW
     Raises:
         UserError: no vehicle is present for a whole window.
     """
-    windows = join_windows([_scene_windows(scene, stride, frames) for scene in scenes])
+    parts = []
+    for scene in scenes:
+        start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
+        start *= stride
+        lane = scene.lane[start + PRESENT, vehicle]
+        part = Windows(
+            positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
+            scene=np.zeros_like(start),
+            start=start,
+            vehicle=vehicle,
+            lane=lane,
+            lane_from_left=scene.lanes - lane,
+            length=scene.length[vehicle],
+            scene_names=(scene.name,),
+        )
+        parts.append(part)
+    windows = join_windows(parts)
     if not len(windows):
         raise UserError(
             f"recordings: no vehicle is present for {frames} frames in a row; give longer tracks (10 Hz)."
         )
     return windows
-
-
-def _scene_windows(scene: SceneTracks, stride: int, frames: int) -> Windows:
-    start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
-    start *= stride
-    lane = scene.lane[start + PRESENT, vehicle]
-    return Windows(
-        positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
-        scene=np.zeros_like(start),
-        start=start,
-        vehicle=vehicle,
-        lane=lane,
-        lane_from_left=scene.lanes - lane,
-        length=scene.length[vehicle],
-        scene_names=(scene.name,),
-    )
 
 
 @dataclass(frozen=True)
@@ -371,9 +369,8 @@ def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
         return cached("groups", content_hash(settings, place, start), compute)["labels"]
 
     # Scattered into [B, G] by group number and rank within the group.
-    _, labels, counts = np.unique(
-        _labels_by_run(windows.scene, labels_of_scene), return_inverse=True, return_counts=True
-    )
+    labels = _labels_by_run(windows.scene, labels_of_scene)
+    _, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
     order = np.argsort(labels, kind="stable")
     rank = np.empty(len(labels), dtype=np.int64)
     rank[order] = np.arange(len(labels)) - np.repeat(np.cumsum(counts) - counts, counts)

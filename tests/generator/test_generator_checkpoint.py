@@ -22,8 +22,7 @@ from ganlane.generator.checkpoint import (
     shipped_generator,
 )
 from ganlane.generator.fit import split_for_fit
-from ganlane.generator.forecasts import BASELINE, paper_forecasts, repeated, scene_metrics
-from ganlane.generator.tasks import rollout_errors
+from ganlane.generator.forecasts import BASELINE, paper_forecasts, repeated, rollout_errors, scene_metrics
 from ganlane.generator.windows import cut_windows, group_windows, scene_tracks
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 from ganlane.weights import save_weights

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from reference.small_networks import silenced, small_generator
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
@@ -13,6 +14,7 @@ from ganlane.generator.forecasts import (
     direction_scores,
     displacement_errors,
     driven_windows,
+    energy_score,
     errors_of,
     idm_forecasts,
     open_loop_scores,
@@ -21,6 +23,7 @@ from ganlane.generator.forecasts import (
     repeated,
     ridge_forecast,
     rmse_by_second,
+    rollout_errors,
     scene_metrics,
     side_classifier_share,
 )
@@ -222,3 +225,22 @@ def test_ridge_regression_finds_a_linear_law_and_keeps_left_and_right_alike():
     predicted = ridge_forecast(known, fresh.past)
     assert np.abs(predicted - fresh.future).mean() < 0.02 * np.abs(fresh.future).mean()
     np.testing.assert_allclose(ridge_forecast(known, fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8)
+
+
+def test_metrics_of_rollouts_name_every_scene_and_count_its_vehicles(scenes):
+    config = CalibratedConfig(held_out_horizon=9, held_out_stride=20)
+    metrics = rollout_errors(small_generator(EXTRA_INPUTS), scenes, config)
+    assert set(metrics) == {"all", "synthetic-0", "synthetic-1"}
+    assert metrics["all"]["windows"] == metrics["synthetic-0"]["windows"] + metrics["synthetic-1"]["windows"]
+    assert metrics["all"]["end_s"] == pytest.approx(0.9)
+    assert metrics["all"]["fde_m/mean"] > metrics["all"]["ade_m/mean"]
+
+
+def test_the_energy_score_is_least_for_the_right_spread():
+    torch.manual_seed(0)
+    recorded = torch.randn(20000, 2)
+    scores = {
+        spread: energy_score(spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded).mean().item()
+        for spread in (0.01, 0.5, 1.0, 1.5, 2.5)
+    }
+    assert min(scores, key=scores.get) == 1.0

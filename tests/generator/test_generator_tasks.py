@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import CALIBRATED, PAPER, SIZES, recorded_scenes, small_generator
+from reference.small_networks import CALIBRATED, PAPER, SIZES, recorded_scenes
 
 from ganlane.errors import UserError
 from ganlane.generator.tasks import (
@@ -16,13 +16,11 @@ from ganlane.generator.tasks import (
     discriminator_accuracy,
     discriminator_loss,
     distances,
-    energy_score,
     learning_rate,
     masked_mean,
-    rollout_errors,
     variety_loss,
 )
-from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig, LoopConfig
+from ganlane.parameters.generator import LoopConfig
 
 
 @pytest.fixture(scope="module")
@@ -90,15 +88,6 @@ def test_the_learning_rate_rises_and_then_falls_to_nothing():
     assert rates[-1] < 1e-5
 
 
-def test_metrics_of_rollouts_name_every_scene_and_count_its_vehicles(scenes):
-    config = CalibratedConfig(held_out_horizon=9, held_out_stride=20)
-    metrics = rollout_errors(small_generator(EXTRA_INPUTS), scenes, config)
-    assert set(metrics) == {"all", "synthetic-0", "synthetic-1"}
-    assert metrics["all"]["windows"] == metrics["synthetic-0"]["windows"] + metrics["synthetic-1"]["windows"]
-    assert metrics["all"]["end_s"] == pytest.approx(0.9)
-    assert metrics["all"]["fde_m/mean"] > metrics["all"]["ade_m/mean"]
-
-
 def test_distances_are_euclidean_accumulate_and_have_a_finite_gradient_at_0():
     predicted = torch.tensor([[[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]])
     torch.testing.assert_close(distances(predicted, torch.zeros(1, 3, 2)), torch.tensor([[5.0, 5.0, 10.0]]))
@@ -118,13 +107,3 @@ def test_losses_by_hand():
     assert discriminator_loss(zeros, zeros).item() == pytest.approx(math.log(2))
     assert adversarial_loss(zeros).item() == pytest.approx(math.log(2))
     assert [discriminator_accuracy(ones, generated).item() for generated in (-ones, ones)] == [1.0, 0.5]
-
-
-def test_the_energy_score_is_least_for_the_right_spread():
-    torch.manual_seed(0)
-    recorded = torch.randn(20000, 2)
-    scores = {
-        spread: energy_score(spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded).mean().item()
-        for spread in (0.01, 0.5, 1.0, 1.5, 2.5)
-    }
-    assert min(scores, key=scores.get) == 1.0

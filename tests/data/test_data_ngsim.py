@@ -139,12 +139,6 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
         read_recordings("ngsim", text)
 
 
-def test_the_order_of_the_rows_does_not_matter(tmp_path):
-    rows = ngsim_rows(FIRST)
-    mixed = read_recordings("ngsim", text_file(tmp_path, rows.sample(fraction=1.0, shuffle=True, seed=1)))
-    assert mixed.equals(read_recordings("ngsim", text_file(tmp_path, rows)))
-
-
 @pytest.mark.parametrize(
     ("columns", "factor", "message"),
     [

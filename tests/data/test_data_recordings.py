@@ -52,21 +52,14 @@ def changed(column: str, change, only: int | None = None) -> list[str]:
     return [",".join(line.values()) for line in lines]
 
 
-def test_lanes_are_counted_from_the_right_and_y_from_the_right_lanes_centre(tmp_path):
+def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows_are_sorted(tmp_path):
     frame = read_scenes(written(tmp_path, ROWS))
     assert frame.schema == SCHEMA
-    left = frame.filter(pl.col("vehicle") == 1)
-    right = frame.filter(pl.col("vehicle") == 2)
-    assert left["lane"].to_list() == [1] * 6
-    assert right["lane"].to_list() == [0] * 6
-    assert left["y"].to_list() == pytest.approx([3.5] * 6)
-    assert right["y"].to_list() == pytest.approx([0.0] * 6)
+    assert frame["lane"].to_list() == [1] * 6 + [0] * 6
+    assert frame["y"].to_list() == pytest.approx([3.5] * 6 + [0.0] * 6)
     assert scene_lane_counts(frame) == {"s": 2}
-
-
-def test_rows_come_out_sorted_whatever_their_order_across_tracks(tmp_path):
     by_frame = sorted(ROWS, key=lambda row: int(row.split(",")[2]))
-    assert read_scenes(written(tmp_path, by_frame)).equals(read_scenes(written(tmp_path, ROWS)))
+    assert read_scenes(written(tmp_path, by_frame)).equals(frame)
 
 
 def test_a_synthetic_recording_survives_the_file(tmp_path):
@@ -76,10 +69,9 @@ def test_a_synthetic_recording_survives_the_file(tmp_path):
     read = read_scenes(path)
     exact = ["scene", "vehicle", "frame", "lane"]
     assert read.select(exact).equals(made.select(exact))
-    for name, tolerance in {"x": 1e-4, "speed": 1e-4, "length": 1e-9, "width": 1e-9}.items():
-        assert (read[name] - made[name]).abs().max() <= tolerance
     # The lane width is estimated anew, to 4 cm; two lanes to the left that makes 8 cm.
-    assert (read["y"] - made["y"]).abs().max() < 0.08
+    for name, tolerance in {"x": 1e-4, "speed": 1e-4, "length": 1e-9, "width": 1e-9, "y": 0.08}.items():
+        assert (read[name] - made[name]).abs().max() <= tolerance
 
 
 @pytest.mark.parametrize(
@@ -279,20 +271,18 @@ def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(absolute, t
     out = (tmp_path if absolute else Path()) / "scenes"
     long = out.with_name("s" * 250)  # the hidden one beside it has a longer name
 
-    def raised(path, fill) -> OSError:
-        with pytest.raises(OSError) as caught, whole_folder(path) as folder:  # noqa: PT011
-            fill(folder)
-        return caught.value
-
     def absent(name):
         raise FileNotFoundError(errno.ENOENT, "No such file or directory", name)
 
-    refused = raised(out, lambda folder: write_bytes(folder / ("s" * 300), b""))
-    assert (refused.errno, refused.filename) == (errno.ENAMETOOLONG, str(out / ("s" * 300)))
-    refused = raised(out, Path.mkdir)
-    assert (refused.errno, refused.filename) == (errno.EEXIST, str(out))
-    refused = raised(long, absent)
-    assert (refused.errno, refused.filename) == (errno.ENAMETOOLONG, str(long))
+    cases = [
+        (out, lambda folder: write_bytes(folder / ("s" * 300), b""), errno.ENAMETOOLONG, str(out / ("s" * 300))),
+        (out, Path.mkdir, errno.EEXIST, str(out)),
+        (long, absent, errno.ENAMETOOLONG, str(long)),
+    ]
     for name in ("scenes.csv", ".hidden/scenes.csv", None):
-        assert raised(out, lambda folder, name=name: absent(name)).filename == name
+        cases.append((out, lambda folder, name=name: absent(name), errno.ENOENT, name))
+    for path, fill, number, named in cases:
+        with pytest.raises(OSError) as caught, whole_folder(path) as folder:  # noqa: PT011
+            fill(folder)
+        assert (caught.value.errno, caught.value.filename) == (number, named)
     assert list(tmp_path.iterdir()) == []

@@ -8,24 +8,7 @@ import torch
 from reference.small_networks import recorded_scenes, silenced, small_generator
 from reference.worlds import vehicles as placed
 
-from ganlane.generator.closed_loop import (
-    ANCHOR,
-    HEADWAY_QUANTILES_S,
-    STEEPEST,
-    DriverMemory,
-    Plan,
-    anchored_step,
-    displacement_of,
-    headway_from_uniform,
-    inside_lane,
-    moved_by,
-    paper_step,
-    rollout,
-    sampled_driver_params,
-    start,
-    typical_driver_params,
-    wander,
-)
+from ganlane.generator import closed_loop
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import cut_segments
 from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
@@ -49,12 +32,12 @@ def silent_generator() -> Generator:
 
 
 def drive(generator, state, seconds, headway=1.27, noise=0.0):
-    history = start(generator, displacement_of(state))
+    history = closed_loop.start(generator, closed_loop.displacement_of(state))
     zero = torch.zeros_like(history.displacement)
-    memory = DriverMemory(history, zero, torch.full_like(state.x, headway))
+    memory = closed_loop.DriverMemory(history, zero, torch.full_like(state.x, headway))
     z = noise * torch.randn(*state.x.shape, generator.sizes.noise, dtype=state.x.dtype)
     for _ in range(round(seconds / 0.1)):
-        state, memory = anchored_step(generator, state, ROAD, memory, z)
+        state, memory = closed_loop.anchored_step(generator, state, ROAD, memory, z)
     return state, memory
 
 
@@ -81,7 +64,7 @@ def test_the_first_step_is_idm_and_the_lateral_law():
     after, _ = drive(silent_generator(), state, 0.1)
     gap = torch.tensor(30.0 - 4.5, dtype=torch.float64)
     own = torch.tensor(20.0, dtype=torch.float64)
-    expected = idm_acceleration(own, 25.0, gap, own, ANCHOR.idm, 1.27)
+    expected = idm_acceleration(own, 25.0, gap, own, closed_loop.ANCHOR.idm, 1.27)
     assert after.x[0, 0].item() == pytest.approx(2.0 + 0.01 * expected.item(), abs=1e-9)
     assert after.y[0, 0].item() == pytest.approx(0.5 + 0.01 * 0.3 * -0.5, abs=1e-9)
 
@@ -105,51 +88,57 @@ def test_a_network_that_always_pushes_sideways_does_not_push_the_body_out_of_its
 def test_only_what_pushes_outwards_is_left_out():
     offset, still, room = torch.tensor([-1.0, -1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 0.0, 2.0]), torch.tensor(0.8)
     push = torch.tensor([0.5, -0.5, 0.5, 0.5])
-    allowed = inside_lane(push, offset, still, room, damping=1.1)
+    allowed = closed_loop.inside_lane(push, offset, still, room, damping=1.1)
     torch.testing.assert_close(allowed, torch.tensor([0.0, -0.5, 0.5, 0.0]))
 
 
 def test_nobody_rolls_back_or_slides_sideways():
     state = vehicles([0.0, 0.0], speed=0.0)
-    after = moved_by(state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double())
+    after = closed_loop.moved_by(state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double())
     assert (after.x[0, 0].item(), after.y[0, 0].item()) == (0.0, 0.0)
-    assert (after.y[0, 1].item(), after.heading[0, 1].item()) == pytest.approx((STEEPEST, math.atan(STEEPEST)))
+    assert (after.y[0, 1].item(), after.heading[0, 1].item()) == pytest.approx(
+        (closed_loop.STEEPEST, math.atan(closed_loop.STEEPEST))
+    )
 
 
 def test_speed_and_heading_carry_the_whole_displacement():
     state = vehicles([100.0, 200.0])
-    after = moved_by(state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double())
+    after = closed_loop.moved_by(state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double())
     step = torch.stack([after.x - state.x, after.y - state.y], dim=-1)
-    torch.testing.assert_close(displacement_of(after), step, atol=1e-8, rtol=1e-8)
+    torch.testing.assert_close(closed_loop.displacement_of(after), step, atol=1e-8, rtol=1e-8)
 
 
 def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
     torch.manual_seed(0)
     begin = z = torch.randn(20000)
     for _ in range(50):
-        z = wander(z, torch.randn(20000), period_s=5.0)
+        z = closed_loop.wander(z, torch.randn(20000), period_s=5.0)
     assert z.std().item() == pytest.approx(1.0, abs=0.02)
     assert (z * begin).mean().item() == pytest.approx(math.exp(-1), abs=0.02)
     fresh = torch.randn(5)
-    torch.testing.assert_close(wander(z[:5], fresh, 0.0), fresh)
+    torch.testing.assert_close(closed_loop.wander(z[:5], fresh, 0.0), fresh)
 
 
 def test_headways_have_the_quantiles_asked_for():
-    headways = headway_from_uniform((torch.arange(100000) + 0.5) / 100000)
+    headways = closed_loop.headway_from_uniform((torch.arange(100000) + 0.5) / 100000)
     quantiles = headways.quantile(torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95]))
-    torch.testing.assert_close(quantiles, torch.tensor(HEADWAY_QUANTILES_S), atol=1e-3, rtol=0)
+    torch.testing.assert_close(quantiles, torch.tensor(closed_loop.HEADWAY_QUANTILES_S), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("execute_k", [1, 3])
 def test_the_paper_drives_the_first_k_predictions_before_planning_anew(execute_k):
     generator, state = small_generator().double().requires_grad_(False), vehicles([0.0, 25.0], y=[0.0, 4.0])
-    history, noise = start(generator, displacement_of(state)), torch.randn(1, 2, 4).double()
-    past = displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
+    history, noise = closed_loop.start(generator, closed_loop.displacement_of(state)), torch.randn(1, 2, 4).double()
+    past = closed_loop.displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
     predicted = generator(generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise)
-    plan = Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long)) if execute_k > 1 else None
+    plan = (
+        closed_loop.Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long))
+        if execute_k > 1
+        else None
+    )
     for step in range(execute_k):
         before = state
-        state, history, plan = paper_step(generator, state, history, noise, plan)
+        state, history, plan = closed_loop.paper_step(generator, state, history, noise, plan)
         moved = torch.stack([state.x - before.x, state.y - before.y], -1)
         torch.testing.assert_close(moved, predicted[..., step, :])
     assert plan is None or (plan.left == 0).all()
@@ -162,7 +151,7 @@ def scenes():
 
 @pytest.fixture
 def segments(scenes):
-    """The first scene from its start, for half a second."""
+    """The first scene from its closed_loop.start, for half a second."""
     return cut_segments([(scenes[0], 0)], horizon=5)
 
 
@@ -173,9 +162,9 @@ def generator():
 
 def typical_rollout(generator, segments):
     """Positions when every driver is typical and z = 0."""
-    drivers = typical_driver_params(segments)
+    drivers = closed_loop.typical_driver_params(segments)
     noise = torch.zeros(1 + segments.future.shape[1], 1, *segments.length.shape, 4)
-    return rollout(generator, segments, drivers, noise, CalibratedConfig())[0]
+    return closed_loop.rollout(generator, segments, drivers, noise, CalibratedConfig())[0]
 
 
 def test_a_rollout_is_the_same_with_more_padding(segments, generator):
@@ -206,7 +195,9 @@ def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(scen
 def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(scenes, generator):
     segments = cut_segments([(scenes[0], 0), (scenes[1], 9)], horizon=6)
     noise = torch.randn(7, 3, 2, 7, 4)
-    positions = rollout(generator, segments, typical_driver_params(segments), noise, CalibratedConfig())
+    positions = closed_loop.rollout(
+        generator, segments, closed_loop.typical_driver_params(segments), noise, CalibratedConfig()
+    )
     (positions - segments.future).abs()[:, segments.scored].sum().backward()
     for name, parameter in generator.named_parameters():
         assert parameter.grad is not None, name
@@ -222,7 +213,7 @@ def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
 
 
 def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(segments):
-    one, other = (sampled_driver_params(segments, torch.Generator().manual_seed(4)) for _ in range(2))
+    one, other = (closed_loop.sampled_driver_params(segments, torch.Generator().manual_seed(4)) for _ in range(2))
     assert all((a == b).all() for a, b in zip(one, other))
     speed = (segments.positions[:, 8] - segments.positions[:, 7]).norm(dim=-1) * 10
     assert (one[1] > speed + 0.99).all()

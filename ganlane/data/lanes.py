@@ -27,9 +27,6 @@ from ganlane.errors import UserError
 
 #: 12 feet, the standard lane of a US freeway: used where a recording has one lane only.
 STANDARD_LANE_WIDTH_M: Final = 3.66
-#: A lane counts for the first fit when it has this many rows (0.5 s of one vehicle or more).
-_FEWEST_ROWS = 5
-_PLAUSIBLE_M = (2.0, 6.0)
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -55,16 +52,12 @@ def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
 
 
 def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
-    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number.
+    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number [R].
 
     The first estimate is the median slope between the median positions of each pair of lanes (Theil and Sen), which
     is robust to outliers. It is kept if no other width within 10 % of it puts more rows into their recorded lane;
     otherwise the result is the middle of the best range. Lane changes make that range narrow, since a vehicle's lane
-    number changes just where it crosses the boundary.
-
-    Args:
-        y: [R] lateral positions, m, with 0 at the centre of lane 0 and growing with the lane number.
-        lane: [R] lane numbers.
+    number changes just where it crosses the boundary. ``y`` [R] in m is 0 at the centre of lane 0.
 
     Raises:
         UserError: the estimate is below 2 m or above 6 m.
@@ -72,10 +65,10 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
     guess = _median_spacing(*_centres(y, lane))
     if guess is None:
         return STANDARD_LANE_WIDTH_M
-    if not _PLAUSIBLE_M[0] <= guess <= _PLAUSIBLE_M[1]:
+    if not 2.0 <= guess <= 6.0:
         raise UserError(
-            f"{scene}: its lanes are {guess:.2f} m apart, expected {_PLAUSIBLE_M[0]:.0f} to {_PLAUSIBLE_M[1]:.0f} m; "
-            "check that y is in metres, grows to the left, and that lanes are numbered in order."
+            f"{scene}: its lanes are {guess:.2f} m apart, expected 2 to 6 m; check that y is in metres, grows to the "
+            "left, and that lanes are numbered in order."
         )
     low, high = _best_range(y, lane, guess)
     return guess if low <= guess <= high else 0.5 * (low + high)
@@ -116,9 +109,9 @@ def _median_spacing(numbers: Integers, centres: Floats) -> float | None:
 
 
 def _centres(y: Floats, lane: Integers) -> tuple[Integers, Floats]:
-    """Lanes with enough rows, and their median positions."""
+    """Lanes with enough rows (0.5 s of one vehicle), and their median positions."""
     numbers, rows = np.unique(lane, return_counts=True)
-    numbers = numbers[rows >= _FEWEST_ROWS]
+    numbers = numbers[rows >= 5]
     return numbers, np.array([np.median(y[lane == number]) for number in numbers])
 
 
@@ -243,8 +236,7 @@ def _find_end(
 ) -> tuple[Integers, Flags]:
     """Start (``direction`` -1) or end (1) of lane changes: first sample that is centred or without lateral movement.
 
-    Returns:
-        [C] the samples, or the first or last samples of their tracks; and [C] whether the end lies within the track.
+    Returns [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies within the track.
     """
     limit = (tracks.first if direction < 0 else tracks.last)[sample]
     path = sample[:, None] + direction * np.arange(_REACH + 1)

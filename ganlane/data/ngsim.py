@@ -57,10 +57,9 @@ COLUMNS: Final = {
 LOCATION: Final = "location"
 #: Further locations in the portal's file: streets with intersections.
 STREETS: Final = ("lankershim", "peachtree")
-#: A file has about six periods; a damaged column of times or frames makes hundreds.
-MAX_PERIODS: Final = 500
-#: Minimum rows of a period in a file with several periods: a vehicle for 5 s.
-MIN_ROWS: Final = 50
+#: A file has about six periods; a damaged column of times or frames makes hundreds, or one of a few rows. The least
+#: number of rows, where there are several periods, are those of a vehicle for 5 s.
+MAX_PERIODS, MIN_ROWS = 500, 50
 #: Maximum number of rows from which lane width and position are estimated.
 ROWS_FOR_LANES: Final = 500_000
 #: Medians of vehicle lengths that can be feet: 15 is usual, 4.5 would be metres, 450 centimetres.
@@ -80,11 +79,9 @@ def ngsim_scenes(
 ) -> Iterator[Scene]:
     """The periods of an NGSIM file, one scene each, in bounded memory (a block, then a period).
 
-    Args:
-        path: a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any case and order; with
-            a column ``location`` it may hold several locations.
-        count: rows read and dropped are added to it.
-        scratch: folder for temporary files, which are removed at the end; by default the system's.
+    ``path`` is a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any case and order;
+    with a column ``location`` it may hold several locations. Rows read and dropped are added to ``count``;
+    ``scratch`` is a folder for temporary files, which are removed at the end, by default the system's.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.

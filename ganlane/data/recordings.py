@@ -148,8 +148,6 @@ QUANTITIES: Final = {
     "time_headway": Bins(0.0, 40.0, 8000),
     "gap": Bins(0.0, 300.0, 6000),
 }
-#: Accelerations beyond this are counted separately, m/s2: few cars reach it.
-STRONG_MPS2: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -186,6 +184,7 @@ class PooledStatistics:
         self._changes: list[LaneChanges] = []
         #: One number per car: few enough to be stored.
         self._headways: list[np.ndarray] = []
+        #: Numbers of accelerations beyond 3 m/s2, which few cars reach.
         self._strong = dict.fromkeys(("acceleration_raw", "acceleration_smoothed"), 0)
 
     def add(self, scene: Scene) -> SceneSummary:
@@ -200,7 +199,7 @@ class PooledStatistics:
             if name == "headway":
                 self._headways.append(values)
             if name in self._strong:
-                self._strong[name] += int(np.count_nonzero(np.abs(values) > STRONG_MPS2))
+                self._strong[name] += int(np.count_nonzero(np.abs(values) > 3.0))
         speed = float(frame["speed"].mean())  # type: ignore[arg-type]
         rates = lane_change_statistics(changes, exposure, speed)
         shared = ("srlc", "per_vehicle_km", "per_vehicle_km_low", "per_vehicle_km_high")

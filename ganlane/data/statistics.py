@@ -20,11 +20,9 @@ from ganlane.errors import UserError
 _Record = TypeVar("_Record")
 #: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
 LEVELS: Final = (0.01, *(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
-#: Gap of a standing car to its leader, m (Table V's ``s_0``): not part of the headway.
-STANDSTILL_GAP_M: Final = 2.0
-#: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s.
-FOLLOWING_GAP_M: Final = 70.0
-MIN_FOLLOWER_MPS: Final = 2.0
+#: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s. The gap of a standing car, m
+#: (Table V's ``s_0``), is not part of the headway.
+_FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = 70.0, 2.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
     mean = median = None
     if is_complete.any():
         ends, survival = survival_curve(times, is_complete)
-        edges = np.concatenate(([0.0], ends, [max(times.max(), ends[-1])]))
+        edges = np.concatenate(([0.0], ends, [times.max()]))
         mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
         halved = np.flatnonzero(survival <= 0.5)
         median = float(ends[halved[0]]) if len(halved) else None
@@ -86,8 +84,7 @@ def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
 def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Kaplan and Meier's (1958) survival curve of durations [C], of which those not ``complete`` are lower bounds.
 
-    Returns:
-        [E] the distinct complete durations, growing, and [E] the shares of longer durations, falling.
+    Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations, falling.
     """
     times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
     ends, ending = np.unique(times[is_complete], return_counts=True)
@@ -110,10 +107,7 @@ class Bins:
 
 
 class Histogram:
-    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part by part.
-
-    Quantiles are interpolated linearly within a bin, so they are accurate to a bin's width.
-    """
+    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part by part."""
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
@@ -144,7 +138,7 @@ class Histogram:
         return Distribution(n, mean, spread, tuple(self.quantile(level) for level in LEVELS))
 
     def quantile(self, level: float) -> float:
-        """Value at ``level``, linear within its bin."""
+        """Value at ``level``, linear within its bin, so accurate to a bin's width."""
         below = np.concatenate(([0], np.cumsum(self.counts)))
         occupied = np.flatnonzero(self.counts)
         k = int(occupied[min(int(np.searchsorted(below[occupied + 1], level * self.total)), len(occupied) - 1)])
@@ -160,11 +154,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Amount of driving.
-
-    ``cars`` counts a car once per scene, however many tracks it has; ``road_m`` is the mean length of the road over
-    the cars; ``vehicle_km`` is the distance driven.
-    """
+    """Amount of driving; ``cars`` are counted once per scene, ``road_m`` is the road's mean length over the cars."""
 
     scenes: int
     tracks: int
@@ -225,9 +215,9 @@ def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
     # Sorting needs most memory: only once, and with no more columns than needed.
     columns = frame.select("scene", "vehicle", "frame", "x", "speed", "lane", "length")
     with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
-    close = pl.col("gap").is_between(0.0, FOLLOWING_GAP_M)
-    following = with_leader.filter(close & (pl.col("speed") >= MIN_FOLLOWER_MPS))
-    headway = (pl.col("gap") - STANDSTILL_GAP_M) / pl.col("speed")
+    close = pl.col("gap").is_between(0.0, _FOLLOWING_GAP_M)
+    following = with_leader.filter(close & (pl.col("speed") >= _MIN_FOLLOWER_MPS))
+    headway = (pl.col("gap") - _STANDSTILL_GAP_M) / pl.col("speed")
     per_follower = following.group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
     return {
         "speed": frame["speed"].to_numpy(),

@@ -32,10 +32,6 @@ KIND = "generator"
 CACHE_VARIABLE = "GANLANE_CACHE"
 #: ``{"all" or scene: {"ERROR/KIND": value}}``.
 Metrics = dict[str, dict[str, float]]
-#: Inputs in addition to the motion, by preset.
-PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
-#: Sizes that older files do not have; they get their defaults.
-_ADDED_LATER = {"differences"}
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,8 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         )
     sizes: Any = metadata.get("sizes")
     kinds = {field.name: type(field.default) for field in fields(GeneratorSizes)}
-    complete = isinstance(sizes, dict) and set(kinds) - _ADDED_LATER <= set(sizes) <= set(kinds)
+    # Older files do not have ``differences``, which gets its default.
+    complete = isinstance(sizes, dict) and set(kinds) - {"differences"} <= set(sizes) <= set(kinds)
     # The bound keeps a damaged file from requesting all memory.
     if not complete or not all(
         isinstance(value, int) and 0 <= value <= 4096 and type(value) is kinds[name] for name, value in sizes.items()
@@ -118,10 +115,10 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         raise UserError(
             f"{path}: its weights do not have the shapes that its sizes {sizes} ask for; fit it again."
         ) from error
-    if generator.sizes.extra_inputs != PRESET_INPUTS[found]:
+    inputs, expected = generator.sizes.extra_inputs, EXTRA_INPUTS if found == "calibrated" else 0
+    if inputs != expected:
         raise UserError(
-            f"{path}: takes {generator.sizes.extra_inputs} further inputs, expected {PRESET_INPUTS[found]} for the "
-            f"preset {found}; fit it again."
+            f"{path}: takes {inputs} further inputs, expected {expected} for the preset {found}; fit it again."
         )
     if not isinstance(metadata.get("driving_statistics"), dict):
         raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")

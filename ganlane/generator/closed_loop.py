@@ -345,34 +345,26 @@ def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tenso
     return torch.where(known, headway.clamp_min(SHORTEST_HEADWAY_S), otherwise)
 
 
-def sampled_driver_params(segments: Segments, random: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Random headways and desired speeds for fitting, [B, V] each: about the balanced ones, above the present speeds.
+def driver_params(
+    segments: Segments, traits: bool = True, random: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Headways in s and desired speeds in m/s of the drivers, [B, V] each.
 
-    In congestion the recordings do not show the desired speeds.
+    With ``random``, for fitting: random ones, about the balanced headways and above the present speeds, since in
+    congestion the recordings do not show the desired speeds. Without it, for evaluation: the balanced headway or the
+    median one, and the middle desired speed. Without ``traits`` (an ablation): Table V's headway and 22 m/s for all.
     """
-    u = torch.rand(2, *segments.length.shape, generator=random)
-    scatter = torch.exp(_SCATTER * torch.randn(segments.length.shape, generator=random))
-    low, high = DESIRED_EXCESS_MPS
-    now = recorded_vehicles(segments, PRESENT, torch.ones_like(scatter))
-    desired = now.speed + low + (high - low) * u[0]
-    otherwise = headway_from_uniform(u[1])
+    if not traits:
+        headway = torch.full_like(segments.length, TABLE_V.headway_s)
+        return headway, torch.full_like(headway, COMMON_SPEED_MPS)
+    now, (low, high) = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length)), DESIRED_EXCESS_MPS
+    if random is None:
+        scatter = torch.ones_like(segments.length)
+        otherwise = torch.full_like(scatter, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
+        desired = now.speed + 0.5 * (low + high)
+    else:
+        u = torch.rand(2, *segments.length.shape, generator=random)
+        scatter = torch.exp(_SCATTER * torch.randn(segments.length.shape, generator=random))
+        otherwise = headway_from_uniform(u[1])
+        desired = now.speed + low + (high - low) * u[0]
     return balanced_headway(now.with_(desired_speed=desired), segments.road, otherwise) * scatter, desired
-
-
-def common_driver_params(segments: Segments) -> tuple[Tensor, Tensor]:
-    """The same for all drivers (an ablation), [B, V] each: Table V's headway and 22 m/s."""
-    headway = torch.full_like(segments.length, TABLE_V.headway_s)
-    return headway, torch.full_like(headway, COMMON_SPEED_MPS)
-
-
-def typical_driver_params(segments: Segments) -> tuple[Tensor, Tensor]:
-    """For evaluation, [B, V] each: the balanced headway or the median one, the middle desired speed."""
-    now = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length))
-    desired = now.speed + 0.5 * sum(DESIRED_EXCESS_MPS)
-    median = torch.full_like(desired, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
-    return balanced_headway(now.with_(desired_speed=desired), segments.road, median), desired
-
-
-def evaluation_params(segments: Segments, config: CalibratedConfig) -> tuple[Tensor, Tensor]:
-    """Headways and desired speeds for evaluation, [B, V] each."""
-    return typical_driver_params(segments) if config.traits else common_driver_params(segments)

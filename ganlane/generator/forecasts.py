@@ -21,15 +21,7 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from ganlane.generator.checkpoint import Metrics
-from ganlane.generator.closed_loop import (
-    common_driver_params,
-    displacement_of,
-    driven_positions,
-    evaluation_params,
-    moved_by,
-    rollout,
-    typical_driver_params,
-)
+from ganlane.generator.closed_loop import displacement_of, driven_positions, driver_params, moved_by, rollout
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
@@ -235,7 +227,7 @@ def calibrated_forecasts(
         shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        return rollout(generator, segments, evaluation_params(segments, config), noise, config)
+        return rollout(generator, segments, driver_params(segments, config.traits), noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
@@ -251,7 +243,7 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
     """
 
     def driver(segments: Segments, own_headway: bool) -> Tensor:
-        headway, desired = typical_driver_params(segments) if own_headway else common_driver_params(segments)
+        headway, desired = driver_params(segments, traits=own_headway)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
             acceleration = following_acceleration(perceive(vehicles, segments.road), TABLE_V, headway)
@@ -338,7 +330,7 @@ def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: Cali
             segments = batch.without_intentions()
             fresh = torch.randn(1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random)
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            drivers, future = evaluation_params(segments, config), segments.future
+            drivers, future = driver_params(segments, config.traits), segments.future
             mean, one, other = rollout(generator, segments, drivers, noise, config)
             errors = {
                 "mean": distance(mean, future),

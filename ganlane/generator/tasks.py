@@ -26,7 +26,7 @@ from ganlane.checksums import has_checksum, note_without_checksum, sealed_archiv
 from ganlane.errors import UserError
 from ganlane.files import write_bytes
 from ganlane.generator.checkpoint import Metrics
-from ganlane.generator.closed_loop import common_driver_params, rollout, sampled_driver_params
+from ganlane.generator.closed_loop import driver_params, rollout
 from ganlane.generator.forecasts import (
     BASELINE,
     distance,
@@ -64,15 +64,9 @@ def variety_loss(errors: Tensor) -> Tensor:
     return errors.amin(dim=0).mean()
 
 
-def adversarial_loss(logits: Tensor) -> Tensor:
-    """Cross-entropy of classifying generated trajectories as recorded; ln 2 is chance."""
-    return binary_cross_entropy_with_logits(logits, torch.ones_like(logits), reduction="none").mean()
-
-
-def discriminator_loss(recorded: Tensor, generated: Tensor) -> Tensor:
-    """Cross-entropy of classifying recorded and generated trajectories by their logits; ln 2 is chance."""
-    fake = binary_cross_entropy_with_logits(generated, torch.zeros_like(generated), reduction="none").mean()
-    return 0.5 * (adversarial_loss(recorded) + fake)
+def cross_entropy(logits: Tensor, recorded: float) -> Tensor:
+    """Cross-entropy of classifying trajectories as recorded (1) or generated (0) by their logits; ln 2 is chance."""
+    return binary_cross_entropy_with_logits(logits, torch.full_like(logits, recorded), reduction="none").mean()
 
 
 def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
@@ -132,13 +126,14 @@ class PaperTask(_Networks):
         generated = self._samples(groups, config.history_noise)
         losses = {}
         if config.weights.adversarial > 0:
-            loss = discriminator_loss(self.discriminator(recorded), self.discriminator(generated[0].detach()))
+            real, fake = self.discriminator(recorded), self.discriminator(generated[0].detach())
+            loss = 0.5 * (cross_entropy(real, 1.0) + cross_entropy(fake, 0.0))
             losses["discriminator"] = self.descend("discriminator", loss)
         observed = config.sizes.observed
         errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
         terms = {"variety": variety_loss(errors[:-1]), "single": errors[:-1].mean(), "mean": errors[-1].mean()}
         if config.weights.adversarial > 0:
-            terms["adversarial"] = adversarial_loss(self.discriminator(generated[0]))
+            terms["adversarial"] = cross_entropy(self.discriminator(generated[0]), 1.0)
         weighted = [getattr(config.weights, name) * term for name, term in terms.items()]
         self.descend("generator", torch.stack(weighted).sum())
         return losses | {name: float(term.detach()) for name, term in terms.items()}
@@ -205,7 +200,7 @@ class CalibratedTask(_Networks):
         """One rollout of a batch of segments and one step: alternately of the mean driver and of two samples."""
         config = self.config
         segments = self._batch()
-        drivers = sampled_driver_params(segments, self.random) if config.traits else common_driver_params(segments)
+        drivers = driver_params(segments, config.traits, self.random)
         sampled = number % 2 == 1
         shape = (1 + segments.future.shape[1], 2 if sampled else 1, *segments.length.shape, config.sizes.noise)
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)

@@ -162,7 +162,7 @@ def generator():
 
 def typical_rollout(generator, segments):
     """Positions when every driver is typical and z = 0."""
-    drivers = closed_loop.typical_driver_params(segments)
+    drivers = closed_loop.driver_params(segments)
     noise = torch.zeros(1 + segments.future.shape[1], 1, *segments.length.shape, 4)
     return closed_loop.rollout(generator, segments, drivers, noise, CalibratedConfig())[0]
 
@@ -196,7 +196,7 @@ def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(scenes, gen
     segments = cut_segments([(scenes[0], 0), (scenes[1], 9)], horizon=6)
     noise = torch.randn(7, 3, 2, 7, 4)
     positions = closed_loop.rollout(
-        generator, segments, closed_loop.typical_driver_params(segments), noise, CalibratedConfig()
+        generator, segments, closed_loop.driver_params(segments), noise, CalibratedConfig()
     )
     (positions - segments.future).abs()[:, segments.scored].sum().backward()
     for name, parameter in generator.named_parameters():
@@ -213,7 +213,7 @@ def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
 
 
 def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(segments):
-    one, other = (closed_loop.sampled_driver_params(segments, torch.Generator().manual_seed(4)) for _ in range(2))
+    one, other = (closed_loop.driver_params(segments, random=torch.Generator().manual_seed(4)) for _ in range(2))
     assert all((a == b).all() for a, b in zip(one, other))
     speed = (segments.positions[:, 8] - segments.positions[:, 7]).norm(dim=-1) * 10
     assert (one[1] > speed + 0.99).all()

@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from ganlane.errors import UserError
 from ganlane.generator import Generator, load_generator
+from ganlane.generator.closed_loop import COMMON_SPEED_MPS
 from ganlane.generator.networks import MotionLSTM, Observation, PairPooling, motion_features
-from ganlane.generator.rollout import COMMON_SPEED_MPS
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.spawn import TABLE_II, SpawnParameters
 from ganlane.sim.state import Road

@@ -254,7 +254,7 @@ def _weights(path: Path) -> Finding:
 
 def recordings() -> Finding:
     """The recordings used with ``data.path=null``; needed for fitting and realism, not for training or driving."""
-    from ganlane.data.download import DATA_VARIABLE, SCENES, default_scenes
+    from ganlane.data.sources import DATA_VARIABLE, SCENES, default_scenes
 
     try:
         path = default_scenes()
@@ -266,7 +266,7 @@ def recordings() -> Finding:
 
 def cache() -> Finding:
     """The folder in which groups of windows are kept between fits."""
-    from ganlane.generator.windows import CACHE_VARIABLE, cache_folder
+    from ganlane.generator.checkpoint import CACHE_VARIABLE, cache_folder
 
     folder = cache_folder()
     if folder is None:

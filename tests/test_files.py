@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 
 from ganlane.agents import read_agent
 from ganlane.data import SyntheticTraffic, read_scenes, synthetic_scenes
-from ganlane.data.scenes import write_prepared
+from ganlane.data.recordings import write_prepared
 from ganlane.errors import UserError
 from ganlane.files import (
     CHECKPOINTS,
@@ -33,8 +33,8 @@ from ganlane.files import (
     write_json,
 )
 from ganlane.generator import load_generator
-from ganlane.generator.fit import FitLoop
-from ganlane.generator.windows import cached, load_arrays, save_arrays
+from ganlane.generator.checkpoint import cached, load_arrays, save_arrays
+from ganlane.generator.tasks import FitLoop
 from ganlane.parameters.generator import LoopConfig, PaperConfig
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 from ganlane.weights import load_weights, save_weights

@@ -18,13 +18,17 @@ from benchmarks.torture.damages import BYTES, TEXT, Damage
 from ganlane.agents import load_agent
 from ganlane.config.command_line import check
 from ganlane.config.runs import with_resumed
-from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
-from ganlane.data.prepare import read_recordings
-from ganlane.data.scenes import read_scenes, write_prepared
+from ganlane.data import (
+    SyntheticTraffic,
+    read_recordings,
+    read_scenes,
+    synthetic_scenes,
+    write_prepared,
+    write_scene_csv,
+)
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.windows import CACHE_VARIABLE, cached
+from ganlane.generator.checkpoint import CACHE_VARIABLE, cached, load_generator
 from ganlane.parameters.generator import NgsimParameters
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 from ganlane.sim.scene_files import read_scene

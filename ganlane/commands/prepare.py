@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Final
 
 from ganlane.config.recordings import PrepareConfig
-from ganlane.data import Preparation, SceneSummary, byte_progress, default_scenes, download, prepare_recordings
+from ganlane.data import Preparation, SceneSummary, byte_progress, prepare_recordings, recordings_path
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
-from ganlane.parameters.generator import NgsimDataConfig
 from ganlane.runtime import peak_resident_bytes
 from ganlane.view.figures import draw_recordings, save_figure
 
@@ -34,11 +33,7 @@ _SHOWN_LEVELS: Final = (0.05, 0.25, 0.5, 0.75, 0.95)
 def prepare(config: PrepareConfig, folder: Path) -> str:
     """Download where asked to, read, write, measure and report; the line that names the results."""
     begun = time.perf_counter()
-    source = Path(config.data.path) if config.data.path else default_scenes()
-    parameters = config.data.parameters()
-    if isinstance(config.data, NgsimDataConfig) and config.data.download:
-        with byte_progress("download") as progress:
-            download(config.data.url, source, config.data.sha256, progress)
+    source, parameters = recordings_path(config.data), config.data.parameters()
     out = Path(config.out) if config.out else folder / "scenes"
 
     def show(scene: SceneSummary) -> None:  # while the others are still read

@@ -6,24 +6,22 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import polars as pl
-
 from ganlane import generator
 from ganlane.config.recordings import TrainGeneratorConfig
-from ganlane.data import byte_progress, default_scenes, download, read_recordings
-from ganlane.errors import UserError
+from ganlane.data import byte_progress, read_recordings, recordings_path
 from ganlane.evaluation import code_version, write_results
 from ganlane.evaluation.table import show
 from ganlane.fit_report import FitProgress, ablation_table, fold_tables, metrics_table, results_of
 from ganlane.generator import FitResult
-from ganlane.parameters.generator import DataConfig, NgsimDataConfig
 from ganlane.torch_settings import set_threads
 
 
 def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     """Read the recordings, fit, print the errors on held-out scenes, save weights and results."""
     set_threads(config.threads)
-    source, frame = _recordings(config.data)
+    source = recordings_path(config.data)
+    with byte_progress("read") as read:
+        frame = read_recordings(config.data.format, source, config.data.parameters(), read)
     fit_config: Any = replace(config.generator, seed=config.seed)
     preset = fit_config.preset
     scenes = generator.scene_tracks(frame)
@@ -65,15 +63,3 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     context = {"seed": config.seed, "held_out": held_out}
     used = asdict(replace(config, generator=fit_config))
     return f"results: {write_results(folder, numbers, used, context)}"
-
-
-def _recordings(data: DataConfig) -> tuple[Path, pl.DataFrame]:
-    """Path of the recordings, downloaded first if asked for, and all of their scenes."""
-    if data.format != "scenes" and data.path is None:
-        raise UserError(f"data={data.format}: which file is missing; give data.path=FILE.")
-    source = Path(data.path) if data.path else default_scenes()
-    if isinstance(data, NgsimDataConfig) and data.download:
-        with byte_progress("download") as progress:
-            download(data.url, source, data.sha256, progress)
-    with byte_progress("read") as progress:
-        return source, read_recordings(data.format, source, data.parameters(), progress)

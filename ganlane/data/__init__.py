@@ -1,14 +1,11 @@
 """Recorded traffic: readers of trajectory recordings into one schema, and statistics of driving.
 
-- ``schema`` defines the common form and validates it;
-- readers: ``scenes`` (scene CSV and Parquet), ``ngsim`` and ``highd``, all based on ``tables``
-  (text tables with errors traced to line and column);
-- ``download`` finds or fetches recordings, ``synthetic`` generates some;
-- measuring: ``lanes`` treats recordings and simulations alike, ``statistics`` combines all measurements;
-- ``prepare`` turns any recording into Parquet and pooled statistics.
+- ``schema`` defines the common form, validates it, and reads text tables with errors traced to line and column;
+- ``sources`` finds, fetches or generates recordings;
+- readers: ``ngsim``, ``highd``, and ``recordings`` (scene CSV, Parquet, any kind), which also prepares Parquet;
+- measuring: ``lanes`` treats recordings and simulations alike, ``statistics`` combines all measurements.
 """
 
-from ganlane.data.download import byte_progress, data_folder, default_scenes, download
 from ganlane.data.highd import highd_scenes
 from ganlane.data.lanes import (
     Tracks,
@@ -19,9 +16,26 @@ from ganlane.data.lanes import (
     tracks_of_frame,
 )
 from ganlane.data.ngsim import ngsim_scenes
-from ganlane.data.prepare import PooledStatistics, Preparation, SceneSummary, prepare_recordings, read_recordings
-from ganlane.data.scenes import read_scenes, write_prepared, write_scene_csv
+from ganlane.data.recordings import (
+    PooledStatistics,
+    Preparation,
+    SceneSummary,
+    prepare_recordings,
+    read_recordings,
+    read_scenes,
+    write_prepared,
+    write_scene_csv,
+)
 from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, TRACK_STRIDE, RowCount, Scene, sort, validate
+from ganlane.data.sources import (
+    SyntheticTraffic,
+    byte_progress,
+    data_folder,
+    default_scenes,
+    download,
+    recordings_path,
+    synthetic_scenes,
+)
 from ganlane.data.statistics import (
     Bins,
     DrivingStatistics,
@@ -30,7 +44,6 @@ from ganlane.data.statistics import (
     leader_gaps,
     survival_curve,
 )
-from ganlane.data.synthetic import SyntheticTraffic, synthetic_scenes
 from ganlane.parameters.generator import NgsimParameters
 
 __all__ = [
@@ -62,6 +75,7 @@ __all__ = [
     "prepare_recordings",
     "read_recordings",
     "read_scenes",
+    "recordings_path",
     "scene_lane_counts",
     "scene_lane_widths",
     "sort",

@@ -19,21 +19,24 @@ import numpy as np
 import polars as pl
 
 from ganlane.data.lanes import Flags, Floats, Integers
-from ganlane.data.schema import FRAME_S, SCHEMA, RowCount, Scene, number_tracks, sort, validate
-from ganlane.data.tables import LINE, raise_where, read_table
+from ganlane.data.schema import (
+    FRAME_S,
+    SCHEMA,
+    RowCount,
+    Scene,
+    number_tracks,
+    raise_where,
+    read_table,
+    sort,
+    validate,
+)
 from ganlane.errors import UserError
 
 _TRACKS: Final = "_tracks.csv"
 #: Columns of ``XX_tracks.csv`` that are read.
 COLUMNS: Final = {
-    "frame": pl.Int64,
-    "id": pl.Int64,
-    "x": pl.Float64,
-    "y": pl.Float64,
-    "width": pl.Float64,
-    "height": pl.Float64,
-    "xvelocity": pl.Float64,
-    "laneid": pl.Int64,
+    **dict.fromkeys(("frame", "id", "laneid"), pl.Int64),
+    **dict.fromkeys(("x", "y", "width", "height", "xvelocity"), pl.Float64),
 }
 #: ``drivingDirection`` of the upper lanes, driven to the left in the image, and of the lower lanes.
 UPPER: Final = 1
@@ -53,10 +56,8 @@ class _Direction:
 def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
     """Two scenes, ``highd-XX-upper`` and ``highd-XX-lower``, for each recording.
 
-    Args:
-        path: an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``, or a folder of
-            them.
-        count: rows read and dropped are added to it.
+    ``path`` is an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``, or a folder of
+    them; rows read and dropped are added to ``count``.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
@@ -76,19 +77,17 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
         rows = _read_rows(tracks, tracks.with_name(f"{stem}_tracksMeta.csv"), count)
         for direction in directions:
             name = f"highd-{stem}-{'upper' if direction.number == UPPER else 'lower'}"
-            scene = _scene(rows, direction, rate_hz, name, tracks, count)
-            if scene is not None:
+            if scene := _scene(rows, direction, rate_hz, name, tracks, count):
                 yield scene
 
 
 def _read_recording_meta(path: Path) -> tuple[float, tuple[_Direction, _Direction]]:
     """Frame rate in Hz, and both directions. Lane ids grow downwards; the id between the directions is unused."""
     columns = {"framerate": pl.Float64, "upperlanemarkings": pl.String, "lowerlanemarkings": pl.String}
-    row = read_table(path, columns).row(0, named=True)
-    rate_hz = row["framerate"]
+    rate_hz, *markings = read_table(path, columns).select(columns.keys()).row(0)
     if rate_hz < 10.0:
         raise UserError(f"{path}, line 2, column framerate: {rate_hz}, expected 10 Hz or more.")
-    upper, lower = (_markings(row[name], path, name) for name in ("upperlanemarkings", "lowerlanemarkings"))
+    upper, lower = (_markings(text, path, name) for text, name in zip(markings, list(columns)[1:]))
     n_upper, n_lower = len(upper) - 1, len(lower) - 1
     upper_ids = tuple(range(2, 2 + n_upper))
     lower_ids = tuple(range(n_upper + 2 + n_lower, n_upper + 2, -1))
@@ -113,20 +112,18 @@ def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
 
 def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     """Rows of a recording, sorted by vehicle and frame; ``direction`` is its vehicle's in the ``meta`` file."""
-    table = read_table(meta, {"id": pl.Int64, "drivingdirection": pl.Int64})
-    direction = table["drivingdirection"]
+    cars = read_table(meta, {"id": pl.Int64, "drivingdirection": pl.Int64})
+    direction = cars["drivingdirection"]
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
-    raise_where(~direction.is_in([UPPER, LOWER]), direction, meta, what, table[LINE])
+    raise_where(~direction.is_in([UPPER, LOWER]), cars, "drivingdirection", meta, what)
     rows = read_table(path, COLUMNS)
     count.read += rows.height
-    lines = rows[LINE]
     for name in ("width", "height"):
-        raise_where(rows[name] <= 0.0, rows[name], path, "is not above 0", lines)
+        raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
-    what = "is not after the last frame of its vehicle; frames must grow"
-    raise_where(step <= 0, rows["frame"], path, what, lines)
-    directions = rows["id"].replace_strict(table["id"], direction, default=None, return_dtype=pl.Int64)
-    raise_where(directions.is_null(), rows["id"], path, "is not in the tracksMeta file", lines)
+    raise_where(step <= 0, rows, "frame", path, "is not after the last frame of its vehicle; frames must grow")
+    directions = rows["id"].replace_strict(cars["id"], direction, default=None, return_dtype=pl.Int64)
+    raise_where(directions.is_null(), rows, "id", path, "is not in the tracksMeta file")
     return rows.with_columns(directions.alias("direction")).sort("id", "frame")
 
 
@@ -136,7 +133,7 @@ def _scene(
     """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles."""
     rows = rows.filter(pl.col("direction") == direction.number)
     on_road = rows["laneid"].is_in(list(direction.lane_ids))
-    count.drop("off the lanes of its direction", int((~on_road).sum()))
+    count.drop("off the lanes of its direction", (~on_road).sum())
     rows = rows.filter(on_road)
     if rows.is_empty():
         return None
@@ -158,12 +155,12 @@ def _scene(
     )
     tracks = number_tracks(turned, str(path))
     begins = (tracks["vehicle"].diff() != 0).fill_null(True).to_numpy()
-    new = resample(begins, tracks["frame"].to_numpy(), rate_hz)
-    columns = {name: tracks[name].to_numpy()[new.before] for name in ("scene", "vehicle")}
-    columns["frame"] = new.frame
-    columns |= {name: new.linear(tracks[name].to_numpy()) for name in ("x", "y", "speed", "length", "width")}
-    columns["lane"] = new.nearest(tracks["lane"].to_numpy())
-    frame = pl.DataFrame(columns, schema_overrides=SCHEMA).select(SCHEMA.names())
+    old = {name: tracks[name].to_numpy() for name in SCHEMA}
+    new = resample(begins, old["frame"], rate_hz)
+    nearest = np.where(new.share > 0.5, new.after, new.before)
+    columns = {"scene": old["scene"][new.before], "vehicle": old["vehicle"][new.before], "frame": new.frame}
+    columns |= {name: new.linear(old[name]) for name in ("x", "y", "speed", "length", "width")}
+    frame = pl.DataFrame(columns | {"lane": old["lane"][nearest]}, schema_overrides=SCHEMA).select(SCHEMA.names())
     if frame.is_empty():
         return None
     return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
@@ -186,10 +183,6 @@ class Resampling(NamedTuple):
     def linear(self, values: Floats) -> Floats:
         """[R] values, interpolated linearly."""
         return values[self.before] + self.share * (values[self.after] - values[self.before])
-
-    def nearest(self, values: Integers) -> Integers:
-        """[R] values of the nearest old sample; of two the earlier."""
-        return values[np.where(self.share > 0.5, self.after, self.before)]
 
 
 def resample(begins: Flags, frame: Integers, rate_hz: float) -> Resampling:

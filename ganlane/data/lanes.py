@@ -9,9 +9,8 @@ new one during the 0.5 s after, without interruption. A vehicle that only touche
 starts at the first sample at which the vehicle is within 0.3 m of the old lane's centre or moves towards the new
 lane at less than 0.1 m/s; ``tau_s`` is the time in between. ``tau_e`` is the time from the crossing to the first
 sample within 0.3 m of the new lane's centre or slower than 0.1 m/s. The lateral speed is the mean over 1 s,
-centred, since recorded positions are noisy. The offset alone is not enough: a fitted road is accurate to a few
-decimetres, and drivers keep an offset from the centre. Where the track ends first, the change is censored on that
-side: its time is a lower bound.
+centred, since recorded positions are noisy; the offset alone is not enough, since a fitted road is accurate to a few
+decimetres and drivers keep an offset. Where the track ends first, the change is censored on that side.
 """
 
 from __future__ import annotations
@@ -28,23 +27,15 @@ from ganlane.errors import UserError
 
 #: 12 feet, the standard lane of a US freeway: used where a recording has one lane only.
 STANDARD_LANE_WIDTH_M: Final = 3.66
-#: A lane counts for the first fit when it has this many rows (0.5 s of one vehicle or more).
-_FEWEST_ROWS = 5
-_PLAUSIBLE_M = (2.0, 6.0)
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-#: Minimum time in the old lane before the change, and in the new lane after it, s.
-HOLD_S: Final = 0.5
-#: Offset from the lane's centre below which the change has not begun or is over, m.
-CENTRED_M: Final = 0.3
-#: Lateral speed towards the new lane below which the change has not begun or is over, m/s.
-STILL_MPS: Final = 0.1
-#: Half the window of the mean lateral speed, s.
-SPEED_HALF_WINDOW_S: Final = 0.5
-#: Longest search for start and end, before and after the crossing, s.
-SEARCH_S: Final = 20.0
+#: Samples, 0.1 s each: least in the old lane before a change and in the new one after it; half the window of the mean
+#: lateral speed; longest search for start and end, before and after the crossing.
+_HOLD, _HALF_WINDOW, _REACH = 5, 5, 200
+#: Offset from the lane's centre and lateral speed below which the change has not begun or is over, m and m/s.
+_CENTRED_M, _STILL_MPS = 0.3, 0.1
 
 
 def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
@@ -57,32 +48,27 @@ def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
 
 def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
     """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
-    counts = frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1)
-    return {str(scene): int(lanes) for scene, lanes in counts.iter_rows()}
+    return dict(frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows())
 
 
 def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
-    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number.
+    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number [R].
 
     The first estimate is the median slope between the median positions of each pair of lanes (Theil and Sen), which
     is robust to outliers. It is kept if no other width within 10 % of it puts more rows into their recorded lane;
     otherwise the result is the middle of the best range. Lane changes make that range narrow, since a vehicle's lane
-    number changes just where it crosses the boundary.
-
-    Args:
-        y: [R] lateral positions, m, with 0 at the centre of lane 0 and growing with the lane number.
-        lane: [R] lane numbers.
+    number changes just where it crosses the boundary. ``y`` [R] in m is 0 at the centre of lane 0.
 
     Raises:
         UserError: the estimate is below 2 m or above 6 m.
     """
-    guess = _median_spacing(y, lane)
+    guess = _median_spacing(*_centres(y, lane))
     if guess is None:
         return STANDARD_LANE_WIDTH_M
-    if not _PLAUSIBLE_M[0] <= guess <= _PLAUSIBLE_M[1]:
+    if not 2.0 <= guess <= 6.0:
         raise UserError(
-            f"{scene}: its lanes are {guess:.2f} m apart, expected {_PLAUSIBLE_M[0]:.0f} to {_PLAUSIBLE_M[1]:.0f} m; "
-            "check that y is in metres, grows to the left, and that lanes are numbered in order."
+            f"{scene}: its lanes are {guess:.2f} m apart, expected 2 to 6 m; check that y is in metres, grows to the "
+            "left, and that lanes are numbered in order."
         )
     low, high = _best_range(y, lane, guess)
     return guess if low <= guess <= high else 0.5 * (low + high)
@@ -94,11 +80,9 @@ def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
     Each lane's median position gives an estimate of the centre; their median is returned.
     """
     numbers, centres = _centres(y, lane)
-    spacing = _median_spacing(y, lane)
-    if spacing is None:
-        centre = float(np.median(y - lane * STANDARD_LANE_WIDTH_M))
-    else:
-        centre = float(np.median(centres - numbers * spacing))
+    spacing = _median_spacing(numbers, centres)
+    from_0 = y - lane * STANDARD_LANE_WIDTH_M if spacing is None else centres - numbers * spacing
+    centre = float(np.median(from_0))
     return lane_width(y - centre, lane, scene), centre
 
 
@@ -116,9 +100,8 @@ def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
     return float(edges[nearest]), float(edges[nearest + 1])
 
 
-def _median_spacing(y: Floats, lane: Integers) -> float | None:
+def _median_spacing(numbers: Integers, centres: Floats) -> float | None:
     """Median slope between the lanes' median positions; None with fewer than two lanes."""
-    numbers, centres = _centres(y, lane)
     if len(numbers) < 2:
         return None
     one, other = np.triu_indices(len(numbers), 1)
@@ -126,9 +109,9 @@ def _median_spacing(y: Floats, lane: Integers) -> float | None:
 
 
 def _centres(y: Floats, lane: Integers) -> tuple[Integers, Floats]:
-    """Lanes with enough rows, and their median positions."""
+    """Lanes with enough rows (0.5 s of one vehicle), and their median positions."""
     numbers, rows = np.unique(lane, return_counts=True)
-    numbers = numbers[rows >= _FEWEST_ROWS]
+    numbers = numbers[rows >= 5]
     return numbers, np.array([np.median(y[lane == number]) for number in numbers])
 
 
@@ -242,7 +225,7 @@ def _crossings(lane: Integers, tracks: Tracks) -> Integers:
     """[C] last samples in an old lane, where both the old and the new lane are kept long enough."""
     starts_run = tracks.begins | (np.diff(lane, prepend=lane[:1]) != 0)
     lengths = np.diff(np.flatnonzero(starts_run), append=len(lane))
-    long_enough = lengths >= round(HOLD_S / FRAME_S)
+    long_enough = lengths >= _HOLD
     run = np.cumsum(starts_run) - 1
     after = np.flatnonzero(starts_run & ~tracks.begins)
     return after[long_enough[run[after]] & long_enough[run[after - 1]]] - 1
@@ -253,16 +236,14 @@ def _find_end(
 ) -> tuple[Integers, Flags]:
     """Start (``direction`` -1) or end (1) of lane changes: first sample that is centred or without lateral movement.
 
-    Returns:
-        [C] the samples, or the first or last samples of their tracks; and [C] whether the end lies within the track.
+    Returns [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies within the track.
     """
-    reach = round(SEARCH_S / FRAME_S)
     limit = (tracks.first if direction < 0 else tracks.last)[sample]
-    path = sample[:, None] + direction * np.arange(reach + 1)
+    path = sample[:, None] + direction * np.arange(_REACH + 1)
     inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
     path = np.where(inside, path, limit[:, None])
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    done = (np.abs(offset) < CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < STILL_MPS)
+    done = (np.abs(offset) < _CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < _STILL_MPS)
     done &= inside
     found = done.any(axis=1)
     at = np.where(found, done.argmax(axis=1), inside.sum(axis=1) - 1)
@@ -271,7 +252,6 @@ def _find_end(
 
 def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
     """Mean lateral speed over 1 s, centred at the samples ``at``, m/s; the window is shorter at a track's ends."""
-    half = round(SPEED_HALF_WINDOW_S / FRAME_S)
-    before = np.maximum(at - half, tracks.first[at])
-    after = np.minimum(at + half, tracks.last[at])
+    before = np.maximum(at - _HALF_WINDOW, tracks.first[at])
+    after = np.minimum(at + _HALF_WINDOW, tracks.last[at])
     return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * FRAME_S)

@@ -6,10 +6,9 @@ the rightmost lane's centre. Rows on ramps (lanes beyond ``lanes``) are dropped,
 lanes. US-101's auxiliary lane (6) is kept, as the rightmost. A car's track ends where a frame is missing or a ramp
 begins.
 
-Vehicle and frame numbers start again in every recording period, so a number alone does not identify a vehicle.
-Within a period ``global_time - 100 ms * frame_id``, the time of frame 0, is the same for every row. Rows are stored
-on disk by the minute of that time, block by block; adjacent minutes are one period. So memory holds one block, then
-one period, never the file, and tracks that extend over several blocks are not cut.
+Vehicle and frame numbers start again in every recording period; ``global_time - 100 ms * frame_id``, the time of
+frame 0, is the same for all rows of one. Rows are stored on disk by the minute of that time, block by block; adjacent
+minutes are one period. So memory holds one block, then one period, and tracks that extend over blocks are not cut.
 """
 
 from __future__ import annotations
@@ -23,23 +22,26 @@ from typing import Final
 import polars as pl
 
 from ganlane.data.lanes import lane_grid
-from ganlane.data.schema import SCHEMA, RowCount, Scene, number_tracks, sort
-from ganlane.data.tables import (
+from ganlane.data.schema import (
     LINE,
+    SCHEMA,
     OnProgress,
+    RowCount,
+    Scene,
     TextTable,
     convert,
     csv_table,
     first_line,
+    number_tracks,
     raise_where,
     read_blocks,
+    sort,
 )
 from ganlane.errors import UserError
 from ganlane.parameters.generator import MOTORWAYS, NgsimParameters
 
 FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100
-MINUTE_MS: Final = 60_000
 #: The 18 columns of the raw text files, which have no header.
 RAW_NAMES: Final = (
     *("vehicle_id", "frame_id", "total_frames", "global_time", "local_x", "local_y", "global_x", "global_y"),
@@ -48,23 +50,16 @@ RAW_NAMES: Final = (
 )
 #: Columns that are read; ``location`` too, where it exists.
 COLUMNS: Final = {
-    "vehicle_id": pl.Int64,
-    "frame_id": pl.Int64,
-    "global_time": pl.Int64,
-    "local_x": pl.Float64,
-    "local_y": pl.Float64,
-    "v_length": pl.Float64,
-    "v_width": pl.Float64,
-    "v_vel": pl.Float64,
+    **dict.fromkeys(("vehicle_id", "frame_id", "global_time"), pl.Int64),
+    **dict.fromkeys(("local_x", "local_y", "v_length", "v_width", "v_vel"), pl.Float64),
     "lane_id": pl.Int64,
 }
 LOCATION: Final = "location"
 #: Further locations in the portal's file: streets with intersections.
 STREETS: Final = ("lankershim", "peachtree")
-#: A file has about six periods; a damaged column of times or frames makes hundreds.
-MAX_PERIODS: Final = 500
-#: Minimum rows of a period in a file with several periods: a vehicle for 5 s.
-MIN_ROWS: Final = 50
+#: A file has about six periods; a damaged column of times or frames makes hundreds, or one of a few rows. The least
+#: number of rows, where there are several periods, are those of a vehicle for 5 s.
+MAX_PERIODS, MIN_ROWS = 500, 50
 #: Maximum number of rows from which lane width and position are estimated.
 ROWS_FOR_LANES: Final = 500_000
 #: Medians of vehicle lengths that can be feet: 15 is usual, 4.5 would be metres, 450 centimetres.
@@ -84,11 +79,9 @@ def ngsim_scenes(
 ) -> Iterator[Scene]:
     """The periods of an NGSIM file, one scene each, in bounded memory (a block, then a period).
 
-    Args:
-        path: a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any case and order; with
-            a column ``location`` it may hold several locations.
-        count: rows read and dropped are added to it.
-        scratch: folder for temporary files, which are removed at the end; by default the system's.
+    ``path`` is a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any case and order;
+    with a column ``location`` it may hold several locations. Rows read and dropped are added to ``count``;
+    ``scratch`` is a folder for temporary files, which are removed at the end, by default the system's.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
@@ -99,11 +92,9 @@ def ngsim_scenes(
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
         periods = _store_by_period(rows, Path(folder), str(path))
         if not periods:
-            places = ", ".join(parameters.locations)
-            raise UserError(f"{path}: no rows of {places}; check data.locations.")
+            raise UserError(f"{path}: no rows of {', '.join(parameters.locations)}; check data.locations.")
         for name, parts in periods.items():
-            scene = _scene(name, _read(parts), path, parameters.lanes, count)
-            if scene is not None:
+            if scene := _scene(name, _read(parts), path, parameters.lanes, count):
                 yield scene
 
 
@@ -133,30 +124,30 @@ def _read_rows(
             text = _keep_locations(text, path, parameters.locations, count)
         else:
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
-        lines = text[LINE]
-        columns = {name: convert(text[name], kind, path, lines, thousands=True) for name, kind in COLUMNS.items()}
+        columns = [convert(text, name, kind, path, thousands=True) for name, kind in COLUMNS.items()]
+        rows = pl.DataFrame([*columns, text[LOCATION], text[LINE]])
         for name in ("v_length", "v_width"):
-            raise_where(columns[name] <= 0.0, columns[name], path, "is not above 0", lines)
-        raise_where(columns["v_vel"] < 0.0, columns["v_vel"], path, "is below 0", lines)
-        yield pl.DataFrame([*columns.values(), text[LOCATION], lines])
+            raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
+        raise_where(rows["v_vel"] < 0.0, rows, "v_vel", path, "is below 0")
+        yield rows
 
 
 def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount) -> pl.DataFrame:
     """Rows of the wanted locations; rows of others are dropped and counted."""
-    found = convert(text[LOCATION], pl.String, path, text[LINE]).str.to_lowercase()
+    text = text.with_columns(convert(text, LOCATION, pl.String, path).str.to_lowercase())
     known = sorted({*MOTORWAYS, *STREETS, *locations})
     what = f"is no known place, expected {', '.join(known)}, or name it in data.locations"
-    raise_where(~found.is_in(known), found, path, what, text[LINE])
-    kept = found.is_in(list(locations))
-    for location, rows in found.filter(~kept).value_counts().iter_rows():
+    raise_where(~text[LOCATION].is_in(known), text, LOCATION, path, what)
+    kept = text[LOCATION].is_in(list(locations))
+    for location, rows in text[LOCATION].filter(~kept).value_counts().iter_rows():
         count.drop(f"location {location}", rows)
-    return text.with_columns(found).filter(kept)
+    return text.filter(kept)
 
 
 def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) -> dict[str, list[Path]]:
     """Store the rows of all blocks under ``folder``; the files of each period, by its name: ``us-101-1``."""
     parts: dict[tuple[str, int], list[Path]] = {}
-    start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // MINUTE_MS
+    start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // 60_000
     for number, block in enumerate(blocks):
         for (location, minute), rows in block.group_by(LOCATION, start.alias("minute"), maintain_order=True):
             part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
@@ -196,8 +187,8 @@ def _scene(name: str, rows: pl.DataFrame, path: Path, lanes: int, count: RowCoun
     rows = _drop_duplicates(rows, count)
     _check_order(rows, path)
     _check_units(rows, source)
-    count.drop("lane below 1", int((rows["lane_id"] < 1).sum()))
-    count.drop("ramp", int((rows["lane_id"] > lanes).sum()))
+    count.drop("lane below 1", (rows["lane_id"] < 1).sum())
+    count.drop("ramp", (rows["lane_id"] > lanes).sum())
     rows = rows.filter(rows["lane_id"].is_between(1, lanes))
     if rows.is_empty():
         return None
@@ -227,10 +218,10 @@ def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
     again = (pl.col("vehicle_id").diff() == 0) & (pl.col("global_time").diff() == 0)
     values = [name for name in COLUMNS if name not in ("vehicle_id", "global_time")]
     equal = pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in values)
-    flags = rows.select(again=again.fill_null(False), equal=equal.fill_null(False))
-    count.drop("duplicate", int((flags["again"] & flags["equal"]).sum()))
-    count.drop("same vehicle and time, other values", int((flags["again"] & ~flags["equal"]).sum()))
-    return rows.filter(~flags["again"])
+    repeated, same = rows.select(again.fill_null(False).alias("again"), equal.fill_null(False)).get_columns()
+    count.drop("duplicate", (repeated & same).sum())
+    count.drop("same vehicle and time, other values", (repeated & ~same).sum())
+    return rows.filter(~repeated)
 
 
 def _check_order(rows: pl.DataFrame, path: Path) -> None:
@@ -241,8 +232,8 @@ def _check_order(rows: pl.DataFrame, path: Path) -> None:
         apart=same_vehicle & (pl.col("global_time").diff() != FRAME_MS * frames),
     )
     what = "does not grow with global_time within its vehicle"
-    raise_where(flags["backwards"], rows["frame_id"], path, what, rows[LINE])
-    raise_where(flags["apart"], rows["global_time"], path, "is not 100 ms a frame after the row before", rows[LINE])
+    raise_where(flags["backwards"], rows, "frame_id", path, what)
+    raise_where(flags["apart"], rows, "global_time", path, "is not 100 ms a frame after the row before")
 
 
 def _check_units(rows: pl.DataFrame, source: str) -> None:
@@ -250,10 +241,10 @@ def _check_units(rows: pl.DataFrame, source: str) -> None:
     line = int(rows[LINE].min())  # type: ignore[arg-type]
     length = float(rows["v_length"].median())  # type: ignore[arg-type]
     if not LENGTHS_FT[0] <= length <= LENGTHS_FT[1]:
-        guess = "they look like metres" if length < LENGTHS_FT[0] else "they look like centimetres or inches"
+        guess = "metres" if length < LENGTHS_FT[0] else "centimetres or inches"
         raise UserError(
             f"{source}, from line {line}, column v_length: the median is {length:.1f}, expected feet, about 15; "
-            f"{guess}, convert all columns to feet."
+            f"they look like {guess}, convert all columns to feet."
         )
     distance = pl.col("local_y").last() - pl.col("local_y").first()
     seconds = (pl.col("global_time").last() - pl.col("global_time").first()) / 1000.0
@@ -262,10 +253,8 @@ def _check_units(rows: pl.DataFrame, source: str) -> None:
         pace=distance / (seconds * speed), rows=pl.len(), speed=speed
     )
     moving = per_vehicle.filter((pl.col("rows") >= _PACE_FRAMES) & (pl.col("speed") >= _PACE_FT_S))
-    if moving.is_empty():
-        return
-    pace = float(moving["pace"].median())  # type: ignore[arg-type]
-    if not PACE[0] <= pace <= PACE[1]:
+    pace = moving["pace"].median()
+    if isinstance(pace, float) and not PACE[0] <= pace <= PACE[1]:
         raise UserError(
             f"{source}, from line {line}, columns local_y and v_vel: vehicles cover {pace:.2f} times the distance "
             "that their speed makes; expected feet and feet per second (0.91 would be km/h, 1.47 miles per hour, "

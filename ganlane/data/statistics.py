@@ -20,13 +20,9 @@ from ganlane.errors import UserError
 _Record = TypeVar("_Record")
 #: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
 LEVELS: Final = (0.01, *(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
-#: Gap of a standing car to its leader, m (Table V's ``s_0``): not part of the headway.
-STANDSTILL_GAP_M: Final = 2.0
-#: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s.
-FOLLOWING_GAP_M: Final = 70.0
-MIN_FOLLOWER_MPS: Final = 2.0
-#: A follower's headway is measured over at least 1 s.
-MIN_FRAMES: Final = 10
+#: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s. The gap of a standing car, m
+#: (Table V's ``s_0``), is not part of the headway.
+_FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = 70.0, 2.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -78,7 +74,7 @@ def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
     mean = median = None
     if is_complete.any():
         ends, survival = survival_curve(times, is_complete)
-        edges = np.concatenate(([0.0], ends, [max(times.max(), ends[-1])]))
+        edges = np.concatenate(([0.0], ends, [times.max()]))
         mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
         halved = np.flatnonzero(survival <= 0.5)
         median = float(ends[halved[0]]) if len(halved) else None
@@ -88,8 +84,7 @@ def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
 def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Kaplan and Meier's (1958) survival curve of durations [C], of which those not ``complete`` are lower bounds.
 
-    Returns:
-        [E] the distinct complete durations, growing, and [E] the shares of longer durations, falling.
+    Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations, falling.
     """
     times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
     ends, ending = np.unique(times[is_complete], return_counts=True)
@@ -112,10 +107,7 @@ class Bins:
 
 
 class Histogram:
-    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part by part.
-
-    Quantiles are interpolated linearly within a bin, so they are accurate to a bin's width.
-    """
+    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part by part."""
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
@@ -146,7 +138,7 @@ class Histogram:
         return Distribution(n, mean, spread, tuple(self.quantile(level) for level in LEVELS))
 
     def quantile(self, level: float) -> float:
-        """Value at ``level``, linear within its bin."""
+        """Value at ``level``, linear within its bin, so accurate to a bin's width."""
         below = np.concatenate(([0], np.cumsum(self.counts)))
         occupied = np.flatnonzero(self.counts)
         k = int(occupied[min(int(np.searchsorted(below[occupied + 1], level * self.total)), len(occupied) - 1)])
@@ -162,11 +154,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Amount of driving.
-
-    ``cars`` counts a car once per scene, however many tracks it has; ``road_m`` is the mean length of the road over
-    the cars; ``vehicle_km`` is the distance driven.
-    """
+    """Amount of driving; ``cars`` are counted once per scene, ``road_m`` is the road's mean length over the cars."""
 
     scenes: int
     tracks: int
@@ -204,59 +192,41 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
 
 
-def followers(with_leader: pl.DataFrame) -> pl.DataFrame:
-    """Rows of :func:`leader_gaps` in which a vehicle follows: gap of 0 to 70 m, speed of at least 2 m/s."""
-    close = pl.col("gap").is_between(0.0, FOLLOWING_GAP_M)
-    return with_leader.filter(close & (pl.col("speed") >= MIN_FOLLOWER_MPS))
+def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
+    """Samples of every quantity of a frame in the schema, sorted: ``speed`` and those below.
 
-
-def median_headways(following: pl.DataFrame) -> pl.Series:
-    """Median of ``(gap - 2 m) / speed`` of every follower, s: one number per track, in the order of the tracks.
-
-    Tracks with less than 1 s of rows of :func:`followers` are left out.
-    """
-    headway = (pl.col("gap") - STANDSTILL_GAP_M) / pl.col("speed")
-    per_track = following.group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
-    return per_track.filter(pl.col("len") >= MIN_FRAMES).sort(TRACK)["headway"]
-
-
-def raw_accelerations(frame: pl.DataFrame) -> pl.Series:
-    """Differences of the recorded speed between frames, m/s2; mostly noise in raw recordings."""
-    steps = frame.select(((pl.col("speed") - _earlier("speed", 1)) / FRAME_S).alias("acceleration"))
-    return steps["acceleration"].drop_nulls()
-
-
-def smoothed_accelerations(frame: pl.DataFrame) -> pl.Series:
-    """Mean speed of one second minus the mean speed of the second before, per second, m/s2.
-
-    The filter is ``(x[t] - 2 x[t - 1 s] + x[t - 2 s]) / (1 s)^2``: the true acceleration weighted by a triangle of
-    two seconds' width. A track of less than two seconds gives no value.
+    ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in raw recordings.
+    ``acceleration_smoothed``: ``(x[t] - 2 x[t - 1 s] + x[t - 2 s]) / (1 s)^2``, the true acceleration weighted by a
+    triangle of two seconds' width, m/s2; none in tracks of less than two seconds. ``gap``: to the leader
+    (:func:`leader_gaps`), m. ``time_headway``: ``gap / speed`` of followers, s: a gap of 0 to 70 m, at least 2 m/s.
+    ``headway``: each follower's median of ``(gap - 2 m) / speed``, s, over at least 1 s; in the order of the tracks.
     """
     lag = round(1.0 / FRAME_S)
-    bend = (pl.col("x") - 2.0 * _earlier("x", lag) + _earlier("x", 2 * lag)) / (lag * FRAME_S) ** 2
-    return frame.select(bend.alias("acceleration"))["acceleration"].drop_nulls()
 
+    def earlier(column: str, frames: int) -> pl.Expr:
+        """The column's value ``frames`` earlier in the same track; null where any frame in between is missing."""
+        same = pl.col("frame").shift(frames).over(TRACK) == pl.col("frame") - frames
+        return pl.when(same).then(pl.col(column).shift(frames).over(TRACK))
 
-def _earlier(column: str, frames: int) -> pl.Expr:
-    """The column's value ``frames`` earlier in the same track; null where any frame in between is missing."""
-    same = pl.col("frame").shift(frames).over(TRACK) == pl.col("frame") - frames
-    return pl.when(same).then(pl.col(column).shift(frames).over(TRACK))
-
-
-def srlc(changes: int, vehicles: int, road_m: float) -> float:
-    """Equation 9: lane changes per vehicle and kilometre of road, ``n / q * 1000 / L``.
-
-    It assumes that every vehicle drives the whole road; where tracks cover only part of it, it is too low.
-    """
-    return changes / vehicles * 1000.0 / road_m
-
-
-def steps_between_changes(rate_per_km: float, speed_mps: float) -> float:
-    """Equation 10's ``t_m``: mean time between two lane changes of a vehicle, in steps of 0.1 s.
-
-    ``rate_per_km`` counts lane changes per vehicle-km and is above 0.
-    """
-    return 1000.0 / (rate_per_km * speed_mps * FRAME_S)
+    accelerations = frame.select(
+        raw=(pl.col("speed") - earlier("speed", 1)) / FRAME_S,
+        smoothed=(pl.col("x") - 2.0 * earlier("x", lag) + earlier("x", 2 * lag)) / (lag * FRAME_S) ** 2,
+    )
+    # Sorting needs most memory: only once, and with no more columns than needed.
+    columns = frame.select("scene", "vehicle", "frame", "x", "speed", "lane", "length")
+    with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
+    close = pl.col("gap").is_between(0.0, _FOLLOWING_GAP_M)
+    following = with_leader.filter(close & (pl.col("speed") >= _MIN_FOLLOWER_MPS))
+    headway = (pl.col("gap") - _STANDSTILL_GAP_M) / pl.col("speed")
+    per_follower = following.group_by(TRACK).agg(headway.median().alias("headway"), pl.len())
+    return {
+        "speed": frame["speed"].to_numpy(),
+        "acceleration_raw": accelerations["raw"].drop_nulls().to_numpy(),
+        "acceleration_smoothed": accelerations["smoothed"].drop_nulls().to_numpy(),
+        "headway": per_follower.filter(pl.col("len") >= lag).sort(TRACK)["headway"].to_numpy(),
+        "time_headway": (following["gap"] / following["speed"]).to_numpy(),
+        "gap": with_leader["gap"].to_numpy(),
+    }
 
 
 def poisson_interval(count: int) -> tuple[float, float]:
@@ -272,10 +242,10 @@ class LaneChangeStatistics:
 
     Attributes:
         count: number of lane changes (:mod:`ganlane.data.lanes` defines what counts).
-        srlc: equation 9, per vehicle and km of road.
+        srlc: equation 9, per vehicle and km of road; too low where tracks cover only part of the road.
         per_vehicle_km, per_vehicle_km_low, per_vehicle_km_high: per driven km, with its exact 95 % interval.
-        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m`` from either rate and the mean speed, in steps of
-            0.1 s; None without lane changes.
+        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m``, the mean time between two lane changes of a
+            vehicle, from either rate and the mean speed, in steps of 0.1 s; None without lane changes.
         duration: equation 11, s.
         lateral_speed: mean lateral speed of each complete change, m/s; its ``mean`` and ``sd`` are the Gaussian.
         lateral_speed_with_censored: the same of all changes, over their recorded parts.
@@ -297,15 +267,15 @@ def lane_change_statistics(changes: LaneChanges, exposure: Exposure, speed_mps: 
     """Statistics of lane changes found in that much driving at that mean speed, m/s."""
     n, km = len(changes), exposure.vehicle_km
     low, high = poisson_interval(n)
-    by_road, by_distance = srlc(n, exposure.cars, exposure.road_m), n / km
+    by_road, by_distance = n / exposure.cars * 1000.0 / exposure.road_m, n / km
     return LaneChangeStatistics(
         count=n,
         srlc=by_road,
         per_vehicle_km=by_distance,
         per_vehicle_km_low=low / km,
         per_vehicle_km_high=high / km,
-        t_m_srlc_steps=steps_between_changes(by_road, speed_mps) if n else None,
-        t_m_vehicle_km_steps=steps_between_changes(by_distance, speed_mps) if n else None,
+        t_m_srlc_steps=1000.0 / (by_road * speed_mps * FRAME_S) if n else None,
+        t_m_vehicle_km_steps=1000.0 / (by_distance * speed_mps * FRAME_S) if n else None,
         duration=describe_durations(changes.duration_s, changes.complete),
         lateral_speed=describe(changes.lateral_speed[changes.complete]),
         lateral_speed_with_censored=describe(changes.lateral_speed),
@@ -316,12 +286,9 @@ def lane_change_statistics(changes: LaneChanges, exposure: Exposure, speed_mps: 
 class DrivingStatistics:
     """Statistics of a recording in SI units; :meth:`to_dict` and :meth:`from_dict` are exact inverses.
 
-    Attributes:
-        speed: of all samples, m/s.
-        speed_sd_in_frame, speed_sd_in_lane: standard deviation of the speeds within a frame, and within a frame and
-            lane, m/s; the mean over those with two vehicles or more, None without any.
-        acceleration_raw, acceleration_smoothed: :func:`raw_accelerations`, :func:`smoothed_accelerations`, m/s2.
-        headway: median ``(gap - 2) / speed`` per follower, s (:func:`median_headways`).
+    ``speed_sd_in_frame`` and ``speed_sd_in_lane`` are standard deviations of the speeds within a frame, and within a
+    frame and lane, m/s: the mean over those with two vehicles or more, None without any. The distributions are of
+    :func:`quantities`.
     """
 
     exposure: Exposure
@@ -363,18 +330,15 @@ def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
 
 def driving_statistics(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> DrivingStatistics:
     """Measure a frame in the schema, sorted; each scene's lane width in m is estimated where not given."""
-    exposure = measure_exposure(frame)
-    speed = describe(frame["speed"].to_numpy())
+    exposure, samples = measure_exposure(frame), quantities(frame)
     changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
+    described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
     return DrivingStatistics(
         exposure=exposure,
-        lane_changes=lane_change_statistics(changes, exposure, float(speed.mean or 0.0)),
-        speed=speed,
+        lane_changes=lane_change_statistics(changes, exposure, float(samples["speed"].mean())),
         speed_sd_in_frame=_mean_spread(frame, ["scene", "frame"]),
         speed_sd_in_lane=_mean_spread(frame, ["scene", "frame", "lane"]),
-        acceleration_raw=describe(raw_accelerations(frame).to_numpy()),
-        acceleration_smoothed=describe(smoothed_accelerations(frame).to_numpy()),
-        headway=describe(median_headways(followers(leader_gaps(frame))).to_numpy()),
+        **{name: describe(samples[name]) for name in described},
     )
 
 

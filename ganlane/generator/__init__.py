@@ -2,20 +2,27 @@
 
 Read in this order:
 
-- recordings to batches: ``segments`` (of scenes), ``windows`` (9 positions observed, 8 to predict; k-means groups);
-- ``networks``: generator and discriminator;
-- closed loop: ``closed_loop`` (one step of each preset, in fitting and in simulation), ``rollout`` (whole scenes);
-- fitting: ``tasks`` (of both presets), ``fit`` (splits, early stopping, resuming, one call), ``checkpoint``;
-- measuring: ``forecasts`` (networks, IDM, baselines; scores), ``cross_validation`` (folds by scene, ablations).
+- ``networks``: generator and discriminator; ``checkpoint``: their files, and arrays that are kept;
+- ``windows``: recordings to batches (segments of scenes; 9 positions observed, 8 to predict; k-means groups);
+- ``closed_loop``: one step of each preset, in fitting and in simulation, and rollouts of whole scenes;
+- ``forecasts``: of networks, IDM and baselines, and their scores;
+- ``tasks``: what each preset fits, and the loop; ``fit``: splits, one call, folds by scene, ablations.
 """
 
 from ganlane.generator.checkpoint import FitResult, Preset, load_generator, shipped_generator
-from ganlane.generator.closed_loop import ANCHOR, AnchorParameters
-from ganlane.generator.cross_validation import ablate, cross_validate
-from ganlane.generator.fit import HELD_OUT, Progress, assign_folds, fit_generator, fit_key, split_for_fit
+from ganlane.generator.closed_loop import ANCHOR, AnchorParameters, headway_quantiles
+from ganlane.generator.fit import (
+    HELD_OUT,
+    ablate,
+    assign_folds,
+    cross_validate,
+    fit_generator,
+    fit_key,
+    split_for_fit,
+)
 from ganlane.generator.networks import Discriminator, Generator
-from ganlane.generator.rollout import headway_quantiles
-from ganlane.generator.segments import scene_tracks
+from ganlane.generator.tasks import Progress
+from ganlane.generator.windows import scene_tracks
 from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
 
 __all__ = [

@@ -1,37 +1,44 @@
-"""A fitted generator with its description, saved and loaded."""
+"""Files: fitted generators with their description, and arrays that are kept so that they are not computed again."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import io
+import json
+import os
+import sys
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import torch
-from torch import Tensor
 
 from ganlane._version import __version__
 from ganlane.errors import UserError
-from ganlane.files import CHECKPOINTS
-from ganlane.generator.forecasts import Metrics
+from ganlane.files import CHECKPOINTS, has_checksum, sealed_archive, write_bytes
 from ganlane.generator.networks import Generator
 from ganlane.parameters.generator import EXTRA_INPUTS, GeneratorSizes, Preset
 from ganlane.weights import load_weights, save_weights
 
 KIND = "generator"
-#: Inputs in addition to the motion, by preset.
-PRESET_INPUTS = {"paper": 0, "calibrated": EXTRA_INPUTS}
-#: Sizes that older files do not have; they get their defaults.
-_ADDED_LATER = {"differences"}
+#: Environment variable with the cache folder; empty switches the cache off.
+CACHE_VARIABLE = "GANLANE_CACHE"
+#: ``{"all" or scene: {"ERROR/KIND": value}}``.
+Metrics = dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """A fitted generator and what it was fitted with.
+    """A fitted generator (``module``) and what it was fitted with.
 
     Attributes:
-        module: the generator with the weights that were best on the validation scenes.
-        metrics: of these weights on the held-out scenes, for ``"all"`` and each scene; the paper's preset also has
+        metrics: on the held-out scenes, for ``"all"`` and each scene; the paper's preset also has
             ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored together.
         config: settings of the fit, as plain data.
         data: file, rows and tracks, and the names of the fitted, validation and held-out scenes.
@@ -90,21 +97,10 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
         raise UserError(
             f"{path}: a generator of preset {found!r}, expected {preset or 'paper or calibrated'!r}; give one."
         )
-    generator = _generator_of(path, metadata.get("sizes"), tensors)
-    if generator.sizes.extra_inputs != PRESET_INPUTS[found]:
-        raise UserError(
-            f"{path}: takes {generator.sizes.extra_inputs} further inputs, expected {PRESET_INPUTS[found]} for the "
-            f"preset {found}; fit it again."
-        )
-    if not isinstance(metadata.get("driving_statistics"), dict):
-        raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
-    return generator.eval().requires_grad_(False), metadata
-
-
-def _generator_of(path: str | Path, sizes: Any, tensors: Mapping[str, Tensor]) -> Generator:
-    """A generator of the stored sizes with the stored weights."""
+    sizes: Any = metadata.get("sizes")
     kinds = {field.name: type(field.default) for field in fields(GeneratorSizes)}
-    complete = isinstance(sizes, dict) and set(kinds) - _ADDED_LATER <= set(sizes) <= set(kinds)
+    # Older files do not have ``differences``, which gets its default.
+    complete = isinstance(sizes, dict) and set(kinds) - {"differences"} <= set(sizes) <= set(kinds)
     # The bound keeps a damaged file from requesting all memory.
     if not complete or not all(
         isinstance(value, int) and 0 <= value <= 4096 and type(value) is kinds[name] for name, value in sizes.items()
@@ -113,9 +109,71 @@ def _generator_of(path: str | Path, sizes: Any, tensors: Mapping[str, Tensor]) -
     try:
         with torch.random.fork_rng(devices=[]):
             generator = Generator(GeneratorSizes(**sizes))
-        generator.load_state_dict(dict(tensors))
+        generator.load_state_dict(tensors)
     except RuntimeError as error:
         raise UserError(
             f"{path}: its weights do not have the shapes that its sizes {sizes} ask for; fit it again."
         ) from error
-    return generator
+    inputs, expected = generator.sizes.extra_inputs, EXTRA_INPUTS if found == "calibrated" else 0
+    if inputs != expected:
+        raise UserError(
+            f"{path}: takes {inputs} further inputs, expected {expected} for the preset {found}; fit it again."
+        )
+    if not isinstance(metadata.get("driving_statistics"), dict):
+        raise UserError(f"{path}: holds no driving statistics of its recordings; fit it again.")
+    return generator.eval().requires_grad_(False), metadata
+
+
+def cache_folder() -> Path | None:
+    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder; None if switched off."""
+    named = os.environ.get(CACHE_VARIABLE)
+    if named is not None:
+        return Path(named) if named else None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
+
+
+def content_hash(settings: Any, *arrays: np.ndarray) -> str:
+    """Hash of plain settings and of the arrays' types, shapes and bytes."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for array in arrays:
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()[:32]
+
+
+def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays that ``compute`` returns, from the cache if it ran for this ``key`` before.
+
+    A damaged file is computed again, and a folder that cannot be written to is ignored.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return compute()
+    path = folder / f"{name}_{key}.npz"
+    arrays = load_arrays(path)
+    if arrays is None:
+        arrays = compute()
+        with suppress(OSError):
+            save_arrays(path, arrays)
+    return arrays
+
+
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as .npz with a checksum, atomically."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's stub takes a name for an option
+    write_bytes(path, sealed_archive(file.getvalue()))
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
+    """What :func:`save_arrays` wrote, without pickle; None where it is absent, with a note where damaged."""
+    if not path.is_file():
+        return None
+    of_numpy = (KeyError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)
+    with suppress(UserError, OSError, ValueError, *of_numpy):
+        content = path.read_bytes()
+        if has_checksum(content, path):
+            with np.load(io.BytesIO(content), allow_pickle=False) as kept:
+                return dict(kept)
+    print(f"{path}: damaged or without a checksum; computed again.", file=sys.stderr)
+    return None

@@ -1,4 +1,4 @@
-"""One step of each preset in closed loop; the same functions run in fitting and in simulation.
+"""Closed loop: one step of each preset, in fitting and in simulation alike, and rollouts of recorded scenes.
 
 **paper**: positions only, the first predicted displacement moves the vehicle (:func:`paper_step`).
 
@@ -13,41 +13,54 @@ move the body out of its lane is left out. The anchor keeps vehicles on the road
 network adds the variety and the reactions of recorded drivers.
 
 Every vehicle carries a history of its motions (:class:`History`) and a latent vector that changes slowly
-(:func:`wander`).
+(:func:`wander`). Each driver has a headway and a desired speed of its own: in rollouts of recorded scenes the headway
+at which IDM is in balance, where it is known (:func:`balanced_headway`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ganlane.data import DrivingStatistics
 from ganlane.generator.networks import Generator, Observation
+from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
-from ganlane.sim.idm import IdmParameters, following_acceleration
-from ganlane.sim.neighbours import Scene, leader, perceive
+from ganlane.sim.idm import TABLE_V, IdmParameters, following_acceleration
+from ganlane.sim.lanes import ENTRY_M, Visibility
+from ganlane.sim.neighbours import FREE_GAP_M, Scene, leader, perceive
 from ganlane.sim.state import Road, Vehicles
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3
-_SLOWEST_MPS = 1e-3
-#: Keeps the gradient of a speed of 0 finite, m/s.
-_TINY = 1e-6
 #: The body keeps this distance from the lane's edge; outward residuals fade over the distance before it, m.
 _MARGIN_M, _FADE_M = 0.1, 0.3
+#: Levels of the headway quantiles.
+QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+#: Quantiles of (gap - 2 m) / speed of recorded followers on US-101, s: the default where no statistics are given.
+HEADWAY_QUANTILES_S = (0.50, 0.93, 1.27, 1.93, 3.27)
+#: Lower bound of a recorded driver's headway, s.
+SHORTEST_HEADWAY_S = 0.1
+#: Desired speed above the present one, m/s: range drawn from in fitting, and the middle used in evaluation.
+DESIRED_EXCESS_MPS = (1.0, 11.0)
+#: Desired speed of all drivers if they do not differ: the middle of Table II's range, m/s.
+COMMON_SPEED_MPS = 22.0
+#: In fitting, standard deviation of the headways' logarithm about the balanced ones, so that drivers are off balance.
+_SCATTER = 0.25
 
 
 class History(NamedTuple):
     """Past motions of [N, M] vehicles.
 
-    Attributes:
-        motions: observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest first. Separate
-            tensors, because a single one would be copied whole at every step.
-        displacement: [N, M, 2], the newest motion's displacement, m per 0.1 s.
+    ``motions`` are observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest first; separate
+    ones, because a single one would be copied whole at every step. ``displacement`` [N, M, 2] is the newest motion's,
+    m per 0.1 s.
     """
 
     motions: tuple[Tensor, ...]
@@ -97,12 +110,13 @@ def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehi
     forward = velocity_x.clamp_min(0.0)
     limit = STEEPEST * forward
     lateral = torch.maximum(torch.minimum(velocity_y, limit), -limit)
-    speed = torch.sqrt(forward * forward + lateral * lateral + _TINY * _TINY)
+    # The small terms keep the gradient at a speed of 0 finite.
+    speed = torch.sqrt(forward * forward + lateral * lateral + 1e-6 * 1e-6)
     return vehicles.with_(
         x=vehicles.x + forward * PHYSICS_STEP_S,
         y=vehicles.y + lateral * PHYSICS_STEP_S,
         speed=speed,
-        heading=torch.atan(lateral / forward.clamp_min(_SLOWEST_MPS)),
+        heading=torch.atan(lateral / forward.clamp_min(1e-3)),
         acceleration=(speed - vehicles.speed) / PHYSICS_STEP_S,
     )
 
@@ -206,12 +220,10 @@ def anchored_step(
     noise: Tensor,
     parameters: AnchorParameters = ANCHOR,
 ) -> tuple[Vehicles, DriverMemory]:
-    """One step of the calibrated preset: vehicles 0.1 s later and their new memory.
+    """One step of the calibrated preset: vehicles [N, M] 0.1 s later and their new memory.
 
-    Args:
-        vehicles: [N, M]; ``target_lane`` is the lane to keep or to change to, ``desired_speed`` is the driver's own.
-        road: one per row in recorded scenes.
-        noise: latent vectors [N, M, Z]; zeros give the mean driver.
+    The vehicles' ``target_lane`` is the lane to keep or to change to, ``desired_speed`` the driver's own; ``road`` is
+    one per row in recorded scenes; latent vectors ``noise`` [N, M, Z] of zeros give the mean driver.
     """
     p = parameters
     displacement = displacement_of(vehicles)
@@ -233,3 +245,126 @@ def anchored_step(
     velocity_x = velocity[..., 0] + (anchor_x + residual[..., 0]) * PHYSICS_STEP_S
     velocity_y = velocity[..., 1] + (anchor_y + residual_y) * PHYSICS_STEP_S
     return moved_by(vehicles, velocity_x, velocity_y), DriverMemory(history, mean, memory.headway)
+
+
+def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> Vehicles:
+    """The recorded vehicles [B, V] at ``frame`` (1 or later), their velocity the last displacement's.
+
+    Each occupies the lane of its centre only, with a small width: recorded lanes are narrow and straightened to some
+    decimetres, so by its body one vehicle in ten would occupy two lanes and make others brake.
+    """
+    position, target = segments.positions[:, frame], segments.target_lane[:, frame]
+    velocity = (position - segments.positions[:, frame - 1]) / PHYSICS_STEP_S
+    x, y = position.unbind(-1)
+    return Vehicles(
+        x=x,
+        y=y,
+        heading=torch.atan(velocity[..., 1] / velocity[..., 0].clamp_min(0.1)),
+        speed=torch.sqrt((velocity * velocity).sum(-1)),
+        acceleration=torch.zeros_like(x),
+        length=segments.length,
+        width=torch.full_like(x, 2.0 * ENTRY_M),
+        desired_speed=desired_speed,
+        target_lane=target,
+        visibility=torch.full_like(target, int(Visibility.CENTRE)),
+        valid=segments.present[:, frame],
+    )
+
+
+def driven_positions(segments: Segments, desired_speed: Tensor, move: Callable[[Vehicles, int], Vehicles]) -> Tensor:
+    """Positions [B, H, V, 2] in m when ``move`` drives all vehicles jointly for H steps after the observed frames.
+
+    ``move`` takes the vehicles now and the step's number to the vehicles 0.1 s later. A vehicle that appears later
+    starts at its first recorded position with the velocity of its first displacement. A vehicle is removed at the
+    frame where its recording ends.
+    """
+    vehicles, positions = recorded_vehicles(segments, PRESENT, desired_speed), []
+    appeared = segments.present.cumsum(dim=1) > 0
+    for step in range(segments.positions.shape[1] - OBSERVED_POSITIONS):
+        moved = move(vehicles, step)
+        entering = recorded_vehicles(segments, PRESENT + step + 1, desired_speed)
+        vehicles = moved.where(appeared[:, PRESENT + step], entering).with_(
+            valid=entering.valid, target_lane=entering.target_lane
+        )
+        positions.append(torch.stack([vehicles.x, vehicles.y], dim=-1))
+    return torch.stack(positions, dim=1)
+
+
+def rollout(
+    generator: Generator, segments: Segments, drivers: tuple[Tensor, Tensor], noise: Tensor, config: CalibratedConfig
+) -> Tensor:
+    """Positions [K, B, H, V, 2] in m of K joint rollouts (:func:`driven_positions`) by the calibrated preset.
+
+    ``drivers`` are the headways in s and desired speeds in m/s, [B, V] each; ``noise`` [1 + H, K, B, V, Z] the latent
+    vectors at the start, then the numbers that change them (:func:`wander`).
+    """
+    parameters = replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
+    samples = noise.shape[1]
+    segments = segments.repeated(samples)
+    headway, desired_speed = (each.repeat(samples, 1) for each in drivers)
+    latent, *fresh = noise.flatten(1, 2)
+    past = segments.positions[:, :OBSERVED_POSITIONS].diff(dim=1).transpose(1, 2)
+    history = recorded(generator, past[..., :-1, :])
+    memory, road = DriverMemory(history, torch.zeros_like(past[..., 0, :]), headway), segments.road
+
+    def move(vehicles: Vehicles, step: int) -> Vehicles:
+        nonlocal memory, latent
+        moved, memory = anchored_step(generator, vehicles, road, memory, latent, parameters)
+        latent = wander(latent, fresh[step], config.noise_period_s)
+        return moved
+
+    return driven_positions(segments, desired_speed, move).unflatten(0, (samples, -1))
+
+
+def headway_quantiles(statistics: Mapping[str, Any]) -> tuple[float, ...]:
+    """The 5, 25, 50, 75 and 95 % headways in s from a checkpoint's ``driving_statistics``."""
+    headway = DrivingStatistics.from_dict(statistics).headway
+    return tuple(headway.quantile(level) for level in QUANTILE_LEVELS)
+
+
+def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S) -> Tensor:
+    """Headways in s from uniform numbers, by linear interpolation of the quantiles; flat beyond the outer ones."""
+    values, levels = u.new_tensor(quantiles_s), u.new_tensor(QUANTILE_LEVELS)
+    upper = torch.searchsorted(levels, u.contiguous()).clamp(1, len(QUANTILE_LEVELS) - 1)
+    low, high = levels[upper - 1], levels[upper]
+    part = ((u - low) / (high - low)).clamp(0.0, 1.0)
+    return values[upper - 1] + part * (values[upper] - values[upper - 1])
+
+
+def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tensor:
+    """The headway [N, M] in s at which IDM neither speeds up nor brakes now; ``otherwise`` where it is unknown.
+
+    Uses gap, speed and desired speed. It is unknown for vehicles without a leader, or further behind it than the
+    largest quantile.
+    """
+    ahead = leader(perceive(vehicles, road), vehicles.target_lane.to(vehicles.x.dtype))
+    ratio = vehicles.speed / vehicles.desired_speed
+    settled = ahead.gap * torch.sqrt((1.0 - ratio * ratio * ratio * ratio).clamp_min(0.0))
+    headway = (settled - TABLE_V.min_gap_m) / vehicles.speed.clamp_min(1.0)
+    known = (ahead.gap < FREE_GAP_M) & (headway <= HEADWAY_QUANTILES_S[-1])
+    return torch.where(known, headway.clamp_min(SHORTEST_HEADWAY_S), otherwise)
+
+
+def driver_params(
+    segments: Segments, traits: bool = True, random: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Headways in s and desired speeds in m/s of the drivers, [B, V] each.
+
+    With ``random``, for fitting: random ones, about the balanced headways and above the present speeds, since in
+    congestion the recordings do not show the desired speeds. Without it, for evaluation: the balanced headway or the
+    median one, and the middle desired speed. Without ``traits`` (an ablation): Table V's headway and 22 m/s for all.
+    """
+    if not traits:
+        headway = torch.full_like(segments.length, TABLE_V.headway_s)
+        return headway, torch.full_like(headway, COMMON_SPEED_MPS)
+    now, (low, high) = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length)), DESIRED_EXCESS_MPS
+    if random is None:
+        scatter = torch.ones_like(segments.length)
+        otherwise = torch.full_like(scatter, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
+        desired = now.speed + 0.5 * (low + high)
+    else:
+        u = torch.rand(2, *segments.length.shape, generator=random)
+        scatter = torch.exp(_SCATTER * torch.randn(segments.length.shape, generator=random))
+        otherwise = headway_from_uniform(u[1])
+        desired = now.speed + low + (high - low) * u[0]
+    return balanced_headway(now.with_(desired_speed=desired), segments.road, otherwise) * scatter, desired

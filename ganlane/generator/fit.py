@@ -1,154 +1,61 @@
-"""Fitting a preset to recordings: scenes are split, the loop fits a preset to some of them, it is measured on others.
+"""Fits of a preset, scored on the scenes that they have not used: one split, k folds by scene, ablations.
 
-The loop of both presets: updates, evaluations on validation scenes, early stopping, resuming.
+State and forecasts of folds and ablations are kept in a folder under a hash of recordings and settings, so that an
+interrupted run resumes and nothing is fitted twice.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import time
 from collections.abc import Callable
-from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import polars as pl
-import torch
-from torch import Tensor
 
 from ganlane.data import TRACK, driving_statistics
 from ganlane.errors import UserError
-from ganlane.files import has_checksum, note_without_checksum, sealed_archive, write_bytes
-from ganlane.generator.checkpoint import FitResult, Preset
-from ganlane.generator.forecasts import Metrics
-from ganlane.generator.segments import SceneTracks, scene_tracks
-from ganlane.generator.tasks import CalibratedTask, PaperTask
-from ganlane.generator.windows import content_hash, count_windows
-from ganlane.parameters.generator import CalibratedConfig, LoopConfig, PaperConfig
+from ganlane.generator.checkpoint import FitResult, Metrics, Preset, content_hash, load_arrays, save_arrays
+from ganlane.generator.forecasts import (
+    BASELINE,
+    SAMPLES,
+    Forecasts,
+    baseline_forecasts,
+    calibrated_forecasts,
+    displacement_errors,
+    errors_of,
+    idm_forecasts,
+    long_rollout_scores,
+    open_loop_scores,
+    paper_forecasts,
+)
+from ganlane.generator.tasks import CalibratedTask, Config, FitLoop, OnProgress, PaperTask, Task
+from ganlane.generator.windows import (
+    OBSERVED_POSITIONS,
+    SceneTracks,
+    Windows,
+    count_windows,
+    cut_windows,
+    group_windows,
+    join_windows,
+    scene_tracks,
+)
+from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 
 #: Scenes that are held out by default.
 HELD_OUT = ("us101-b", "us101-e", "us101-h", "us101-i")
 #: Least share of the remaining windows that the validation scenes hold.
 VALIDATION_SHARE = 1 / 12
-Config = PaperConfig | CalibratedConfig
-Task = PaperTask | CalibratedTask
+#: Frames between the starts of two scored windows, the same for both presets.
+STRIDE = 3
+#: Steps of the long rollouts (5 s), and frames between their starts.
+LONG_STEPS, LONG_STRIDE = 50, 5
+#: Called with the name of the next fit.
+OnFit = Callable[[str], None]
 _CONFIGS: dict[str, type[Config]] = {"paper": PaperConfig, "calibrated": CalibratedConfig}
-
-
-@dataclass(frozen=True)
-class Progress:
-    """State of a fit after ``update`` of at most ``updates``, ``seconds`` after the start of this run.
-
-    ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best`` the lowest.
-    """
-
-    update: int
-    updates: int
-    losses: dict[str, float]
-    score: float | None
-    best: float
-    seconds: float
-
-
-OnProgress = Callable[[Progress], None]
-
-
-class FitLoop:
-    """Runs a task until it stops improving.
-
-    ``resume_path`` keeps the state after every evaluation; the fit resumes from it if it exists. ``seconds`` is the
-    time that the updates took, in earlier runs of the same fit too.
-    """
-
-    def __init__(self, task: Task, resume_path: str | Path | None = None):
-        self.task, self.config = task, task.config.loop
-        self.path = None if resume_path is None else Path(resume_path)
-        self.done, self.waited, self.best_update, self.best = 0, 0, 0, math.inf
-        self.seconds = 0.0
-        self.best_weights: dict[str, dict[str, Tensor]] = {}
-        if self.path is not None and self.path.exists():
-            self._resume(self.path)
-
-    def run(self, on_progress: OnProgress | None = None) -> None:
-        """Fit, then put the best weights into the task's networks."""
-        begun, earlier, score = time.monotonic(), self.seconds, None
-        while self.done < self.config.updates and self.waited < self.config.patience:
-            for optimiser in self.task.optimisers.values():
-                optimiser.param_groups[0]["lr"] = learning_rate(self.config, self.done)
-            losses = self.task.update(self.done)
-            self.done += 1
-            seconds = time.monotonic() - begun
-            self.seconds = earlier + seconds
-            late = self.config.max_seconds is not None and seconds > self.config.max_seconds
-            if self.done % self.config.evaluate_every == 0 or self.done == self.config.updates or late:
-                score = self._evaluate()
-            if on_progress is not None:
-                on_progress(Progress(self.done, self.config.updates, losses, score, self.best, seconds))
-            if late:
-                break
-        for name, weights in self.best_weights.items():
-            self.task.modules[name].load_state_dict(weights)
-
-    def _evaluate(self) -> float:
-        score = self.task.evaluate()
-        self.waited += 1
-        if score < self.best:
-            self.best, self.best_update, self.waited = score, self.done, 0
-            self.best_weights = {name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()}
-        if self.path is not None:
-            file = io.BytesIO()
-            torch.save(self._state(), file)
-            write_bytes(self.path, sealed_archive(file.getvalue()))
-        return score
-
-    def _state(self) -> dict[str, Any]:
-        """Counters, weights, optimisers and the random generator: tensors and plain data."""
-        return {
-            "counters": [self.done, self.waited, self.best_update],
-            "best": self.best,
-            "seconds": self.seconds,
-            "best_weights": self.best_weights,
-            "modules": {name: module.state_dict() for name, module in self.task.modules.items()},
-            "optimisers": {name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()},
-            "random": self.task.random.get_state(),
-        }
-
-    def _resume(self, path: Path) -> None:
-        """Continue from a stored state; reading it never executes code."""
-        content = path.read_bytes()
-        whole = has_checksum(content, path)
-        try:
-            state = torch.load(io.BytesIO(content), weights_only=True)
-            if "counters" not in state:
-                raise ValueError("no counters")
-        except Exception as error:
-            raise UserError(
-                f"{path}: not the state of a fit; give the file that a fit keeps, or remove it."
-            ) from error
-        try:
-            for name, module in self.task.modules.items():
-                module.load_state_dict(state["modules"][name])
-            for name, optimiser in self.task.optimisers.items():
-                optimiser.load_state_dict(state["optimisers"][name])
-        except (KeyError, RuntimeError, ValueError) as error:
-            raise UserError(
-                f"{path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
-            ) from error
-        self.done, self.waited, self.best_update = state["counters"]
-        self.best, self.best_weights = state["best"], state["best_weights"]
-        self.seconds = state["seconds"]
-        self.task.random.set_state(state["random"])
-        if not whole:
-            note_without_checksum(path)
-
-
-def learning_rate(config: LoopConfig, number: int) -> float:
-    """Linear warm-up, then a half cosine to 0."""
-    rise = min(1.0, (number + 1) / max(1, config.warmup))
-    return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))
 
 
 class Split(NamedTuple):
@@ -200,8 +107,7 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
             f"recordings of one scene, {', '.join(names)}: one has to be fitted to and another held out; cut it into "
             "several with ganlane prepare ... scene_s=30."
         )
-    unknown = sorted(set(held_out) - set(names))
-    if unknown:
+    if unknown := sorted(set(held_out) - set(names)):
         raise UserError(f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these.")
     others = [scene for scene in scenes if scene.name not in held_out]
     reported = [scene for scene in scenes if scene.name in held_out]
@@ -259,8 +165,7 @@ def fit_generator(
 
     Args:
         preset: ``"paper"`` (positions only, open loop) or ``"calibrated"`` (anchored, closed-loop rollouts).
-        held_out: names of the scenes that are reported, used for neither fitting nor early stopping.
-        config: of this preset; its defaults if None.
+        held_out: names of the scenes that are reported.
         source: name of the recordings' file, for the metadata.
         resume_path: file that keeps the state; the fit resumes from it if it exists.
         on_progress: called after every update.
@@ -287,19 +192,176 @@ def fit_result(
     loop: FitLoop, split: Split, frame: pl.DataFrame, source: str, metrics: Metrics, others: pl.DataFrame
 ) -> FitResult:
     """The result of a finished ``loop``; ``others`` are the recordings of the driving statistics."""
-    task = loop.task
+    task, tracks = loop.task, frame.select(TRACK).n_unique()
     return FitResult(
         preset=task.config.preset,
         module=task.generator.eval().requires_grad_(False),
         metrics=metrics,
         config=asdict(task.config),
-        data={
-            "file": Path(source).name,
-            "rows": frame.height,
-            "tracks": frame.select(TRACK).n_unique(),
-            **split.names,
-        },
+        data={"file": Path(source).name, "rows": frame.height, "tracks": tracks, **split.names},
         statistics=driving_statistics(others).to_dict(),
         updates=loop.best_update,
         seconds=loop.seconds,
     )
+
+
+class HeldOut(NamedTuple):
+    """Windows of held-out scenes and all forecasts of them."""
+
+    windows: Windows
+    forecasts: Forecasts
+
+
+class ScoredFit(NamedTuple):
+    """A finished fit and forecasts of its held-out scenes: ``short`` as far as the preset predicts, ``long`` for 5 s.
+
+    Long forecasts are made by the calibrated preset only, and only if a vehicle was recorded for long enough.
+    """
+
+    loop: FitLoop
+    short: HeldOut
+    long: HeldOut | None
+
+
+def fit_and_forecast(config: Config, split: Split, folder: Path, on_progress: OnProgress | None = None) -> ScoredFit:
+    """Fit to ``split`` and forecast its held-out scenes; resumes from what ``folder`` holds."""
+    task = fit_task(config, split)
+    path = folder / f"{config.preset}_{fit_key(config, split)}.pt"
+    loop = FitLoop(task, path)
+    loop.run(on_progress)
+    short = _forecasts(path, task, split, config.sizes.predicted, STRIDE)
+    frames = OBSERVED_POSITIONS + LONG_STEPS
+    far = isinstance(task, CalibratedTask) and any((each.present.sum(0) >= frames).any() for each in split.held_out)
+    return ScoredFit(loop, short, _forecasts(path, task, split, LONG_STEPS, LONG_STRIDE) if far else None)
+
+
+def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) -> HeldOut:
+    """Forecasts of the held-out windows by the generator, IDM and all baselines, saved next to the fit's state."""
+    path = path.with_name(f"{path.stem}_{steps}.npz")
+    windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
+    kept = load_arrays(path)
+    if kept is not None:
+        return HeldOut(windows, kept)
+    if isinstance(task, CalibratedTask):
+        samples = 1 if steps == LONG_STEPS else SAMPLES  # the best of 20 is for short forecasts only
+        own = calibrated_forecasts(task.generator, split.held_out, steps, stride, task.config, samples)
+    else:
+        groups = group_windows(windows, task.config.group_size, task.config.seed)
+        own = paper_forecasts(task.generator, windows, groups, task.config.seed)
+    baselines = baseline_forecasts(windows, split.fitted + split.validation, stride)
+    every = own | baselines | idm_forecasts(split.held_out, steps, stride)
+    forecasts = {name: positions.astype(np.float32) for name, positions in every.items()}
+    save_arrays(path, forecasts)
+    return HeldOut(windows, forecasts)
+
+
+def pooled(parts: list[HeldOut]) -> tuple[Windows, Forecasts, np.ndarray]:
+    """All folds' windows and forecasts, and the fold [W] of each window."""
+    forecasts = {name: np.concatenate([part.forecasts[name] for part in parts]) for name in parts[0].forecasts}
+    fold = np.repeat(np.arange(len(parts)), [len(part.windows) for part in parts])
+    return join_windows([part.windows for part in parts]), forecasts, fold
+
+
+def cross_validate(
+    frame: pl.DataFrame,
+    config: Config,
+    folds: int,
+    folder: Path,
+    on_fit: OnFit | None = None,
+    on_progress: OnProgress | None = None,
+    on_fold: Callable[[int, FitResult], None] | None = None,
+    source: str = "",
+) -> dict[str, Any]:
+    """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
+
+    ``on_fold`` gets each fold's number, from 1, and its generator, with driving statistics of its other scenes only;
+    ``source`` names the recordings in its metadata.
+
+    Returns:
+        ``open_loop`` (:func:`open_loop_scores`), ``splits`` (names of the scenes of each fold's parts), and for the
+        calibrated preset ``rollout`` (:func:`long_rollout_scores`).
+
+    Raises:
+        UserError: too many folds for the recordings.
+    """
+    scenes = scene_tracks(frame)
+    splits = [split_for_fit(scenes, names) for names in assign_folds(scenes, folds)]
+    fits: list[ScoredFit] = []
+    for number, split in enumerate(splits, start=1):
+        if on_fit is not None:
+            on_fit(f"fold {number} of {folds}")
+        fit = fit_and_forecast(config, split, folder, on_progress)
+        fits.append(fit)
+        if on_fold is not None:
+            others = frame.filter(~pl.col("scene").is_in(split.names["held_out"]))
+            on_fold(number, fit_result(fit.loop, split, frame, source, {}, others))
+    open_loop = open_loop_scores(*pooled([fit.short for fit in fits]))
+    scores: dict[str, Any] = {"splits": [split.names for split in splits], "open_loop": open_loop}
+    if long := [fit.long for fit in fits if fit.long is not None]:
+        windows, forecasts, _ = pooled(long)
+        scores["rollout"] = long_rollout_scores(windows, forecasts)
+    return scores
+
+
+def variants(config: Config) -> dict[str, Config]:
+    """Settings of the ablations by name, with a quarter of the updates; the first is the preset itself."""
+    loop = config.loop
+    quarter = {name: max(1, getattr(loop, name) // 4) for name in ("updates", "evaluate_every", "warmup")}
+    config = replace(config, loop=replace(loop, **quarter))
+    if isinstance(config, CalibratedConfig):
+        return {
+            "as it is": config,
+            "without washout": replace(config, washout_s=math.inf),
+            "without further inputs": replace(config, further_inputs=False),
+            "without traits": replace(config, traits=False),
+        }
+    sizes, weights = config.sizes, config.weights
+    return {
+        "as it is (p_l = 8)": config,
+        "p_l = 4": replace(config, sizes=replace(sizes, predicted=4)),
+        "p_l = 12": replace(config, sizes=replace(sizes, predicted=12)),
+        "without pooling": replace(config, sizes=replace(sizes, neighbours=0)),
+        "without differences as inputs": replace(config, sizes=replace(sizes, differences=False)),
+        "without adversarial term": replace(config, weights=replace(weights, adversarial=0.0)),
+        "without single-sample term": replace(config, weights=replace(weights, single=0.0)),
+        "variety term alone": replace(config, weights=replace(weights, single=0.0, mean=0.0, adversarial=0.0)),
+        "with history noise of 0.5": replace(config, history_noise=0.5),
+    }
+
+
+def ablate(
+    frame: pl.DataFrame,
+    config: Config,
+    held_out: tuple[str, ...],
+    folder: Path,
+    on_fit: OnFit | None = None,
+    on_progress: OnProgress | None = None,
+) -> dict[str, dict[str, Any]]:
+    """Fit the preset with one part changed at a time to one split, and score every variant on ``held_out``.
+
+    Returns:
+        Per variant ``windows``, the change of ADE to constant velocity's in % (``ade_change_percent``) by kind, over
+        all predicted steps and over the first 0.4 s (``ade_change_percent_0.4_s``), and for the calibrated preset
+        ``rmse_5_s_ratio``, the RMSE after 5 s divided by constant velocity's.
+    """
+    split = split_for_fit(scene_tracks(frame), held_out)
+    rows = {}
+    for name, variant in variants(config).items():
+        if on_fit is not None:
+            on_fit(name)
+        rows[name] = _ablation_row(fit_and_forecast(variant, split, folder, on_progress))
+    return rows
+
+
+def _ablation_row(fit: ScoredFit) -> dict[str, Any]:
+    kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
+    errors = errors_of({kind: fit.short.forecasts[kind] for kind in kinds}, fit.short.windows.future)
+    all_steps = displacement_errors(errors)
+    # Predictions of any length can be compared over 0.4 s.
+    early = displacement_errors({kind: values[:, :4] for kind, values in errors.items()})
+    row = {name: all_steps[name] for name in ("windows", "ade_change_percent")}
+    row["ade_change_percent_0.4_s"] = early["ade_change_percent"]
+    if fit.long is not None:
+        ratio = long_rollout_scores(fit.long.windows, fit.long.forecasts)["ratio_to_constant_velocity"]
+        row["rmse_5_s_ratio"] = {kind: ratio[kind] for kind in ("mean", "single")}
+    return row

@@ -1,7 +1,7 @@
 """Forecasts of recorded windows by both presets, by IDM and by baselines without a network, and their scores.
 
 Every forecast is positions [W, T, 2] in m relative to the present, for the windows of
-:func:`ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator: ``mean`` (z = 0),
+:func:`~ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator: ``mean`` (z = 0),
 ``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean error over the predicted steps, FDE the error at the
 last of them, both in m.
 """
@@ -20,17 +20,20 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
-from ganlane.generator.closed_loop import displacement_of, moved_by
+from ganlane.generator.checkpoint import Metrics
+from ganlane.generator.closed_loop import displacement_of, driven_positions, driver_params, moved_by, rollout
 from ganlane.generator.networks import Generator
-from ganlane.generator.rollout import (
-    common_driver_params,
-    driven_positions,
-    evaluation_params,
-    rollout_as_fitted,
-    typical_driver_params,
+from ganlane.generator.windows import (
+    OBSERVED_POSITIONS,
+    PREDICTED_STEPS,
+    PRESENT,
+    Groups,
+    SceneTracks,
+    Segments,
+    Windows,
+    cut_windows,
+    segment_batches,
 )
-from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks, Segments, segment_batches
-from ganlane.generator.windows import Groups, Windows, cut_windows
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V, following_acceleration
@@ -47,13 +50,11 @@ TRUCK_M = 6.0
 SIDEWAYS_M = 0.1
 #: Keeps the gradient of a distance of 0 finite; 0.1 mm.
 _SMALLEST_DISTANCE_M = 1e-4
-#: ``{"all" or scene: {"ERROR/KIND": value}}``.
-Metrics = dict[str, dict[str, float]]
 #: Name of a forecast to positions [W, T, 2] in m relative to the present, or to errors [W, T] in m.
 Forecasts = dict[str, np.ndarray]
 Row = dict[str, Any]
-#: Groups, and segments times samples, in one pass; bounds the memory.
-_GROUPS, _ROLLOUTS = 128, 160
+#: Groups, segments times samples, and segments with three samples in one pass; bounds the memory.
+_GROUPS, _ROLLOUTS, _SEGMENTS = 128, 160, 16
 #: Penalties from which the ridge regression chooses by leave-one-out validation.
 _PENALTIES = tuple(10.0**power for power in range(-2, 6))
 
@@ -90,22 +91,19 @@ def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Ro
 
 def parts_of(windows: Windows, least: int) -> dict[str, np.ndarray]:
     """Masks [W] of the windows by lane (1 the leftmost) and by class, of parts with at least ``least`` windows."""
-    truck = windows.length > TRUCK_M
-    parts = {f"lane {lane}": windows.lane_from_left == lane for lane in np.unique(windows.lane_from_left)}
-    parts |= {"car": ~truck, "truck": truck}
+    lanes, truck = windows.lane_from_left, windows.length > TRUCK_M
+    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)} | {"car": ~truck, "truck": truck}
     return {name: rows for name, rows in parts.items() if rows.sum() >= least}
 
 
-def direction_scores(forecasts: Forecasts, recorded: np.ndarray, observed: np.ndarray | None = None) -> Row:
+def direction_scores(forecasts: Forecasts, recorded: np.ndarray, observed: np.ndarray | float = 0.0) -> Row:
     """Among vehicles that move more than 0.1 m sideways: share predicted to the right side.
 
-    ``observed`` are lateral moves [W] in m while observed, to be added to both; if None, only the move after the
-    present counts.
+    ``observed`` are lateral moves [W] in m before the present, to be added to both.
     """
-    before = 0.0 if observed is None else observed
-    lateral = before + recorded[:, -1, 1]
+    lateral = observed + recorded[:, -1, 1]
     moving = np.abs(lateral) > SIDEWAYS_M
-    right = {name: ((before + course[:, -1, 1]) * lateral > 0)[moving] for name, course in forecasts.items()}
+    right = {name: ((observed + course[:, -1, 1]) * lateral > 0)[moving] for name, course in forecasts.items()}
     shares = {name: float(hits.mean()) if len(hits) else None for name, hits in right.items()}
     return {"windows": int(moving.sum()), "share_right": shares}
 
@@ -135,10 +133,7 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
 def rmse_by_second(errors: Forecasts) -> dict[str, dict[str, float]]:
     """Root mean square error in m after each whole second (10 steps), of every forecast."""
     return {
-        name: {
-            f"{second} s": float(np.sqrt((values[:, 10 * second - 1] ** 2).mean()))
-            for second in range(1, values.shape[1] // 10 + 1)
-        }
+        name: {f"{k} s": float(np.sqrt((each**2).mean())) for k, each in enumerate(values.T[9::10], start=1)}
         for name, values in errors.items()
     }
 
@@ -176,9 +171,7 @@ def long_rollout_scores(windows: Windows, forecasts: Forecasts) -> Row:
 
 def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
     """``mean`` (z = 0), ``single`` and ``best_of_20`` (by ADE) of samples [1 + K, W, T, 2], the first with z = 0."""
-    if len(samples) < 2:
-        return {"mean": samples[0]}
-    kinds = {"mean": samples[0], "single": samples[1]}
+    kinds = dict(zip(("mean", "single"), samples))
     if len(samples) > SAMPLES:
         errors = np.linalg.norm(samples[1:] - recorded, axis=-1).mean(-1)
         kinds[f"best_of_{SAMPLES}"] = samples[1:][errors.argmin(0), np.arange(len(recorded))]
@@ -205,10 +198,9 @@ def paper_forecasts(
 def driven_windows(
     driver: Callable[[Segments], Tensor], scenes: list[SceneTracks], horizon: int, stride: int, samples: int = 1
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames.
+    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames: the vehicles recorded throughout a segment.
 
-    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K = ``samples``
-    samples. The vehicles that were recorded throughout a segment are the windows.
+    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K = ``samples``.
     """
     forecasts = []
     for scene in scenes:
@@ -235,7 +227,7 @@ def calibrated_forecasts(
         shape = (1 + horizon, 1 + samples, *segments.length.shape, generator.sizes.noise)
         noise = torch.randn(shape, generator=random)
         noise[:, 0] = 0.0
-        return rollout_as_fitted(generator, segments, evaluation_params(segments, config), noise, config)
+        return rollout(generator, segments, driver_params(segments, config.traits), noise, config)
 
     forecasts = driven_windows(driver, scenes, horizon, stride, 1 + samples)
     recorded = driven_windows(lambda segments: segments.future[None], scenes, horizon, stride)[0]
@@ -251,7 +243,7 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
     """
 
     def driver(segments: Segments, own_headway: bool) -> Tensor:
-        headway, desired = typical_driver_params(segments) if own_headway else common_driver_params(segments)
+        headway, desired = driver_params(segments, traits=own_headway)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
             acceleration = following_acceleration(perceive(vehicles, segments.road), TABLE_V, headway)
@@ -307,3 +299,65 @@ def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
     model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
     model.fit(features(known), (future - repeated(known[:, -1], steps)).reshape(len(known), -1))
     return repeated(past[:, -1], steps) + model.predict(features(past)).reshape(len(past), steps, 2)
+
+
+def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
+    """Energy score of two samples, in the unit of the positions: mean error minus half their distance.
+
+    All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from the distribution
+    of the recordings (Gneiting and Raftery 2007).
+    """
+    mean_error = 0.5 * (distance(one, recorded) + distance(other, recorded))
+    return mean_error - 0.5 * distance(one, other)
+
+
+@torch.no_grad()
+def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: CalibratedConfig) -> Metrics:
+    """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.
+
+    Target lanes and driver parameters are those of the present, so no information of the future is used. Unlike
+    forecasts of windows, these count a vehicle for as long as it is recorded.
+
+    Returns:
+        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
+        "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``, ``single``,
+        ``constant_velocity`` and ``energy`` (the energy score of two samples).
+    """
+    random, horizon = torch.Generator().manual_seed(0), config.held_out_horizon
+    parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
+    for scene in scenes:
+        for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
+            segments = batch.without_intentions()
+            fresh = torch.randn(1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random)
+            noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
+            drivers, future = driver_params(segments, config.traits), segments.future
+            mean, one, other = rollout(generator, segments, drivers, noise, config)
+            errors = {
+                "mean": distance(mean, future),
+                "single": distance(one, future),
+                "energy": energy_score(one, other, future),
+                BASELINE: distance(segments.constant_velocity, future),
+            }
+            for name in ("all", scene.name):
+                parts.setdefault(name, []).append((errors, segments.scored))
+    return {name: _step_means(errors, horizon) for name, errors in parts.items()}
+
+
+def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dict[str, float]:
+    """Means over the vehicles that are still recorded at the step in question."""
+    means = {kind: mean_by_step([(errors[kind], scored) for errors, scored in parts]) for kind in parts[0][0]}
+    short = min(PREDICTED_STEPS, horizon)
+    metrics = {"end_s": 0.1 * horizon, "windows": max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts)))}
+    for kind, errors in means.items():
+        metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
+        metrics[f"fde_m/{kind}"] = float(errors[short - 1])
+        metrics[f"end_m/{kind}"] = float(errors[-1])
+    for kind in ("mean", "energy"):
+        metrics[f"relative_{kind}"] = float((means[kind] / means[BASELINE].clamp_min(1e-6)).mean())
+    return metrics
+
+
+def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
+    count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
+    return torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0) / count

@@ -24,20 +24,13 @@ from torch import Tensor, nn
 from ganlane.parameters.generator import GeneratorSizes
 
 #: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the networks' units.
-DISPLACEMENT_SCALE_M = (1.0, 0.05)
-DIFFERENCE_SCALE_M = (0.04, 0.02)
+DISPLACEMENT_SCALE_M, DIFFERENCE_SCALE_M = (1.0, 0.05), (0.04, 0.02)
 #: Changes of displacement are clipped here (in units of the scale): recorded positions sometimes jump.
 LARGEST_DIFFERENCE = 5.0
-MOTION_FEATURES = 4
-#: Units of relative position (m) and relative displacement (m per 0.1 s), along and across the road.
-_POSITION_SCALE_M = (20.0, 4.0)
-_MOTION_SCALE_M = (0.4, 0.05)
+#: Units of a pair's relative position (m) and relative displacement (m per 0.1 s), each along and across the road.
+_PAIR_SCALE = (20.0, 4.0, 0.4, 0.05)
 #: Vehicles further away than this along the road have no influence, m.
 RANGE_M = 100.0
-_PAIR_FEATURES = 4
-#: Subtracted where masked, so that the maximum ignores it.
-_MASKED = 1e9
-
 #: oneDNN is faster from this number of rows.
 _MANY_ROWS = 512
 _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
@@ -91,7 +84,7 @@ class MotionLSTM(nn.Module):
     def __init__(self, embedding: int, hidden: int, differences: bool = True):
         super().__init__()
         self.hidden, self.differences = hidden, differences
-        self.embed = nn.Linear(MOTION_FEATURES, embedding)
+        self.embed = nn.Linear(4, embedding)
         self.input = nn.Linear(embedding, 4 * hidden)
         self.recurrent = nn.Parameter(torch.empty(4 * hidden, hidden))
         bound = 1.0 / math.sqrt(hidden)
@@ -165,7 +158,7 @@ class PairPooling(nn.Module):
     def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
         super().__init__()
         self.neighbours = neighbours
-        self.per_pair = nn.Linear(_PAIR_FEATURES, inner)
+        self.per_pair = nn.Linear(len(_PAIR_SCALE), inner)
         self.per_vehicle = nn.Linear(hidden, inner, bias=False)
         self.second = nn.Linear(inner, pooled)
 
@@ -175,12 +168,13 @@ class PairPooling(nn.Module):
             return hidden.new_zeros(*hidden.shape[:-1], self.second.out_features)
         index, real = nearest(position, valid, self.neighbours)
         # Relative to the first vehicle: far down the road, differences of float32 positions lose digits.
-        scale = position.new_tensor((*_POSITION_SCALE_M, *_MOTION_SCALE_M))
+        scale = position.new_tensor(_PAIR_SCALE)
         state = torch.cat([position - position[..., :1, :], displacement], dim=-1) / scale
         own = nn.functional.linear(state, self.per_pair.weight)
         others = gather_vehicles(apply(self.per_vehicle, hidden) + own + self.per_pair.bias, index)
         first = (others - own[..., None, :]).relu_()
-        second = apply(self.second, first).add_(~real[..., None], alpha=-_MASKED)
+        # So much is subtracted where masked that the maximum ignores it.
+        second = apply(self.second, first).add_(~real[..., None], alpha=-1e9)
         return torch.relu(second.amax(dim=-2))
 
 
@@ -193,8 +187,7 @@ class Observation(NamedTuple):
             before, so 8 displacements are 7 motions.
         displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference to the one before.
         position: [B, G, 2], m, relative to any common point.
-        valid: [B, G] bool.
-        extra: [B, G, extra_inputs].
+        valid, extra: [B, G] bool and [B, G, extra_inputs].
     """
 
     projections: Tensor | Sequence[Tensor]

@@ -1,4 +1,4 @@
-"""What is fitted: the losses, updates and scores of both presets.
+"""What is fitted: the losses, updates and scores of both presets, and the loop that runs them.
 
 **paper**, open loop: adversarial, variety, single-sample and mean terms on k-means groups of windows. Losses after
 Gupta et al. (2018), with the changes that the fit needs here.
@@ -9,33 +9,47 @@ two samples, whose loss is the energy score; both are divided, step by step, by 
 
 from __future__ import annotations
 
+import io
+import math
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ganlane.generator.forecasts import BASELINE, Metrics, distance, paper_forecasts, repeated, scene_metrics
-from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
-from ganlane.generator.rollout import (
-    common_driver_params,
-    evaluation_params,
-    rollout_as_fitted,
-    sampled_driver_params,
+from ganlane.errors import UserError
+from ganlane.files import has_checksum, note_without_checksum, sealed_archive, write_bytes
+from ganlane.generator.checkpoint import Metrics
+from ganlane.generator.closed_loop import driver_params, rollout
+from ganlane.generator.forecasts import (
+    BASELINE,
+    distance,
+    energy_score,
+    mean_by_step,
+    paper_forecasts,
+    repeated,
+    rollout_errors,
+    scene_metrics,
 )
-from ganlane.generator.segments import SceneTracks, Segments, cut_segments, segment_batches, segment_starts
-from ganlane.generator.windows import PREDICTED_STEPS, Groups, Windows, cut_windows, group_windows
-from ganlane.parameters.generator import CalibratedConfig, PaperConfig
+from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
+from ganlane.generator.windows import (
+    Groups,
+    SceneTracks,
+    Segments,
+    Windows,
+    cut_segments,
+    cut_windows,
+    group_windows,
+    segment_starts,
+)
+from ganlane.parameters.generator import CalibratedConfig, LoopConfig, PaperConfig
 
-#: Segments in one forward pass of an evaluation; bounds the memory.
-_SEGMENTS = 16
-
-
-def descend(optimiser: torch.optim.Optimizer, loss: Tensor, largest: float) -> None:
-    """One step of ``optimiser`` down ``loss``, with the norm of its parameters' gradient clipped at ``largest``."""
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    nn.utils.clip_grad_norm_(optimiser.param_groups[0]["params"], largest)
-    optimiser.step()
+Config = PaperConfig | CalibratedConfig
 
 
 def distances(predicted: Tensor, recorded: Tensor) -> Tensor:
@@ -49,15 +63,9 @@ def variety_loss(errors: Tensor) -> Tensor:
     return errors.amin(dim=0).mean()
 
 
-def adversarial_loss(logits: Tensor) -> Tensor:
-    """Cross-entropy of classifying generated trajectories as recorded; ln 2 is chance."""
-    return binary_cross_entropy_with_logits(logits, torch.ones_like(logits), reduction="none").mean()
-
-
-def discriminator_loss(recorded: Tensor, generated: Tensor) -> Tensor:
-    """Cross-entropy of classifying recorded and generated trajectories by their logits; ln 2 is chance."""
-    fake = binary_cross_entropy_with_logits(generated, torch.zeros_like(generated), reduction="none").mean()
-    return 0.5 * (adversarial_loss(recorded) + fake)
+def cross_entropy(logits: Tensor, recorded: float) -> Tensor:
+    """Cross-entropy of classifying trajectories as recorded (1) or generated (0) by their logits; ln 2 is chance."""
+    return binary_cross_entropy_with_logits(logits, torch.full_like(logits, recorded), reduction="none").mean()
 
 
 def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
@@ -65,20 +73,35 @@ def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
     return 0.5 * ((recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean())
 
 
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
+    kept = mask.expand_as(values).to(values.dtype)
+    return (values * kept).sum() / kept.sum().clamp_min(1.0)
+
+
 class _Networks:
     """A generator with its optimiser and random numbers, to which a task adds other networks."""
 
-    def __init__(self, config: PaperConfig | CalibratedConfig):
+    def __init__(self, config: Config):
         torch.manual_seed(config.seed)
         self.generator = Generator(config.sizes)
         self.modules: dict[str, nn.Module] = {}
         self.optimisers: dict[str, torch.optim.Optimizer] = {}
         self.add("generator", self.generator)
         self.random = torch.Generator().manual_seed(config.seed)
+        self.largest_gradient = config.loop.largest_gradient
 
     def add(self, name: str, module: nn.Module) -> None:
         """One more network to fit, with an optimiser of its own."""
         self.modules[name], self.optimisers[name] = module, torch.optim.Adam(module.parameters())
+
+    def descend(self, name: str, loss: Tensor) -> float:
+        """One step of a network down its ``loss``, whose value is returned, with the gradient's norm clipped."""
+        self.optimisers[name].zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.modules[name].parameters(), self.largest_gradient)
+        self.optimisers[name].step()
+        return float(loss.detach())
 
 
 class PaperTask(_Networks):
@@ -99,19 +122,19 @@ class PaperTask(_Networks):
         if config.mirror:
             groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         recorded = groups.displacements[groups.mask]
-        generated = self._samples(groups, self.config.history_noise)
+        generated = self._samples(groups, config.history_noise)
         losses = {}
-        if self.config.weights.adversarial > 0:
-            loss = discriminator_loss(self.discriminator(recorded), self.discriminator(generated[0].detach()))
-            descend(self.optimisers["discriminator"], loss, self.config.loop.largest_gradient)
-            losses["discriminator"] = float(loss.detach())
-        observed = self.config.sizes.observed
+        if config.weights.adversarial > 0:
+            real, fake = self.discriminator(recorded), self.discriminator(generated[0].detach())
+            loss = 0.5 * (cross_entropy(real, 1.0) + cross_entropy(fake, 0.0))
+            losses["discriminator"] = self.descend("discriminator", loss)
+        observed = config.sizes.observed
         errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
         terms = {"variety": variety_loss(errors[:-1]), "single": errors[:-1].mean(), "mean": errors[-1].mean()}
-        if self.config.weights.adversarial > 0:
-            terms["adversarial"] = adversarial_loss(self.discriminator(generated[0]))
-        weighted = [getattr(self.config.weights, name) * term for name, term in terms.items()]
-        descend(self.optimisers["generator"], torch.stack(weighted).sum(), self.config.loop.largest_gradient)
+        if config.weights.adversarial > 0:
+            terms["adversarial"] = cross_entropy(self.discriminator(generated[0]), 1.0)
+        weighted = [getattr(config.weights, name) * term for name, term in terms.items()]
+        self.descend("generator", torch.stack(weighted).sum())
         return losses | {name: float(term.detach()) for name, term in terms.items()}
 
     def evaluate(self) -> float:
@@ -158,76 +181,6 @@ class PaperTask(_Networks):
         return torch.cat([past[mask].expand(len(future), -1, -1, -1), future], dim=-2)
 
 
-def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Mean of ``values`` where ``mask`` (broadcast) is true; 0 if it is nowhere."""
-    kept = mask.expand_as(values).to(values.dtype)
-    return (values * kept).sum() / kept.sum().clamp_min(1.0)
-
-
-def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
-    """Energy score of two samples, in the unit of the positions: mean error minus half their distance.
-
-    All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from the distribution
-    of the recordings (Gneiting and Raftery 2007).
-    """
-    mean_error = 0.5 * (distance(one, recorded) + distance(other, recorded))
-    return mean_error - 0.5 * distance(one, other)
-
-
-@torch.no_grad()
-def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: CalibratedConfig) -> Metrics:
-    """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.
-
-    Target lanes and driver parameters are those of the present, so no information of the future is used. Unlike
-    forecasts of windows, these count a vehicle for as long as it is recorded.
-
-    Returns:
-        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
-        "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``, ``single``,
-        ``constant_velocity`` and ``energy`` (the energy score of two samples).
-    """
-    random, horizon = torch.Generator().manual_seed(0), config.held_out_horizon
-    parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
-    for scene in scenes:
-        for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
-            segments = batch.without_intentions()
-            fresh = torch.randn(1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random)
-            noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
-            drivers = evaluation_params(segments, config)
-            mean, one, other = rollout_as_fitted(generator, segments, drivers, noise, config)
-            future = segments.future
-            errors = {
-                "mean": distance(mean, future),
-                "single": distance(one, future),
-                "energy": energy_score(one, other, future),
-                BASELINE: distance(segments.constant_velocity, future),
-            }
-            for name in ("all", scene.name):
-                parts.setdefault(name, []).append((errors, segments.scored))
-    return {name: _step_means(errors, horizon) for name, errors in parts.items()}
-
-
-def mean_by_step(parts: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Mean [H] of errors [B, H, V] where their mask [B, H, V] is true, over all parts."""
-    count = torch.stack([scored.sum((0, 2)) for _, scored in parts]).sum(0).clamp_min(1)
-    return torch.stack([(errors * scored).sum((0, 2)) for errors, scored in parts]).sum(0) / count
-
-
-def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dict[str, float]:
-    """Means over the vehicles that are still recorded at the step in question."""
-    means = {kind: mean_by_step([(errors[kind], scored) for errors, scored in parts]) for kind in parts[0][0]}
-    short = min(PREDICTED_STEPS, horizon)
-    metrics = {}
-    for kind, errors in means.items():
-        metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
-        metrics[f"fde_m/{kind}"] = float(errors[short - 1])
-        metrics[f"end_m/{kind}"] = float(errors[-1])
-    for kind in ("mean", "energy"):
-        metrics[f"relative_{kind}"] = float((means[kind] / means[BASELINE].clamp_min(1e-6)).mean())
-    windows = max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts)))
-    return metrics | {"end_s": 0.1 * horizon, "windows": windows}
-
-
 class CalibratedTask(_Networks):
     """The anchored generator on whole scenes."""
 
@@ -246,18 +199,17 @@ class CalibratedTask(_Networks):
         """One rollout of a batch of segments and one step: alternately of the mean driver and of two samples."""
         config = self.config
         segments = self._batch()
-        drivers = sampled_driver_params(segments, self.random) if config.traits else common_driver_params(segments)
+        drivers = driver_params(segments, config.traits, self.random)
         sampled = number % 2 == 1
         shape = (1 + segments.future.shape[1], 2 if sampled else 1, *segments.length.shape, config.sizes.noise)
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
-        positions = rollout_as_fitted(self.generator, segments, drivers, noise, config)
+        positions = rollout(self.generator, segments, drivers, noise, config)
         if sampled:
             name, losses = "energy", energy_score(positions[0], positions[1], segments.future)
         else:
             name, losses = "mean", distance(positions[0], segments.future)
         loss = masked_mean(losses / self.scale[: losses.shape[1], None], segments.scored)
-        descend(self.optimisers["generator"], loss, config.loop.largest_gradient)
-        return {name: float(loss.detach())}
+        return {name: self.descend("generator", loss)}
 
     def evaluate(self) -> float:
         """Mean of the error for z = 0 and the energy score on validation scenes, relative to constant velocity."""
@@ -278,3 +230,116 @@ class CalibratedTask(_Networks):
         segments = cut_segments([self.cuts[row] for row in rows.tolist()], horizon)
         flip = self.config.mirror and float(torch.rand((), generator=self.random)) < 0.5
         return segments.mirrored() if flip else segments
+
+
+Task = PaperTask | CalibratedTask
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State of a fit after ``update`` of at most ``updates``, ``seconds`` after the start of this run.
+
+    ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best`` the lowest.
+    """
+
+    update: int
+    updates: int
+    losses: dict[str, float]
+    score: float | None
+    best: float
+    seconds: float
+
+
+OnProgress = Callable[[Progress], None]
+
+
+class FitLoop:
+    """Runs a task until it stops improving: updates, evaluations on validation scenes, early stopping.
+
+    ``path`` keeps the state after every evaluation; the fit resumes from it if it exists. ``seconds`` is the time of
+    the updates, those in earlier runs of the same fit too.
+    """
+
+    def __init__(self, task: Task, path: str | Path | None = None):
+        self.task, self.config = task, task.config.loop
+        self.path = None if path is None else Path(path)
+        self.done, self.waited, self.best_update, self.best = 0, 0, 0, math.inf
+        self.seconds = 0.0
+        self.best_weights: dict[str, dict[str, Tensor]] = {}
+        if self.path is not None and self.path.exists():
+            self._resume(self.path)
+
+    def run(self, on_progress: OnProgress | None = None) -> None:
+        """Fit, then put the best weights into the task's networks."""
+        begun, earlier, score = time.monotonic(), self.seconds, None
+        while self.done < self.config.updates and self.waited < self.config.patience:
+            for optimiser in self.task.optimisers.values():
+                optimiser.param_groups[0]["lr"] = learning_rate(self.config, self.done)
+            losses = self.task.update(self.done)
+            self.done += 1
+            seconds = time.monotonic() - begun
+            self.seconds = earlier + seconds
+            late = self.config.max_seconds is not None and seconds > self.config.max_seconds
+            if self.done % self.config.evaluate_every == 0 or self.done == self.config.updates or late:
+                score = self._evaluate()
+            if on_progress is not None:
+                on_progress(Progress(self.done, self.config.updates, losses, score, self.best, seconds))
+            if late:
+                break
+        for name, weights in self.best_weights.items():
+            self.task.modules[name].load_state_dict(weights)
+
+    def _evaluate(self) -> float:
+        score = self.task.evaluate()
+        self.waited += 1
+        if score < self.best:
+            self.best, self.best_update, self.waited = score, self.done, 0
+            self.best_weights = {name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()}
+        if self.path is not None:
+            # Tensors and plain data only.
+            state = {
+                "counters": [self.done, self.waited, self.best_update],
+                "best": self.best,
+                "seconds": self.seconds,
+                "best_weights": self.best_weights,
+                "modules": {name: module.state_dict() for name, module in self.task.modules.items()},
+                "optimisers": {name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()},
+                "random": self.task.random.get_state(),
+            }
+            file = io.BytesIO()
+            torch.save(state, file)
+            write_bytes(self.path, sealed_archive(file.getvalue()))
+        return score
+
+    def _resume(self, path: Path) -> None:
+        """Continue from a stored state; reading it never executes code."""
+        content = path.read_bytes()
+        whole = has_checksum(content, path)
+        try:
+            state = torch.load(io.BytesIO(content), weights_only=True)
+            if "counters" not in state:
+                raise ValueError("no counters")
+        except Exception as error:
+            raise UserError(
+                f"{path}: not the state of a fit; give the file that a fit keeps, or remove it."
+            ) from error
+        try:
+            for name, module in self.task.modules.items():
+                module.load_state_dict(state["modules"][name])
+            for name, optimiser in self.task.optimisers.items():
+                optimiser.load_state_dict(state["optimisers"][name])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise UserError(
+                f"{path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
+            ) from error
+        self.done, self.waited, self.best_update = state["counters"]
+        self.best, self.best_weights, self.seconds = state["best"], state["best_weights"], state["seconds"]
+        self.task.random.set_state(state["random"])
+        if not whole:
+            note_without_checksum(path)
+
+
+def learning_rate(config: LoopConfig, number: int) -> float:
+    """Linear warm-up, then a half cosine to 0."""
+    rise = min(1.0, (number + 1) / max(1, config.warmup))
+    return config.learning_rate * rise * 0.5 * (1.0 + math.cos(math.pi * number / config.updates))

@@ -1,40 +1,222 @@
-"""Windows of 9 observed and 8 future positions, cut from recorded scenes, and k-means groups of them.
+"""Recorded scenes as arrays, and what is cut from them: segments for joint rollouts, windows and groups of windows.
 
-Nothing is smoothed: a filter applied before windows are cut would carry the future into the past. Grouping takes most
-of the time before a fit, so it is cached under a hash of everything that it follows from.
+A segment is a stretch of a scene with all its vehicles; a window is 9 observed and 8 future positions of one vehicle.
+Nothing is smoothed: a filter applied before windows are cut would carry the future into the past. Grouping windows
+takes most of the time before a fit, so it is cached under a hash of everything that it follows from.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import os
-import sys
-import tokenize
-import zipfile
-import zlib
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import polars as pl
 import sklearn
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from sklearn.cluster import KMeans
 from torch import Tensor
 
+from ganlane.data import SCHEMA, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.files import has_checksum, sealed_archive, write_bytes
-from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, SceneTracks
+from ganlane.generator.checkpoint import cached, content_hash
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.sim.state import Road
 
-#: Environment variable with the cache folder; empty switches the cache off.
-CACHE_VARIABLE = "GANLANE_CACHE"
+#: Observed positions; they give 8 observed displacements (the paper's ``o_l`` = 8).
+OBSERVED_POSITIONS = 9
+#: Row of the last of them.
+PRESENT = OBSERVED_POSITIONS - 1
 #: Predicted positions (the paper's ``p_l``): 0.8 s.
 PREDICTED_STEPS = 8
 WINDOW_FRAMES = OBSERVED_POSITIONS + PREDICTED_STEPS
+#: In fitting, a recorded driver's target lane is its lane after this time, s.
+INTENTION_S = 2.0
+
+
+@dataclass(frozen=True)
+class SceneTracks:
+    """One recorded scene of T frames (0.1 s apart) and V vehicles; entries of absent vehicles are 0.
+
+    Attributes:
+        vehicles: [V] vehicle numbers.
+        positions: [T, V, 2] float64, centre of the body, m; x along the road, y to the left.
+        lane, present: [T, V] int64, 0 is the rightmost, and bool.
+        length, width: [V] float64, m.
+    """
+
+    name: str
+    lane_width_m: float
+    vehicles: np.ndarray
+    positions: np.ndarray
+    lane: np.ndarray
+    present: np.ndarray
+    length: np.ndarray
+    width: np.ndarray
+
+    @property
+    def lanes(self) -> int:
+        """Number of lanes: the highest lane number plus one."""
+        return int(self.lane[self.present].max()) + 1
+
+    @cached_property
+    def endless_positions(self) -> np.ndarray:
+        """Positions [T, V, 2], at constant velocity before a vehicle's first and after its last present frame."""
+        frames, column = np.arange(len(self.present))[:, None], np.arange(self.present.shape[1])
+        first, last = self._first_and_last
+        begin, end = self.positions[first, column], self.positions[last, column]
+        longer = (last > first)[:, None]
+        early = np.where(longer, self.positions[np.minimum(first + 1, last), column] - begin, 0.0)
+        late = np.where(longer, end - self.positions[np.maximum(last - 1, first), column], 0.0)
+        before = begin + early * (frames - first)[..., None]
+        after = end + late * (frames - last)[..., None]
+        inside = np.where(self.present[..., None], self.positions, 0.0)
+        return np.where((frames < first)[..., None], before, np.where((frames > last)[..., None], after, inside))
+
+    @cached_property
+    def target_lane(self) -> np.ndarray:
+        """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its track."""
+        ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
+        return np.take_along_axis(self.lane, np.clip(ahead, *self._first_and_last), axis=0)
+
+    @property
+    def _first_and_last(self) -> tuple[np.ndarray, np.ndarray]:
+        """First and last present frame of each vehicle, [V] each."""
+        return self.present.argmax(0), len(self.present) - 1 - self.present[::-1].argmax(0)
+
+
+def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
+    """Every scene of a trajectory frame (``ganlane.data``'s schema), in order of their names.
+
+    Raises:
+        UserError: a column is missing, there is no row, or lanes are implausibly wide or narrow.
+    """
+    missing = [name for name in SCHEMA if name not in frame.columns]
+    if missing:
+        raise UserError(
+            f"trajectory frame: columns {missing} are missing; expected {list(SCHEMA)}; "
+            "read the recordings with ganlane.data.read_scenes."
+        )
+    if frame.is_empty():
+        raise UserError("trajectory frame: no rows; give recordings of at least 1.7 s.")
+    scenes = []
+    for name, lane_width_m in sorted(scene_lane_widths(frame).items()):
+        rows = frame.filter(pl.col("scene") == name)
+        vehicles, column = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)
+        row = rows["frame"].to_numpy()
+        row = row - row.min()
+        shape = (int(row.max()) + 1, len(vehicles))
+        positions, lane = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.int64)
+        present, size = np.zeros(shape, dtype=bool), np.zeros((2, len(vehicles)))
+        positions[row, column] = rows.select("x", "y").to_numpy()
+        lane[row, column] = rows["lane"].to_numpy()
+        present[row, column] = True
+        size[:, column] = rows.select("length", "width").to_numpy().T
+        scenes.append(SceneTracks(name, lane_width_m, vehicles, positions, lane, present, *size))
+    return scenes
+
+
+@dataclass(frozen=True)
+class Segments:
+    """B segments of recorded scenes: 9 observed frames and H more, padded to V vehicles.
+
+    Positions go on at constant velocity before a track's first and after its last frame, so they are finite
+    everywhere; ``present`` is true where they were recorded.
+
+    Attributes:
+        positions: [B, 9 + H, V, 2] float32, m, x relative to the segment's mean at the present.
+        present, target_lane: [B, 9 + H, V], bool and int64.
+        length, width: [B, V] m.
+        lanes, lane_width: [B, 1].
+    """
+
+    positions: Tensor
+    present: Tensor
+    target_lane: Tensor
+    length: Tensor
+    width: Tensor
+    lanes: Tensor
+    lane_width: Tensor
+
+    @property
+    def scored(self) -> Tensor:
+        """Vehicles [B, H, V] that the model drives (present in the first 9 frames) and that are still recorded."""
+        observed, after = self.present[:, :OBSERVED_POSITIONS], self.present[:, OBSERVED_POSITIONS:]
+        return observed.all(dim=1, keepdim=True) & after
+
+    @property
+    def future(self) -> Tensor:
+        """Recorded positions [B, H, V, 2]."""
+        return self.positions[:, OBSERVED_POSITIONS:]
+
+    @property
+    def constant_velocity(self) -> Tensor:
+        """Positions [B, H, V, 2] when the last observed displacement is repeated."""
+        now, before = self.positions[:, PRESENT, None], self.positions[:, PRESENT - 1, None]
+        steps = torch.arange(1, self.positions.shape[1] - PRESENT, dtype=now.dtype)
+        return now + (now - before) * steps[:, None, None]
+
+    @property
+    def road(self) -> Road:
+        """One road per segment."""
+        return Road(self.lanes, self.lane_width)
+
+    def repeated(self, times: int) -> Segments:
+        """The segments repeated ``times`` times along the batch dimension."""
+        return Segments(*(value.repeat(times, *[1] * (value.dim() - 1)) for value in vars(self).values()))
+
+    def mirrored(self) -> Segments:
+        """The segments with left and right swapped."""
+        positions, last = self.positions.clone(), self.lanes - 1
+        positions[..., 1] = (last * self.lane_width)[..., None] - positions[..., 1]
+        return replace(self, positions=positions, target_lane=last[..., None] - self.target_lane)
+
+    def without_intentions(self) -> Segments:
+        """Target lanes are the present ones, so that no information of the future is used (for evaluation)."""
+        y = self.positions[:, PRESENT : PRESENT + 1, :, 1]
+        lane = Road(self.lanes[..., None], self.lane_width[..., None]).lane_of(y).long()
+        return replace(self, target_lane=lane.expand_as(self.target_lane).contiguous())
+
+
+def segment_starts(scene: SceneTracks, horizon: int, stride: int = 1) -> list[int]:
+    """Rows where a segment of 9 + ``horizon`` frames with at least one driven vehicle starts."""
+    rows = range(0, len(scene.present) - OBSERVED_POSITIONS - horizon + 1, stride)
+    return [row for row in rows if scene.present[row : row + OBSERVED_POSITIONS].all(0).any()]
+
+
+def segment_batches(scene: SceneTracks, horizon: int, stride: int, size: int) -> Iterator[Segments]:
+    """All segments that start every ``stride`` frames, ``size`` at a time."""
+    rows = segment_starts(scene, horizon, stride)
+    for first in range(0, len(rows), size):
+        yield cut_segments([(scene, row) for row in rows[first : first + size]], horizon)
+
+
+def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
+    """The segments that start at (scene, row), ``horizon`` steps beyond the present, padded to one batch."""
+    frames = OBSERVED_POSITIONS + horizon
+    members = [np.flatnonzero(scene.present[row : row + frames].any(0)) for scene, row in cuts]
+    batch, most = len(cuts), max(map(len, members))
+    segments = Segments(
+        positions=torch.zeros(batch, frames, most, 2),
+        present=torch.zeros(batch, frames, most, dtype=torch.bool),
+        target_lane=torch.zeros(batch, frames, most, dtype=torch.int64),
+        length=torch.ones(batch, most),
+        width=torch.ones(batch, most),
+        lanes=torch.tensor([[scene.lanes] for scene, _ in cuts]),
+        lane_width=torch.tensor([[scene.lane_width_m] for scene, _ in cuts], dtype=torch.float32),
+    )
+    for number, ((scene, row), who) in enumerate(zip(cuts, members)):
+        at = slice(row, row + frames), who
+        positions, count = scene.endless_positions[at], len(who)
+        middle = np.array([positions[PRESENT, :, 0].mean(), 0.0])
+        segments.positions[number, :, :count] = torch.from_numpy(positions - middle)
+        segments.present[number, :, :count] = torch.from_numpy(scene.present[at])
+        segments.target_lane[number, :, :count] = torch.from_numpy(scene.target_lane[at])
+        segments.length[number, :count] = torch.from_numpy(scene.length[who])
+        segments.width[number, :count] = torch.from_numpy(scene.width[who])
+    return segments
 
 
 @dataclass(frozen=True)
@@ -45,8 +227,7 @@ class Windows:
         positions: [W, frames, 2] float64, m.
         scene: [W] int64, index into ``scene_names``.
         start, vehicle: [W] int64, row of the scene at which the window starts, and column of its vehicle.
-        lane: [W] int64, its lane at the last observed position, 0 the rightmost.
-        lane_from_left: [W] int64, the same counted from the scene's leftmost lane, which is 1.
+        lane, lane_from_left: [W] int64, at the last observed position; 0 is the rightmost, 1 from left the leftmost.
         length: [W] float64, m.
     """
 
@@ -81,23 +262,20 @@ class Windows:
 
 def join_windows(parts: list[Windows]) -> Windows:
     """All windows of ``parts`` in order; no two parts share a scene."""
-    names = tuple(name for part in parts for name in part.scene_names)
-    before = np.cumsum([0, *(len(part.scene_names) for part in parts[:-1])])
     joined = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts])
-        for field in fields(Windows)
-        if field.name not in ("scene", "scene_names")
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("positions", "start", "vehicle", "lane", "lane_from_left", "length")
     }
+    before = np.cumsum([0, *(len(part.scene_names) for part in parts[:-1])])
     scene = np.concatenate([part.scene + first for part, first in zip(parts, before)])
-    return Windows(**joined, scene=scene, scene_names=names)
+    return Windows(**joined, scene=scene, scene_names=tuple(name for part in parts for name in part.scene_names))
 
 
 def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
     """Whether each vehicle is present in all ``frames`` frames that start at each row; bool [S, V]."""
     if len(scene.present) < frames:
         return np.zeros((0, scene.present.shape[1]), dtype=bool)
-    running = np.concatenate([np.zeros_like(scene.present[:1], dtype=np.int64), scene.present.cumsum(0)])
-    return running[frames:] - running[:-frames] == frames
+    return np.all(sliding_window_view(scene.present, frames, axis=0), axis=-1)
 
 
 def count_windows(scene: SceneTracks) -> int:
@@ -111,84 +289,28 @@ def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW
     Raises:
         UserError: no vehicle is present for a whole window.
     """
-    windows = join_windows([_scene_windows(scene, stride, frames) for scene in scenes])
+    parts = []
+    for scene in scenes:
+        start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
+        start *= stride
+        lane = scene.lane[start + PRESENT, vehicle]
+        part = Windows(
+            positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
+            scene=np.zeros_like(start),
+            start=start,
+            vehicle=vehicle,
+            lane=lane,
+            lane_from_left=scene.lanes - lane,
+            length=scene.length[vehicle],
+            scene_names=(scene.name,),
+        )
+        parts.append(part)
+    windows = join_windows(parts)
     if not len(windows):
         raise UserError(
             f"recordings: no vehicle is present for {frames} frames in a row; give longer tracks (10 Hz)."
         )
     return windows
-
-
-def _scene_windows(scene: SceneTracks, stride: int, frames: int) -> Windows:
-    start, vehicle = np.nonzero(_present_throughout(scene, frames)[::stride])
-    start *= stride
-    lane = scene.lane[start + PRESENT, vehicle]
-    return Windows(
-        positions=scene.positions[start[:, None] + np.arange(frames), vehicle[:, None]],
-        scene=np.zeros_like(start),
-        start=start,
-        vehicle=vehicle,
-        lane=lane,
-        lane_from_left=scene.lanes - lane,
-        length=scene.length[vehicle],
-        scene_names=(scene.name,),
-    )
-
-
-def cache_folder() -> Path | None:
-    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder; None if switched off."""
-    named = os.environ.get(CACHE_VARIABLE)
-    if named is not None:
-        return Path(named) if named else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ganlane"
-
-
-def content_hash(settings: Any, *arrays: np.ndarray) -> str:
-    """Hash of plain settings and of the arrays' types, shapes and bytes."""
-    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-    for array in arrays:
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()[:32]
-
-
-def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The arrays that ``compute`` returns, from the cache if it ran for this ``key`` before.
-
-    A damaged file is computed again, and a folder that cannot be written to is ignored.
-    """
-    folder = cache_folder()
-    if folder is None:
-        return compute()
-    path = folder / f"{name}_{key}.npz"
-    kept = load_arrays(path)
-    if kept is not None:
-        return kept
-    arrays = compute()
-    with suppress(OSError):
-        save_arrays(path, arrays)
-    return arrays
-
-
-def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays as .npz with a checksum, atomically."""
-    file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's stub takes a name for an option
-    write_bytes(path, sealed_archive(file.getvalue()))
-
-
-def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """What :func:`save_arrays` wrote, without pickle; None where it is absent, with a note where damaged."""
-    if not path.is_file():
-        return None
-    of_numpy = (KeyError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)
-    with suppress(UserError, OSError, ValueError, *of_numpy):
-        content = path.read_bytes()
-        if has_checksum(content, path):
-            with np.load(io.BytesIO(content), allow_pickle=False) as kept:
-                return dict(kept)
-    print(f"{path}: damaged or without a checksum; computed again.", file=sys.stderr)
-    return None
 
 
 @dataclass(frozen=True)
@@ -246,26 +368,13 @@ def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
 
         return cached("groups", content_hash(settings, place, start), compute)["labels"]
 
-    return _pad(windows, now, _labels_by_run(windows.scene, labels_of_scene))
-
-
-def _labels_by_run(values: np.ndarray, labels_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Labels [W] of each run of equal ``values`` [W], by ``labels_of`` its rows; no label is used in two runs."""
-    labels, used = np.empty(len(values), dtype=np.int64), 0
-    for rows in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
-        labels[rows] = used + labels_of(rows)
-        used = int(labels[rows].max()) + 1
-    return labels
-
-
-def _pad(windows: Windows, now: np.ndarray, labels: np.ndarray) -> Groups:
-    """Scatter windows into [B, G] by group number and rank within the group."""
+    # Scattered into [B, G] by group number and rank within the group.
+    labels = _labels_by_run(windows.scene, labels_of_scene)
     _, labels, counts = np.unique(labels, return_inverse=True, return_counts=True)
     order = np.argsort(labels, kind="stable")
     rank = np.empty(len(labels), dtype=np.int64)
     rank[order] = np.arange(len(labels)) - np.repeat(np.cumsum(counts) - counts, counts)
-    shape = (len(counts), int(counts.max()))
-    window = np.full(shape, -1)
+    window = np.full((len(counts), int(counts.max())), -1)
     window[labels, rank] = np.arange(len(labels))
     mean = np.stack([np.bincount(labels, now[:, axis]) / counts for axis in (0, 1)], axis=-1)
     mask = window >= 0
@@ -277,3 +386,12 @@ def _pad(windows: Windows, now: np.ndarray, labels: np.ndarray) -> Groups:
         torch.from_numpy(mask),
         torch.from_numpy(window),
     )
+
+
+def _labels_by_run(values: np.ndarray, labels_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Labels [W] of each run of equal ``values`` [W], by ``labels_of`` its rows; no label is used in two runs."""
+    labels, used = np.empty(len(values), dtype=np.int64), 0
+    for rows in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
+        labels[rows] = used + labels_of(rows)
+        used = int(labels[rows].max()) + 1
+    return labels

@@ -19,7 +19,7 @@ import polars as pl
 
 from ganlane.data import FRAME_S, SCHEMA
 from ganlane.data.lanes import STANDARD_LANE_WIDTH_M, Flags, Floats
-from ganlane.data.tables import read_table
+from ganlane.data.schema import read_table
 from ganlane.errors import UserError
 
 #: A scene must last longer than the seconds that every measure leaves out, s.

@@ -19,7 +19,7 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array
 from ganlane.files import CHECKPOINTS, PLACE, has_checksum, note_without_checksum, write_json
-from ganlane.generator.rollout import headway_from_uniform
+from ganlane.generator.closed_loop import headway_from_uniform
 from ganlane.realism.measures import QUANTITIES, Measured, ceiling, lane_change_rate
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive

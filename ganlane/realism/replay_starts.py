@@ -27,7 +27,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.generator.rollout import balanced_headway
+from ganlane.generator.closed_loop import balanced_headway
 from ganlane.realism.recordings import Recording, frame_of
 from ganlane.sim.lanes import ENTRY_M
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform

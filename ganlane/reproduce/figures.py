@@ -22,8 +22,14 @@ from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.generator.forecasts import paper_forecasts
-from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, scene_tracks
-from ganlane.generator.windows import Windows, cut_windows, group_windows
+from ganlane.generator.windows import (
+    OBSERVED_POSITIONS,
+    PRESENT,
+    Windows,
+    cut_windows,
+    group_windows,
+    scene_tracks,
+)
 from ganlane.sim.random import Stream
 from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
 from ganlane.view.record import EpisodeLabel, Trajectory, record_episode

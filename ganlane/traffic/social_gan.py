@@ -12,17 +12,18 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.generator.closed_loop import (
     ANCHOR,
+    HEADWAY_QUANTILES_S,
     AnchorParameters,
     DriverMemory,
     History,
     Plan,
     anchored_step,
+    headway_from_uniform,
     paper_step,
     start,
     wander,
 )
 from ganlane.generator.networks import Generator
-from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.generator import EXTRA_INPUTS

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.recordings import HIGHD_CARS, write_highd
+from reference.recordings import write_highd
 
 from ganlane.data import SCHEMA, RowCount, highd_scenes, read_recordings
 from ganlane.data.highd import resample
@@ -20,41 +20,29 @@ def recording(tmp_path):
     return tmp_path / "01_tracks.csv"
 
 
-def test_each_direction_is_a_scene_with_x_forward_and_lane_0_rightmost(recording):
+def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(recording):
     upper, lower = highd_scenes(recording)
     assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
     assert upper.frame.schema == lower.frame.schema == SCHEMA
     assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
     # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12) and 3.
-    driven = {
-        vehicle: (rows["lane"].unique().to_list(), rows["y"][0], rows["speed"][0])
-        for scene in (upper, lower)
-        for (vehicle,), rows in scene.frame.group_by("vehicle")
-    }
-    assert driven[1] == ([0], pytest.approx(0.0), 30.0)
-    assert driven[2] == ([1], pytest.approx(4.5), 35.0)
     # Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
-    assert driven[3] == ([0], pytest.approx(0.0), 25.0)
-    assert driven[4] == ([1], pytest.approx(4.0), 28.0)
-
-
-def test_cars_drive_forward_from_the_centre_of_their_box(recording):
-    for scene in highd_scenes(recording):
+    expected = {1: (0, 0.0, 30.0), 2: (1, 4.5, 35.0), 3: (0, 0.0, 25.0), 4: (1, 4.0, 28.0)}
+    begin = {}
+    for scene in (upper, lower):
         assert 0.0 <= scene.frame["x"].min() < 4.0
-        for (vehicle,), rows in scene.frame.group_by("vehicle", maintain_order=True):
-            assert (rows["length"].to_list()[0], rows["width"].to_list()[0]) == (5.0, 2.0)
-            pace = np.diff(rows["x"].to_numpy()) / 0.1
-            assert pace == pytest.approx(np.full(len(pace), abs(HIGHD_CARS[vehicle][1])))
-    upper, _ = highd_scenes(recording)
-    at = {vehicle: rows["x"][0] for (vehicle,), rows in upper.frame.group_by("vehicle", maintain_order=True)}
+        for (vehicle,), rows in scene.frame.group_by("vehicle"):
+            begin[vehicle] = rows.row(0, named=True)
+            lane, y, speed = expected[vehicle]
+            assert rows["lane"].unique().to_list() == [lane]
+            assert begin[vehicle]["y"] == pytest.approx(y)
+            assert [begin[vehicle][name] for name in ("length", "width", "speed")] == [5.0, 2.0, speed]
+            assert np.diff(rows["x"].to_numpy()) / 0.1 == pytest.approx(np.full(rows.height - 1, speed))
+            # Recorded are the frames 1 to 200 at 25 Hz, 0.04 to 8 s.
+            assert rows["frame"].to_list() == list(range(1, 81))
+    assert begin.keys() == expected.keys()
     # Car 2 starts 20 m further to the left than car 1, that is ahead of it; both are read at 0.1 s, frame 2.5.
-    assert at[2] - at[1] == pytest.approx(20.0 + 0.06 * 5.0)
-
-
-def test_frames_are_a_tenth_of_a_second_apart(recording):
-    frames = read_recordings("highd", recording).filter(pl.col("vehicle") == 1)["frame"].to_list()
-    # Recorded are the frames 1 to 200 at 25 Hz, 0.04 to 8 s.
-    assert frames == list(range(1, 81))
+    assert begin[2]["x"] - begin[1]["x"] == pytest.approx(20.0 + 0.06 * 5.0)
 
 
 def test_a_folder_is_read_recording_by_recording(tmp_path):

@@ -27,11 +27,8 @@ def test_vehicles_on_the_boundary_tell_the_width_where_lane_keepers_sit_off_cent
     assert lane_width(y, np.rint(y / width).astype(np.int64)) == pytest.approx(width, abs=0.03)
 
 
-def test_a_single_lane_gets_the_standard_width():
+def test_a_single_lane_gets_the_standard_width_and_one_stray_row_does_not_make_a_lane():
     assert lane_width(np.linspace(-0.3, 0.3, 20), np.zeros(20, np.int64)) == 3.66
-
-
-def test_one_stray_row_does_not_make_a_lane():
     y = np.concatenate((np.zeros(50), np.full(50, 3.5), [30.0]))
     lane = np.concatenate((np.zeros(50), np.ones(50), [5])).astype(np.int64)
     assert lane_width(y, lane) == pytest.approx(3.5)
@@ -52,12 +49,8 @@ def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
     # The boundary, 1.8 m, is crossed at 3.85 s. Going back, 2.3 s is the first sample within 0.3 m of the old
     # centre (0.25 m); going on, 5.4 s is the first within 0.3 m of the new one (3.35 m).
     change = found(RAMP)
-    assert len(change) == 1
-    assert (change.old_lane[0], change.new_lane[0]) == (0, 1)
-    assert change.sample[0] == 38
-    assert change.tau_s[0] == pytest.approx(1.55)
-    assert change.tau_e[0] == pytest.approx(1.55)
-    assert change.duration_s[0] == pytest.approx(3.1)
+    assert (change.old_lane.tolist(), change.new_lane.tolist(), change.sample.tolist()) == ([0], [1], [38])
+    assert (change.tau_s[0], change.tau_e[0], change.duration_s[0]) == pytest.approx((1.55, 1.55, 3.1))
     assert change.lateral_speed[0] == pytest.approx(1.0)
     assert change.complete[0]
 
@@ -70,14 +63,12 @@ def test_a_driver_who_stops_beside_the_centre_has_ended_the_change():
 
 
 def test_a_track_that_ends_in_the_middle_of_the_change_is_censored():
-    change = found(RAMP[:45])
-    assert change.end_censored[0]
-    assert not change.start_censored[0]
-    assert change.tau_e[0] == pytest.approx(4.4 - 3.85)
-    late = found(RAMP[33:])
-    assert late.start_censored[0]
-    assert not late.end_censored[0]
-    assert late.tau_s[0] == pytest.approx(3.85 - 3.3)
+    early, late = found(RAMP[:45]), found(RAMP[33:])
+    assert [(each.start_censored[0], each.end_censored[0]) for each in (early, late)] == [
+        (False, True),
+        (True, False),
+    ]
+    assert (early.tau_e[0], late.tau_s[0]) == pytest.approx((4.4 - 3.85, 3.85 - 3.3))
     assert not late.complete[0]
 
 

@@ -27,23 +27,23 @@ def portal_file(folder, content):
 
 
 def same_driving(read: pl.DataFrame, made: pl.DataFrame) -> None:
-    made = made.sort("vehicle", "frame")
-    for name in ("vehicle", "frame", "lane"):
-        assert read[name].to_list() == made[name].to_list(), name
-    for name, tolerance in {"x": 1e-5, "speed": 1e-5, "length": 1e-5, "width": 1e-5}.items():
-        assert (read[name] - made[name]).abs().max() < tolerance, name
+    made, same = made.sort("vehicle", "frame"), ["vehicle", "frame", "lane"]
+    assert read.select(same).equals(made.select(same))
     # Lane width and the first lane's centre are estimated from positions that wander by 0.15 m.
-    assert (read["y"] - made["y"]).abs().max() < 0.2
+    for name, tolerance in {**dict.fromkeys(("x", "speed", "length", "width"), 1e-5), "y": 0.2}.items():
+        assert (read[name] - made[name]).abs().max() < tolerance, name
 
 
 def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right(tmp_path):
-    scenes = list(ngsim_scenes(text_file(tmp_path, ngsim_rows(FIRST))))
-    assert [scene.name for scene in scenes] == ["trajectories-0750am-0805am-1"]
-    assert scenes[0].frame.schema == SCHEMA
-    assert scenes[0].lanes == 3
-    assert scenes[0].lane_width_m == pytest.approx(LANE_M, abs=0.1)
-    same_driving(scenes[0].frame, FIRST)
-    validate(scenes[0].frame, "read")
+    path = text_file(tmp_path, ngsim_rows(FIRST))
+    (scene,) = ngsim_scenes(path)
+    assert (scene.name, scene.frame.schema, scene.lanes) == ("trajectories-0750am-0805am-1", SCHEMA, 3)
+    assert scene.lane_width_m == pytest.approx(LANE_M, abs=0.1)
+    same_driving(scene.frame, FIRST)
+    validate(scene.frame, "read")
+    assert read_recordings("ngsim", path).equals(scene.frame)
+    with pytest.raises(UserError, match="moon: no such kind of recordings; expected scenes, ngsim or highd"):
+        read_recordings("moon", path)
 
 
 @pytest.mark.parametrize(("block_bytes", "thousands"), [(10_000, True), (2**25, False)])
@@ -97,24 +97,21 @@ def test_lanes_is_how_many_are_kept_from_the_left(tmp_path):
     assert sorted(kept["lane"].unique()) == [0, 1]
 
 
-def changed(row: int, column: str, value: str) -> list[str]:
-    """The portal's lines with one field changed; ``row`` counts from 0 below the header."""
+def changed(folder, row: int, column: str, value: str):
+    """The portal's file with one field changed; ``row`` counts from 0 below the header."""
     lines = portal_csv(ngsim_rows(FIRST), thousands=False).splitlines()
     fields = lines[row + 1].split(",")
     fields[lines[0].split(",").index(column)] = value
     lines[row + 1] = ",".join(fields)
-    return lines
+    return portal_file(folder, "\n".join(lines) + "\n")
 
 
 @pytest.mark.parametrize(
     ("row", "column", "value", "message"),
     [
-        (3, "local_y", "far", r"line 5, column local_y: 'far' is not a number"),
         (400, "local_x", "NaN", r"line 402, column local_x: 'NaN' is not a finite number"),
-        (0, "v_vel", "", r"line 2, column v_vel: the field is empty"),
         (7, "v_vel", "-3.0", r"line 9, column v_vel: -3.0 is below 0"),
         (8, "v_length", "0", r"line 10, column v_length: 0.0 is not above 0"),
-        (5, "frame_id", "5.5", r"line 7, column frame_id: '5.5' is not a whole number"),
         (6, "local_y", '"1,2"', r"line 8, column local_y: '1,2' is not a number"),
         (6, "location", "us-10", r"line 8, column location: 'us-10' is no known place"),
         (9, "frame_id", "9000000", r"line 11, columns frame_id and global_time: frame 9000000 .* fits no recording"),
@@ -124,7 +121,7 @@ def changed(row: int, column: str, value: str) -> list[str]:
 )
 @pytest.mark.parametrize("block_bytes", [20_000, 2**25])
 def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message, block_bytes):
-    path = portal_file(tmp_path, "\n".join(changed(row, column, value)) + "\n")
+    path = changed(tmp_path, row, column, value)
     with pytest.raises(UserError, match=message) as caught:
         read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
     assert str(path) in str(caught.value)
@@ -140,12 +137,6 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
     text.write_bytes(text.read_bytes()[:-30])
     with pytest.raises(UserError, match=r"line 540, column \w+: the file breaks off here"):
         read_recordings("ngsim", text)
-
-
-def test_the_order_of_the_rows_does_not_matter(tmp_path):
-    rows = ngsim_rows(FIRST)
-    mixed = read_recordings("ngsim", text_file(tmp_path, rows.sample(fraction=1.0, shuffle=True, seed=1)))
-    assert mixed.equals(read_recordings("ngsim", text_file(tmp_path, rows)))
 
 
 @pytest.mark.parametrize(
@@ -166,26 +157,15 @@ def test_units_that_cannot_be_feet_and_seconds_are_refused(tmp_path, columns, fa
     assert "line 1" in str(caught.value)
 
 
-def test_missing_columns_and_files_that_are_none_are_refused(tmp_path):
-    without = portal_csv(ngsim_rows(FIRST).drop("v_Vel", "Lane_ID"))
-    with pytest.raises(UserError, match=r"line 1: no column v_vel, lane_id; found vehicle_id"):
-        read_recordings("ngsim", portal_file(tmp_path, without))
+def test_files_of_other_columns_or_places_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"line 1: 17 columns; expected the 18"):
         read_recordings("ngsim", text_file(tmp_path, ngsim_rows(FIRST).drop("v_Class")))
-    with pytest.raises(UserError, match="no such file"):
-        read_recordings("ngsim", tmp_path / "nowhere.txt")
-    with pytest.raises(UserError, match="the file is empty"):
-        read_recordings("ngsim", portal_file(tmp_path, ""))
-    (tmp_path / "packed.zip").write_bytes(b"PK\x03\x04\xff\xfe\x00" * 40)
-    with pytest.raises(UserError, match=r"packed.zip, line 1: not text"):
-        read_recordings("ngsim", tmp_path / "packed.zip")
     with pytest.raises(UserError, match=r"no rows of us-101, i-80; check data.locations"):
         read_recordings("ngsim", portal_file(tmp_path, portal_csv(ngsim_rows(FIRST), "peachtree")))
 
 
 def test_temporary_files_are_removed_after_an_error(tmp_path):
-    path = portal_file(tmp_path, "\n".join(changed(500, "local_y", "far")) + "\n")
-    scratch = tmp_path / "scratch"
+    path, scratch = changed(tmp_path, 500, "local_y", "far"), tmp_path / "scratch"
     scratch.mkdir()
     with pytest.raises(UserError):
         list(ngsim_scenes(path, NgsimParameters(block_bytes=20_000), scratch=scratch))
@@ -195,11 +175,3 @@ def test_temporary_files_are_removed_after_an_error(tmp_path):
 def test_a_small_extract_is_a_period_of_its_own(tmp_path):
     rows = ngsim_rows(FIRST).filter((pl.col("Vehicle_ID") < 3) & (pl.col("Frame_ID") < 20))
     assert read_recordings("ngsim", portal_file(tmp_path, portal_csv(rows))).height == 40
-
-
-def test_recordings_are_read_whole_by_their_kind(tmp_path):
-    path = text_file(tmp_path, ngsim_rows(FIRST))
-    (scene,) = ngsim_scenes(path)
-    assert read_recordings("ngsim", path).equals(scene.frame)
-    with pytest.raises(UserError, match="moon: no such kind of recordings; expected scenes, ngsim or highd"):
-        read_recordings("moon", path)

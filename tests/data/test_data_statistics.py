@@ -1,4 +1,4 @@
-"""Equations 9 and 10, intervals, and whole statistics against values worked by hand."""
+"""Statistics against values worked by hand, and the figures published with the US-101 recordings, where they are."""
 
 import json
 
@@ -8,7 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ganlane.data import SCHEMA, SyntheticTraffic, synthetic_scenes
+from ganlane.data import (
+    SCHEMA,
+    SyntheticTraffic,
+    default_scenes,
+    find_lane_changes,
+    read_scenes,
+    scene_lane_widths,
+    synthetic_scenes,
+    tracks_of_frame,
+)
 from ganlane.data.statistics import (
     Bins,
     DrivingStatistics,
@@ -16,14 +25,8 @@ from ganlane.data.statistics import (
     describe,
     describe_durations,
     driving_statistics,
-    followers,
-    leader_gaps,
-    median_headways,
     poisson_interval,
-    raw_accelerations,
-    smoothed_accelerations,
-    srlc,
-    steps_between_changes,
+    quantities,
     survival_curve,
 )
 from ganlane.errors import UserError
@@ -39,16 +42,6 @@ def track(vehicle, x, lane=0, scene="s", y=None, length=4.0):
     return pl.DataFrame(dict(zip(SCHEMA, columns)), schema=SCHEMA, strict=False)
 
 
-def test_equation_9_counts_changes_per_vehicle_and_kilometre_of_road():
-    # 6 changes among 100 vehicles on 500 m: 0.06 each, on half a kilometre.
-    assert srlc(6, 100, 500.0) == pytest.approx(0.12)
-
-
-def test_equation_10s_mean_time_between_changes():
-    # Half a change per km at 20 m/s: a change every 2 km, that is every 100 s, that is every 1000 steps.
-    assert steps_between_changes(0.5, 20.0) == pytest.approx(1000.0)
-
-
 @pytest.mark.parametrize(
     ("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39), (57, 43.17, 73.85)]
 )
@@ -57,28 +50,30 @@ def test_the_exact_interval_of_a_count_is_the_tabled_one(count, low, high):
     assert poisson_interval(count) == pytest.approx((low, high), rel=2e-3)
 
 
+def accelerations(frame):
+    measured = quantities(frame)
+    return measured["acceleration_raw"].tolist(), measured["acceleration_smoothed"].tolist()
+
+
 def test_a_steady_acceleration_is_found_by_either_measure_and_a_lost_frame_splits_a_track():
     time = np.arange(50) * 0.1
     frame = track(1, 10.0 * time + 0.75 * time**2)
-    assert smoothed_accelerations(frame).to_list() == pytest.approx([1.5] * 30)
+    raw, smoothed = accelerations(frame)
+    assert smoothed == pytest.approx([1.5] * 30)
     # numpy's gradient is one-sided at both ends.
-    assert raw_accelerations(frame)[1:-1].to_list() == pytest.approx([1.5] * 47)
-    holed = frame.filter(pl.col("frame") != 25)
+    assert raw[1:-1] == pytest.approx([1.5] * 47)
+    raw, smoothed = accelerations(frame.filter(pl.col("frame") != 25))
     # Frames 20 to 24 and 46 to 49 have two seconds without a gap behind them.
-    assert smoothed_accelerations(holed).to_list() == pytest.approx([1.5] * 9)
-    assert len(raw_accelerations(holed)) == 49 - 2
+    assert smoothed == pytest.approx([1.5] * 9)
+    assert len(raw) == 49 - 2
 
 
 def test_noise_from_frame_to_frame_is_smoothed_away():
     time = np.arange(100) * 0.1
     noisy = track(1, 10.0 * time + 0.05 * (-1.0) ** np.arange(100))
-    assert smoothed_accelerations(noisy).abs().max() == pytest.approx(0.0, abs=1e-9)
-    shaken = noisy.with_columns(speed=10.0 + pl.col("frame") % 2)
-    assert raw_accelerations(shaken).abs().min() == pytest.approx(10.0)
-
-
-def headways(frame):
-    return median_headways(followers(leader_gaps(frame)))
+    raw, smoothed = accelerations(noisy.with_columns(speed=10.0 + pl.col("frame") % 2))
+    assert np.abs(smoothed).max() == pytest.approx(0.0, abs=1e-9)
+    assert np.abs(raw).min() == pytest.approx(10.0)
 
 
 def test_the_headway_is_the_followers_own():
@@ -86,11 +81,11 @@ def test_the_headway_is_the_followers_own():
     leader = track(1, 26.0 + 10.0 * time)
     follower = track(2, 10.0 * time)  # gap 22 m at 10 m/s: (22 - 2) / 10 = 2 s
     beside = track(3, 13.0 + 10.0 * time, lane=1)
-    assert headways(pl.concat((leader, follower, beside))).to_list() == pytest.approx([2.0])
+    assert quantities(pl.concat((leader, follower, beside)))["headway"].tolist() == pytest.approx([2.0])
     far = track(1, 100.0 + 10.0 * time)
-    assert len(headways(pl.concat((far, follower)))) == 0
     short = pl.concat((leader, follower)).filter(pl.col("frame") < 9)
-    assert len(headways(short)) == 0
+    for without in (pl.concat((far, follower)), short):
+        assert len(quantities(without)["headway"]) == 0
 
 
 def recording():
@@ -113,8 +108,8 @@ def test_a_recording_is_measured_as_by_hand():
     assert changes.count == 1
     assert changes.srlc == pytest.approx(1 / 3 * 1000 / 500)
     assert changes.per_vehicle_km == pytest.approx(1 / 1.2, rel=1e-3)
-    assert changes.per_vehicle_km_low == pytest.approx(0.0253 / 1.2, rel=1e-2)
-    assert changes.per_vehicle_km_high == pytest.approx(5.572 / 1.2, rel=1e-2)
+    bounds = (changes.per_vehicle_km_low, changes.per_vehicle_km_high)
+    assert bounds == pytest.approx((0.0253 / 1.2, 5.572 / 1.2), rel=1e-2)
     assert changes.t_m_srlc_steps == pytest.approx(750.0)
     assert changes.t_m_vehicle_km_steps == pytest.approx(600.0, rel=1e-3)
     assert changes.duration.complete.count == 1
@@ -151,12 +146,10 @@ def test_foreign_statistics_are_refused():
 
 def test_a_lone_lane_keeper_leaves_the_rest_open():
     measured = driving_statistics(synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0)))
-    assert measured.lane_changes.count == 0
-    assert measured.lane_changes.t_m_srlc_steps is None
-    assert measured.lane_changes.per_vehicle_km_low == 0.0
-    assert measured.lane_changes.per_vehicle_km_high > 0.0
-    assert measured.headway.count == 0
-    assert measured.speed_sd_in_frame is None
+    changes = measured.lane_changes
+    assert (changes.count, changes.t_m_srlc_steps, changes.per_vehicle_km_low) == (0, None, 0.0)
+    assert changes.per_vehicle_km_high > 0.0
+    assert (measured.headway.count, measured.speed_sd_in_frame) == (0, None)
 
 
 @given(st.lists(st.floats(-30.0, 30.0), min_size=2, max_size=300), st.integers(1, 5))
@@ -168,11 +161,11 @@ def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
     assert (found.count, found.mean) == (exact.count, pytest.approx(exact.mean, abs=1e-9))
     assert found.sd == pytest.approx(exact.sd, abs=1e-5)
     ordered = np.clip(np.sort(values), -20.0, 20.0)
-    for level, value in ((0.25, found.quantile(0.25)), (0.5, found.quantile(0.5)), (0.95, found.quantile(0.95))):
+    for level in (0.25, 0.5, 0.95):
         # Between the neighbours of the exact place, and a bin's width more.
         at = level * len(ordered)
         low, high = ordered[max(int(np.floor(at)) - 1, 0)], ordered[min(int(np.ceil(at)), len(ordered) - 1)]
-        assert low - 0.1 - 1e-9 <= value <= high + 0.1 + 1e-9
+        assert low - 0.1 - 1e-9 <= found.quantile(level) <= high + 0.1 + 1e-9
 
 
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
@@ -190,9 +183,7 @@ def test_the_survival_curve_takes_censored_times_as_lower_bounds():
 
 def test_durations_that_are_all_censored_have_no_mean():
     durations = describe_durations([1.0, 2.0], [False, False])
-    assert durations.censored == 2
-    assert durations.survival_mean_s is None
-    assert durations.complete.mean is None
+    assert (durations.censored, durations.survival_mean_s, durations.complete.mean) == (2, None, None)
     # One seen and a longer one cut off: the curve stays at one half or above after the last end.
     open_ended = describe_durations([1.0, 2.0, 2.5], [True, False, False])
     assert open_ended.survival_median_s is None
@@ -207,3 +198,55 @@ def test_a_sample_is_summed_up():
     assert Histogram(Bins(0.0, 1.0, 10)).describe() == describe([])
     assert describe([]).quantiles == ()
     assert describe([2.0]).sd is None
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    try:
+        path = default_scenes()
+    except UserError as missing:
+        pytest.skip(str(missing))
+    return read_scenes(path)
+
+
+@pytest.fixture(scope="module")
+def measured(scenes):
+    return driving_statistics(scenes)
+
+
+def test_the_amount_of_driving(measured):
+    exposure = measured.exposure
+    assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (11, 645, 539, 47_382)
+    assert exposure.vehicle_km == pytest.approx(61.7, abs=0.05)
+    assert exposure.road_m == pytest.approx(309, abs=0.5)
+    assert (measured.speed.mean, measured.speed.quantile(0.5)) == pytest.approx((13.2, 13.7), abs=0.05)
+
+
+def test_the_lane_changes(scenes, measured):
+    changes = measured.lane_changes
+    rates = (changes.srlc, changes.per_vehicle_km, changes.per_vehicle_km_low, changes.per_vehicle_km_high)
+    assert rates == pytest.approx((0.34, 0.92, 0.70, 1.20), abs=0.005)
+    assert changes.t_m_srlc_steps == pytest.approx(2220, abs=5)
+    assert changes.count == changes.duration.complete.count + changes.duration.censored == 57
+    assert changes.duration.complete.mean < changes.duration.survival_mean_s
+    assert 2.5 < changes.duration.survival_mean_s < 4.5
+    rows = find_lane_changes(tracks_of_frame(scenes)).sample
+    counts = dict(scenes[rows]["scene"].value_counts().iter_rows())
+    assert [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"] == [16, 5, 3, 21, 2, 0, 3, 3, 0, 3, 1]
+
+
+def test_the_lane_widths(scenes):
+    published = [3.50, 3.54, 3.44, 3.42, 3.58, 3.56, 3.52, 3.33, 3.53, 3.35, 3.39]
+    widths = scene_lane_widths(scenes)
+    assert [widths[f"us101-{letter}"] for letter in "abcdefghijk"] == pytest.approx(published, abs=0.035)
+    width = scenes["scene"].replace_strict(widths).to_numpy()
+    assert np.mean(np.rint(scenes["y"].to_numpy() / width) == scenes["lane"].to_numpy()) > 0.999
+    assert scenes.filter(pl.col("scene") == "us101-d")["lane"].max() == 6
+
+
+def test_the_spread_of_speeds_accelerations_and_headways(measured):
+    assert (measured.speed_sd_in_frame, measured.speed_sd_in_lane) == pytest.approx((2.8, 1.7), abs=0.05)
+    smooth = [measured.acceleration_smoothed.quantile(level) for level in (0.05, 0.95)]
+    assert smooth == pytest.approx([-1.2, 1.4], abs=0.05)
+    headways = [measured.headway.quantile(level) for level in (0.05, 0.25, 0.5, 0.75, 0.95)]
+    assert headways == pytest.approx([0.50, 0.93, 1.27, 1.93, 3.27], rel=0.03)

@@ -1,28 +1,17 @@
-"""One step of each preset in closed loop."""
+"""One step of each preset in closed loop, and joint rollouts of recorded scenes."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from reference.small_networks import silenced, small_generator
+from reference.small_networks import recorded_scenes, silenced, small_generator
 from reference.worlds import vehicles as placed
 
-from ganlane.generator.closed_loop import (
-    ANCHOR,
-    STEEPEST,
-    DriverMemory,
-    Plan,
-    anchored_step,
-    displacement_of,
-    inside_lane,
-    moved_by,
-    paper_step,
-    start,
-    wander,
-)
+from ganlane.generator import closed_loop
 from ganlane.generator.networks import Generator
-from ganlane.generator.rollout import HEADWAY_QUANTILES_S, headway_from_uniform
-from ganlane.parameters.generator import EXTRA_INPUTS
+from ganlane.generator.windows import cut_segments
+from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
 from ganlane.sim.lanes import Visibility
 from ganlane.sim.state import Road
@@ -43,12 +32,12 @@ def silent_generator() -> Generator:
 
 
 def drive(generator, state, seconds, headway=1.27, noise=0.0):
-    history = start(generator, displacement_of(state))
+    history = closed_loop.start(generator, closed_loop.displacement_of(state))
     zero = torch.zeros_like(history.displacement)
-    memory = DriverMemory(history, zero, torch.full_like(state.x, headway))
+    memory = closed_loop.DriverMemory(history, zero, torch.full_like(state.x, headway))
     z = noise * torch.randn(*state.x.shape, generator.sizes.noise, dtype=state.x.dtype)
     for _ in range(round(seconds / 0.1)):
-        state, memory = anchored_step(generator, state, ROAD, memory, z)
+        state, memory = closed_loop.anchored_step(generator, state, ROAD, memory, z)
     return state, memory
 
 
@@ -62,14 +51,12 @@ def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
 
 
 def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
-    state = vehicles([0.0], y=[0.0], target=[1])
-    highest = 0.0
-    generator = silent_generator()
+    state, generator, course = vehicles([0.0], y=[0.0], target=[1]), silent_generator(), []
     for _ in range(20):
         state, _ = drive(generator, state, 0.5)
-        highest = max(highest, state.y.item())
-    assert state.y.item() == pytest.approx(4.0, abs=0.3)
-    assert highest < 4.05
+        course.append(state.y.item())
+    assert course[-1] == pytest.approx(4.0, abs=0.3)
+    assert max(course) < 4.05
 
 
 def test_the_first_step_is_idm_and_the_lateral_law():
@@ -77,7 +64,7 @@ def test_the_first_step_is_idm_and_the_lateral_law():
     after, _ = drive(silent_generator(), state, 0.1)
     gap = torch.tensor(30.0 - 4.5, dtype=torch.float64)
     own = torch.tensor(20.0, dtype=torch.float64)
-    expected = idm_acceleration(own, 25.0, gap, own, ANCHOR.idm, 1.27)
+    expected = idm_acceleration(own, 25.0, gap, own, closed_loop.ANCHOR.idm, 1.27)
     assert after.x[0, 0].item() == pytest.approx(2.0 + 0.01 * expected.item(), abs=1e-9)
     assert after.y[0, 0].item() == pytest.approx(0.5 + 0.01 * 0.3 * -0.5, abs=1e-9)
 
@@ -101,55 +88,132 @@ def test_a_network_that_always_pushes_sideways_does_not_push_the_body_out_of_its
 def test_only_what_pushes_outwards_is_left_out():
     offset, still, room = torch.tensor([-1.0, -1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 0.0, 2.0]), torch.tensor(0.8)
     push = torch.tensor([0.5, -0.5, 0.5, 0.5])
-    allowed = inside_lane(push, offset, still, room, damping=1.1)
+    allowed = closed_loop.inside_lane(push, offset, still, room, damping=1.1)
     torch.testing.assert_close(allowed, torch.tensor([0.0, -0.5, 0.5, 0.0]))
 
 
 def test_nobody_rolls_back_or_slides_sideways():
     state = vehicles([0.0, 0.0], speed=0.0)
-    after = moved_by(state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double())
-    assert after.x[0, 0].item() == 0.0
-    assert after.y[0, 0].item() == 0.0
-    assert after.y[0, 1].item() == pytest.approx(STEEPEST * 1.0)
-    assert after.heading[0, 1].item() == pytest.approx(math.atan(STEEPEST))
+    after = closed_loop.moved_by(state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double())
+    assert (after.x[0, 0].item(), after.y[0, 0].item()) == (0.0, 0.0)
+    assert (after.y[0, 1].item(), after.heading[0, 1].item()) == pytest.approx(
+        (closed_loop.STEEPEST, math.atan(closed_loop.STEEPEST))
+    )
 
 
 def test_speed_and_heading_carry_the_whole_displacement():
     state = vehicles([100.0, 200.0])
-    after = moved_by(state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double())
+    after = closed_loop.moved_by(state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double())
     step = torch.stack([after.x - state.x, after.y - state.y], dim=-1)
-    torch.testing.assert_close(displacement_of(after), step, atol=1e-8, rtol=1e-8)
+    torch.testing.assert_close(closed_loop.displacement_of(after), step, atol=1e-8, rtol=1e-8)
 
 
 def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
     torch.manual_seed(0)
     begin = z = torch.randn(20000)
     for _ in range(50):
-        z = wander(z, torch.randn(20000), period_s=5.0)
+        z = closed_loop.wander(z, torch.randn(20000), period_s=5.0)
     assert z.std().item() == pytest.approx(1.0, abs=0.02)
     assert (z * begin).mean().item() == pytest.approx(math.exp(-1), abs=0.02)
     fresh = torch.randn(5)
-    torch.testing.assert_close(wander(z[:5], fresh, 0.0), fresh)
+    torch.testing.assert_close(closed_loop.wander(z[:5], fresh, 0.0), fresh)
 
 
 def test_headways_have_the_quantiles_asked_for():
-    u = (torch.arange(100000) + 0.5) / 100000
-    levels = torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95])
-    torch.testing.assert_close(
-        headway_from_uniform(u).quantile(levels), torch.tensor(HEADWAY_QUANTILES_S), atol=1e-3, rtol=0
-    )
+    headways = closed_loop.headway_from_uniform((torch.arange(100000) + 0.5) / 100000)
+    quantiles = headways.quantile(torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95]))
+    torch.testing.assert_close(quantiles, torch.tensor(closed_loop.HEADWAY_QUANTILES_S), atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("execute_k", [1, 3])
 def test_the_paper_drives_the_first_k_predictions_before_planning_anew(execute_k):
     generator, state = small_generator().double().requires_grad_(False), vehicles([0.0, 25.0], y=[0.0, 4.0])
-    history, noise = start(generator, displacement_of(state)), torch.randn(1, 2, 4).double()
-    past = displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
+    history, noise = closed_loop.start(generator, closed_loop.displacement_of(state)), torch.randn(1, 2, 4).double()
+    past = closed_loop.displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
     predicted = generator(generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise)
-    plan = Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long)) if execute_k > 1 else None
+    plan = (
+        closed_loop.Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long))
+        if execute_k > 1
+        else None
+    )
     for step in range(execute_k):
         before = state
-        state, history, plan = paper_step(generator, state, history, noise, plan)
+        state, history, plan = closed_loop.paper_step(generator, state, history, noise, plan)
         moved = torch.stack([state.x - before.x, state.y - before.y], -1)
         torch.testing.assert_close(moved, predicted[..., step, :])
     assert plan is None or (plan.left == 0).all()
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return recorded_scenes()
+
+
+@pytest.fixture
+def segments(scenes):
+    """The first scene from its closed_loop.start, for half a second."""
+    return cut_segments([(scenes[0], 0)], horizon=5)
+
+
+@pytest.fixture
+def generator():
+    return small_generator(EXTRA_INPUTS)
+
+
+def typical_rollout(generator, segments):
+    """Positions when every driver is typical and z = 0."""
+    drivers = closed_loop.driver_params(segments)
+    noise = torch.zeros(1 + segments.future.shape[1], 1, *segments.length.shape, 4)
+    return closed_loop.rollout(generator, segments, drivers, noise, CalibratedConfig())[0]
+
+
+def test_a_rollout_is_the_same_with_more_padding(segments, generator):
+    pad = torch.nn.functional.pad
+    wide = replace(
+        segments,
+        positions=pad(segments.positions, (0, 0, 0, 4)),
+        present=pad(segments.present, (0, 4)),
+        target_lane=pad(segments.target_lane, (0, 4)),
+        length=pad(segments.length, (0, 4), value=1.0),
+        width=pad(segments.width, (0, 4), value=1.0),
+    )
+    torch.testing.assert_close(typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments))
+
+
+def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(scenes, generator):
+    segments = cut_segments([(scenes[0], 0)], horizon=9)
+    segments.present[:, :12, 2] = False
+    positions = typical_rollout(generator, segments)
+    torch.testing.assert_close(positions[:, :4, 2], segments.future[:, :4, 2])
+    assert not torch.allclose(positions[:, 4:, 2], segments.future[:, 4:, 2], atol=1e-5)
+    assert not segments.scored[0, :, 2].any()
+    # Where it goes later does not matter.
+    segments.positions[:, 14:, 2] += 5.0
+    torch.testing.assert_close(typical_rollout(generator, segments), positions)
+
+
+def test_gradient_of_a_rollout_is_finite_and_reaches_every_parameter(scenes, generator):
+    segments = cut_segments([(scenes[0], 0), (scenes[1], 9)], horizon=6)
+    noise = torch.randn(7, 3, 2, 7, 4)
+    positions = closed_loop.rollout(
+        generator, segments, closed_loop.driver_params(segments), noise, CalibratedConfig()
+    )
+    (positions - segments.future).abs()[:, segments.scored].sum().backward()
+    for name, parameter in generator.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
+    before = typical_rollout(generator, segments.without_intentions())
+    segments.positions[:, 9:] += 7.0
+    segments.target_lane[:, 9:] = 0
+    torch.testing.assert_close(typical_rollout(generator, segments.without_intentions()), before)
+
+
+def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(segments):
+    one, other = (closed_loop.driver_params(segments, random=torch.Generator().manual_seed(4)) for _ in range(2))
+    assert all((a == b).all() for a, b in zip(one, other))
+    speed = (segments.positions[:, 8] - segments.positions[:, 7]).norm(dim=-1) * 10
+    assert (one[1] > speed + 0.99).all()

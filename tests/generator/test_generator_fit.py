@@ -1,170 +1,38 @@
-"""Fits of both presets: splits of scenes, losses, early stopping, resuming, stored weights."""
+"""Splits of scenes, fits of both presets, k folds and ablations."""
 
-import json
 import math
 from dataclasses import asdict, replace
 
+import polars as pl
 import pytest
 import torch
+from reference.small_networks import CALIBRATED, LOOP, PAPER
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes
+from ganlane.data.statistics import measure_exposure
 from ganlane.errors import UserError
+from ganlane.fit_report import ablation_table, fold_tables
 from ganlane.generator.checkpoint import load_generator
-from ganlane.generator.fit import assign_folds, fit_generator, learning_rate, split_for_fit
-from ganlane.generator.networks import Generator
-from ganlane.generator.segments import scene_tracks
-from ganlane.generator.tasks import (
-    CalibratedTask,
-    adversarial_loss,
-    discriminator_accuracy,
-    discriminator_loss,
-    distances,
-    energy_score,
-    masked_mean,
-    variety_loss,
+from ganlane.generator.fit import (
+    ablate,
+    assign_folds,
+    cross_validate,
+    fit_generator,
+    split_for_fit,
+    variants,
 )
-from ganlane.generator.windows import count_windows
-from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
-from ganlane.weights import save_weights
-
-SIZES = GeneratorSizes(embedding=16, hidden=16, pooling=12, pooled=8, context=16, noise=4)
-HELD_OUT = ("synthetic-1",)
-
-
-@pytest.fixture(scope="module")
-def frame():
-    return synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=8, seconds=7.0))
-
-
-def paper_config(updates: int) -> PaperConfig:
-    loop = LoopConfig(updates=updates, evaluate_every=10, learning_rate=5e-3, warmup=1)
-    return PaperConfig(SIZES, LossWeights(), loop, stride=4, held_out_stride=8, samples=3, batch=8)
-
-
-def calibrated_config(updates: int) -> CalibratedConfig:
-    loop = LoopConfig(updates=updates, evaluate_every=3, learning_rate=5e-3, warmup=1)
-    sizes = replace(SIZES, extra_inputs=4)
-    return CalibratedConfig(
-        sizes, loop, horizons=(4, 6), shares=(1, 1), held_out_horizon=8, batch=3, held_out_stride=20
-    )
-
-
-def test_fitting_the_paper_preset_lowers_its_error(frame):
-    seen = []
-    fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(40), on_progress=seen.append)
-    losses = [progress.losses["mean"] for progress in seen]
-    assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
-    assert {"variety", "single", "mean", "adversarial", "discriminator"} == set(seen[-1].losses)
-
-
-def test_fitting_the_calibrated_preset_reports_the_held_out_scenes(frame):
-    result = fit_generator("calibrated", frame, held_out=HELD_OUT, config=calibrated_config(3))
-    assert set(result.metrics) == {"all", "synthetic-1"}
-    assert result.data["fitted"] == ["synthetic-0"]
-    assert result.updates == 3
-
-
-def test_the_calibrated_loss_falls(frame):
-    fitted, held_out = scene_tracks(frame)
-    task = CalibratedTask([fitted], [held_out], calibrated_config(16))
-    for optimiser in task.optimisers.values():
-        optimiser.param_groups[0]["lr"] = 5e-3
-    losses = [task.update(0)["mean"] for _ in range(16)]
-    assert sum(losses[-5:]) < sum(losses[:5])
-
-
-def test_save_and_load_give_the_same_network_and_its_description(frame, tmp_path):
-    result = fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(2))
-    path = tmp_path / "generator.safetensors"
-    result.save(path)
-    generator, metadata = load_generator(path, "paper")
-    for name, tensor in result.module.state_dict().items():
-        assert (generator.state_dict()[name] == tensor).all(), name
-    assert metadata["config"] == json.loads(json.dumps(asdict(paper_config(2))))
-    assert metadata["metrics"]["all"]["ade_m/mean"] == result.metrics["all"]["ade_m/mean"]
-    assert {"headway", "lane_changes"} <= set(metadata["driving_statistics"])
-    assert not any(parameter.requires_grad for parameter in generator.parameters())
-
-
-def test_an_interrupted_fit_goes_on_to_the_same_weights(frame, tmp_path):
-    whole = fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(16))
-    path = tmp_path / "fit.pt"
-
-    def stop(progress):
-        if progress.update == 12:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(16), resume_path=path, on_progress=stop)
-    resumed = fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(16), resume_path=path)
-    for name, tensor in whole.module.state_dict().items():
-        torch.testing.assert_close(resumed.module.state_dict()[name], tensor, msg=name)
-
-
-def test_foreign_states_are_refused(frame, tmp_path):
-    path = tmp_path / "fit.pt"
-    path.write_bytes(b"not a state")
-    with pytest.raises(UserError, match="not the state of a fit"):
-        fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(2), resume_path=path)
-    path.unlink()
-    fit_generator("paper", frame, held_out=HELD_OUT, config=paper_config(2), resume_path=path)
-    other = replace(paper_config(4), sizes=replace(SIZES, hidden=20))
-    with pytest.raises(UserError, match="another fit"):
-        fit_generator("paper", frame, held_out=HELD_OUT, config=other, resume_path=path)
-
-
-def generator_file(path, sizes=None, preset="paper", tensors=None, kind="generator"):
-    generator = Generator(SIZES)
-    metadata = {"preset": preset, "sizes": asdict(SIZES) if sizes is None else sizes}
-    save_weights(path, kind, generator.state_dict() if tensors is None else tensors, metadata)
-    return path
-
-
-def test_wrong_checkpoints_are_refused_in_one_sentence(tmp_path):
-    path = tmp_path / "generator.safetensors"
-    with pytest.raises(UserError, match="no such file"):
-        load_generator(path)
-    path.write_bytes(b"\x10\x00\x00")
-    with pytest.raises(UserError, match="not a readable safetensors"):
-        load_generator(path)
-    for wrong, preset, message in (
-        ({"kind": "agent"}, None, "expected a ganlane checkpoint of kind generator"),
-        ({}, "calibrated", "expected 'calibrated'"),
-        ({"preset": "own"}, None, "preset 'own'"),
-        ({"sizes": {"hidden": 3}}, None, "not those of a generator"),
-        ({"sizes": {**asdict(SIZES), "hidden": 10**9}}, None, "not those of a generator"),
-        ({"sizes": {**asdict(SIZES), "hidden": 20}}, None, "shapes"),
-        ({"tensors": {"x": torch.zeros(2)}}, None, "shapes"),
-        ({"preset": "calibrated"}, "calibrated", "further inputs"),
-    ):
-        with pytest.raises(UserError, match=message):
-            load_generator(generator_file(path, **wrong), preset)
-
-
-def test_a_preset_and_its_config_must_agree(frame):
-    with pytest.raises(UserError, match="preset 'sgan'"):
-        fit_generator("sgan", frame, held_out=HELD_OUT)
-    with pytest.raises(UserError, match="PaperConfig"):
-        fit_generator("calibrated", frame, held_out=HELD_OUT, config=paper_config(1))
-
-
-def test_the_learning_rate_rises_and_then_falls_to_nothing():
-    config = LoopConfig(updates=100, warmup=10, learning_rate=1e-2)
-    rates = [learning_rate(config, number) for number in range(100)]
-    assert rates[0] < rates[5] < rates[9]
-    assert rates[10:] == sorted(rates[10:], reverse=True)
-    assert rates[-1] < 1e-5
+from ganlane.generator.windows import count_windows, scene_tracks
+from ganlane.parameters.generator import CalibratedConfig, LoopConfig, PaperConfig
 
 
 @pytest.fixture(scope="module")
 def scenes():
     """Seven scenes of 2.5 to 8.5 s, so that they differ in their windows."""
-    every = []
-    for number in range(7):
-        frame = synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number), seed=number)
-        (scene,) = scene_tracks(frame)
-        every.append(type(scene)(**{**vars(scene), "name": f"scene-{number}"}))
-    return every
+    frames = [
+        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number), seed=number)
+        for number in range(7)
+    ]
+    return [replace(scene_tracks(frame)[0], name=f"scene-{number}") for number, frame in enumerate(frames)]
 
 
 @pytest.mark.parametrize("folds", [2, 3, 5, 7])
@@ -183,9 +51,8 @@ def test_reported_scenes_have_no_say_in_when_to_stop(scenes):
         names = split.names
         assert sorted(name for part in names.values() for name in part) == [scene.name for scene in scenes]
         assert tuple(names["held_out"]) == held_out
-        others = [*split.fitted, *split.validation]
-        held = sum(count_windows(scene) for scene in split.validation)
-        total = sum(count_windows(scene) for scene in others)
+        held = sum(map(count_windows, split.validation))
+        total = held + sum(map(count_windows, split.fitted))
         assert total / 12 <= held < total / 2
 
 
@@ -194,56 +61,133 @@ def test_a_single_other_scene_is_fitted_to_and_chooses_when_to_stop(scenes):
     assert split.names == {"fitted": ["scene-0"], "validation": ["scene-0"], "held_out": ["scene-1"]}
 
 
-def test_more_folds_than_scenes_are_refused(scenes):
+def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(scenes):
     with pytest.raises(UserError, match="folds=8"):
         assign_folds(scenes, 8)
     with pytest.raises(UserError, match="at least 3 scenes"):
         assign_folds(scenes[:2], 2)
+    for held_out in (("nowhere",), (), tuple(scene.name for scene in scenes)):
+        with pytest.raises(UserError, match=r"data\.held_out="):
+            split_for_fit(scenes, held_out)
 
 
-@pytest.mark.parametrize("held_out", [("nowhere",), (), tuple(f"scene-{number}" for number in range(7))])
-def test_a_split_without_two_parts_is_refused(scenes, held_out):
-    with pytest.raises(UserError, match=r"data\.held_out="):
-        split_for_fit(scenes, held_out)
+@pytest.fixture(scope="module")
+def frame():
+    return synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=5, seconds=6.5))
 
 
-def test_distance_is_euclidean_and_accumulates():
-    predicted = torch.tensor([[[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]])
-    torch.testing.assert_close(distances(predicted, torch.zeros(1, 3, 2)), torch.tensor([[5.0, 5.0, 10.0]]))
+def test_a_fit_reports_the_held_out_scenes_and_its_preset_and_config_must_agree(frame):
+    result = fit_generator(
+        "calibrated", frame, held_out=("synthetic-1",), config=CALIBRATED, source="folder/made.csv"
+    )
+    assert set(result.metrics) == {"all", "synthetic-1"}
+    assert {*result.data["fitted"], *result.data["validation"]} == {"synthetic-0", "synthetic-2"}
+    assert (result.data["held_out"], result.data["file"]) == (["synthetic-1"], "made.csv")
+    assert result.updates in (2, 4)
+    assert {"headway", "lane_changes"} <= set(result.statistics)
+    with pytest.raises(UserError, match="preset 'sgan'"):
+        fit_generator("sgan", frame)
+    with pytest.raises(UserError, match="PaperConfig"):
+        fit_generator("calibrated", frame, config=PAPER)
 
 
-def test_the_gradient_of_a_perfect_prediction_is_finite():
-    predicted = torch.zeros(1, 8, 2, requires_grad=True)
-    distances(predicted, torch.zeros(1, 8, 2)).sum().backward()
-    assert predicted.grad.isfinite().all()
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fits")
 
 
-def test_only_each_vehicles_best_sample_counts_for_variety():
-    assert variety_loss(torch.tensor([[1.0, 9.0], [5.0, 3.0]])).item() == pytest.approx(2.0)
+@pytest.fixture(scope="module")
+def scored(frame, folder):
+    """Scores of three folds by preset, and each fold's generator."""
+    results = {}
+    for config in (PAPER, CALIBRATED):
+        fits = {}
+        scores = cross_validate(frame, config, 3, folder, on_fold=fits.__setitem__, source="folder/made.csv")
+        results[config.preset] = scores, fits
+    return results
 
 
-def test_masked_vehicles_do_not_count():
-    values = torch.tensor([[1.0, 100.0]])
-    assert masked_mean(values, torch.tensor([[True, False]])).item() == 1.0
-    assert masked_mean(values, torch.zeros(1, 2, dtype=torch.bool)).item() == 0.0
+def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(scored):
+    scores, _ = scored["paper"]
+    assert {name for split in scores["splits"] for name in split["held_out"]} == set(scores["open_loop"]["scenes"])
+    for split in scores["splits"]:
+        assert not set(split["held_out"]) & {*split["fitted"], *split["validation"]}
+    pooled = scores["open_loop"]
+    assert pooled["windows"] == sum(row["windows"] for row in pooled["folds"].values()) > 0
+    kinds = {"mean", "single", "best_of_20", "constant_velocity", "constant_acceleration", "ridge", "idm"}
+    assert kinds <= set(pooled["ade_m"])
+    assert "best_of_20" in fold_tables(scores)
 
 
-def test_an_undecided_discriminator_loses_ln_2():
-    zeros = torch.zeros(1, 2)
-    assert discriminator_loss(zeros, zeros).item() == pytest.approx(math.log(2))
-    assert adversarial_loss(zeros).item() == pytest.approx(math.log(2))
+def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, folder, scored):
+    updates, fits = [], {}
+    scores = cross_validate(frame, PAPER, 3, folder, on_progress=updates.append, on_fold=fits.__setitem__)
+    first, first_fits = scored["paper"]
+    assert scores == first
+    assert not updates
+    for number, fit in fits.items():
+        for name, weights in fit.module.state_dict().items():
+            assert torch.equal(weights, first_fits[number].module.state_dict()[name])
+    cross_validate(frame, replace(PAPER, seed=1), 3, folder, on_progress=updates.append)
+    assert len(updates) == 3 * LOOP.updates
 
 
-def test_accuracy_counts_both_kinds_alike():
-    assert discriminator_accuracy(torch.ones(1, 2), -torch.ones(1, 2)).item() == 1.0
-    assert discriminator_accuracy(torch.ones(1, 2), torch.ones(1, 2)).item() == 0.5
+def test_the_calibrated_preset_is_also_rolled_out_for_five_seconds(scored):
+    scores, _ = scored["calibrated"]
+    rollout = scores["rollout"]
+    assert rollout["tracks"] == 15
+    assert list(rollout["rmse_m"]["mean"]) == ["1 s", "2 s", "3 s", "4 s", "5 s"]
+    assert rollout["ratio_to_constant_velocity"]["constant_velocity"] == 1.0
+    assert scores["open_loop"]["windows"] > rollout["windows"]
+    assert "Social-GAN (published)" in fold_tables(scores)
 
 
-def test_the_energy_score_is_least_for_the_right_spread():
-    torch.manual_seed(0)
-    recorded = torch.randn(20000, 2)
-    scores = {
-        spread: energy_score(spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded).mean().item()
-        for spread in (0.01, 0.5, 1.0, 1.5, 2.5)
-    }
-    assert min(scores, key=scores.get) == 1.0
+@pytest.mark.parametrize("preset", ["paper", "calibrated"])
+def test_the_folds_generators_name_the_scenes_they_were_fitted_to(preset, frame, scored, tmp_path):
+    scores, fits = scored[preset]
+    assert list(fits) == [1, 2, 3]
+    for fit, split in zip(fits.values(), scores["splits"]):
+        fit.save(tmp_path / "fold.safetensors")
+        _, metadata = load_generator(tmp_path / "fold.safetensors", preset)
+        assert (metadata["data"]["held_out"], metadata["data"]["file"]) == (split["held_out"], "made.csv")
+        # Its driving statistics are those of its other scenes.
+        others = measure_exposure(frame.filter(~pl.col("scene").is_in(split["held_out"]))).vehicle_km
+        assert 0.0 < metadata["driving_statistics"]["exposure"]["vehicle_km"] == others
+        assert others < measure_exposure(frame).vehicle_km
+
+
+def flat(config) -> dict:
+    """Settings and the settings within them."""
+    plain = asdict(config)
+    parts = {key: part for key, part in plain.items() if isinstance(part, dict)}
+    inner = {f"{key}.{name}": value for key, part in parts.items() for name, value in part.items()}
+    return {key: value for key, value in plain.items() if key not in parts} | inner
+
+
+@pytest.mark.parametrize("config", [PaperConfig(), CalibratedConfig()])
+def test_every_variant_has_a_quarter_of_the_updates_and_differs_in_its_part_alone(config):
+    first, *others = ((name, flat(variant)) for name, variant in variants(config).items())
+    assert first[1]["loop.updates"] == config.loop.updates // 4
+    for name, variant in others:
+        changed = {key for key, value in variant.items() if value != first[1][key]}
+        assert 1 <= len(changed) <= (3 if name == "variety term alone" else 1), name
+
+
+@pytest.mark.parametrize("config", [PAPER, CALIBRATED])
+def test_ablations_stand_side_by_side_and_the_calibrated_ones_are_rolled_out_too(config, frame, tmp_path):
+    config = replace(config, loop=LoopConfig(updates=4, evaluate_every=4, warmup=1))
+    names, updates = [], []
+    told = (names.append, updates.append) if config.preset == "paper" else ()
+    rows = ablate(frame, config, ("synthetic-1",), tmp_path, *told)
+    assert list(rows) == list(variants(config))
+    if config.preset == "calibrated":
+        assert variants(config)["without washout"].washout_s == math.inf
+        assert all(math.isfinite(row["rmse_5_s_ratio"]["mean"]) for row in rows.values())
+        assert rows["as it is"] != rows["without traits"]
+        assert "RMSE 5 s" in ablation_table(rows)
+    else:
+        assert (names, len(updates)) == (list(rows), len(rows))
+        short = rows["p_l = 4"]
+        assert short["windows"] > rows["p_l = 12"]["windows"]
+        assert short["ade_change_percent"] == short["ade_change_percent_0.4_s"]
+        assert len(ablation_table(rows).splitlines()) == 2 + len(rows)

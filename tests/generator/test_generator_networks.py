@@ -7,18 +7,6 @@ from torch import nn
 
 from ganlane.generator import networks
 from ganlane.generator.closed_loop import push, recorded, start
-from ganlane.generator.networks import (
-    DIFFERENCE_SCALE_M,
-    RANGE_M,
-    Discriminator,
-    MotionLSTM,
-    PairPooling,
-    apply,
-    dense,
-    gather_vehicles,
-    motion_features,
-    nearest,
-)
 
 
 @pytest.fixture
@@ -31,6 +19,24 @@ def scene():
     return displacements, position, mask
 
 
+@pytest.fixture
+def pooled(scene):
+    """A pooling and its arguments: hidden states [3, 13, 12], positions, displacements and mask."""
+    _, position, mask = scene
+    return networks.PairPooling(12, 10, 6, 8), (torch.randn(3, 13, 12), position, torch.randn(3, 13, 2), mask)
+
+
+@pytest.fixture
+def generator():
+    return small_generator(seed=1)
+
+
+@pytest.fixture
+def now(scene, generator):
+    """The generator's input in that scene."""
+    return generator.observe(*scene)
+
+
 @pytest.mark.parametrize("relu", [False, True])
 @pytest.mark.parametrize("shape", [(3, 5), (700, 5), (80, 9, 5)])
 def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
@@ -38,14 +44,14 @@ def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
     layer, x = nn.Linear(5, 7), torch.randn(*shape)
     expected = layer(x).relu() if relu else layer(x)
     with torch.no_grad():
-        torch.testing.assert_close(apply(layer, x, relu), expected)
-        torch.testing.assert_close(dense(x, layer.weight), x @ layer.weight.T)
-        torch.testing.assert_close(apply(layer.double(), x.double(), relu).float(), expected)
+        torch.testing.assert_close(networks.apply(layer, x, relu), expected)
+        torch.testing.assert_close(networks.dense(x, layer.weight), x @ layer.weight.T)
+        torch.testing.assert_close(networks.apply(layer.double(), x.double(), relu).float(), expected)
 
 
 def test_gradients_reach_the_weights_of_many_rows():
     layer = nn.Linear(5, 7)
-    apply(layer, torch.randn(700, 5), relu=True).sum().backward()
+    networks.apply(layer, torch.randn(700, 5), relu=True).sum().backward()
     assert layer.weight.grad.abs().sum() > 0
 
 
@@ -55,15 +61,15 @@ def test_many_rows_go_to_onednn(monkeypatch):
     monkeypatch.setattr(networks, "_onednn", lambda x, *rest: seen.append(len(x)))
     layer = nn.Linear(5, 7).requires_grad_(False)
     with torch.no_grad():
-        apply(layer, torch.randn(700, 5))
-        apply(layer, torch.randn(7, 5))
-    apply(layer, torch.randn(700, 5))
+        networks.apply(layer, torch.randn(700, 5))
+        networks.apply(layer, torch.randn(7, 5))
+    networks.apply(layer, torch.randn(700, 5))
     assert seen == [700]
 
 
 def test_the_recurrence_is_torchs_own_lstm():
     torch.manual_seed(2)
-    lstm = MotionLSTM(5, 7)
+    lstm = networks.MotionLSTM(5, 7)
     reference = nn.LSTM(5, 7, batch_first=True)
     order = torch.arange(28).reshape(4, 7)[[0, 1, 3, 2]].flatten()  # torch's: input, forget, new, output
     with torch.no_grad():
@@ -72,51 +78,44 @@ def test_the_recurrence_is_torchs_own_lstm():
         reference.weight_hh_l0.copy_(lstm.recurrent[order])
         reference.bias_hh_l0.zero_()
     displacement, difference = torch.randn(4, 6, 2), 0.05 * torch.randn(4, 6, 2)
-    embedded = torch.relu(lstm.embed(motion_features(displacement, difference)))
+    embedded = torch.relu(lstm.embed(networks.motion_features(displacement, difference)))
     torch.testing.assert_close(lstm.encode(lstm.project(displacement, difference)), reference(embedded)[1][0][0])
 
 
-def test_pooling_does_not_depend_on_the_order_of_vehicles(scene):
-    _, position, mask = scene
-    pooling = PairPooling(12, 10, 6, 8)
-    hidden, motion, order = torch.randn(3, 13, 12), torch.randn(3, 13, 2), torch.randperm(13)
-    pooled = pooling(hidden, position, motion, mask)
-    shuffled = pooling(hidden[:, order], position[:, order], motion[:, order], mask[:, order])
-    torch.testing.assert_close(shuffled, pooled[:, order])
+def test_pooling_does_not_depend_on_the_order_of_vehicles(pooled):
+    pooling, given = pooled
+    order = torch.randperm(13)
+    shuffled = pooling(*(part[:, order] for part in given))
+    torch.testing.assert_close(shuffled, pooling(*given)[:, order])
 
 
 @pytest.mark.parametrize("count", [9, 13])
-def test_pooling_ignores_padding(scene, count):
-    _, position, mask = (part[:, :count] for part in scene)
-    pooling = PairPooling(12, 10, 6, 8)
-    hidden, motion = torch.randn(3, count, 12), torch.randn(3, count, 2)
-    pooled = pooling(hidden, position, motion, mask)
-    noisy = torch.where(mask[..., None], hidden, 99.0), torch.where(mask[..., None], position, -3.0)
-    torch.testing.assert_close(pooling(noisy[0], noisy[1], motion, mask)[mask], pooled[mask])
-    torch.testing.assert_close(
-        pooling(hidden[1:2, :7], position[1:2, :7], motion[1:2, :7], mask[1:2, :7]), pooled[1:2, :7]
-    )
+def test_pooling_ignores_padding(pooled, count):
+    pooling, whole = pooled
+    hidden, position, motion, mask = given = [part[:, :count] for part in whole]
+    expected, real = pooling(*given), mask[..., None]
+    noisy = pooling(torch.where(real, hidden, 99.0), torch.where(real, position, -3.0), motion, mask)
+    torch.testing.assert_close(noisy[mask], expected[mask])
+    torch.testing.assert_close(pooling(*(part[1:2, :7] for part in given)), expected[1:2, :7])
 
 
-def test_the_split_first_layer_equals_the_whole_one(scene):
-    _, position, mask = scene
-    pooling = PairPooling(12, 10, 6, 8)
-    hidden, motion = torch.randn(3, 13, 12), torch.randn(3, 13, 2)
-    index, seen = nearest(position, mask, 8)
+def test_the_split_first_layer_equals_the_whole_one(pooled):
+    pooling, (hidden, position, motion, mask) = pooled
+    index, seen = networks.nearest(position, mask, 8)
     state = torch.cat([position / torch.tensor([20.0, 4.0]), motion / torch.tensor([0.4, 0.05])], dim=-1)
-    pairs = gather_vehicles(state, index) - state[..., None, :]
+    pairs = networks.gather_vehicles(state, index) - state[..., None, :]
     whole = nn.Linear(4 + 12, 10)
     with torch.no_grad():
         whole.weight.copy_(torch.cat([pooling.per_pair.weight, pooling.per_vehicle.weight], dim=1))
         whole.bias.copy_(pooling.per_pair.bias)
-    first = torch.relu(whole(torch.cat([pairs, gather_vehicles(hidden, index)], dim=-1)))
+    first = torch.relu(whole(torch.cat([pairs, networks.gather_vehicles(hidden, index)], dim=-1)))
     expected = torch.relu(pooling.second(first)).masked_fill(~seen[..., None], 0.0).amax(-2)
     torch.testing.assert_close(pooling(hidden, position, motion, mask), expected)
 
 
 def test_the_nearest_are_found_as_by_sorting(scene):
     _, position, mask = scene
-    index, seen = nearest(position, mask, 8)
+    index, seen = networks.nearest(position, mask, 8)
     for row in range(3):
         for own in range(13):
             others = [j for j in range(13) if j != own and mask[row, j]]
@@ -126,47 +125,39 @@ def test_the_nearest_are_found_as_by_sorting(scene):
 
 def test_a_few_vehicles_are_all_each_others_neighbours(scene):
     _, position, mask = (part[:, :9] for part in scene)
-    index, seen = nearest(position, mask, 8)
+    index, seen = networks.nearest(position, mask, 8)
     assert index is None
-    assert (seen.sum(-1)[mask] <= mask.sum(-1, keepdim=True).expand_as(mask)[mask] - 1).all()
+    assert (seen.sum(-1) < mask.sum(-1, keepdim=True))[mask].all()
     assert seen[1, 0].tolist() == [False] + [True] * 6 + [False] * 2
 
 
 def test_vehicles_out_of_range_have_no_influence():
-    position = torch.tensor([[[0.0, 0.0], [RANGE_M + 1.0, 0.0], [RANGE_M - 1.0, 0.0]]])
-    _, seen = nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)
+    position = torch.tensor([[[0.0, 0.0], [networks.RANGE_M + 1.0, 0.0], [networks.RANGE_M - 1.0, 0.0]]])
+    _, seen = networks.nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)
     assert seen[0, 0].tolist() == [False, False, True]
 
 
 def test_a_recorded_jump_is_cut_off_before_it_reaches_the_network():
-    jump, cut = torch.tensor([1.5, 0.0]), torch.tensor([5.0 * DIFFERENCE_SCALE_M[0], 0.0])
+    jump, cut = torch.tensor([1.5, 0.0]), torch.tensor([5.0 * networks.DIFFERENCE_SCALE_M[0], 0.0])
     same = torch.zeros(2)
-    torch.testing.assert_close(motion_features(same, jump), motion_features(same, cut))
+    torch.testing.assert_close(networks.motion_features(same, jump), networks.motion_features(same, cut))
 
 
-@pytest.fixture
-def generator():
-    return small_generator(seed=1)
-
-
-def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generator):
-    displacements, position, mask = scene
-    predicted = silenced(generator)(generator.observe(displacements, position, mask), torch.randn(3, 13, 4))
+def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generator, now):
+    displacements = scene[0]
+    predicted = silenced(generator)(now, torch.randn(3, 13, 4))
     torch.testing.assert_close(predicted, displacements[..., -1:, :].expand_as(predicted))
 
 
 @pytest.mark.parametrize("execute_k", [1, 3, 8])
-def test_the_first_k_decoder_steps_are_those_of_the_whole(scene, generator, execute_k):
-    displacements, position, mask = scene
-    now, noise = generator.observe(displacements, position, mask), torch.randn(3, 13, 4)
+def test_the_first_k_decoder_steps_are_those_of_the_whole(generator, now, execute_k):
+    noise = torch.randn(3, 13, 4)
     torch.testing.assert_close(generator(now, noise, execute_k), generator(now, noise)[..., :execute_k, :])
 
 
-def test_samples_share_one_context(scene, generator):
-    displacements, position, mask = scene
-    now, noise = generator.observe(displacements, position, mask), torch.randn(5, 3, 13, 4)
-    together = generator(now, noise)
-    torch.testing.assert_close(together[3], generator(now, noise[3]))
+def test_samples_share_one_context(generator, now):
+    noise = torch.randn(5, 3, 13, 4)
+    torch.testing.assert_close(generator(now, noise)[3], generator(now, noise[3]))
 
 
 def test_kept_projections_equal_those_computed_anew(generator):
@@ -185,10 +176,10 @@ def test_a_fresh_history_is_that_of_constant_velocity(generator):
     torch.testing.assert_close(torch.stack(start(generator, displacement).motions, -2), generator.project(always))
 
 
-def test_gradient_reaches_every_parameter_of_both_networks(scene, generator):
-    displacements, position, mask = scene
-    discriminator = Discriminator(16, 12)
-    predicted = generator(generator.observe(displacements, position, mask), torch.randn(3, 13, 4))
+def test_gradient_reaches_every_parameter_of_both_networks(scene, generator, now):
+    displacements, _, mask = scene
+    discriminator = networks.Discriminator(16, 12)
+    predicted = generator(now, torch.randn(3, 13, 4))
     discriminator(torch.cat([displacements, predicted], dim=-2))[mask].sum().backward()
     for module in (generator, discriminator):
         for name, parameter in module.named_parameters():

@@ -1,25 +1,27 @@
-"""Windows cut from recorded scenes, their k-means groups, and the groups' cache."""
+"""Recorded scenes as arrays, segments and windows cut from them, and k-means groups of windows."""
 
-from unittest.mock import Mock
+from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 import pytest
 import torch
+from reference.small_networks import recorded_scenes
 
 from ganlane.data import SCHEMA
 from ganlane.errors import UserError
-from ganlane.generator.segments import OBSERVED_POSITIONS, scene_tracks
+from ganlane.generator.forecasts import distance
 from ganlane.generator.windows import (
-    CACHE_VARIABLE,
+    PRESENT,
     WINDOW_FRAMES,
-    cache_folder,
-    cached,
-    content_hash,
     count_windows,
+    cut_segments,
     cut_windows,
     group_windows,
     kmeans_labels,
+    scene_tracks,
 )
 
 
@@ -39,16 +41,66 @@ def recording(seed: int = 0, scenes: int = 3, vehicles: int = 14) -> pl.DataFram
     return pl.DataFrame(rows, schema=SCHEMA, orient="row")
 
 
+@pytest.fixture(scope="module")
+def scenes():
+    return recorded_scenes()
+
+
+@pytest.fixture(scope="module")
+def windows():
+    return cut_windows(scene_tracks(recording()))
+
+
+def test_tracks_go_on_at_constant_velocity_beyond_their_ends(scenes):
+    present = np.array([False, False, True, True, True, False])[:, None]
+    positions = np.zeros((6, 1, 2))
+    positions[2:5, 0, 0] = [10.0, 11.0, 13.0]
+    endless = replace(scenes[0], positions=positions, present=present).endless_positions
+    np.testing.assert_allclose(endless[:, 0, 0], [8, 9, 10, 11, 13, 15])
+
+
+def test_a_changer_intends_its_new_lane_two_seconds_before_it_is_there(scenes):
+    lanes = scenes[0].lane
+    changer = next(v for v in range(lanes.shape[1]) if len(set(lanes[:, v])) == 2)
+    crossed = int((lanes[:, changer] != lanes[0, changer]).argmax())
+    first = int((scenes[0].target_lane[:, changer] == lanes[crossed, changer]).argmax())
+    assert first == max(0, crossed - 20)
+
+
+def test_cut_segments_show_the_recorded_positions(scenes):
+    segments = cut_segments([(scenes[0], 3), (scenes[1], 5)], horizon=6)
+    assert segments.positions.shape == (2, 15, 7, 2)
+    recorded, shown = scenes[1].positions[5:20], segments.positions[1].numpy()
+    np.testing.assert_allclose(np.diff(shown, axis=0), np.diff(recorded, axis=0), atol=1e-4)
+    np.testing.assert_allclose(shown[..., 1], recorded[..., 1], atol=1e-5)
+
+
+def test_mirroring_twice_changes_nothing_and_once_swaps_the_lanes(scenes):
+    segments = cut_segments([(scenes[0], 0)], horizon=4)
+    once = segments.mirrored()
+    torch.testing.assert_close(once.mirrored().positions, segments.positions, atol=1e-5, rtol=0)
+    assert (once.target_lane == 2 - segments.target_lane).all()
+    torch.testing.assert_close(once.positions[..., 1], 2 * 3.5 - segments.positions[..., 1])
+
+
+def test_constant_velocity_errs_as_worked_by_hand(scenes):
+    segments = cut_segments([(scenes[0], 0)], horizon=4)
+    course = segments.positions[0, :, 3]
+    expected = (course[8] + 3 * (course[8] - course[7]) - course[11]).norm()
+    errors = distance(segments.constant_velocity, segments.future)
+    assert errors[0, 2, 3].item() == pytest.approx(expected.item(), abs=1e-3)
+
+
 def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int, int], np.ndarray]:
-    """(scene, start row, vehicle number) -> positions, by looking every position up in a dictionary."""
-    place = {(s, v, f): (x, y) for s, v, f, x, y in frame.select("scene", "vehicle", "frame", "x", "y").iter_rows()}
-    begins = {s: f for s, f in frame.group_by("scene").agg(pl.col("frame").min()).iter_rows()}
-    found = {}
-    for (scene, vehicle, first), _ in place.items():
-        course = [place.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
+    """(scene, start row, vehicle number) -> positions, lane and length, by looking every frame up in a dictionary."""
+    columns = ("scene", "vehicle", "frame", "x", "y", "lane", "length")
+    found, rows = {}, {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
+    begins = dict(frame.group_by("scene").agg(pl.col("frame").min()).iter_rows())
+    for scene, vehicle, first in rows:
+        course = [rows.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
         row = first - begins[scene]
         if None not in course and row % stride == 0:
-            found[scene, row, vehicle] = np.array(course)
+            found[scene, row, vehicle] = np.array([place[:2] for place in course]), course[PRESENT][2:]
     return found
 
 
@@ -56,28 +108,14 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
 def test_windows_are_those_of_a_brute_force_search(stride):
     frame = recording()
     scenes = scene_tracks(frame)
-    windows = cut_windows(scenes, stride)
-    expected = brute_force_windows(frame, stride)
+    windows, expected = cut_windows(scenes, stride), brute_force_windows(frame, stride)
     numbers = [scenes[s].vehicles[v] for s, v in zip(windows.scene, windows.vehicle)]
     keys = [(windows.scene_names[s], t, v) for s, t, v in zip(windows.scene, windows.start, numbers)]
-    assert set(keys) == set(expected)
-    assert len(keys) == len(expected)
-    np.testing.assert_array_equal(windows.positions, np.stack([expected[key] for key in keys]))
-
-
-def test_a_window_carries_the_lane_and_length_of_its_vehicle():
-    frame = recording()
-    scenes = scene_tracks(frame)
-    windows = cut_windows(scenes)
-    row = len(windows.scene) // 2
-    scene = scenes[windows.scene[row]]
-    number, now = (
-        scene.vehicles[windows.vehicle[row]],
-        scene.first_frame + windows.start[row] + OBSERVED_POSITIONS - 1,
-    )
-    same = (pl.col("scene") == scene.name) & (pl.col("vehicle") == number) & (pl.col("frame") == now)
-    record = frame.filter(same).row(0, named=True)
-    assert (windows.lane[row], windows.length[row]) == (record["lane"], record["length"])
+    assert sorted(keys) == sorted(expected)
+    np.testing.assert_array_equal(windows.positions, np.stack([expected[key][0] for key in keys]))
+    assert list(zip(windows.lane, windows.length)) == [expected[key][1] for key in keys]
+    if stride == 1:
+        assert [count_windows(scene) for scene in scenes] == [len(cut_windows([scene])) for scene in scenes]
 
 
 def test_recordings_without_a_needed_column_or_too_short_are_refused():
@@ -89,77 +127,16 @@ def test_recordings_without_a_needed_column_or_too_short_are_refused():
         cut_windows(scene_tracks(recording().filter(pl.col("frame") < 110)))
 
 
-def test_windows_are_counted_as_they_are_cut():
-    scenes = scene_tracks(recording())
-    assert [count_windows(scene) for scene in scenes] == [len(cut_windows([scene])) for scene in scenes]
-
-
-ARRAYS = {"labels": np.arange(5), "more": np.ones((2, 3))}
-
-
-def test_a_cached_result_is_computed_again_only_where_its_file_is_damaged(monkeypatch, tmp_path):
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    compute = Mock(return_value=ARRAYS)
-    first, again = (cached("groups", "key", compute) for _ in range(2))
-    assert compute.call_count == 1
-    assert first.keys() == again.keys()
-    assert all((first[name] == again[name]).all() for name in first)
-    (file,) = tmp_path.iterdir()
-    for damage in (b"", b"PK\x03\x04 half a file", b"something else"):
-        file.write_bytes(damage)
-        assert (cached("groups", "key", compute)["labels"] == np.arange(5)).all()
-    assert compute.call_count == 4
-    cached("groups", "another", compute)
-    assert compute.call_count == 5
-
-
-def test_an_unwritable_cache_folder_is_ignored(monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
-    assert (cached("groups", "key", lambda: ARRAYS)["labels"] == np.arange(5)).all()
-
-
-def test_an_empty_name_switches_the_cache_off_and_none_takes_the_users_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv(CACHE_VARIABLE, "")
-    assert cache_folder() is None
-    monkeypatch.delenv(CACHE_VARIABLE)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / "ganlane"
-
-
-def test_the_hash_sees_settings_values_shapes_and_types():
-    values = np.arange(6.0)
-    hashes = {
-        content_hash({"size": 9}, values),
-        content_hash({"size": 8}, values),
-        content_hash({"size": 9}, values + 1e-9),
-        content_hash({"size": 9}, values.reshape(2, 3)),
-        content_hash({"size": 9}, values.astype(np.float32)),
-        content_hash({"size": 9}, values, values),
-    }
-    assert len(hashes) == 6
-    assert content_hash({"a": 1, "b": 2}, values) == content_hash({"b": 2, "a": 1}, values.copy())
-
-
-def test_groups_never_mix_scenes_or_frames_and_lose_nobody():
-    windows = cut_windows(scene_tracks(recording()))
+def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacements_of_their_windows(windows):
     groups = group_windows(windows, size=4)
     assert (groups.window == group_windows(windows, size=4).window).all()
-    members = groups.window[groups.mask].numpy()
-    assert sorted(members) == list(range(len(windows.scene)))
-    for row in range(len(groups)):
-        inside = groups.window[row][groups.mask[row]].numpy()
+    assert sorted(groups.window[groups.mask].tolist()) == list(range(len(windows)))
+    for row, mask in enumerate(groups.mask):
+        inside = groups.window[row][mask].numpy()
         assert len(set(zip(windows.scene[inside], windows.start[inside]))) == 1
-
-
-def test_groups_hold_the_displacements_of_their_windows():
-    windows = cut_windows(scene_tracks(recording()))
-    groups = group_windows(windows, size=4)
-    inside = groups.window[5][groups.mask[5]].numpy()
-    kept = groups.displacements[5][groups.mask[5]].numpy()
-    np.testing.assert_allclose(kept, np.diff(windows.positions[inside], axis=1), atol=1e-6)
-    place = windows.positions[inside, OBSERVED_POSITIONS - 1]
-    np.testing.assert_allclose(groups.position[5][groups.mask[5]].numpy(), place - place.mean(0), atol=1e-4)
+        kept, place = groups.displacements[row][mask].numpy(), windows.positions[inside, PRESENT]
+        np.testing.assert_allclose(kept, np.diff(windows.positions[inside], axis=1), atol=1e-6)
+        np.testing.assert_allclose(groups.position[row][mask].numpy(), place - place.mean(0), atol=1e-4)
 
 
 def test_kmeans_puts_two_distant_platoons_into_two_groups():
@@ -169,11 +146,9 @@ def test_kmeans_puts_two_distant_platoons_into_two_groups():
     assert labels[0] != labels[9]
 
 
-def test_mirroring_flips_only_the_chosen_groups():
-    groups = group_windows(cut_windows(scene_tracks(recording())), size=4).select(slice(0, 2))
-    flipped = groups.mirrored(torch.tensor([False, False]))
-    assert (flipped.displacements == groups.displacements).all()
-    flipped = groups.mirrored(torch.tensor([True, True]))
-    assert (flipped.displacements[..., 1] == -groups.displacements[..., 1]).all()
-    assert (flipped.displacements[..., 0] == groups.displacements[..., 0]).all()
-    assert (flipped.position[..., 1] == -groups.position[..., 1]).all()
+def test_mirroring_flips_only_the_chosen_groups(windows):
+    groups = group_windows(windows, size=4).select(slice(0, 2))
+    flipped = groups.mirrored(torch.tensor([False, True]))
+    for now, before in ((flipped.displacements, groups.displacements), (flipped.position, groups.position)):
+        assert (now[0] == before[0]).all()
+        assert (now[1] == before[1] * torch.tensor([1.0, -1.0])).all()

@@ -10,7 +10,7 @@ from reference.recordings import made_by_hand, recorded_cars
 from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
-from ganlane.generator.rollout import balanced_headway
+from ganlane.generator.closed_loop import balanced_headway
 from ganlane.realism.measures import measure_recordings, pooled_distance
 from ganlane.realism.recordings import recorded_frame
 from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving

@@ -14,11 +14,6 @@ FOOT_M = 0.3048
 LANE_M = 3.5
 #: 15 June 2005, 14:50 UTC, in milliseconds.
 START_MS = 1_118_847_000_000
-RAW = (
-    *("Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y"),
-    *("v_length", "v_Width", "v_Class", "v_Vel", "v_Acc", "Lane_ID", "Preceding", "Following"),
-    *("Space_Headway", "Time_Headway"),
-)
 
 
 def traffic(**more) -> pl.DataFrame:
@@ -28,7 +23,6 @@ def traffic(**more) -> pl.DataFrame:
 
 def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS, lanes: int = 3) -> pl.DataFrame:
     """One scene of the schema in NGSIM's 18 columns: feet, front centres, lanes and positions from the left."""
-    zero = pl.lit(0)
     return scene.sort("vehicle", "frame").select(
         pl.col("vehicle").alias("Vehicle_ID"),
         pl.col("frame").alias("Frame_ID"),
@@ -44,7 +38,7 @@ def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS, lanes: int = 3) ->
         (pl.col("speed") / FOOT_M).round(6).alias("v_Vel"),
         pl.lit(0.0).alias("v_Acc"),
         (lanes - pl.col("lane")).alias("Lane_ID"),
-        *(zero.alias(name) for name in RAW[14:]),
+        *(pl.lit(0).alias(name) for name in ("Preceding", "Following", "Space_Headway", "Time_Headway")),
     )
 
 
@@ -55,40 +49,35 @@ def raw_text(rows: pl.DataFrame) -> str:
 
 def portal_csv(rows: pl.DataFrame, location: str = "us-101", thousands: bool = True) -> str:
     """The portal's CSV: lower-case names, a location, quoted numbers with commas between thousands."""
+
+    def field(value) -> str:
+        if thousands and not isinstance(value, str) and abs(value) >= 1000:
+            whole, dot, rest = str(value).partition(".")
+            return f'"{int(whole):,}{dot}{rest}"'
+        return str(value)
+
     named = rows.rename(str.lower).with_columns(location=pl.lit(location))
-    lines = [",".join(named.columns)]
-    for row in named.iter_rows():
-        lines.append(",".join(_field(value, thousands) for value in row))
-    return "\n".join(lines) + "\n"
+    return "".join(",".join(map(field, row)) + "\n" for row in [named.columns, *named.iter_rows()])
 
 
-def _field(value, thousands: bool) -> str:
-    if thousands and not isinstance(value, str) and abs(value) >= 1000:
-        whole, dot, rest = str(value).partition(".")
-        return f'"{int(whole):,}{dot}{rest}"'
-    return str(value)
-
-
-def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> pl.DataFrame:
-    """One recording with two lanes each way and a car in each; returns the cars' true course as a table.
+def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> None:
+    """One recording with two lanes each way and a car in each.
 
     Upper lanes between 8, 12 and 16 m, lower ones between 20, 24 and 28 m. Car 1 drives to the left in the upper
     outer lane, car 2 to the left in the inner one and then out; car 3 to the right in the lower outer lane.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    frames = list(range(1, int(25 * seconds) + 1))
-    rows = []
-    for vehicle, (centre_x, speed, centre_y, lane) in HIGHD_CARS.items():
-        for frame in frames:
-            x = centre_x + speed * (frame - 1) / 25.0
-            rows.append((frame, vehicle, x - 2.5, centre_y - 1.0, 5.0, 2.0, speed, 0.0, lane))
+    rows = [
+        (frame, vehicle, centre_x + speed * (frame - 1) / 25.0 - 2.5, centre_y - 1.0, 5.0, 2.0, speed, 0.0, lane)
+        for vehicle, (centre_x, speed, centre_y, lane) in HIGHD_CARS.items()
+        for frame in range(1, int(25 * seconds) + 1)
+    ]
     names = ["frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity", "laneId"]
     pl.DataFrame(rows, schema=names, orient="row").write_csv(folder / f"{name}_tracks.csv")
     meta = [(vehicle, 1 if speed < 0 else 2) for vehicle, (_, speed, _, _) in HIGHD_CARS.items()]
     pl.DataFrame(meta, schema=["id", "drivingDirection"], orient="row").write_csv(folder / f"{name}_tracksMeta.csv")
     recording = {"id": 1, "frameRate": 25, "upperLaneMarkings": "8.00;12.00;16.00", "lowerLaneMarkings": "20;24;28"}
     pl.DataFrame(recording).write_csv(folder / f"{name}_recordingMeta.csv")
-    return pl.read_csv(folder / f"{name}_tracks.csv")
 
 
 def recorded_cars(**size) -> list[Recording]:

@@ -1,19 +1,28 @@
-"""Small generators for tests."""
+"""Small generators, quick settings of fits, and scenes to fit to."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
+from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.generator.networks import Generator
-from ganlane.parameters.generator import GeneratorSizes
+from ganlane.generator.windows import SceneTracks, scene_tracks
+from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig
 
 SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14, noise=4)
+LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)
+PAPER = PaperConfig(SIZES, loop=LOOP, stride=6, samples=2, batch=4)
+CALIBRATED = CalibratedConfig(
+    replace(SIZES, extra_inputs=4), LOOP, (4,), (1.0,), held_out_horizon=8, batch=2, held_out_stride=20
+)
 
 
 def small_generator(extra_inputs: int = 0, seed: int = 0) -> Generator:
     """A generator with random weights."""
     torch.manual_seed(seed)
-    return Generator(GeneratorSizes(**{**vars(SIZES), "extra_inputs": extra_inputs}))
+    return Generator(replace(SIZES, extra_inputs=extra_inputs))
 
 
 def silenced(generator: Generator) -> Generator:
@@ -21,3 +30,9 @@ def silenced(generator: Generator) -> Generator:
     torch.nn.init.zeros_(generator.head.weight)
     torch.nn.init.zeros_(generator.head.bias)
     return generator
+
+
+def recorded_scenes() -> list[SceneTracks]:
+    """Two synthetic scenes of 8 s with seven vehicles on three lanes of 3.5 m."""
+    frame = synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=7, seconds=8.0))
+    return [replace(scene, lane_width_m=3.5) for scene in scene_tracks(frame)]

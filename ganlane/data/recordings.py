@@ -1,8 +1,14 @@
-"""From any reader to Parquet files and pooled statistics, one scene at a time, so that memory stays bounded."""
+"""Recordings of any kind: read, measured scene by scene, and written, so that every command reads them again.
+
+Scene CSV and Parquet hold recordings that are already straightened and in metres. A scene CSV counts lanes from the
+left; Parquet holds the schema itself: ``ganlane prepare`` writes it.
+"""
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,10 +20,20 @@ import numpy as np
 import polars as pl
 
 from ganlane.data.highd import highd_scenes
-from ganlane.data.lanes import LaneChanges, find_lane_changes, tracks_of_frame
+from ganlane.data.lanes import LaneChanges, find_lane_changes, lane_width, scene_lane_widths, tracks_of_frame
 from ganlane.data.ngsim import ngsim_scenes
-from ganlane.data.scenes import cut_into_scenes, parquet_name, read_scenes, scene_csv_scenes, write_prepared
-from ganlane.data.schema import FRAME_S, TRACK, RowCount, Scene, sort
+from ganlane.data.schema import (
+    FRAME_S,
+    SCHEMA,
+    OnProgress,
+    RowCount,
+    Scene,
+    raise_where,
+    read_table,
+    reason,
+    sort,
+    validate,
+)
 from ganlane.data.statistics import (
     Bins,
     Distribution,
@@ -25,17 +41,102 @@ from ganlane.data.statistics import (
     Histogram,
     LaneChangeStatistics,
     describe,
-    followers,
     lane_change_statistics,
-    leader_gaps,
     measure_exposure,
-    median_headways,
-    raw_accelerations,
-    smoothed_accelerations,
+    quantities,
 )
-from ganlane.data.tables import OnProgress
 from ganlane.errors import UserError
+from ganlane.files import PLACE, atomic_path, has_checksum, sealed, write_bytes
 from ganlane.parameters.generator import NgsimParameters
+
+#: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0 at the centre of
+#: lane 1, which is the leftmost.
+COLUMNS: Final = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
+_ENDING: Final = ".parquet"
+
+
+def read_scenes(path: str | Path) -> pl.DataFrame:
+    """Read a scene CSV, or what ``ganlane prepare`` wrote, into the schema, sorted by scene, vehicle and frame.
+
+    Lanes of a CSV are renumbered from the right (a scene's highest number becomes 0), and ``y`` is shifted so that it
+    is 0 at the centre of that lane. Positions are not smoothed.
+
+    ``path``: CSV with :data:`COLUMNS` (others are ignored), in metres, m/s and 0.1 s a frame; or Parquet in the
+    schema, a file ``*.parquet`` or a folder of them.
+
+    Raises:
+        UserError: a missing or damaged file, or a scene in two files; the message names file, line and column.
+    """
+    return sort(pl.concat(_read_files(Path(path))))
+
+
+def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
+    """Write a frame in the schema as Parquet with a checksum, atomically."""
+    file = io.BytesIO()
+    frame.write_parquet(file, compression="zstd", metadata={"checksum": PLACE})
+    write_bytes(path, sealed(file.getvalue()))
+
+
+def write_scene_csv(frame: pl.DataFrame, path: str | Path) -> None:
+    """Write a frame in the schema, with lanes of 3.5 m, as a scene CSV; lane 1 is the leftmost in use in a scene."""
+    with atomic_path(path) as part:
+        scene_csv(frame, pl.col("lane").max().over("scene"), 3.5).write_csv(part)
+
+
+def scene_csv(frame: pl.DataFrame, leftmost: pl.Expr, lane_width_m: float) -> pl.DataFrame:
+    """A frame in the schema as the columns of a scene CSV; ``leftmost`` is the number of the leftmost lane."""
+    y = pl.col("y") - leftmost * lane_width_m
+    return frame.with_columns(v=pl.col("speed"), lane=leftmost + 1 - pl.col("lane"), y=y).select(COLUMNS.keys())
+
+
+def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
+    """Cut each recording into scenes of at most ``seconds``, so that some of them can be held out.
+
+    ``us-101-1`` becomes ``us-101-1-000``, ``us-101-1-001`` and so on; frame numbers do not change.
+    """
+    frames = max(1, round(seconds / FRAME_S))
+    first = pl.col("frame").min().over("scene")
+    number = ((pl.col("frame") - first) // frames).cast(pl.String).str.zfill(3)
+    return sort(frame.with_columns(scene=pl.col("scene") + "-" + number))
+
+
+def _read_files(path: Path) -> Iterator[pl.DataFrame]:
+    """The CSV, or the Parquet files one by one; a scene must not be in two of them."""
+    files = sorted(path.glob(f"*{_ENDING}")) if path.is_dir() else [path]
+    if not files:
+        raise UserError(f"{path}: no such file as *{_ENDING} in this folder; give what ganlane prepare wrote.")
+    file_of: dict[str, Path] = {}
+    for file in files:
+        frame = _read_parquet(file) if file.suffix == _ENDING else _read_csv(file)
+        for scene in frame["scene"].unique():
+            if file_of.setdefault(scene, file) != file:
+                raise UserError(f"{file}: scene {scene} is in {file_of[scene]} too; remove one of them.")
+        yield frame
+
+
+def _read_csv(path: Path) -> pl.DataFrame:
+    table = read_table(path, COLUMNS).rename({"v": "speed"})
+    raise_where(table["lane"] < 1, table, "lane", path, "is below 1, the leftmost lane")
+    scenes = []
+    for (name,), scene in validate(table, str(path)).group_by("scene"):
+        from_left = scene["lane"].to_numpy() - 1
+        width = lane_width(-scene["y"].to_numpy(), from_left, f"{path}, scene {name}")
+        last = int(from_left.max())
+        scenes.append(scene.with_columns(y=pl.col("y") + last * width, lane=last + 1 - pl.col("lane")))
+    return pl.concat(scenes)
+
+
+def _read_parquet(path: Path) -> pl.DataFrame:
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder.")
+    content = path.read_bytes()
+    has_checksum(content, path)  # tables of other programs have none
+    try:
+        frame = pl.read_parquet(content)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise UserError(f"{path}: not a readable Parquet file ({reason(error)}); prepare it again.") from error
+    return validate(frame, str(path), first_line=None)
+
 
 #: Bins of each quantity in m/s, m/s2, s or m; quantiles are accurate to a bin's width.
 QUANTITIES: Final = {
@@ -46,8 +147,6 @@ QUANTITIES: Final = {
     "time_headway": Bins(0.0, 40.0, 8000),
     "gap": Bins(0.0, 300.0, 6000),
 }
-#: Accelerations beyond this are counted separately, m/s2: few cars reach it.
-STRONG_MPS2: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +183,7 @@ class PooledStatistics:
         self._changes: list[LaneChanges] = []
         #: One number per car: few enough to be stored.
         self._headways: list[np.ndarray] = []
+        #: Numbers of accelerations beyond 3 m/s2, which few cars reach.
         self._strong = dict.fromkeys(("acceleration_raw", "acceleration_smoothed"), 0)
 
     def add(self, scene: Scene) -> SceneSummary:
@@ -93,13 +193,12 @@ class PooledStatistics:
         changes = find_lane_changes(tracks)
         self._exposures.append(exposure)
         self._changes.append(changes)
-        for name, values in _quantities(frame).items():
+        for name, values in quantities(frame).items():
             self.histograms[name].add(values)
             if name == "headway":
                 self._headways.append(values)
             if name in self._strong:
-                self._strong[name] += int(np.count_nonzero(np.abs(values) > STRONG_MPS2))
-        frames = frame["frame"].to_numpy()
+                self._strong[name] += int(np.count_nonzero(np.abs(values) > 3.0))
         speed = float(frame["speed"].mean())  # type: ignore[arg-type]
         rates = lane_change_statistics(changes, exposure, speed)
         shared = ("srlc", "per_vehicle_km", "per_vehicle_km_low", "per_vehicle_km_high")
@@ -107,7 +206,7 @@ class PooledStatistics:
             name=scene.name,
             rows=frame.height,
             tracks=exposure.tracks,
-            seconds=round(FRAME_S * int(np.ptp(frames) + 1), 1),
+            seconds=round(FRAME_S * int(np.ptp(frame["frame"].to_numpy()) + 1), 1),
             lanes=scene.lanes,
             lane_width_m=scene.lane_width_m,
             nearest_lane_share=float(np.mean(tracks.lane == frame["lane"].to_numpy())),
@@ -159,22 +258,6 @@ class PooledStatistics:
         }
 
 
-def _quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
-    """Samples of every quantity in one scene; time headways of followers only."""
-    # Sorting needs most memory: only once, and with no more columns than needed.
-    columns = frame.select("scene", "vehicle", "frame", "x", "speed", "lane", "length")
-    with_leader = leader_gaps(columns).select(*TRACK, "speed", "gap")
-    following = followers(with_leader)
-    return {
-        "speed": frame["speed"].to_numpy(),
-        "acceleration_raw": raw_accelerations(frame).to_numpy(),
-        "acceleration_smoothed": smoothed_accelerations(frame).to_numpy(),
-        "headway": median_headways(following).to_numpy(),
-        "time_headway": (following["gap"] / following["speed"]).to_numpy(),
-        "gap": with_leader["gap"].to_numpy(),
-    }
-
-
 @dataclass(frozen=True)
 class Preparation:
     """Result of :func:`prepare_recordings`: rows read, dropped and written, files, and statistics of all scenes."""
@@ -186,9 +269,8 @@ class Preparation:
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers for ``results.json``."""
-        count = self.count
-        rows = {"read": count.read, "kept": count.kept, "dropped": dict(count.dropped), "written": self.written}
-        return {"rows": rows, "files": list(self.files), **self.statistics.to_dict()}
+        rows = {"read": self.count.read, "kept": self.count.kept, "dropped": dict(self.count.dropped)}
+        return {"rows": rows | {"written": self.written}, "files": list(self.files), **self.statistics.to_dict()}
 
 
 def open_scenes(
@@ -208,12 +290,17 @@ def open_scenes(
         UserError: a damaged or missing file, or an unknown kind.
     """
     if kind == "ngsim":
-        return ngsim_scenes(path, parameters, count, scratch, on_progress)
-    if kind == "highd":
-        return highd_scenes(path, count)
-    if kind == "scenes":
-        return scene_csv_scenes(path, count)
-    raise UserError(f"{kind}: no such kind of recordings; expected scenes, ngsim or highd.")
+        yield from ngsim_scenes(path, parameters, count, scratch, on_progress)
+    elif kind == "highd":
+        yield from highd_scenes(path, count)
+    elif kind == "scenes":
+        for frame in _read_files(Path(path)):
+            count.read += frame.height
+            widths = scene_lane_widths(frame)
+            for (name,), rows in sort(frame).group_by("scene", maintain_order=True):
+                yield Scene(str(name), rows, widths[str(name)])
+    else:
+        raise UserError(f"{kind}: no such kind of recordings; expected scenes, ngsim or highd.")
 
 
 def read_recordings(
@@ -256,7 +343,8 @@ def prepare_recordings(
             if scene.frame["speed"].max() == 0.0 or scene.frame["frame"].n_unique() < 2:
                 count.drop("scene in which nobody drives", scene.frame.height)
                 continue
-            summary, file = statistics.add(scene), parquet_name(scene.name)
+            # Letters, digits, dots and dashes.
+            summary, file = statistics.add(scene), re.sub(r"[^\w.-]+", "_", scene.name).lstrip(".") + _ENDING
             if file in files:
                 raise UserError(f"{path}: a second scene that {file} is the file of; rename one.")
             files.append(file)
@@ -275,7 +363,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 
     Raises:
         UserError: there is something at ``path`` already.
-        OSError: the file system's error; it names ``path``, or the file in it that was to be written.
+        OSError: it names ``path``, or the file in it that was to be written.
     """
     path = Path(path)
     if path.is_file() or (path.is_dir() and any(path.iterdir())):

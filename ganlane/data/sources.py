@@ -1,9 +1,13 @@
-"""Where recordings are on this machine, and downloads of large files that resume after an interruption.
+"""Where recordings come from: this machine's folder, a download that resumes, or a random generator.
 
-Bytes are written to ``.NAME.part`` next to the file, and the server's version of it to ``.NAME.part.json``. After a
-broken connection, or an earlier run that was interrupted, the download resumes with HTTP's Range, guarded by
-If-Range, so that two versions of a file are never joined. If the server ignores Range, the download starts again.
-Errors of the disk are not retried. The file gets its name only when it is complete.
+**Downloads.** Bytes are written to ``.NAME.part`` next to the file, and the server's version of it to
+``.NAME.part.json``. After a broken connection, or an earlier run that was interrupted, the download resumes with
+HTTP's Range, guarded by If-Range, so that two versions of a file are never joined. If the server ignores Range, the
+download starts again. Errors of the disk are not retried. The file gets its name only when it is complete.
+
+**Synthetic recordings** are deterministic and free to share: for tests and for machines without data. They are not a
+driver model: vehicles start in slots of their own along the road, keep about one speed, and some change lanes along
+half a cosine. No two vehicles overlap.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import http.client
 import json
+import math
 import os
 import sys
 import time
@@ -19,31 +24,30 @@ import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+import polars as pl
 from tqdm import tqdm
 
-from ganlane.data.tables import OnProgress
+from ganlane.data.schema import FRAME_S, SCHEMA, OnProgress, sort
 from ganlane.errors import UserError
 from ganlane.files import write_json
+from ganlane.parameters.generator import DataConfig, NgsimDataConfig
 
 #: Environment variable with the folder of the recordings.
 DATA_VARIABLE: Final = "GANLANE_DATA"
 SCENES: Final = Path("ngsim") / "us101_scenes.csv"
 _FOLDER = Path("shared") / "data"
-_PIECE_BYTES: Final = 2**18
 _SCHEMES: Final = ("http", "https")
 #: Larger files are refused, bytes: NGSIM's largest has 2 GB.
 MOST_BYTES: Final = 64 * 2**30
-#: Where there is no terminal, progress is shown from this time on and as rarely, s.
-_QUIET_S: Final = 10.0
 
 
 def data_folder() -> Path | None:
     """Folder of the recordings: ``GANLANE_DATA``, else ``../shared/data`` next to the checkout or the current folder.
-
-    None where the variable is unset and no such folder exists.
 
     Raises:
         UserError: the folder in ``GANLANE_DATA`` does not exist.
@@ -78,6 +82,21 @@ def default_scenes() -> Path:
     )
 
 
+def recordings_path(data: DataConfig) -> Path:
+    """Path of the recordings that the group ``data`` names, downloaded first if asked for.
+
+    Raises:
+        UserError: there is no path and no default, or an error of :func:`download`.
+    """
+    if data.format != "scenes" and data.path is None:
+        raise UserError(f"data={data.format}: which file is missing; give data.path=FILE.")
+    path = Path(data.path) if data.path else default_scenes()
+    if isinstance(data, NgsimDataConfig) and data.download:
+        with byte_progress("download") as progress:
+            download(data.url, path, data.sha256, progress)
+    return path
+
+
 class _BrokenConnection(Exception):
     """The connection ended before the file did."""
 
@@ -96,7 +115,6 @@ def download(
 
     Args:
         sha256: checksum in hexadecimal digits; a downloaded file with another checksum is removed.
-        on_progress: called after every piece.
         timeout_s: without a byte for this long, the connection counts as broken.
         attempts: connections without any progress before giving up.
         wait_s: before the second attempt; doubled each time.
@@ -235,7 +253,7 @@ def _connect(part: _Part, on_progress: OnProgress | None, timeout_s: float) -> N
         with part.file.open("ab" if received else "wb") as file:
             while True:
                 with _network_errors():
-                    piece = answer.read1(_PIECE_BYTES)
+                    piece = answer.read1(2**18)
                 if not piece:
                     break
                 received += len(piece)
@@ -273,8 +291,8 @@ def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
 
 @contextmanager
 def byte_progress(what: str) -> Iterator[OnProgress]:
-    """Shows bytes done, rate and time left on stderr; without a terminal only what takes more than 10 s."""
-    quiet_s = 0.0 if sys.stderr.isatty() else _QUIET_S
+    """Shows bytes done, rate and time left on stderr; without a terminal every 10 s, and nothing of shorter work."""
+    quiet_s = 0.0 if sys.stderr.isatty() else 10.0
     with tqdm(
         desc=what, unit="B", unit_scale=True, file=sys.stderr, delay=quiet_s, mininterval=max(0.1, quiet_s)
     ) as bar:
@@ -284,3 +302,68 @@ def byte_progress(what: str) -> Iterator[OnProgress]:
             bar.update(done - bar.n)
 
         yield show
+
+
+@dataclass(frozen=True)
+class SyntheticTraffic:
+    """Speeds follow ``speed_mps`` plus a sine of up to ``speed_swing_mps`` and a period of 6 to 10 s.
+
+    With the default slots no two vehicles can collide. A lane change takes 3 to 5 s and ends within the recording.
+    """
+
+    scenes: int = 2
+    vehicles: int = 12
+    lanes: int = 3
+    seconds: float = 10.0
+    lane_width_m: float = 3.5
+    slot_m: float = 18.0
+    speed_mps: float = 14.0
+    speed_swing_mps: float = 1.5
+    changing_share: float = 0.3
+    wander_m: float = 0.15
+
+
+def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> pl.DataFrame:
+    """A frame in the schema with ``traffic.scenes`` scenes named ``synthetic-0``, ``synthetic-1`` and so on."""
+    traffic = traffic or SyntheticTraffic()
+    return sort(pl.concat(_synthetic_scene(traffic, number, seed) for number in range(traffic.scenes)))
+
+
+def _synthetic_scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
+    """One scene; every vehicle is present in every frame."""
+    random = np.random.default_rng((seed, number))
+    n, frames = traffic.vehicles, round(traffic.seconds / FRAME_S)
+    time = np.arange(frames) * FRAME_S
+    home = random.permutation(np.arange(n) % traffic.lanes)
+    # Along the road: a slot each, and a sine around one speed.
+    swing = random.uniform(0.3, 1.0, (n, 1)) * traffic.speed_swing_mps
+    omega = 2.0 * math.pi / random.uniform(6.0, 10.0, (n, 1))
+    phase = random.uniform(0.0, 2.0 * math.pi, (n, 1))
+    speed = traffic.speed_mps + swing * np.cos(omega * time + phase)
+    slots = (np.arange(n) * traffic.slot_m)[:, None]
+    x = slots + traffic.speed_mps * time + swing / omega * np.sin(omega * time + phase)
+    y = home[:, None] * traffic.lane_width_m + _across(traffic, time, home, random)
+    columns = {
+        "scene": np.full(n * frames, f"synthetic-{number}"),
+        "vehicle": np.repeat(np.arange(1, n + 1), frames),
+        "frame": np.tile(np.arange(frames), n),
+        "x": x.ravel(),
+        "y": y.ravel(),
+        "speed": speed.ravel(),
+        "lane": np.rint(y / traffic.lane_width_m).astype(np.int64).clip(0, traffic.lanes - 1).ravel(),
+        "length": np.repeat(random.uniform(4.0, 5.5, n).round(2), frames),
+        "width": np.repeat(random.uniform(1.7, 2.2, n).round(2), frames),
+    }
+    return pl.DataFrame(columns, schema=SCHEMA)
+
+
+def _across(traffic: SyntheticTraffic, time: np.ndarray, home: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Offsets from the first lane's centre, [vehicles, frames]: a slow wander, and for some a lane change."""
+    n, end = traffic.vehicles, time[-1]
+    wander = traffic.wander_m * np.sin(random.uniform(0.3, 0.8, (n, 1)) * time + random.uniform(0.0, 6.28, (n, 1)))
+    side = np.where(home == 0, 1, np.where(home == traffic.lanes - 1, -1, random.choice([-1, 1], n)))
+    changes = (random.uniform(size=n) < traffic.changing_share) & (traffic.lanes > 1) & (end > 6.0)
+    lasts = random.uniform(3.0, 5.0, n)
+    begins = random.uniform(0.5, np.maximum(end - lasts - 0.5, 0.6))
+    done = np.clip((time - begins[:, None]) / lasts[:, None], 0.0, 1.0)
+    return wander + (changes * side * traffic.lane_width_m)[:, None] * 0.5 * (1.0 - np.cos(math.pi * done))

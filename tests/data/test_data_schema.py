@@ -1,4 +1,4 @@
-"""Text tables: rows, line numbers and errors do not depend on the size of a block."""
+"""Text tables, whose rows, line numbers and errors do not depend on the size of a block, and the validator."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ganlane.data.tables import LINE, TextTable, convert, csv_table, read_blocks, read_table
+from ganlane.data import SyntheticTraffic, synthetic_scenes, validate
+from ganlane.data.schema import LINE, TextTable, convert, csv_table, read_blocks
 from ganlane.errors import UserError
 
 
@@ -76,14 +77,23 @@ def test_empty_lines_at_the_end_are_no_rows(tmp_path):
 
 def test_quoted_fields_may_hold_commas(tmp_path):
     found = read(tmp_path / "t.csv", b'a,b,c\n"1,234",2,"5,678.25"\n7,8,9\n')
-    numbers = convert(found["c"], pl.Float64, tmp_path, found[LINE], thousands=True)
-    assert numbers.to_list() == [5678.25, 9.0]
+    assert convert(found, "c", pl.Float64, tmp_path, thousands=True).to_list() == [5678.25, 9.0]
 
 
-@pytest.mark.parametrize("text", ["1,23", "12,34,567", "1,2345", "1.234,5", ",5"])
-def test_a_comma_that_separates_no_thousands_makes_no_number(tmp_path, text):
-    with pytest.raises(UserError, match="is not a number"):
-        convert(pl.Series("x", [text]), pl.Float64, tmp_path, pl.Series([1]), thousands=True)
+@pytest.mark.parametrize(
+    ("text", "kind", "message"),
+    [
+        *((text, pl.Float64, "is not a number") for text in ("1,23", "12,34,567", "1,2345", "1.234,5", ",5", "far")),
+        ("NaN", pl.Float64, "'NaN' is not a finite number"),
+        ("", pl.String, "the field is empty; the row is incomplete"),
+        ("5.5", pl.Int64, "'5.5' is not a whole number"),
+        *((text, pl.Int64, "is too large a number") for text in ("1e30", "-1e308", str(2**63))),
+    ],
+)
+def test_a_wrong_field_is_named_by_file_line_and_column(tmp_path, text, kind, message):
+    rows = pl.DataFrame({"x": ["1", text], LINE: [2, 3]})
+    with pytest.raises(UserError, match=f"t.csv, line 3, column x: .*{message}"):
+        convert(rows, "x", kind, tmp_path / "t.csv", thousands=True)
 
 
 def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path):
@@ -92,8 +102,15 @@ def test_a_header_is_read_in_any_case_with_quotes_and_a_byte_order_mark(tmp_path
     assert csv_table(path, {"a": pl.Int64, "c": pl.Int64}).names == ("a", "b", "c")
 
 
-@pytest.mark.parametrize("value", ["1e30", "-1e308", str(2**63)])
-def test_a_whole_number_too_large_for_an_integer_is_named(value, tmp_path):
-    (tmp_path / "table.csv").write_text(f"frame\n1\n{value}\n")
-    with pytest.raises(UserError, match=r"line 3, column frame: .* is too large a number"):
-        read_table(tmp_path / "table.csv", {"frame": pl.Int64})
+def test_the_validator_checks_frames_that_come_from_nowhere():
+    made = synthetic_scenes(SyntheticTraffic(scenes=1))
+    assert validate(made, "made").equals(made)
+    holed = made.with_columns(x=pl.when(pl.int_range(pl.len()) == 7).then(None).otherwise("x"))
+    for wrong, message in (
+        (made.drop("speed"), "made: no column speed"),
+        (made.clear(), "made: no rows"),
+        (made.with_columns(x=pl.lit("here")), "made, column x: String found, Float64 expected"),
+        (holed, "made, line 9, column x: None is not a finite number"),
+    ):
+        with pytest.raises(UserError, match=message):
+            validate(wrong, "made")

@@ -1,0 +1,100 @@
+"""What is fitted: losses, updates and scores of both presets; the loop's early stopping and resuming."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from reference.small_networks import CALIBRATED, PAPER, SIZES, recorded_scenes
+
+from ganlane.errors import UserError
+from ganlane.generator import tasks
+from ganlane.parameters.generator import LoopConfig
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return recorded_scenes()
+
+
+def paper_task(scenes, **changes) -> tasks.PaperTask:
+    loop = LoopConfig(evaluate_every=10, learning_rate=5e-3, warmup=1, **changes)
+    fitted, validation = scenes
+    return tasks.PaperTask([fitted], [validation], replace(PAPER, loop=loop, stride=4, samples=3, batch=8))
+
+
+def test_fitting_the_papers_preset_lowers_its_error(scenes):
+    seen = []
+    tasks.FitLoop(paper_task(scenes, updates=40)).run(seen.append)
+    losses = [progress.losses["mean"] for progress in seen]
+    assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
+    assert set(seen[-1].losses) == {"variety", "single", "mean", "adversarial", "discriminator"}
+
+
+def test_the_calibrated_loss_falls(scenes):
+    fitted, validation = scenes
+    task = tasks.CalibratedTask(
+        [fitted], [validation], replace(CALIBRATED, horizons=(4, 6), shares=(1.0, 1.0), batch=3)
+    )
+    task.optimisers["generator"].param_groups[0]["lr"] = 5e-3
+    losses = [task.update(0)["mean"] for _ in range(16)]
+    assert sum(losses[-5:]) < sum(losses[:5])
+
+
+def test_an_interrupted_fit_goes_on_to_the_same_weights(scenes, tmp_path):
+    whole, stopped, resumed = (paper_task(scenes, updates=16) for _ in range(3))
+    tasks.FitLoop(whole).run()
+
+    def stop(progress):
+        if progress.update == 12:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tasks.FitLoop(stopped, tmp_path / "fit.pt").run(stop)
+    loop = tasks.FitLoop(resumed, tmp_path / "fit.pt")
+    assert loop.done == 10
+    loop.run()
+    for name, tensor in whole.generator.state_dict().items():
+        torch.testing.assert_close(resumed.generator.state_dict()[name], tensor, msg=name)
+
+
+def test_foreign_states_are_refused(scenes, tmp_path):
+    path = tmp_path / "fit.pt"
+    path.write_bytes(b"not a state")
+    task = paper_task(scenes, updates=2)
+    with pytest.raises(UserError, match="not the state of a fit"):
+        tasks.FitLoop(task, path)
+    path.unlink()
+    tasks.FitLoop(task, path).run()
+    other = tasks.PaperTask(*([scene] for scene in scenes), replace(task.config, sizes=replace(SIZES, hidden=20)))
+    with pytest.raises(UserError, match="another fit"):
+        tasks.FitLoop(other, path)
+
+
+def test_the_learning_rate_rises_and_then_falls_to_nothing():
+    config = LoopConfig(updates=100, warmup=10, learning_rate=1e-2)
+    rates = [tasks.learning_rate(config, number) for number in range(100)]
+    assert rates[0] < rates[5] < rates[9]
+    assert rates[10:] == sorted(rates[10:], reverse=True)
+    assert rates[-1] < 1e-5
+
+
+def test_distances_are_euclidean_accumulate_and_have_a_finite_gradient_at_0():
+    predicted = torch.tensor([[[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]])
+    torch.testing.assert_close(tasks.distances(predicted, torch.zeros(1, 3, 2)), torch.tensor([[5.0, 5.0, 10.0]]))
+    perfect = torch.zeros(1, 8, 2, requires_grad=True)
+    tasks.distances(perfect, torch.zeros(1, 8, 2)).sum().backward()
+    assert perfect.grad.isfinite().all()
+
+
+def test_losses_by_hand():
+    # Only each vehicle's best sample counts for variety, and masked vehicles do not count.
+    assert tasks.variety_loss(torch.tensor([[1.0, 9.0], [5.0, 3.0]])).item() == pytest.approx(2.0)
+    values = torch.tensor([[1.0, 100.0]])
+    assert tasks.masked_mean(values, torch.tensor([[True, False]])).item() == 1.0
+    assert tasks.masked_mean(values, torch.zeros(1, 2, dtype=torch.bool)).item() == 0.0
+    # An undecided discriminator loses ln 2; accuracy counts both kinds alike.
+    zeros, ones = torch.zeros(1, 2), torch.ones(1, 2)
+    for recorded in (0.0, 1.0):
+        assert tasks.cross_entropy(zeros, recorded).item() == pytest.approx(math.log(2))
+    assert [tasks.discriminator_accuracy(ones, generated).item() for generated in (-ones, ones)] == [1.0, 0.5]

@@ -27,9 +27,8 @@ from ganlane.config.evaluate import EvaluateConfig
 from ganlane.config.schemas import SCHEMAS, made, node_of
 from ganlane.config.traffic import TRAFFICS, TrafficConfig
 from ganlane.errors import UserError
-from ganlane.evaluation.episodes import SIDES
+from ganlane.evaluation.episodes import SIDES, Rollout, replay, roll_out
 from ganlane.evaluation.results import plain
-from ganlane.evaluation.rollouts import Rollout, replay, roll_out
 from ganlane.files import write_json
 from ganlane.parameters.checks import NotNegative, Record, Rule, Seed, Text, one_of
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters

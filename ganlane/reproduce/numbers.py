@@ -11,9 +11,12 @@ import polars as pl
 
 from ganlane.errors import UserError
 from ganlane.evaluation.rows import FAILURES, SCALE_BOTTOM, SCALE_TOP
-from ganlane.evaluation.statistics import Array, Estimate, clopper_pearson, entries
-from ganlane.evaluation.trainings import (
+from ganlane.evaluation.statistics import (
+    Array,
+    Estimate,
+    clopper_pearson,
     difference,
+    entries,
     interquartile_mean,
     mcnemar,
     normalized_over_trainings,

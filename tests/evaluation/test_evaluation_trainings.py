@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ganlane.evaluation.statistics import poisson_interval
-from ganlane.evaluation.trainings import (
+from ganlane.evaluation.statistics import (
     difference,
     interquartile_mean,
     mcnemar,
     over_trainings,
+    poisson_interval,
     probability_of_improvement,
     rate_over_trainings,
 )

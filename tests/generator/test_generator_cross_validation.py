@@ -5,9 +5,9 @@ import polars as pl
 import pytest
 import torch
 
+from ganlane.commands.train_generator import ablation_table, fold_tables
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.data.statistics import measure_exposure
-from ganlane.fit_report import ablation_table, fold_tables
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.cross_validation import ablate, cross_validate, variants
 from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, PaperConfig

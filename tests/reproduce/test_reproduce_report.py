@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from ganlane.errors import UserError
-from ganlane.reproduce.numbers import by_recipe, comparisons, recipe_of, rows
+from ganlane.reproduce.report import by_recipe, comparisons, recipe_of, rows
 
 KM = 5.0
 

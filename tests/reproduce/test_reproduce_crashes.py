@@ -12,11 +12,11 @@ import pytest
 
 from ganlane.config.env import EnvConfig
 from ganlane.config.evaluate import EvaluateConfig
-from ganlane.crashes import ENDS, Crash, CrashList, find_crashes, read_crashes, write_crashes
 from ganlane.errors import UserError
 from ganlane.render import main
+from ganlane.reproduce.crashes import ENDS, Crash, CrashList, find_crashes, read_crashes, write_crashes
 
-SHIPPED = Path(__file__).parents[1] / "docs" / "reproduce" / "crashes.json"
+SHIPPED = Path(__file__).parents[2] / "docs" / "reproduce" / "crashes.json"
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from ganlane.generator import load_generator
 from ganlane.generator.fit import FitLoop
 from ganlane.generator.windows import cached, load_arrays, save_arrays
 from ganlane.parameters.generator import LoopConfig, PaperConfig
-from ganlane.realism.references import SHIPPED_REFERENCE, Reference
+from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.weights import load_weights, save_weights
 
 

@@ -25,7 +25,7 @@ from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
 from ganlane.generator.windows import cached
-from ganlane.realism.references import Reference
+from ganlane.realism.measures import Reference
 from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights, save_weights
 

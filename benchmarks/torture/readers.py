@@ -26,7 +26,7 @@ from ganlane.files import CHECKPOINTS
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.windows import CACHE_VARIABLE, cached
 from ganlane.parameters.data import NgsimParameters
-from ganlane.realism.references import SHIPPED_REFERENCE, Reference
+from ganlane.realism.measures import SHIPPED_REFERENCE, Reference
 from ganlane.sim.scene_files import read_scene
 from ganlane.training.checkpoint import TrainingState
 from ganlane.training.logs import CsvLog, read_rows

@@ -19,6 +19,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Array, Estimate, entries
 from ganlane.generator import HELD_OUT, Preset, shipped_generator
 from ganlane.parameters.checks import assign
+from ganlane.realism.driving import FLOORS, Factory, StartOptions
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
 from ganlane.realism.measures import (
     RESAMPLES,
@@ -31,9 +32,7 @@ from ganlane.realism.measures import (
     pooled_distance,
 )
 from ganlane.realism.recordings import I80_FILES, read_i80
-from ganlane.realism.replay_starts import Factory, StartOptions
 from ganlane.realism.starts import (
-    FLOORS,
     Fold,
     Starts,
     check_folds_cover,

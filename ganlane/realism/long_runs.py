@@ -19,7 +19,7 @@ from ganlane import keys
 from ganlane.data import lane_changes_of_arrays
 from ganlane.evaluation.statistics import entries, poisson_interval
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.realism.replay_starts import Factory, step_traffic
+from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.sim.neighbours import leader, perceive

@@ -20,10 +20,11 @@ from ganlane.evaluation import code_version, machine
 from ganlane.evaluation.table import aligned, number, with_interval
 from ganlane.evaluation.table import show as show_tables
 from ganlane.files import split_at_markers, write_between_markers, write_bytes
-from ganlane.realism import references
+from ganlane.realism import measures
 from ganlane.realism.card import Card, floors_of
+from ganlane.realism.driving import FLOORS
 from ganlane.realism.measures import QUANTITIES, UNITS
-from ganlane.realism.starts import FLOORS, Starts, print_progress
+from ganlane.realism.starts import Starts, print_progress
 from ganlane.view.figures import (
     FAINT,
     GRID,
@@ -70,8 +71,8 @@ def publish(starts: Starts) -> None:
     """Write the file that ships, with the distances of the reference drivers measured in this run."""
     source = Path(starts.reference.source).name
     floors = floors_of(starts.driven, starts.recorded.counts)
-    replace(starts.reference, floors=floors, source=source).save(references.SHIPPED_REFERENCE)
-    print_progress(f"wrote {references.SHIPPED_REFERENCE}")
+    replace(starts.reference, floors=floors, source=source).save(measures.SHIPPED_REFERENCE)
+    print_progress(f"wrote {measures.SHIPPED_REFERENCE}")
 
 
 def markers(card: str) -> tuple[str, str]:

@@ -18,17 +18,22 @@ import polars as pl
 
 from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
+from ganlane.realism.driving import FLOORS, Factory, StartOptions, drive_recordings
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
-from ganlane.realism.measures import QUANTITIES, Measured, measure, measure_recordings, pooled_distance
+from ganlane.realism.measures import (
+    QUANTITIES,
+    SHIPPED_REFERENCE,
+    Measured,
+    Reference,
+    measure,
+    measure_recordings,
+    pooled_distance,
+)
 from ganlane.realism.recordings import SHORTEST_S, Recording, recorded_frame, recordings_of, units_of
-from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
-from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
 from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.state import Road
 from ganlane.weights import load_weights
 
-#: Reference drivers at the ends of the scale.
-FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}
 #: Candidates for the mean excess of desired speeds over the speed at entry, m/s.
 EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
 #: Quantities by which the excess is chosen: all that need no lane change.

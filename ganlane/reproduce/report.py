@@ -1,4 +1,4 @@
-"""The report: a row for each recipe on each traffic, comparisons of drivers, tables beside the paper's, and a page."""
+"""The report: a row for each recipe on each traffic, drivers compared, tables beside the paper's, and a page."""
 
 from __future__ import annotations
 

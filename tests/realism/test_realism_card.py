@@ -3,10 +3,9 @@
 from reference.recordings import recorded_cars
 
 from ganlane.realism.card import card_checks, quantity_rows
+from ganlane.realism.driving import ConstantVelocity, RandomDriving, StartOptions
 from ganlane.realism.long_runs import LongRunParameters, long_run
 from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
-from ganlane.realism.references import ConstantVelocity, RandomDriving
-from ganlane.realism.replay_starts import StartOptions
 from ganlane.realism.starts import simulate
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic

@@ -14,8 +14,7 @@ from ganlane.config.recordings import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.generator import shipped_generator
 from ganlane.realism import main
-from ganlane.realism.measures import QUANTITIES
-from ganlane.realism.references import SHIPPED_REFERENCE
+from ganlane.realism.measures import QUANTITIES, SHIPPED_REFERENCE
 from ganlane.weights import load_weights, save_weights
 
 QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
@@ -171,7 +170,7 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, reco
 
 
 def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, monkeypatch, tmp_path):
-    from ganlane.realism import references as module
+    from ganlane.realism import measures as module
 
     assert not RealismConfig().publish
     there = tmp_path / "shipped.json"

@@ -3,15 +3,8 @@
 import pytest
 import torch
 
-from ganlane.realism.long_runs import (
-    EventCounter,
-    GuardMeter,
-    LongRunParameters,
-    long_run,
-    spawned_vehicles,
-    totals,
-)
-from ganlane.realism.references import ConstantVelocity, RandomDriving
+from ganlane.realism.driving import ConstantVelocity, RandomDriving
+from ganlane.realism.long_runs import EventCounter, GuardMeter, LongRunParameters, long_run, spawned_vehicles, totals
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Road
 from ganlane.traffic import Guard, IdmTraffic, TrafficModule

@@ -5,10 +5,10 @@ import pytest
 from matplotlib.colors import to_hex
 
 from ganlane.realism.card import card_checks
+from ganlane.realism.driving import ConstantVelocity
 from ganlane.realism.long_runs import LongRunParameters, long_run, totals
 from ganlane.realism.measures import QUANTITIES
 from ganlane.realism.output import checks_text, draw_distances, draw_distributions, draw_speeds_over_time, long_table
-from ganlane.realism.references import ConstantVelocity
 from ganlane.sim.state import Road
 from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 from ganlane.view.figures import COLOURS, INK

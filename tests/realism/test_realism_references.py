@@ -9,9 +9,8 @@ from reference.recordings import recorded_cars
 
 from ganlane.data import default_scenes, read_scenes, scene_lane_widths
 from ganlane.errors import UserError
-from ganlane.realism.measures import QUANTITIES, ceiling, measure_recordings
+from ganlane.realism.measures import QUANTITIES, SHIPPED_REFERENCE, Reference, ceiling, measure_recordings
 from ganlane.realism.recordings import recordings_of
-from ganlane.realism.references import SHIPPED_REFERENCE, Reference
 
 
 @pytest.fixture

@@ -11,10 +11,16 @@ from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
 from ganlane.generator.rollout import balanced_headway
+from ganlane.realism.driving import (
+    ConstantVelocity,
+    HeadwayIdm,
+    RandomDriving,
+    StartOptions,
+    drive_recordings,
+    with_recorded_headways,
+)
 from ganlane.realism.measures import measure_recordings, pooled_distance
 from ganlane.realism.recordings import recorded_frame
-from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
-from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways
 from ganlane.realism.starts import simulate
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive

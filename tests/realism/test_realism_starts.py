@@ -7,10 +7,9 @@ from reference.recordings import made_by_hand
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
 from ganlane.realism.card import card_rows
+from ganlane.realism.driving import ConstantVelocity, StartOptions
 from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.measures import ceiling
-from ganlane.realism.references import ConstantVelocity
-from ganlane.realism.replay_starts import StartOptions
 from ganlane.realism.starts import Fold, fit_excess, recorded_starts, spawned_frame
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic

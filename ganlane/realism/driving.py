@@ -1,4 +1,4 @@
-"""Recorded scenes driven by a traffic model: the same vehicles and road, for as long as they were recorded.
+"""Recorded scenes driven by a traffic: the same vehicles and road, for as long as recorded; and reference drivers.
 
 A vehicle is driven from the frame at which it was first recorded to the one at which it was last recorded, or until
 it passes the end of the recorded road. One that appears later waits while another occupies its place, and enters in
@@ -12,6 +12,8 @@ Headways: a driver recorded behind a leader has shown how closely it follows. Wi
 the drivers would begin with hard braking, and the first seconds would measure nothing else. So a traffic with a
 headway per driver (a memory ``headway`` [N, M] in s) starts with those that balance the recorded gaps. Traffic with
 one headway for everybody (IDM, Table V) keeps it.
+
+Two drivers mark the ends of the scale (random driving, constant velocity); :class:`HeadwayIdm` is a control.
 """
 
 from __future__ import annotations
@@ -27,12 +29,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.generator.rollout import balanced_headway
+from ganlane.generator.rollout import balanced_headway, headway_from_uniform
 from ganlane.realism.recordings import Recording, frame_of
+from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lanes import ENTRY_M
+from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.lane_change import random_side
 
 #: Makes a traffic model for a road.
 Factory = Callable[[Road], TrafficModule]
@@ -261,3 +266,70 @@ def with_recorded_headways(memory: TensorDictBase, vehicles: Vehicles, road: Roa
         return torch.where(who, balanced_headway(vehicles, road, value), value) if last == HEADWAY else value
 
     return memory.named_apply(shown, nested_keys=True)
+
+
+class ConstantVelocity(TrafficModule):
+    """Every vehicle keeps its lane and the speed at which it entered."""
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step along the road."""
+        v = vehicles
+        return v.with_(x=v.x + v.speed * self.dt, acceleration=torch.zeros_like(v.speed)), memory
+
+
+class RandomDriving(TrafficModule):
+    """Drivers that ignore all others: the far end of the scale.
+
+    An acceleration is drawn every second, uniform up to 3 m/s2 either way; a lane change to a random side starts at a
+    constant hazard, every 20 s on average, and takes 4 s. Speeds are never negative.
+    """
+
+    hardest, every_s, change_s = 3.0, 20.0, 4.0
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step: the second's acceleration, and towards the target lane."""
+        v, m, dtype = vehicles, vehicles.x.shape[1], vehicles.x.dtype
+        pace = uniform(key, torch.div(step, 10, rounding_mode="floor"), m, [Purpose.ACCELERATION], dtype)[..., 0]
+        drawn = uniform(key, step, m, [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE], dtype)
+        remaining = self.road.centre_of(v.target_lane, dtype) - v.y
+        starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
+        side = torch.where(starts, random_side(drawn[..., 1], v.target_lane, self.road.lanes), 0)
+        target = v.target_lane + side
+        stride = self.road.lane_width_m * self.dt / self.change_s
+        aside = (remaining / stride).clamp(-1.0, 1.0) * stride
+        speed = (v.speed + self.hardest * (2.0 * pace - 1.0) * self.dt).clamp_min(0.0)
+        moved = v.with_(
+            x=v.x + 0.5 * (v.speed + speed) * self.dt,
+            y=v.y + aside,
+            speed=speed,
+            acceleration=(speed - v.speed) / self.dt,
+            target_lane=target,
+        )
+        return moved, memory
+
+
+class HeadwayIdm(TrafficModule):
+    """IDM without lane changes, each driver with its own headway: generated traffic without its network.
+
+    A control, none of the shipped traffics: Table V gives everybody the same headway. Memory: ``headway`` [N, M]
+    in s, drawn from the recorded distribution, or taken from a recorded start.
+    """
+
+    memory_fields = {"headway": ((), None)}  # noqa: RUF012
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+        """A random headway for each driver."""
+        u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
+        return {"headway": headway_from_uniform(u)}
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step along the road."""
+        v = vehicles
+        wanted = following_acceleration(perceive(v, self.road), headway_s=memory["headway"])
+        speed = (v.speed + wanted * self.dt).clamp_min(0.0)
+        x = v.x + 0.5 * (v.speed + speed) * self.dt
+        return v.with_(x=x, speed=speed, acceleration=(speed - v.speed) / self.dt), memory
+
+
+#: Reference drivers at the ends of the scale.
+FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}

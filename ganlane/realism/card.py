@@ -53,9 +53,6 @@ PRESETS: Final[Mapping[str, Preset]] = {"gan": "paper", "gan_calibrated": "calib
 I80_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
 #: Quantities in which generated traffic should come closer to recordings than rules do.
 CLOSER_IN = ("speed_spread", "acceleration", "time_headway", "time_to_collision", "lane_change_duration")
-#: Largest relative error of an acceleration quantile; largest share of steps that a guard may alter.
-_QUANTILE_SHARE = 0.3
-_MOST_GUARD = 0.05
 
 
 @dataclass(frozen=True)
@@ -76,11 +73,6 @@ class Card:
     long_runs: Mapping[str, list[dict[str, Any]]]
     resamples: int
 
-    @property
-    def runs(self) -> list[dict[str, Any]]:
-        """The traffic's own long runs."""
-        return self.long_runs[self.traffic]
-
     @cached_property
     def quantities(self) -> dict[str, Any]:
         """Its rows, by quantity."""
@@ -90,21 +82,19 @@ class Card:
         """The content of ``results.json``."""
         starts, held_out = self.starts, self.starts.separately_held_out
         apart = card_rows(starts.restricted_to(held_out), self.traffic, self.resamples) if held_out else None
-        driving = {name: each.summary() for name, each in starts.driven.items()}
-        recorded, own = starts.recorded.summary(), driving[self.traffic]
-        rate, spread = starts.reference.rate(), starts.reference.spread_mps
-        checks = card_checks(
-            self.quantities, own["quantiles"], recorded["quantiles"], rate["per_vehicle_km_ci"], spread, self.runs
-        )
+        driving = {name: each.summary() for name, each in {"recorded": starts.recorded, **starts.driven}.items()}
+        own, recorded = (driving[name]["quantiles"] for name in (self.traffic, "recorded"))
+        runs, rate, spread = self.long_runs[self.traffic], starts.reference.rate(), starts.reference.spread_mps
+        checks = card_checks(self.quantities, own, recorded, rate["per_vehicle_km_ci"], spread, runs)
         return {
             "traffic": self.traffic,
             **starts.description(),
             "quantities": self.quantities,
             "quantities_held_out": apart,
-            "driving": {"recorded": recorded, **driving},
+            "driving": driving,
             "i80": self.site,
-            **totals(self.runs),
-            "long_runs": self.runs,
+            **totals(runs),
+            "long_runs": runs,
             "long_runs_against": {name: runs for name, runs in self.long_runs.items() if name != self.traffic},
             "checks": checks,
         }
@@ -198,8 +188,8 @@ def card_checks(
             rivals.setdefault(other, {})[name] = row["verdict"]
     pairs = [(own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")]
     near = None
-    if not any(value is None for pair in pairs for value in pair):
-        near = all(abs(mine - theirs) <= _QUANTILE_SHARE * abs(theirs) for mine, theirs in pairs)
+    if all(None not in pair for pair in pairs):
+        near = all(abs(mine - theirs) <= 0.3 * abs(theirs) for mine, theirs in pairs)
     return {
         "compared_with": rivals,
         "acceleration_quantiles_within_30_percent": near,
@@ -221,7 +211,7 @@ def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, s
         "nobody_off_the_road": run["off_road"] == 0,
         "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,
         "spread_at_least_half_the_recorded": wide,
-        "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < _MOST_GUARD,
+        "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < 0.05,
     }
 
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import polars as pl
@@ -45,15 +44,12 @@ Factory = Callable[[Road], TrafficModule]
 ENTRY_GAP_M = 2.0
 #: Desired speeds are kept within these bounds, m/s.
 SLOWEST_DESIRED_MPS, FASTEST_DESIRED_MPS = 5.0, 35.0
-#: Name of the traffic memory that holds headways.
-HEADWAY: Final = "headway"
 #: Rows times vehicles times vehicles simulated at once; bounds the memory.
 _MOST_PAIRS = 1_000_000
 #: Position of absent vehicles, m.
 _ABSENT_M = -10_000.0
 #: Tolerance of positions, m.
 _ROUNDING_M = 0.01
-_FIELDS = ("x", "y", "speed")
 
 
 @dataclass(frozen=True)
@@ -71,10 +67,7 @@ class StartOptions:
 
 
 def drive_recordings(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> pl.DataFrame:
-    """Drive every recording ``options.repeats`` times; the trajectories as :func:`frame_of` gives them.
-
-    Recordings on equal roads are driven side by side.
-    """
+    """Drive every recording ``options.repeats`` times, those on equal roads side by side; see :func:`frame_of`."""
     roads: dict[tuple[int, float], list[Recording]] = {}
     for each in recordings:
         roads.setdefault((each.lanes, each.lane_width_m), []).append(each)
@@ -102,7 +95,7 @@ def _drive(traffic: TrafficModule, rows: list[Recording], options: StartOptions,
     """Drives a batch of recordings on one road; one frame per row."""
     batch, n = RecordingBatch.of(rows), len(rows)
     counters = {keys.SEED: torch.full((n,), options.seed), keys.EPISODE: first + torch.arange(n)}
-    key = episode_key(traffic.stream, counters[keys.SEED], counters[keys.EPISODE])
+    key = episode_key(traffic.stream, *counters.values())
     u = uniform(key, 0, batch.x.shape[2], [Purpose.SPAWN_DESIRED_SPEED])[..., 0]
     excess = 2.0 * options.desired_above_mps * u
     state = no_vehicles(batch, traffic)
@@ -152,13 +145,11 @@ def _updated_memory(
     if memory is not None and not bool(enters.any()):
         return memory
     fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
-    if memory is None:
-        return fresh
 
     def merged(new: Tensor, old: Tensor) -> Tensor:
         return torch.where(enters.reshape(*enters.shape, *[1] * (new.ndim - 2)), new, old)
 
-    return fresh.apply(merged, memory)
+    return fresh if memory is None else fresh.apply(merged, memory)
 
 
 @dataclass(frozen=True)
@@ -188,12 +179,11 @@ class RecordingBatch:
             for index, value in enumerate(values):
                 where = (slice(len(value)), index) if value.ndim == 2 else (index,)
                 whole[(*where, slice(1, value.shape[-1] + 1))] = value
-            made = torch.from_numpy(whole)
-            return made.float() if made.is_floating_point() else made
+            tensor = torch.from_numpy(whole)
+            return tensor.float() if tensor.is_floating_point() else tensor
 
-        x, y, speed = padded("x"), padded("y"), padded("speed")
-        end_m = torch.tensor([[row.end_m] for row in rows])
-        return cls(x, y, speed, padded("present"), padded("length"), padded("driven"), end_m)
+        made = {name: padded(name) for name in ("x", "y", "speed", "present", "length", "driven")}
+        return cls(**made, end_m=torch.tensor([[row.end_m] for row in rows]))
 
 
 def no_vehicles(batch: RecordingBatch, traffic: TrafficModule) -> Vehicles:
@@ -221,8 +211,8 @@ def remove_finished(batch: RecordingBatch, state: Vehicles, step: int) -> Vehicl
     stays = state.valid & batch.present[step] & on_road
     state = state.with_(valid=stays, x=torch.where(stays, state.x, _ABSENT_M))
     replayed = stays & ~batch.driven
-    shown = {name: torch.where(replayed, getattr(batch, name)[step], getattr(state, name)) for name in _FIELDS}
-    return state.with_(**shown)
+    fields = ("x", "y", "speed")
+    return state.with_(**{f: torch.where(replayed, getattr(batch, f)[step], getattr(state, f)) for f in fields})
 
 
 def may_enter(batch: RecordingBatch, state: Vehicles, waiting: Tensor, road: Road, step: int) -> Tensor:
@@ -263,7 +253,7 @@ def with_recorded_headways(memory: TensorDictBase, vehicles: Vehicles, road: Roa
 
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
         last = name if isinstance(name, str) else name[-1]
-        return torch.where(who, balanced_headway(vehicles, road, value), value) if last == HEADWAY else value
+        return torch.where(who, balanced_headway(vehicles, road, value), value) if last == "headway" else value
 
     return memory.named_apply(shown, nested_keys=True)
 
@@ -311,8 +301,8 @@ class RandomDriving(TrafficModule):
 class HeadwayIdm(TrafficModule):
     """IDM without lane changes, each driver with its own headway: generated traffic without its network.
 
-    A control, none of the shipped traffics: Table V gives everybody the same headway. Memory: ``headway`` [N, M]
-    in s, drawn from the recorded distribution, or taken from a recorded start.
+    A control, none of the shipped traffics: Table V gives everybody the same headway. Here they are drawn from the
+    recorded distribution, or taken from a recorded start.
     """
 
     memory_fields = {"headway": ((), None)}  # noqa: RUF012

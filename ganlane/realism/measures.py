@@ -203,10 +203,7 @@ def measure_recordings(recordings: Sequence[Recording]) -> Measured:
 
 
 def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
-    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them, sorted by track.
-
-    ``units`` are what the bootstrap resamples, in the order of the rows of ``counts``.
-    """
+    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them; ``units`` are the rows."""
     motion = _motion(frame)
     own = motion.filter(pl.col("counts"))
     near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)

@@ -40,8 +40,6 @@ from ganlane.view.figures import (
 
 #: Colour of the recordings.
 RECORDED = INK
-#: The check of a guard, and its answer where there is none.
-_GUARD, _WITHOUT_GUARD = "guard_under_5_percent", "no guard"
 
 
 def check_targets(config: RealismConfig, path: Path | None) -> None:
@@ -158,19 +156,17 @@ def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
 
 def checks_text(checks: Mapping[str, Any]) -> str:
     """The card's checks, a line each."""
-    words = {True: "yes", False: "no", None: "unknown"}
+
+    def told(name: str, value: bool | None) -> str:
+        unknown = "no guard" if name == "guard_under_5_percent" else "unknown"
+        return f"{name.replace('_', ' ')}: {unknown if value is None else 'yes' if value else 'no'}"
+
     near = "acceleration_quantiles_within_30_percent"
-    lines = [f"{near.replace('_', ' ')}: {words[checks[near]]}"]
+    lines = [told(near, checks[near])]
     for other, verdicts in checks["compared_with"].items():
-        lines.append(
-            f"than {short_name(other)}: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
-        )
+        lines.append(f"than {short_name(other)}: " + ", ".join(map(" ".join, verdicts.items())))
     for run in checks["long_runs"]:
-        results = ", ".join(
-            f"{name.replace('_', ' ')}: {_WITHOUT_GUARD if name == _GUARD and value is None else words[value]}"
-            for name, value in run.items()
-            if name != "vehicles"
-        )
+        results = ", ".join(told(name, value) for name, value in run.items() if name != "vehicles")
         lines.append(f"{run['vehicles']} vehicles: {results}")
     return "\n".join(lines)
 
@@ -271,6 +267,6 @@ def draw(card: Card, to: Path) -> list[Path]:
         "distributions": draw_distributions(recorded, simulated),
         "distances": draw_distances(card.quantities, card.traffic),
     }
-    if card.runs:
-        figures["drift"] = draw_speeds_over_time(card.runs, starts.reference.spread_mps)
+    if runs := card.long_runs[card.traffic]:
+        figures["drift"] = draw_speeds_over_time(runs, starts.reference.spread_mps)
     return [save_figure(figure, to / f"{name}.png") for name, figure in figures.items()]

@@ -36,8 +36,6 @@ from ganlane.weights import load_weights
 
 #: Candidates for the mean excess of desired speeds over the speed at entry, m/s.
 EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
-#: Quantities by which the excess is chosen: all that need no lane change.
-FITTED_BY = tuple(name for name in QUANTITIES if name != "lane_change_duration")
 #: Spawned starts: vehicles of an episode, its seconds, and episodes per repeat.
 _SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8
 
@@ -68,14 +66,15 @@ def fit_excess(
 ) -> float:
     """The mean excess of desired speeds, of ``grid``, at which a traffic is nearest to ``recordings``, m/s.
 
-    Nearest by the mean distance over :data:`FITTED_BY`. Every traffic is fitted, so that none suffers from desired
-    speeds chosen for another.
+    Nearest by the mean distance over all quantities that need no lane change. Every traffic is fitted, so that none
+    suffers from desired speeds chosen for another.
     """
     recorded = measure_recordings(recordings)
 
     def mean_distance(excess: float) -> float:
         driven = simulate(make, recordings, replace(options, desired_above_mps=excess, repeats=1))
-        values = [pooled_distance(driven.counts[name], recorded.counts[name]) for name in FITTED_BY]
+        fitted_by = [name for name in QUANTITIES if name != "lane_change_duration"]
+        values = [pooled_distance(driven.counts[name], recorded.counts[name]) for name in fitted_by]
         return float(np.nanmean(values))
 
     return min(grid, key=mean_distance)

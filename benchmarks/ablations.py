@@ -60,11 +60,7 @@ ABLATIONS: Mapping[str, tuple[str, ...]] = {
 #: Mask that its agents are compared behind, where it is another than none.
 BEHIND = {"legal": "legal", "safe": "safe"}
 SEEDS = (0, 1, 2)
-OPTIONS = (
-    "traffics=[idm_mobil,idm,idm_faults]",
-    "episodes=500",
-    "workers=2",
-)
+OPTIONS = ("traffics=[idm_mobil,idm,idm_faults]", "episodes=500", "workers=2")
 
 
 def train(folder: Path, name: str, seed: int, options: Sequence[str]) -> None:

@@ -250,9 +250,7 @@ def _pair(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[Array, Array]:
 
 
 def _estimate(
-    tables: Sequence[Array],
-    statistic: Callable[..., Array],
-    bounds: tuple[float, float] = (-np.inf, np.inf),
+    tables: Sequence[Array], statistic: Callable[..., Array], bounds: tuple[float, float] = (-np.inf, np.inf)
 ) -> Estimate:
     """``statistic`` of the trainings' means of ``tables`` [..., S, E], with its interval within ``bounds``.
 

@@ -37,11 +37,8 @@ _ORIGIN = "ganlane"
 def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
     """Run the episodes of ``config`` with each driver on each of its traffics.
 
-    Args:
-        drivers: see :func:`ganlane.build.make_driver`; each drives with its own observation and mask, or with those
-            of ``config`` if it names none; the sensors are those of ``config`` for all.
-        config: traffics, episodes and environment.
-        quiet: show no progress.
+    Each of ``drivers`` (:func:`ganlane.build.make_driver`) drives with its own observation and mask, or with those of
+    ``config`` if it names none; the sensors are those of ``config`` for all. ``quiet`` shows no progress.
 
     Returns:
         What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
@@ -111,17 +108,11 @@ def publish(
     seeds: Mapping[str, Any],
     numbers: Mapping[str, Any] | None = None,
 ) -> str:
-    """Print the tables of a comparison, write its episodes and ``results.json``; return the line that names it.
+    """Print the tables of what :func:`compare` gave, write its episodes and ``results.json``; the line that names it.
 
-    The record also holds ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table with two drivers or
-    more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`) and, where a traffic replays recorded scenes,
-    ``crashes_by_scene`` (:func:`recorded_crashes`).
-
-    Args:
-        table: what :func:`compare` returned.
-        folder: of the run.
-        config, seeds: of the run, for the record.
-        numbers: further entries of the record.
+    The record holds ``rows``, ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table with two drivers or
+    more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`), ``crashes_by_scene`` where a traffic replays
+    recorded scenes (:func:`recorded_crashes`), and further ``numbers``.
     """
     rows, paired, recorded = evaluation.evaluation_rows(table), evaluation.paired_rows(table), recorded_crashes(table)
     tables = [evaluation.text_table(rows), *([evaluation.paired_table(paired)] if paired else [])]
@@ -168,11 +159,7 @@ def available(config: ReproduceConfig) -> tuple[dict[str, TrafficConfig], dict[s
 
 
 def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> list[Cell]:
-    """Every cell, traffic by traffic.
-
-    Raises:
-        UserError: an unknown driver, or one that does not fit.
-    """
+    """Every cell, traffic by traffic; :class:`UserError` for a driver that is not known or does not fit."""
     drivers = make_drivers(config.agents, config.env, config.device)
     cells = []
     for traffic, option in traffics.items():
@@ -252,10 +239,9 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
 
 
 def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str, float]]:
-    """All episodes, one below the other, the revisions of the code that drove them, and how long it took.
+    """All episodes, one below the other, the revisions that drove them, and how long each traffic took, s.
 
-    Returns:
-        The third: by traffic, s, all drivers together; a file that does not say it counts as 0.
+    A file that does not say how long it took counts as 0.
 
     Raises:
         UserError: a file without the episodes of a cell; the message names it.

@@ -101,7 +101,7 @@ class Card:
 
 
 def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
-    """The rows of a traffic's card by quantity, compared with every other traffic from the same starts."""
+    """The rows of a traffic's card, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
     return quantity_rows(traffic, starts.driven, starts.recorded.counts, floors, starts.paired, resamples)
 
@@ -243,7 +243,7 @@ def scenes_path(config: RealismConfig) -> Path | None:
 
 
 def traffic_factories(config: RealismConfig, weights: Mapping[str, Path] | None = None) -> dict[str, Factory]:
-    """Factories of traffic on a given road, by name: the card's traffic first, then its rivals.
+    """Factories by name: the card's traffic first, then its rivals.
 
     ``weights`` of a fold, by preset, replace those that generated traffics name themselves; :class:`UserError` where
     there are none of a preset.

@@ -43,7 +43,7 @@ RECORDED = INK
 
 
 def check_targets(config: RealismConfig, path: Path | None) -> None:
-    """Raise :class:`UserError` before anything is driven if the results could not be written."""
+    """Raise :class:`UserError`, before anything is driven, if the results could not be written."""
     if config.publish and path is None:
         raise UserError("publish=true: the file that ships is made from recordings; give data.path=FILE.")
     if config.report is not None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
@@ -80,15 +80,13 @@ def _recording(name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lan
     """The recording of ``rows`` [R], of which ``track`` [R] gives the index of each one's track."""
     time = rows["frame"].to_numpy() - rows["frame"].to_numpy().min()
     shape = (int(time.max()) + 1, int(track.max()) + 1)
-    dense = {field: np.zeros(shape) for field in ("x", "y", "speed")}
-    flat = {field: np.zeros(shape[1]) for field in ("length", "width")} | {"driven": np.zeros(shape[1], dtype=bool)}
+    made: dict[str, Any] = {field: np.zeros(shape) for field in ("x", "y", "speed")}
+    made |= {"length": np.zeros(shape[1]), "width": np.zeros(shape[1]), "driven": np.zeros(shape[1], dtype=bool)}
+    for field, values in made.items():
+        values[(time, track) if values.ndim == 2 else track] = rows[field].to_numpy()
     present = np.zeros(shape, dtype=bool)
     present[time, track] = True
-    for field, values in dense.items():
-        values[time, track] = rows[field].to_numpy()
-    for field, values in flat.items():
-        values[track] = rows[field].to_numpy()
-    return Recording(name, name, lanes, lane_width_m, present=present, **dense, **flat)
+    return Recording(name, name, lanes, lane_width_m, present=present, **made)
 
 
 def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: str) -> pl.DataFrame:

@@ -194,12 +194,9 @@ def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> 
 def recorded_starts(
     folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str
 ) -> Starts:
-    """Drive every traffic from recorded scenes; those that are too short are skipped.
+    """Drive every traffic from recorded scenes (``frame``, in the schema); those that are too short are skipped.
 
-    Args:
-        frame: the recordings, in the schema.
-        fit: whether to fit every traffic's desired speeds on a fold's other scenes, or take those of ``options``.
-        source: of the recordings.
+    ``fit``: every traffic's desired speeds, on a fold's other scenes; else they are those of ``options``.
 
     Raises:
         UserError: a fold names an unknown scene, or no scene is long enough.

@@ -109,8 +109,7 @@ def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> t
     """Drive failed episodes again and list those that end in the same way.
 
     Args:
-        episodes: rows of failed and other episodes: ``agent, traffic, episode, reason, decisions``.
-        config: what they were driven with.
+        episodes: rows of failed and other episodes, driven with ``config``.
         most: episodes per driver and traffic, those with the fewest decisions first.
 
     Returns:

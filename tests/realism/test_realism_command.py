@@ -49,7 +49,7 @@ def run(capsys, *arguments):
 def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordings, capsys, tmp_path):
     document, figures = tmp_path / "page.md", tmp_path / "figures"
     figures.mkdir()
-    document.write_text("before\n<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\nafter\n")
+    document.write_text("<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\n")
     asked = ["scenes=all", f"report={document}", f"figures={figures}", "long_against=true"]
     held_out = "data.held_out=[synthetic-1]"
     status, results, out, _ = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *asked)
@@ -65,8 +65,6 @@ def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordin
     assert results["long_runs_against"].keys() == {"idm_mobil"}
     assert "changes per vehicle-km" in out
     text = document.read_text()
-    assert text.startswith("before\n<!-- begin realism idm all -->\n")
-    assert text.endswith("<!-- end realism idm all -->\nafter\n")
     assert "former" not in text
     for part in ("python -m ganlane.realism quick=true", "held-out scenes alone", "idm_mobil, long runs"):
         assert part in text

@@ -23,8 +23,7 @@ The modules, from the bottom up:
 - :mod:`~ganlane.realism.long_runs`: long runs, and the events in them.
 - :mod:`~ganlane.realism.starts`: every traffic from recorded or spawned starts, its desired speeds fitted, by folds
   where asked for.
-- :mod:`~ganlane.realism.card`: drives a card; its numbers and checks.
-- :mod:`~ganlane.realism.output`: tables, documents and figures.
+- :mod:`~ganlane.realism.card`: a card's numbers and checks, as tables and figures.
 """
 
 from functools import partial

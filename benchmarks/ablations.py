@@ -25,12 +25,12 @@ from tqdm import tqdm
 from benchmarks.pack_seeds import AGENT_FILE, collect
 from benchmarks.script import make_parser, run_script
 from ganlane.agents.checkpoint import save_agents
+from ganlane.compare import available, cells_of, drive, read_cells
 from ganlane.config.command_line import check
 from ganlane.config.commands import ReproduceConfig
 from ganlane.errors import UserError
 from ganlane.evaluation import write_results
-from ganlane.reproduce import numbers
-from ganlane.reproduce.matrix import available, cells_of, drive, read_cells
+from ganlane.reproduce import report
 
 OUT = Path("docs/reproduce/ablations")
 RUNS = Path("outputs/ablations")
@@ -60,11 +60,7 @@ ABLATIONS: Mapping[str, tuple[str, ...]] = {
 #: Mask that its agents are compared behind, where it is another than none.
 BEHIND = {"legal": "legal", "safe": "safe"}
 SEEDS = (0, 1, 2)
-OPTIONS = (
-    "traffics=[idm_mobil,idm,idm_faults]",
-    "episodes=500",
-    "workers=2",
-)
+OPTIONS = ("traffics=[idm_mobil,idm,idm_faults]", "episodes=500", "workers=2")
 
 
 def train(folder: Path, name: str, seed: int, options: Sequence[str]) -> None:
@@ -104,12 +100,12 @@ def compared(files: Mapping[str, Path], options: Sequence[str]) -> tuple[dict[st
     episodes, revisions, _ = read_cells(cells)
     found = {
         (name.partition("+")[0], traffic): trainings
-        for (name, traffic), trainings in numbers.by_recipe(episodes).items()
+        for (name, traffic), trainings in report.by_recipe(episodes).items()
     }
     pairs = [(name, BASE) for name in files if name != BASE]
     record = {
-        "rows": numbers.rows(found),
-        "comparisons": numbers.comparisons(found, pairs),
+        "rows": report.rows(found),
+        "comparisons": report.comparisons(found, pairs),
         "revisions": revisions,
         "changed": {name: list(ABLATIONS[name]) for name in files},
     }

@@ -4,7 +4,7 @@ Per episode up to K states are alive. Each is driven on by one decision with eve
 there; what crashed is dropped, what came to nearly the same is merged, and K of the rest are kept, spread over
 lanes and over progress (:func:`choose`). The search ends with the first state that reaches
 the episode's end, or when all are dead. It is a heuristic: a sequence that it finds is proof
-(:func:`ganlane.evaluation.rollouts.replay`), none found is not.
+(:func:`ganlane.evaluation.episodes.replay`), none found is not.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 from ganlane import keys
 from ganlane.agents.drivers import legal_actions
 from ganlane.errors import UserError
-from ganlane.evaluation.rollouts import base_of, start_rows, step_rows
+from ganlane.evaluation.episodes import base_of, start_rows, step_rows
 from ganlane.keys import EGO_INDEX
 
 #: States that agree in lane and change under way and within these steps are one: x and y in m, speed in m/s.

@@ -30,7 +30,7 @@ from benchmarks.beam_search import beam_search
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.api import load_agent, make_env
 from ganlane.evaluation import clopper_pearson, write_results
-from ganlane.evaluation.rollouts import SIDES, Rollout, replay, roll_out
+from ganlane.evaluation.episodes import SIDES, Rollout, replay, roll_out
 from ganlane.evaluation.table import Table
 from ganlane.runtime import keep_freed_memory
 

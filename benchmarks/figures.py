@@ -27,8 +27,8 @@ from torch import Tensor, nn
 from benchmarks.script import make_parser, run_script
 from ganlane.data import FRAME_S, default_scenes, read_scenes, scene_lane_widths
 from ganlane.generator import Discriminator, Generator, load_generator, shipped_generator
+from ganlane.realism.driving import StartOptions, drive_recordings
 from ganlane.realism.recordings import recorded_frame, recordings_of
-from ganlane.realism.replay_starts import StartOptions, drive_recordings
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
 from ganlane.traffic import TrafficModule

@@ -113,16 +113,19 @@ def _drivers(results: Results, among: Sequence[str]) -> list[str]:
     return [driver for driver in among if driver in there]
 
 
-def _by_traffic(results: Results, drivers: Sequence[str], cell: Callable[[str, str], str], first: str) -> str:
-    traffics = _traffics(results)
-    lines = [[DRIVERS[driver][0], *(cell(driver, traffic) for traffic in traffics)] for driver in drivers]
-    return Table("", [first, *(f"`{traffic}`" for traffic in traffics)], lines).markdown(heading=False)
+def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) -> str:
+    """Lines of a name and a cell for every traffic."""
+    return Table("", [first, *(f"`{traffic}`" for traffic in _traffics(results))], lines).markdown(heading=False)
 
 
 def leads(results: Results) -> str:
     """Drivers by traffics: paired lead over MOBIL."""
     drivers = _drivers(results, [name for name in DRIVERS if name != "random_legal"])
-    table = _by_traffic(results, drivers, lambda d, t: _lead(_at(results, d, t), DRIVERS[d][1]), "lead over MOBIL")
+    lines = [
+        [DRIVERS[driver][0], *(_lead(_at(results, driver, t), DRIVERS[driver][1]) for t in _traffics(results))]
+        for driver in drivers
+    ]
+    table = _by_traffic(results, "lead over MOBIL", lines)
     means = ", ".join(f"{_at(results, 'mobil', t)['mean_reward']:.1f} on `{t}`" for t in _traffics(results))
     return f"{table}\n\nMOBIL's own mean reward: {means}."
 
@@ -135,13 +138,11 @@ def failures(results: Results) -> str:
         return f"{row['hard_crash']}, {row['out_of_road']} of {row['trainings'] * row['episodes']}"
 
     names = {**DRIVERS, "mobil": ("MOBIL", frozenset[str]())}
-    traffics = _traffics(results)
     lines = [
-        [names[driver][0], *(cell(driver, traffic) for traffic in traffics)]
+        [names[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))]
         for driver in _drivers(results, ["mobil", *DRIVERS])
     ]
-    headings = ["hard crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
-    return Table("", headings, lines).markdown(heading=False)
+    return _by_traffic(results, "hard crashes, departures", lines)
 
 
 def _differences(results: Results, pairs: Sequence[tuple[str, str, str]]) -> list[list[str]]:
@@ -157,21 +158,17 @@ def _differences(results: Results, pairs: Sequence[tuple[str, str, str]]) -> lis
 
 def claims(results: Results) -> str:
     """Pairs of :data:`CLAIMS` by traffics."""
-    headings = ["lead", *(f"`{traffic}`" for traffic in _traffics(results))]
-    return Table("", headings, _differences(results, CLAIMS)).markdown(heading=False)
+    return _by_traffic(results, "lead", _differences(results, CLAIMS))
 
 
 def controls(results: Results) -> str:
     """Control trainings by traffics: lead over MOBIL and failures, then their differences from the paper's agents."""
-    own = results["controls"]
-    traffics = _traffics(own)
-    lines = []
+    own, lines = results["controls"], []
     for driver in _drivers(own, list(CONTROLS)):
         name, trained = CONTROLS[driver]
-        rows = [_at(own, driver, traffic) for traffic in traffics]
+        rows = [_at(own, driver, traffic) for traffic in _traffics(own)]
         lines.append([name, *(f"{_lead(row, trained)}; {row['hard_crash']}, {row['out_of_road']}" for row in rows)])
-    headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
-    return Table("", headings, lines + _differences(own, CONTROL_CLAIMS)).markdown(heading=False)
+    return _by_traffic(own, "lead; crashes, departures", lines + _differences(own, CONTROL_CLAIMS))
 
 
 def trainings(results: Results) -> str:
@@ -186,8 +183,7 @@ def trainings(results: Results) -> str:
     lines.append(["together", *map(_lead_and_failures, together)])
     mobil = [_mean_and_failures(_at(own, "mobil", traffic)) for traffic in traffics]
     lines.append(["MOBIL (its mean reward)", *mobil])
-    headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
-    return Table("", headings, lines).markdown(heading=False)
+    return _by_traffic(own, "lead; crashes, departures", lines)
 
 
 def readme(results: Results) -> str:
@@ -199,7 +195,8 @@ def readme(results: Results) -> str:
         return f"{_lead(row, DRIVERS[driver][1])}, {per_1000[0]:.0f} ({per_1000[1]:.0f})"
 
     drivers = _drivers(results, ["agent_general+safe", "agent_idm+none", "agent_gan+none", "mobil_egoistic"])
-    return _by_traffic(results, drivers, cell, "driver")
+    lines = [[DRIVERS[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))] for driver in drivers]
+    return _by_traffic(results, "driver", lines)
 
 
 def roads(results: Results) -> str:
@@ -227,8 +224,7 @@ def elsewhere(results: Results) -> str:
     there, traffics = {row["driver"] for row in own["rows"]}, _traffics(own)
     lines = [[names[driver], *(cell(driver, traffic) for traffic in traffics)] for driver in names if driver in there]
     episodes = ["episodes of each training", *(str(own["seeds"]["episodes"][traffic]) for traffic in traffics)]
-    headings = ["lead; crashes, departures", *(f"`{traffic}`" for traffic in traffics)]
-    return Table("", headings, [episodes, *lines]).markdown(heading=False)
+    return _by_traffic(own, "lead; crashes, departures", [episodes, *lines])
 
 
 def ablations(results: Results) -> str:
@@ -244,8 +240,7 @@ def ablations(results: Results) -> str:
                 _lead_and_failures({**row, **leads[name, traffic]}, "lead") if changed else _mean_and_failures(row)
             )
         lines.append([f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)", *cells])
-    headings = ["changed: lead; crashes, departures", *(f"`{traffic}`" for traffic in _traffics(own))]
-    return Table("", headings, lines).markdown(heading=False)
+    return _by_traffic(own, "changed: lead; crashes, departures", lines)
 
 
 #: Document and name of the markers to the table between them.

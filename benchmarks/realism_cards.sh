@@ -12,7 +12,7 @@
 set -eu
 export OMP_NUM_THREADS=1
 python="${PYTHON:-python}"
-rivals='against=[gan,idm_mobil,idm,idm_faults,ganlane.realism.references.HeadwayIdm]'
+rivals='against=[gan,idm_mobil,idm,idm_faults,ganlane.realism.driving.HeadwayIdm]'
 
 "$python" -m ganlane.realism traffic=gan_calibrated "$rivals" scenes=all long_against=true \
     report=docs/realism.md figures=docs/figures

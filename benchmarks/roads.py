@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.script import make_parser, run_script
+from ganlane.compare import available, cells_of, drive, read_cells
 from ganlane.config.command_line import check
 from ganlane.config.commands import ReproduceConfig
 from ganlane.evaluation import write_results
-from ganlane.reproduce import numbers
-from ganlane.reproduce.matrix import available, cells_of, drive, read_cells
+from ganlane.reproduce import report
 
 OUT = Path("docs/reproduce/roads")
 #: Vehicles, the ego included, and lanes. The first is the paper's, on which all agents were trained.
@@ -53,7 +53,7 @@ def rows_on(vehicles: int, lanes: int, config: ReproduceConfig) -> tuple[list[di
     drive(cells, config)
     episodes, revisions, _ = read_cells(cells)
     kept = {*KEPT, *(f"{name}_ci" for name in KEPT)}
-    rows = numbers.rows(numbers.by_recipe(episodes))
+    rows = report.rows(report.by_recipe(episodes))
     place = {"vehicles": vehicles, "lanes": lanes}
     return [place | {name: value for name, value in row.items() if name in kept} for row in rows], revisions
 

@@ -71,7 +71,7 @@ def test_the_record_holds_rows_paired_leads_and_crashes_by_scene(table, tmp_path
         assert sum(scene["distance_km"] for scene in row["scenes"]) == pytest.approx(own["distance_m"].sum() / 1000)
 
 
-def test_other_traffics_have_no_scenes(table, tmp_path, capsys):
+def test_other_traffics_have_no_scenes(table, tmp_path):
     others = table.filter(pl.col("traffic") == "idm").drop("scene")
     assert recorded_crashes(others) == []
     publish(others, tmp_path, {}, {})

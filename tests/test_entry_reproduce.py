@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ganlane.reproduce import main, matrix
+from ganlane import compare
+from ganlane.reproduce import main
 
 SHORT = ["episodes=3", "workers=1", "env.goal_m=60", "hydra.run.dir=out"]
 SMALL = ["agents=[random_legal,mobil,agent_idm@all+none,agent_gan+none]", "traffics=[idm,gan]"]
@@ -17,13 +18,13 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 @pytest.fixture
 def cells_driven(monkeypatch):
     """The cells that were driven, by driver and traffic."""
-    driven, drive_cell = [], matrix.drive_cell
+    driven, drive_cell = [], compare.drive_cell
 
     def noting(cell, config):
         driven.append((cell.driver, cell.traffic))
         drive_cell(cell, config)
 
-    monkeypatch.setattr(matrix, "drive_cell", noting)
+    monkeypatch.setattr(compare, "drive_cell", noting)
     return driven
 
 

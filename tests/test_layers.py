@@ -26,7 +26,7 @@ ORDER = [
     {"config"},
     {"build"},
     {"training"},
-    {"compare", "crashes", "fit_report"},
+    {"compare"},
     {"realism", "bench", "reproduce", "doctor"},
     {"options"},
     # The typed calls run the commands' own functions.

@@ -24,8 +24,8 @@ from ganlane.config.train import FinalEvaluationConfig, TrainConfig
 from ganlane.errors import UserError
 from ganlane.files import CHECKPOINTS
 from ganlane.generator import load_generator
-from ganlane.generator.checkpoint import cached
-from ganlane.realism.references import Reference
+from ganlane.generator.windows import cached
+from ganlane.realism.measures import Reference
 from ganlane.traffic import TrafficModule
 from ganlane.weights import load_weights, save_weights
 

@@ -148,10 +148,7 @@ def squeeze(scene: Scene, distances: Distances) -> np.ndarray:
 
 
 def drive_highway_env(
-    scene: Scene,
-    distances: Distances = Distances.BUMPERS,
-    dt: float = PHYSICS_STEP_S,
-    idm: IdmParameters = TABLE_V,
+    scene: Scene, distances: Distances = Distances.BUMPERS, dt: float = PHYSICS_STEP_S, idm: IdmParameters = TABLE_V
 ) -> Trace:
     """Drive ``scene`` with HighwayEnv at steps of ``dt`` seconds; positions in the trace are the bodies' centres."""
     road = highway_env_road(scene, distances, idm)

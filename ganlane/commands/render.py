@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.render import FILMS, MOST_EPISODES, RenderConfig
-from ganlane.crashes import read_crashes
 from ganlane.errors import UserError
-from ganlane.evaluation.rollouts import ScriptedPolicy
+from ganlane.evaluation.episodes import ScriptedPolicy
+from ganlane.reproduce.crashes import read_crashes
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 from ganlane.view import (

@@ -14,16 +14,16 @@ from matplotlib.figure import Figure
 
 from ganlane.agents import read_agent
 from ganlane.agents.checkpoint import save_agents, with_seeds
+from ganlane.compare import available, cells_of, drive, read_cells
 from ganlane.config.commands import ReproduceConfig
 from ganlane.config.runs import stored_command
-from ganlane.crashes import find_crashes, write_crashes
 from ganlane.errors import UserError
 from ganlane.evaluation import failed_episodes, machine_sentence, write_results
 from ganlane.evaluation.table import Table
-from ganlane.reproduce import figures as papers
-from ganlane.reproduce import numbers, report
-from ganlane.reproduce.matrix import available, cells_of, drive, read_cells
-from ganlane.reproduce.numbers import Row
+from ganlane.reproduce import figures as drawings
+from ganlane.reproduce import report
+from ganlane.reproduce.crashes import find_crashes, write_crashes
+from ganlane.reproduce.report import Row
 from ganlane.torch_settings import set_threads
 
 #: Hours that one training of the paper's schedule took, on one core.
@@ -54,14 +54,14 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
     set_threads(config.threads)
     if config.source == "scratch":
         config = trained_from_scratch(config)
-    report.read_transfers(config.runs, [])  # a folder that cannot be read shows before hours of driving
+    drawings.read_transfers(config.runs, [])  # a folder that cannot be read shows before hours of driving
     traffics, missing = available(config)
     _print_left_out(missing)
     cells = cells_of(config, traffics)
     drive(cells, config)
     episodes, revisions, seconds = read_cells(cells)
-    by_recipe = numbers.by_recipe(episodes)
-    rows, compared = numbers.rows(by_recipe), numbers.comparisons(by_recipe, _pairs(by_recipe))
+    by_recipe = report.by_recipe(episodes)
+    rows, compared = report.rows(by_recipe), report.comparisons(by_recipe, _pairs(by_recipe))
     tables = _tables(rows, compared, folder)
     figures, not_drawn = _figures(config, traffics, rows, folder)
     missing |= not_drawn
@@ -109,14 +109,14 @@ def _figures(
     config: ReproduceConfig, traffics: Mapping[str, Any], rows: list[Row], folder: Path
 ) -> tuple[dict[str, Figure], dict[str, str]]:
     """The figures of the report by name, and why others are missing; the numbers behind each as a CSV file."""
-    drawn = papers.draw_all(config, traffics)
+    drawn = drawings.draw_all(config, traffics)
     _print_left_out(drawn.missing)
-    figures = {"matrix": report.draw_matrix(rows), **drawn.figures}
+    figures = {"matrix": drawings.draw_matrix(rows), **drawn.figures}
     for name, frame in drawn.numbers.items():
         report.write_csv(folder / f"{name}.csv", frame.to_dicts())
-    transfer = report.read_transfers(config.runs, rows)
+    transfer = drawings.read_transfers(config.runs, rows)
     if transfer is not None:
-        figures["figure_4"] = report.draw_transfer(transfer)
+        figures["figure_4"] = drawings.draw_transfer(transfer)
         curves = [{"run": name, **row} for name, frame in transfer.runs.items() for row in frame.to_dicts()]
         report.write_csv(folder / "figure_4.csv", curves)
     return figures, drawn.missing

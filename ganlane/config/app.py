@@ -48,7 +48,7 @@ from ganlane.runtime import check_process, keep_freed_memory, open_closed_stream
 #: A command's function of config and run folder; it returns the last line to print, or None.
 Task = Callable[[Any, Path], str | None]
 #: Modules of the commands' functions, each named as its command, that are not in :mod:`ganlane.commands`.
-_ELSEWHERE = {"evaluate": "ganlane.compare", "realism": "ganlane.realism.output"}
+_ELSEWHERE = {"evaluate": "ganlane.compare"}
 
 
 def function_of(command: str) -> Callable[[Any, Path], str]:

@@ -8,9 +8,8 @@ whole recorded scenes. :func:`text_table` and :func:`paired_table` print, :func:
 Traffics are compared with recorded driving in :mod:`ganlane.realism`.
 """
 
-from ganlane.evaluation.episodes import run_episodes
+from ganlane.evaluation.episodes import Rollout, replay, roll_out, run_episodes
 from ganlane.evaluation.results import code_version, machine, machine_sentence, write_episodes, write_results
-from ganlane.evaluation.rollouts import Rollout, replay, roll_out
 from ganlane.evaluation.rows import (
     CrashesByScene,
     NormalizedScore,

@@ -57,7 +57,7 @@ def write_results(
     Args:
         folder: of the run.
         numbers: the command's own results, for instance ``{"rows": evaluation_rows(...)}``.
-        config: the whole configuration, plain or dataclasses.
+        config: the whole configuration.
         seeds: the seeds and episode numbers behind the numbers.
     """
     path = Path(folder) / "results.json"
@@ -121,10 +121,10 @@ def plain(value: Any) -> Any:
         return plain(asdict(value))
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, range)):
-        return [plain(item) for item in value]
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         return plain(value.tolist())
+    if isinstance(value, (list, tuple, set, range)):
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, (bool, int, str)) else str(value)
@@ -154,10 +154,11 @@ def _git(*arguments: str) -> str | None:
 
 def machine() -> dict[str, Any]:
     """CPU, usable cores, torch's threads, system, accelerator (or None), and the versions that ran."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    info = Path("/proc/cpuinfo")
+    named = re.search(r"^model name\s*:(.*)$", info.read_text(errors="replace") if info.is_file() else "", re.M)
     return {
-        "cpu": _cpu_name(),
-        "cores": usable,
+        "cpu": named[1].strip() if named else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
         "system": platform.platform(),
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -176,12 +177,3 @@ def machine_sentence(threads: Sequence[int]) -> str:
         f"{here['cpu']}, {usable}{accelerator}; Python {here['python']}, torch {here['torch']} (threads: "
         f"{', '.join(map(str, threads))}); ganlane {code['version']}{revision}."
     )
-
-
-def _cpu_name() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text(errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()

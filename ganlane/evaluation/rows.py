@@ -40,9 +40,8 @@ Row = dict[str, Any]
 def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
     """Rows of the ``evaluate`` command, in the order in which agents and traffics first appear.
 
-    Args:
-        episodes: what :func:`ganlane.evaluation.run_episodes` returns, with ``agent`` and ``traffic`` added,
-            for every pair, one below the other.
+    ``episodes`` are what :func:`ganlane.evaluation.run_episodes` returns, with ``agent`` and ``traffic`` added, for
+    every pair, one below the other.
 
     Returns:
         Per pair ``agent, traffic, episodes``; the counts ``goal, hard_crash, out_of_road, timeout,
@@ -117,10 +116,7 @@ def paired_lead(driver: pl.DataFrame, other: pl.DataFrame) -> tuple[Estimate | N
 
 
 def paired_rows(episodes: pl.DataFrame) -> list[Row]:
-    """The first driver against each of the others, traffic by traffic.
-
-    Args:
-        episodes: as for :func:`evaluation_rows`.
+    """The first driver against each of the others, traffic by traffic; ``episodes`` as for :func:`evaluation_rows`.
 
     Returns:
         Per traffic and other driver ``agent, over, traffic, episodes`` (driven by both), ``lead`` (mean return of
@@ -214,7 +210,7 @@ def crashes_by_scene(
     observations: whole scenes are resampled, and the ratio (all crashes over all km) is taken anew in each resample.
 
     Args:
-        episodes: ``reason`` and ``distance_m`` per episode (:func:`ganlane.evaluation.run_episodes`), of one driver.
+        episodes: ``reason`` and ``distance_m`` per episode, of one driver.
         scenes: the scene of each of them (:meth:`ganlane.traffic.ReplayTraffic.scenes_of_episodes`).
         resamples, seed: of the bootstrap.
 

@@ -135,32 +135,20 @@ def percent(share: float | None, digits: int = 0) -> str:
     return NOTHING if share is None else f"{100 * share:.{digits}f} %"
 
 
-def _plain(key: str) -> Callable[[Row], str]:
-    return lambda row: str(row.get(key, NOTHING))
-
-
-def _estimate(key: str, digits: int) -> Callable[[Row], str]:
-    return lambda row: with_interval(row, key, digits)
-
-
-#: Heading and cell of each column of an evaluation, names before numbers; ``run``: of a sweep.
-_COLUMNS: Mapping[str, Callable[[Row], str]] = {
-    "run": _plain("run"),
-    "agent": _plain("agent"),
-    "traffic": _plain("traffic"),
-    "episodes": _plain("episodes"),
-    "goal": _plain("goal"),
-    "hard": _plain("hard_crash"),
-    "soft": _plain("soft_crash"),
-    "off road": _plain("out_of_road"),
-    "time-out": _plain("timeout"),
-    "scene end": _plain("scene_end"),
-    "mean reward [95 %]": _estimate("mean_reward", 1),
-    "minus MOBIL, paired": _estimate("minus_mobil", 1),
-    "m/s": _estimate("mean_speed_mps", 1),
-    "changes/km": _estimate("lane_changes_per_km", 2),
-    "% of MOBIL [95 %]": _estimate("normalized_percent", 0),
-    "crashes/1000 km [95 %]": _estimate("crashes_per_1000_km", 1),
+#: Heading, key and digits of each column of an evaluation, names before numbers; ``run``: of a sweep.
+_COLUMNS: Mapping[str, tuple[str, int | None]] = {
+    **{name: (name, None) for name in ("run", "agent", "traffic", "episodes", "goal")},
+    "hard": ("hard_crash", None),
+    "soft": ("soft_crash", None),
+    "off road": ("out_of_road", None),
+    "time-out": ("timeout", None),
+    "scene end": ("scene_end", None),
+    "mean reward [95 %]": ("mean_reward", 1),
+    "minus MOBIL, paired": ("minus_mobil", 1),
+    "m/s": ("mean_speed_mps", 1),
+    "changes/km": ("lane_changes_per_km", 2),
+    "% of MOBIL [95 %]": ("normalized_percent", 0),
+    "crashes/1000 km [95 %]": ("crashes_per_1000_km", 1),
 }
 #: Columns that are left out where no row has anything in them.
 _OPTIONAL = ("run", "time-out", "scene end", "minus MOBIL, paired")
@@ -173,20 +161,18 @@ _FIRST_TO_GO = (
 
 def text_table(rows: Sequence[Row]) -> str:
     """The rows of :func:`ganlane.evaluation.evaluation_rows`, and a line for each reason why a score is missing."""
-    columns = {
-        heading: cell
-        for heading, cell in _COLUMNS.items()
-        if heading not in _OPTIONAL or any(cell(row) not in ("0", NOTHING) for row in rows)
+    cells = {
+        heading: [str(row.get(key, NOTHING)) if digits is None else with_interval(row, key, digits) for row in rows]
+        for heading, (key, digits) in _COLUMNS.items()
     }
+    cells = {name: column for name, column in cells.items() if name not in _OPTIONAL or {*column} - {"0", NOTHING}}
     reasons: dict[str, dict[str, None]] = {}
     for row in rows:
         reason = row.get("normalized_percent_reason")
         if reason is not None:
             reasons.setdefault(reason, {})[row["traffic"]] = None
     notes = [f"% of MOBIL on {', '.join(traffics)}: none, {reason}" for reason, traffics in reasons.items()]
-    table = aligned(
-        [list(columns), *([cell(row) for cell in columns.values()] for row in rows)], 2 + ("run" in columns)
-    )
+    table = aligned([list(cells), *map(list, zip(*cells.values()))], 2 + ("run" in cells))
     return "\n".join([table, *(["", *notes] if notes else [])])
 
 

@@ -17,14 +17,13 @@ driving. Long runs without an ego show what a traffic does over minutes.
 The modules, from the bottom up:
 
 - :mod:`~ganlane.realism.recordings`: recorded scenes as arrays.
-- :mod:`~ganlane.realism.measures`: what is measured of trajectories, and the distance of two distributions.
-- :mod:`~ganlane.realism.references`: the histograms that ship, and reference drivers.
-- :mod:`~ganlane.realism.replay_starts`: a traffic drives recorded scenes.
+- :mod:`~ganlane.realism.measures`: what is measured of trajectories, the distance of two distributions, and the
+  histograms that ship.
+- :mod:`~ganlane.realism.driving`: a traffic drives recorded scenes; reference drivers.
 - :mod:`~ganlane.realism.long_runs`: long runs, and the events in them.
 - :mod:`~ganlane.realism.starts`: every traffic from recorded or spawned starts, its desired speeds fitted, by folds
   where asked for.
-- :mod:`~ganlane.realism.card`: drives a card; its numbers and checks.
-- :mod:`~ganlane.realism.output`: tables, documents and figures.
+- :mod:`~ganlane.realism.card`: a card's numbers and checks, as tables and figures.
 """
 
 from functools import partial

@@ -1,62 +1,50 @@
-"""A card: every traffic driven from the command's configuration, its distances to the recordings, and checks."""
+"""A card: a traffic's distances to the recordings, and checks; as tables and figures."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from ganlane.build import make_road, make_traffic
-from ganlane.config.env import EnvConfig
-from ganlane.config.recordings import RealismConfig
-from ganlane.config.traffic import TrafficConfig
-from ganlane.data import data_folder, default_scenes, read_scenes
-from ganlane.errors import UserError
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ganlane.evaluation import code_version, machine
 from ganlane.evaluation.statistics import Array, Estimate, entries
-from ganlane.generator import HELD_OUT, Preset, shipped_generator
-from ganlane.parameters import assign
-from ganlane.realism.long_runs import LongRunParameters, long_run, totals
+from ganlane.evaluation.table import aligned, number, percent, with_interval
+from ganlane.realism.driving import FLOORS
+from ganlane.realism.long_runs import totals
 from ganlane.realism.measures import (
+    QUANTITIES,
     RESAMPLES,
     UNITS,
     Measured,
     ceiling,
     distance,
     distance_difference,
-    measure_recordings,
     pooled_distance,
 )
-from ganlane.realism.recordings import I80_FILES, read_i80
-from ganlane.realism.replay_starts import Factory, StartOptions
-from ganlane.realism.starts import (
-    FLOORS,
-    Fold,
-    Starts,
-    check_folds_cover,
-    fold_weights,
-    print_progress,
-    recorded_starts,
-    simulate_all,
-    spawned_starts,
+from ganlane.realism.starts import Starts
+from ganlane.view.figures import (
+    FAINT,
+    GRID,
+    INK,
+    STYLE,
+    FloatArray,
+    add_legend,
+    palette,
+    panel_grid,
+    plot_line,
+    save_figure,
 )
-from ganlane.sim.random import Stream
-from ganlane.sim.state import Road
-from ganlane.traffic import TrafficModule
-from ganlane.weights import load_weights
 
-#: Preset of the weights that a traffic drives with.
-PRESETS: Final[Mapping[str, Preset]] = {"gan": "paper", "gan_calibrated": "calibrated"}
-#: Quantities that one lane shows.
-I80_QUANTITIES: Final = ("speed", "acceleration", "time_headway")
 #: Quantities in which generated traffic should come closer to recordings than rules do.
 CLOSER_IN = ("speed_spread", "acceleration", "time_headway", "time_to_collision", "lane_change_duration")
-#: Largest relative error of an acceleration quantile; largest share of steps that a guard may alter.
-_QUANTILE_SHARE = 0.3
-_MOST_GUARD = 0.05
 
 
 @dataclass(frozen=True)
@@ -77,11 +65,6 @@ class Card:
     long_runs: Mapping[str, list[dict[str, Any]]]
     resamples: int
 
-    @property
-    def runs(self) -> list[dict[str, Any]]:
-        """The traffic's own long runs."""
-        return self.long_runs[self.traffic]
-
     @cached_property
     def quantities(self) -> dict[str, Any]:
         """Its rows, by quantity."""
@@ -91,28 +74,26 @@ class Card:
         """The content of ``results.json``."""
         starts, held_out = self.starts, self.starts.separately_held_out
         apart = card_rows(starts.restricted_to(held_out), self.traffic, self.resamples) if held_out else None
-        driving = {name: each.summary() for name, each in starts.driven.items()}
-        recorded, own = starts.recorded.summary(), driving[self.traffic]
-        rate, spread = starts.reference.rate(), starts.reference.spread_mps
-        checks = card_checks(
-            self.quantities, own["quantiles"], recorded["quantiles"], rate["per_vehicle_km_ci"], spread, self.runs
-        )
+        driving = {name: each.summary() for name, each in {"recorded": starts.recorded, **starts.driven}.items()}
+        own, recorded = (driving[name]["quantiles"] for name in (self.traffic, "recorded"))
+        runs, rate, spread = self.long_runs[self.traffic], starts.reference.rate(), starts.reference.spread_mps
+        checks = card_checks(self.quantities, own, recorded, rate["per_vehicle_km_ci"], spread, runs)
         return {
             "traffic": self.traffic,
             **starts.description(),
             "quantities": self.quantities,
             "quantities_held_out": apart,
-            "driving": {"recorded": recorded, **driving},
+            "driving": driving,
             "i80": self.site,
-            **totals(self.runs),
-            "long_runs": self.runs,
+            **totals(runs),
+            "long_runs": runs,
             "long_runs_against": {name: runs for name, runs in self.long_runs.items() if name != self.traffic},
             "checks": checks,
         }
 
 
 def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
-    """The rows of a traffic's card by quantity, compared with every other traffic from the same starts."""
+    """The rows of a traffic's card, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
     return quantity_rows(traffic, starts.driven, starts.recorded.counts, floors, starts.paired, resamples)
 
@@ -199,8 +180,8 @@ def card_checks(
             rivals.setdefault(other, {})[name] = row["verdict"]
     pairs = [(own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")]
     near = None
-    if not any(value is None for pair in pairs for value in pair):
-        near = all(abs(mine - theirs) <= _QUANTILE_SHARE * abs(theirs) for mine, theirs in pairs)
+    if all(None not in pair for pair in pairs):
+        near = all(abs(mine - theirs) <= 0.3 * abs(theirs) for mine, theirs in pairs)
     return {
         "compared_with": rivals,
         "acceleration_quantiles_within_30_percent": near,
@@ -222,139 +203,195 @@ def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, s
         "nobody_off_the_road": run["off_road"] == 0,
         "nobody_standing_in_free_flow": run["standstills_in_free_flow"] == 0,
         "spread_at_least_half_the_recorded": wide,
-        "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < _MOST_GUARD,
+        "guard_under_5_percent": None if run["guard_share"] is None else run["guard_share"] < 0.05,
     }
 
 
-def drive_card(config: RealismConfig, path: Path | None) -> Card:
-    """Drive the traffic and its rivals: from the same starts, on I-80, and in long runs.
+def card_text(numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """The card's tables: of the ``numbers`` in ``results.json``, and of the long runs of all traffics."""
+    traffic = numbers["traffic"]
+    tables = [quantities_table(numbers["quantities"], traffic)]
+    if numbers["quantities_held_out"] is not None:
+        tables.append(f"held-out scenes alone\n{quantities_table(numbers['quantities_held_out'], traffic)}")
+    tables.append(starts_table(numbers["driving"]))
+    tables += [f"I-80, {name}\n{quantities_table(rows, traffic)}" for name, rows in numbers["i80"].items()]
+    tables += [long_table(runs, name) for name, runs in long_runs.items() if runs]
+    return [*tables, checks_text(numbers["checks"])]
 
-    ``path`` is None where there are no recordings.
 
-    Raises:
-        UserError: recordings, weights or names that do not fit, or I-80 files that were asked for and are not there.
+def document_text(tables: Sequence[str], numbers: Mapping[str, Any], command: str, written: str) -> str:
+    """A card's section of a document: command, machine, starts, tables."""
+    here, code = machine(), code_version()
+    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    excess = ", ".join(f"{name} {value:g}" for name, value in numbers["desired_above_mps"].items())
+    paragraphs = [
+        f"Written by the command on {written}:\n\n    {command}",
+        f"Taken with Python {here['python']}, torch {here['torch']}, ganlane {code['version']}{revision}, from "
+        f"{numbers['starts']} starts: {', '.join(numbers['scenes']) or 'none recorded'}. Desired speeds above the "
+        f"speed at entry, mean, m/s: {excess or 'not fitted'}.",
+    ]
+    return "\n\n".join([*paragraphs, *(f"```text\n{table}\n```" for table in tables)])
+
+
+def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
+    """Distances, one quantity per line: the traffic, the scale, and each rival with the difference to it."""
+    others = list(next(iter(quantities.values()))["against"])
+    heading = ["distance to recorded", f"{short_name(traffic)} [95 %]", "ceiling", "constant v", "random"]
+    for other in others:
+        heading += [short_name(other), f"minus {short_name(other)} [95 %]", ""]
+    lines = [heading]
+    for name, row in quantities.items():
+        scale = (number(row[key]) for key in ("ceiling", "constant_velocity", "floor"))
+        line = [f"{name}, {row['unit']}", with_interval(row, "distance"), *scale]
+        for other in others:
+            rival = row["against"][other]
+            line += [number(rival["distance"]), with_interval(rival, "difference"), rival["verdict"]]
+        lines.append(line)
+    return aligned(lines)
+
+
+def starts_table(driving: Mapping[str, Any]) -> str:
+    """Lane changes and accelerations, one traffic per line, the recordings among them."""
+    lines = [["from the same starts", "changes per vehicle-km [95 %]", "vehicle-km", "acceleration 5 %, 95 %"]]
+    for name, row in driving.items():
+        tails = ", ".join(number(row["quantiles"]["acceleration"][level], 2) for level in ("0.05", "0.95"))
+        rate, km = with_interval(row, "per_vehicle_km", 2), number(row["vehicle_km"], 1)
+        lines.append([short_name(name), rate, km, tails])
+    return aligned(lines)
+
+
+def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
+    """The long runs of a traffic, one column each."""
+    cells = {
+        f"{short_name(traffic)}, long runs": [f"{run['vehicles']} vehicles" for run in runs],
+        "vehicle-km": [number(run["vehicle_km"], 0) for run in runs],
+        "changes per vehicle-km": [with_interval(run, "lane_changes_per_vehicle_km", 2) for run in runs],
+        "overlaps per 1000 vehicle-km": [with_interval(run, "overlaps_per_1000_vehicle_km", 2) for run in runs],
+        "off road": [str(run["off_road"]) for run in runs],
+        "standstills in free flow": [str(run["standstills_in_free_flow"]) for run in runs],
+    }
+    for time in runs[0]["speeds"]:
+        at = [run["speeds"][time] for run in runs]
+        speeds = [f"{number(each['mean_speed_mps'], 1)}, {number(each['spread_mps'], 2)}" for each in at]
+        cells[f"mean speed, spread after {time}, m/s"] = speeds
+    for level in runs[0]["acceleration_quantiles"]:
+        quantiles = [number(run["acceleration_quantiles"][level], 2) for run in runs]
+        cells[f"acceleration, {100 * float(level):g} % quantile"] = quantiles
+    shares = [run["guard_share"] for run in runs]
+    cells["the guard's share"] = ["none" if share is None else percent(share, 1) for share in shares]
+    return aligned([[name, *row] for name, row in cells.items()])
+
+
+def checks_text(checks: Mapping[str, Any]) -> str:
+    """The card's checks, a line each."""
+
+    def told(name: str, value: bool | None) -> str:
+        unknown = "no guard" if name == "guard_under_5_percent" else "unknown"
+        return f"{name.replace('_', ' ')}: {unknown if value is None else 'yes' if value else 'no'}"
+
+    near = "acceleration_quantiles_within_30_percent"
+    lines = [told(near, checks[near])]
+    for other, verdicts in checks["compared_with"].items():
+        lines.append(f"than {short_name(other)}: " + ", ".join(map(" ".join, verdicts.items())))
+    for run in checks["long_runs"]:
+        results = ", ".join(told(name, value) for name, value in run.items() if name != "vehicles")
+        lines.append(f"{run['vehicles']} vehicles: {results}")
+    return "\n".join(lines)
+
+
+def short_name(traffic: str) -> str:
+    """A traffic's name without the path that it is imported from."""
+    return traffic.rpartition(".")[2]
+
+
+@rc_context(STYLE)
+def draw_distributions(
+    recorded: Mapping[str, FloatArray], simulated: Mapping[str, Mapping[str, FloatArray]]
+) -> Figure:
+    """A panel per quantity: the recorded density, and each traffic's, from counts [bins] (none where all are 0)."""
+    figure, grid = panel_grid(len(recorded))
+    colours = {**palette(list(simulated)), "recorded": INK}
+    for axes, name in zip(grid, recorded):
+        bounds, unit = QUANTITIES[name].edges, UNITS[name].replace("s2", "s²").replace("s3", "s³")
+        axes.set(title=name.replace("_", " "), xlabel=unit, ylabel=f"density, per {unit}")
+        axes.set_xlim(bounds[0], bounds[-1])
+        for driver, counts in {**simulated, "recorded": recorded}.items():
+            if total := float(counts[name].sum()):
+                middle = 0.5 * (bounds[1:] + bounds[:-1])
+                density = counts[name] / total / np.diff(bounds)
+                plot_line(axes, middle, density, color=colours[driver])
+                # The bins at both ends hold all values beyond, too.
+                for end, mark in ((0, "<"), (-1, ">")):
+                    if counts[name][end]:
+                        axes.plot(middle[end], density[end], mark, color=colours[driver], clip_on=False)
+    beyond = Line2D([], [], color=FAINT, label="and all values beyond", marker=">", ls="")
+    add_legend(figure, {"recorded": INK, **colours}, [beyond])
+    return figure
+
+
+@rc_context(STYLE)
+def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
+    """The rows of :func:`ganlane.realism.card.quantity_rows`: a block per quantity, a line per traffic.
+
+    Vertical lines are the ends of the scale: recordings against each other, and random driving.
     """
-    factories, files, traffic = traffic_factories(config), i80_files_wanted(config, path), config.traffic.label()
-    starts = drive_from_starts(config, factories, path)
-    site = i80_cards(factories, files, starts.options, config.resamples)
-    far = factories if config.long_against else {traffic: factories[traffic]}
-    runs = {name: long_runs(config, name, make) for name, make in far.items()}
-    return Card(traffic, starts, site, runs, config.resamples)
+    others = list(next(iter(quantities.values()))["against"])
+    colours = palette([traffic, *others])
+    block = len(colours) + 1
+    figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
+    axes = figure.subplots()
+    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0), xlabel="Jensen-Shannon distance to recorded driving")
+    axes.set_yticks([block * (index + 0.5) for index in range(len(quantities))])
+    axes.set_yticklabels([name.replace("_", " ") for name in quantities], color=INK, size=9)
+    axes.tick_params("y", length=0)
+    axes.grid(False, axis="y")
+    for index, row in enumerate(quantities.values()):
+        top = block * index
+        axes.axhline(top, color=GRID, lw=0.8)
+        for mark, colour in (("ceiling", INK), ("floor", FAINT)):
+            if row[mark] is not None:
+                axes.vlines(row[mark], top + 0.3, top + block - 0.3, color=colour, lw=1.6)
+        for line, (driver, colour) in enumerate(colours.items()):
+            shown = row if driver == traffic else row["against"][driver]
+            if shown["distance"] is not None:
+                low, high = shown["distance_ci"] or (shown["distance"], shown["distance"])
+                axes.plot([low, high], [top + line + 1] * 2, color=colour)
+                axes.plot(shown["distance"], top + line + 1, "o", color=colour, ms=5)
+    ends = {"half against half": INK, "random": FAINT}
+    marks = [Line2D([], [], color=colour, label=name, marker="|", ls="", ms=10) for name, colour in ends.items()]
+    add_legend(figure, {short_name(name): colour for name, colour in colours.items()}, marks)
+    return figure
 
 
-def scenes_path(config: RealismConfig) -> Path | None:
-    """The recordings; None where none are named and none are found."""
-    if config.data.path:
-        return Path(config.data.path)
-    data_folder()  # a folder that was named must be there
-    try:
-        return default_scenes()
-    except UserError:
-        return None
+@rc_context(STYLE)
+def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
+    """Mean and spread of the speeds of long runs over time; the recorded mean spread within a frame as a level."""
+    figure, grid = panel_grid(2)
+    colours = palette([f"{run['vehicles']} vehicles" for run in runs])
+    for axes, (key, title) in zip(grid, {"mean_speed_mps": "mean speed", "spread_mps": "spread of speeds"}.items()):
+        axes.set(title=title, xlabel="time, s", ylabel="m/s")
+        for run, colour in zip(runs, colours.values()):
+            timed = [(float(time.split()[0]), at[key]) for time, at in run["speeds"].items() if time.endswith(" s")]
+            x, y = np.array(timed, dtype=np.float64).T  # None, where nobody was left to measure, becomes NaN
+            plot_line(axes, x, y, color=colour)
+    grid[1].axhline(spread_mps, color=INK)
+    add_legend(figure, {"recorded": INK, **colours})
+    return figure
 
 
-def traffic_factories(config: RealismConfig, weights: Mapping[str, Path] | None = None) -> dict[str, Factory]:
-    """Factories of traffic on a given road, by name: the card's traffic first, then its rivals.
-
-    ``weights`` of a fold, by preset, replace those that generated traffics name themselves; :class:`UserError` where
-    there are none of a preset.
-    """
-    every = {config.traffic.label(): config.traffic, **config.rivals()}
-    if weights is not None:
-        for name in [name for name in every if name in PRESETS]:
-            path = weights.get(PRESETS[name])
-            if path is None:
-                raise UserError(
-                    f"fold_weights: traffic {name} needs the preset {PRESETS[name]}, and a fold has no such file; "
-                    "give one for every fold."
-                )
-            every[name] = replace(every[name], path=str(path))  # type: ignore[call-arg]
-    return {name: _factory(traffic, config.env) for name, traffic in every.items()}
-
-
-def _factory(traffic: TrafficConfig, env: EnvConfig) -> Factory:
-    def make(road: Road) -> TrafficModule:
-        # A copy that is not checked again: a recorded road need not fit Table II's vehicles.
-        own = copy(env)
-        assign(own, lanes=int(road.lanes), lane_width_m=float(road.lane_width_m))
-        return make_traffic(traffic, own, Stream.REPORT)
-
-    return make
-
-
-def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
-    """The scenes that traffics start from: the held-out ones, all, or all by folds."""
-    if not config.fold_weights:
-        everywhere = config.scenes == "all"
-        # Nothing is held out of recordings that nothing is fitted to.
-        held_out = () if everywhere and not _fits(config, scenes) else config.data.held_out_scenes(scenes, HELD_OUT)
-        if not everywhere and not held_out:
-            raise UserError(
-                f"recordings of one scene, {', '.join(scenes)}: none is held out to start from; give scenes=all, or "
-                "cut it into several with ganlane prepare ... scene_s=30."
-            )
-        return [Fold(traffic_factories(config), scenes if everywhere else held_out, held_out)]
-    folds = fold_weights([Path(path) for path in config.fold_weights])
-    check_folds_cover(list(folds), scenes)
-    return [Fold(traffic_factories(config, weights), held_out, held_out) for held_out, weights in folds.items()]
-
-
-def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
-    """Whether anything is, or was, fitted to some of the ``scenes``, or the user says which were held out."""
-    if config.data.held_out is not None or config.desired_above_mps is None:
-        return True
-    used = {**config.rivals(), config.traffic.label(): config.traffic}
-    for name in PRESETS.keys() & used.keys():
-        path = getattr(used[name], "path", None) or shipped_generator(PRESETS[name])
-        data = load_weights(path, "generator")[1].get("data", {})
-        if set(scenes) & {*data.get("fitted", ()), *data.get("validation", ())}:
-            return True
-    return False
-
-
-def drive_from_starts(config: RealismConfig, factories: Mapping[str, Factory], path: Path | None) -> Starts:
-    """Drive every traffic from recorded scenes, or from spawned ones where there are none."""
-    if path is None:
-        spawn = config.env.spawn_parameters()
-        return spawned_starts(factories, make_road(config.env), spawn, config.repeats, config.seed)
-    frame = read_scenes(path)
-    folds = folds_of(config, sorted(frame["scene"].unique().to_list()))
-    fit, options = config.desired_above_mps is None, StartOptions(repeats=config.repeats, seed=config.seed)
-    if config.desired_above_mps is not None:
-        options = replace(options, desired_above_mps=config.desired_above_mps)
-    return recorded_starts(folds, frame, options, fit, str(path))
-
-
-def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
-    """The I-80 files next to the scenes that ``config`` asks for, by name."""
-    folder = None if config.i80 is False or path is None else path.parent
-    files = {name: folder / file for name, file in I80_FILES.items() if folder and (folder / file).is_file()}
-    if config.i80 and not files:
-        raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use i80=false.")
-    return files
-
-
-def i80_cards(
-    factories: Mapping[str, Factory], files: Mapping[str, Path], options: Mapping[str, StartOptions], resamples: int
-) -> dict[str, Any]:
-    """By I-80 file, the rows of the first of ``factories``; nothing is fitted to the site."""
-    cards, once = {}, {name: replace(each, repeats=1) for name, each in options.items()}
-    for name, path in files.items():
-        recordings = read_i80(name, path)
-        driven, measured = simulate_all(factories, recordings, once), measure_recordings(recordings)
-        recorded = {quantity: measured.counts[quantity] for quantity in I80_QUANTITIES}
-        cards[name] = quantity_rows(next(iter(factories)), driven, recorded, {}, resamples=resamples)
-    return cards
-
-
-def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str, Any]]:
-    """One long run of a traffic per number of vehicles."""
-    spawn, runs = config.env.spawn_parameters(), []
-    for vehicles in config.long_vehicles if config.vehicle_km > 0 else []:
-        parameters = LongRunParameters(vehicles, config.vehicle_km, config.long_s, config.seed, spawn)
-
-        def report(km: float, vehicles: int = vehicles) -> None:
-            print_progress(f"{name}, long run of {vehicles} vehicles: {km:.0f} of {config.vehicle_km:g} vehicle-km")
-
-        runs.append(long_run(make, make_road(config.env), parameters, report))
-    return runs
+def draw(card: Card, to: Path) -> list[Path]:
+    """The figures of a card, into the folder ``to``: distributions, distances, and drift if there are long runs."""
+    starts = card.starts
+    simulated = {
+        short_name(name): {quantity: counts.sum(0) for quantity, counts in driven.counts.items()}
+        for name, driven in starts.driven.items()
+        if name not in FLOORS
+    }
+    recorded = {name: counts.sum(0) for name, counts in starts.recorded.counts.items()}
+    figures = {
+        "distributions": draw_distributions(recorded, simulated),
+        "distances": draw_distances(card.quantities, card.traffic),
+    }
+    if runs := card.long_runs[card.traffic]:
+        figures["drift"] = draw_speeds_over_time(runs, starts.reference.spread_mps)
+    return [save_figure(figure, to / f"{name}.png") for name, figure in figures.items()]

@@ -19,7 +19,7 @@ from ganlane import keys
 from ganlane.data import lane_changes_of_arrays
 from ganlane.evaluation.statistics import entries, poisson_interval
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.realism.replay_starts import Factory, step_traffic
+from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.lanes import lateral_half_extent
 from ganlane.sim.neighbours import leader, perceive
@@ -31,8 +31,6 @@ from ganlane.traffic import Guard, TrafficModule
 #: Times at which speeds are summarised, s; and the distance of the goal, m.
 SPEEDS_AT_S = (10.0, 60.0, 150.0, 300.0)
 GOAL_M = 5000.0
-#: Levels of the acceleration's quantiles.
-QUANTILES = (0.05, 0.95)
 #: Events that are reported as plain counts.
 _EVENTS = ("off_road", "standstills_in_free_flow")
 #: Samples of one batch (times, rows, vehicles); bounds the memory.
@@ -43,8 +41,6 @@ EDGE_M: Final = 0.01
 #: A vehicle slower than this with a leader no nearer than that has stopped without reason, m/s and m.
 STANDING_MPS: Final = 1.0
 FREE_M: Final = 50.0
-#: Standstills are tested once in so many steps.
-_SECOND: Final = 10
 #: A guard intervenes where it alters more than this, m/s2 and m.
 ALTERED_ACCELERATION: Final = 0.1
 ALTERED_POSITION_M: Final = 0.02
@@ -96,11 +92,8 @@ class EventCounter:
     def __init__(self, road: Road) -> None:
         self.road = road
         self.overlaps = self.off_road = self.standstills = 0
-        self._before: dict[str, Tensor] = {}
-
-    def begin(self) -> None:
-        """Forget the last state: a new batch of episodes begins."""
-        self._before = {}
+        #: The last state; empty where a new batch of episodes begins.
+        self.before: dict[str, Tensor] = {}
 
     def count(self, vehicles: Vehicles, step: int) -> None:
         """Count the events of a physics step."""
@@ -110,15 +103,15 @@ class EventCounter:
         left, right = self.road.left_edge_m(), self.road.right_edge_m()
         outside = (others.y + half > left) | (others.y - half < right)
         self.off_road += self._onsets("off_road", outside & others.valid)
-        if step % _SECOND == _SECOND - 1:
+        if step % 10 == 9:  # once a second
             slow = (vehicles.speed < STANDING_MPS) & vehicles.valid
             ahead = leader(perceive(vehicles, self.road), self.road.lane_of(vehicles.y))
             self.standstills += self._onsets("standstill", (slow & (ahead.gap > FREE_M))[:, 1:])
 
     def _onsets(self, name: str, now: Tensor) -> int:
         """Number of entries that are true now and were not at the last count."""
-        before = self._before.get(name, torch.zeros_like(now))
-        self._before[name] = now
+        before = self.before.get(name, torch.zeros_like(now))
+        self.before[name] = now
         return int((now & ~before).sum())
 
 
@@ -126,8 +119,7 @@ class GuardMeter:
     """Counts, on the device, the vehicle-steps in which a guard alters acceleration or lateral position."""
 
     def __init__(self) -> None:
-        self._altered = torch.zeros((), dtype=torch.int64)
-        self._steps = torch.zeros((), dtype=torch.int64)
+        self._altered, self._steps = torch.zeros(2, dtype=torch.int64)
 
     def watch(self, traffic: TrafficModule) -> None:
         """Be called by every guard in ``traffic`` from now on."""
@@ -137,8 +129,7 @@ class GuardMeter:
 
     def __call__(self, before: Vehicles, moved: Vehicles, guarded: Vehicles) -> None:
         """Called by the guard at every step; index 0 is the ego's and does not count."""
-        wanted = (moved.speed - before.speed) / PHYSICS_STEP_S
-        given = (guarded.speed - before.speed) / PHYSICS_STEP_S
+        wanted, given = ((after.speed - before.speed) / PHYSICS_STEP_S for after in (moved, guarded))
         along = (given - wanted).abs() > ALTERED_ACCELERATION
         across = (guarded.y - moved.y).abs() > ALTERED_POSITION_M
         counts = before.valid.clone()
@@ -195,7 +186,9 @@ class LongRun:
             **rates(changes, events.overlaps, km),
             "off_road": events.off_road,
             "standstills_in_free_flow": events.standstills,
-            "acceleration_quantiles": {f"{level:g}": float(np.quantile(acceleration, level)) for level in QUANTILES},
+            "acceleration_quantiles": {
+                f"{level:g}": float(np.quantile(acceleration, level)) for level in (0.05, 0.95)
+            },
             "speeds": {
                 name: _mean_speeds([row for part in parts for row in part["speeds"][name]], name.endswith(" m"))
                 for name in parts[0]["speeds"]
@@ -247,7 +240,7 @@ def drive_spawned(
     memory = traffic.init_memory(state, absorb(key, 0))
     snapshots, start = [_snapshot(state)], state.x
     sizes = (state.length[:, 1:].numpy(), state.width[:, 1:].numpy())
-    events.begin()
+    events.before.clear()
     for step in range(round(parameters.most_s / PHYSICS_STEP_S)):
         state, memory = step_traffic(traffic, state, memory, counters, step)
         events.count(state, step)

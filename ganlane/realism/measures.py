@@ -7,8 +7,10 @@ the start everything looks real.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,9 +18,14 @@ import polars as pl
 from scipy.special import stdtrit
 
 from ganlane.data import FRAME_S, TRACK, Bins, find_lane_changes, leader_gaps, tracks_of_frame
+from ganlane.errors import UserError
 from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, entries, poisson_interval, resample_counts
+from ganlane.files import CHECKPOINTS, PLACE, has_checksum, note_without_checksum, write_json
 from ganlane.realism.recordings import Recording, recorded_frame, units_of
 
+#: Recorded driving as histograms, which ships; it holds derived numbers, never an excerpt of a recording.
+SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"
+_KIND = "ganlane realism reference"
 RESAMPLES = 2_000
 #: Random halves of the recordings that the ceiling is the mean of.
 SPLITS = 200
@@ -195,10 +202,7 @@ def measure_recordings(recordings: Sequence[Recording]) -> Measured:
 
 
 def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
-    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them, sorted by track.
-
-    ``units`` are what the bootstrap resamples, in the order of the rows of ``counts``.
-    """
+    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them; ``units`` are the rows."""
     motion = _motion(frame)
     own = motion.filter(pl.col("counts"))
     near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)
@@ -267,3 +271,85 @@ def _lane_changes(motion: pl.DataFrame) -> pl.DataFrame:
     changes = find_lane_changes(tracks_of_frame(motion, widths))
     rows = motion[changes.sample].select("unit", "counts").with_columns(value=pl.Series(changes.duration_s))
     return rows.filter(pl.col("counts")).select("unit", "value")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Recorded driving as histograms and rates.
+
+    Attributes:
+        source: where it was recorded.
+        units: names of the scenes.
+        counts: by quantity, [units, bins].
+        quantiles: by quantity, by level as text.
+        lane_changes, vehicle_km: from 3 s after each vehicle's first frame.
+        whole: lane changes and vehicle-km of all frames, and ``speed_spread_mps``; long runs are compared with these.
+        floors: by driver (``random``, ``constant_velocity``), by quantity: its distance from here.
+    """
+
+    source: str
+    units: list[str]
+    counts: Mapping[str, Array]
+    quantiles: Mapping[str, Mapping[str, float | None]]
+    lane_changes: int
+    vehicle_km: float
+    whole: Mapping[str, float]
+    floors: Mapping[str, Mapping[str, float]]
+
+    @classmethod
+    def of(cls, measured: Measured, units: Sequence[str], whole: Mapping[str, float], source: str) -> Reference:
+        """The reference that measured recordings give, without floors."""
+        changes, km = measured.lane_changes, measured.vehicle_km
+        return cls(source, list(units), measured.counts, measured.quantiles(), changes, km, whole, floors={})
+
+    def summary(self) -> dict[str, Any]:
+        """As :meth:`Measured.summary`."""
+        return {**lane_change_rate(self.lane_changes, self.vehicle_km), "quantiles": self.quantiles}
+
+    @property
+    def spread_mps(self) -> float:
+        """Recorded spread of speeds within a frame, its mean over the frames, m/s."""
+        return self.whole["speed_spread_mps"]
+
+    def rate(self) -> dict[str, Any]:
+        """Lane changes per vehicle-km of the whole recording, with its exact interval."""
+        return lane_change_rate(int(self.whole["lane_changes"]), self.whole["vehicle_km"])
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, atomically."""
+        ceilings = {quantity: ceiling(counts) for quantity, counts in self.counts.items()}
+        plain = {**vars(self), "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()}}
+        write_json(path, {"kind": _KIND, "checksum": PLACE, "bins": _bins(), "ceilings": ceilings, **plain})
+
+    @classmethod
+    def load(cls, path: Path) -> Reference:
+        """What :meth:`save` wrote.
+
+        Raises:
+            UserError: no such file, a damaged one, another file, or one with other bins.
+        """
+        try:
+            content = path.read_bytes()
+            whole = has_checksum(content, path)
+            numbers = json.loads(content)
+            if numbers.pop("kind") != _KIND:
+                raise ValueError("another kind of file")
+            if numbers.pop("bins") != _bins():
+                raise ValueError("its histograms have other bins")
+            for derived in ("ceilings", "checksum"):
+                numbers.pop(derived, None)
+            counts = {name: np.asarray(value, dtype=np.float64) for name, value in numbers.pop("counts").items()}
+            reference = cls(counts=counts, **numbers)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise UserError(
+                f"{path}: not the histograms of recorded driving that the realism card needs ({error}); give the "
+                "recordings with data.path=FILE."
+            ) from error
+        if not whole:
+            note_without_checksum(path)
+        return reference
+
+
+def _bins() -> dict[str, list[float]]:
+    """Low edge, high edge and number of the bins, by quantity."""
+    return {name: [bins.low, bins.high, bins.number] for name, bins in QUANTITIES.items()}

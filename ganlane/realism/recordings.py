@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
@@ -67,10 +67,7 @@ class Recording:
 
 
 def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:
-    """The scenes of a frame in the schema, whose tracks have no gaps, in the order of their names.
-
-    ``lane_widths`` are in m, by scene.
-    """
+    """The scenes of a frame in the schema, whose tracks have no gaps, by name; ``lane_widths`` are in m."""
     made = []
     for name in sorted(frame["scene"].unique().to_list()):
         rows = frame.filter(pl.col("scene") == name).with_columns(driven=pl.lit(True))
@@ -83,18 +80,13 @@ def _recording(name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lan
     """The recording of ``rows`` [R], of which ``track`` [R] gives the index of each one's track."""
     time = rows["frame"].to_numpy() - rows["frame"].to_numpy().min()
     shape = (int(time.max()) + 1, int(track.max()) + 1)
-
-    def dense(field: str) -> Floats:
-        values = np.zeros(shape)
-        values[time, track] = rows[field].to_numpy()
-        return values
-
-    present, driven = np.zeros(shape, dtype=bool), np.zeros(shape[1], dtype=bool)
-    length, width = np.zeros(shape[1]), np.zeros(shape[1])
-    present[time, track], driven[track] = True, rows["driven"].to_numpy()
-    length[track], width[track] = rows["length"].to_numpy(), rows["width"].to_numpy()
-    x, y, speed = (dense(field) for field in ("x", "y", "speed"))
-    return Recording(name, name, lanes, lane_width_m, x, y, speed, present, length, width, driven)
+    made: dict[str, Any] = {field: np.zeros(shape) for field in ("x", "y", "speed")}
+    made |= {"length": np.zeros(shape[1]), "width": np.zeros(shape[1]), "driven": np.zeros(shape[1], dtype=bool)}
+    for field, values in made.items():
+        values[(time, track) if values.ndim == 2 else track] = rows[field].to_numpy()
+    present = np.zeros(shape, dtype=bool)
+    present[time, track] = True
+    return Recording(name, name, lanes, lane_width_m, present=present, **made)
 
 
 def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: str) -> pl.DataFrame:
@@ -140,8 +132,7 @@ def segments(recording: Recording, seconds: float, skip_s: float = 0.0) -> list[
         who = recording.present[rows].any(0)
         dense = {field: getattr(recording, field)[rows][:, who] for field in ("x", "y", "speed", "present")}
         flat = {field: getattr(recording, field)[who] for field in ("length", "width", "driven")}
-        name = f"{recording.name}@{start}"
-        pieces.append(Recording(name, recording.unit, recording.lanes, recording.lane_width_m, **dense, **flat))
+        pieces.append(replace(recording, name=f"{recording.name}@{start}", **dense, **flat))
     return pieces
 
 
@@ -179,14 +170,8 @@ def _following(path: Path) -> list[Recording]:
     table = read_table(path, kinds | dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64))
 
     def car(role: str, length: pl.Expr) -> pl.DataFrame:
-        return table.select(
-            *whose,
-            "frame",
-            vehicle=pl.col(role),
-            x=pl.col(f"x_{role}") - 0.5 * length,
-            length=length,
-            driven=pl.lit(role == "follower"),
-        )
+        x, driven = pl.col(f"x_{role}") - 0.5 * length, pl.lit(role == "follower")
+        return table.select(*whose, "frame", vehicle=pl.col(role), x=x, length=length, driven=driven)
 
     cars = pl.concat([car("follower", pl.lit(_LENGTH_M)), car("leader", pl.col("leader_length"))])
     return _pair_segments("", cars.group_by(whose, maintain_order=True))

@@ -18,21 +18,24 @@ import polars as pl
 
 from ganlane.data import FRAME_S, driving_statistics, scene_lane_widths
 from ganlane.errors import UserError
+from ganlane.realism.driving import FLOORS, Factory, StartOptions, drive_recordings
 from ganlane.realism.long_runs import EventCounter, LongRunParameters, drive_spawned
-from ganlane.realism.measures import QUANTITIES, Measured, measure, measure_recordings, pooled_distance
+from ganlane.realism.measures import (
+    QUANTITIES,
+    SHIPPED_REFERENCE,
+    Measured,
+    Reference,
+    measure,
+    measure_recordings,
+    pooled_distance,
+)
 from ganlane.realism.recordings import SHORTEST_S, Recording, recorded_frame, recordings_of, units_of
-from ganlane.realism.references import SHIPPED_REFERENCE, ConstantVelocity, RandomDriving, Reference
-from ganlane.realism.replay_starts import Factory, StartOptions, drive_recordings
 from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.state import Road
 from ganlane.weights import load_weights
 
-#: Reference drivers at the ends of the scale.
-FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}
 #: Candidates for the mean excess of desired speeds over the speed at entry, m/s.
 EXCESS_GRID = (2.0, 4.0, 6.0, 8.0, 11.0, 15.0, 20.0)
-#: Quantities by which the excess is chosen: all that need no lane change.
-FITTED_BY = tuple(name for name in QUANTITIES if name != "lane_change_duration")
 #: Spawned starts: vehicles of an episode, its seconds, and episodes per repeat.
 _SPAWNED_VEHICLES, _SPAWNED_S, _SPAWNED_ROWS = 30, 30.0, 8
 
@@ -63,14 +66,15 @@ def fit_excess(
 ) -> float:
     """The mean excess of desired speeds, of ``grid``, at which a traffic is nearest to ``recordings``, m/s.
 
-    Nearest by the mean distance over :data:`FITTED_BY`. Every traffic is fitted, so that none suffers from desired
-    speeds chosen for another.
+    Nearest by the mean distance over all quantities that need no lane change. Every traffic is fitted, so that none
+    suffers from desired speeds chosen for another.
     """
     recorded = measure_recordings(recordings)
 
     def mean_distance(excess: float) -> float:
         driven = simulate(make, recordings, replace(options, desired_above_mps=excess, repeats=1))
-        values = [pooled_distance(driven.counts[name], recorded.counts[name]) for name in FITTED_BY]
+        fitted_by = [name for name in QUANTITIES if name != "lane_change_duration"]
+        values = [pooled_distance(driven.counts[name], recorded.counts[name]) for name in fitted_by]
         return float(np.nanmean(values))
 
     return min(grid, key=mean_distance)
@@ -190,12 +194,9 @@ def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> 
 def recorded_starts(
     folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str
 ) -> Starts:
-    """Drive every traffic from recorded scenes; those that are too short are skipped.
+    """Drive every traffic from recorded scenes (``frame``, in the schema); those that are too short are skipped.
 
-    Args:
-        frame: the recordings, in the schema.
-        fit: whether to fit every traffic's desired speeds on a fold's other scenes, or take those of ``options``.
-        source: of the recordings.
+    ``fit``: every traffic's desired speeds, on a fold's other scenes; else they are those of ``options``.
 
     Raises:
         UserError: a fold names an unknown scene, or no scene is long enough.

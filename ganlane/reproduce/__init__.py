@@ -9,8 +9,8 @@ Writes results.json, report.html, crashes.json (for ``ganlane render crashes=FIL
 behind each into its run folder. What was driven stays in ``cells``: a command that was stopped goes on where it was,
 and one with other drivers drives those alone.
 
-The modules: :mod:`~ganlane.reproduce.matrix` drives, :mod:`~ganlane.reproduce.numbers` computes,
-:mod:`~ganlane.reproduce.figures` draws the paper's Figures 2 and 3, :mod:`~ganlane.reproduce.report` writes.
+:mod:`ganlane.compare` drives, :mod:`~ganlane.reproduce.report` computes and writes,
+:mod:`~ganlane.reproduce.figures` draws, :mod:`~ganlane.reproduce.crashes` lists crashes and drives them again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,10 @@
-"""The paper's Figures 2 and 3: what the trajectory generator predicts, and an episode among generated drivers."""
+"""The matrix drawn, and the paper's figures: forecasts (2), an episode among generated drivers (3), transfer (4)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +13,9 @@ import polars as pl
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import EngFormatter, NullLocator
 from matplotlib.transforms import Affine2D
 
 from ganlane.agents.checkpoint import with_seeds
@@ -22,16 +26,10 @@ from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.generator.forecasts import paper_forecasts
-from ganlane.generator.windows import (
-    OBSERVED_POSITIONS,
-    PRESENT,
-    Windows,
-    cut_windows,
-    group_windows,
-    scene_tracks,
-)
+from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, Windows, cut_windows, group_windows, scene_tracks
+from ganlane.reproduce.report import Row, rows_of
 from ganlane.sim.random import Stream
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid
+from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid, read_metrics
 from ganlane.view.record import EpisodeLabel, Trajectory, record_episode
 
 #: Panels of Figure 2 by what the vehicle does, and samples drawn in each.
@@ -221,3 +219,94 @@ def _draw_body(axes: Axes, at: dict[str, float], **style: Any) -> None:
     length, width = at["length_m"], at["width_m"]
     turned = Affine2D().rotate(at["heading_rad"]).translate(at["x_m"], at["y_m"]) + axes.transData
     axes.add_patch(Rectangle((-length / 2.0, -width / 2.0), length, width, lw=0, transform=turned, **style))
+
+
+#: Ticks of the leads: linear up to 20, logarithmic beyond.
+_LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
+
+
+@rc_context(STYLE)
+def draw_matrix(rows: Sequence[Row]) -> Figure:
+    """Lead over MOBIL, one panel per traffic: the interval over trainings and episodes, a dot for each training."""
+    drawn = [row for row in rows if row["minus_mobil"] is not None]
+    drivers = list(dict.fromkeys(row["driver"] for row in drawn))
+    traffics = list(dict.fromkeys(row["traffic"] for row in drawn))
+    mobil = {row["traffic"]: row["mean_reward"] for row in rows if row["driver"] == "mobil"}
+    bounds = [bound for row in drawn for bound in row["minus_mobil_ci"] or (row["minus_mobil"],)]
+    lowest, highest = min(-20.0, *bounds), max(20.0, *bounds)
+    figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
+    for place, (axes, traffic) in enumerate(zip(grid, traffics)):
+        axes.axvline(0.0, color=FAINT, lw=0.9)
+        axes.set(title=traffic, xlabel="mean reward minus MOBIL's", ylim=(len(drivers) - 0.5, -0.5))
+        axes.set_xscale("symlog", linthresh=20.0)
+        axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
+        axes.set_xticks([x for x in _LEADS if lowest <= x <= highest], minor=False)
+        axes.set_xlim(1.15 * lowest, 1.15 * highest)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
+        for row in drawn:
+            if row["traffic"] == traffic:
+                line, trained = drivers.index(row["driver"]), len(row["each"]) > 1
+                colour = COLOURS[0] if trained else INK
+                low, high = row["minus_mobil_ci"] or (row["minus_mobil"],) * 2
+                axes.plot([low, high], [line, line], color=colour, lw=2.2, solid_capstyle="butt")
+                axes.plot(row["minus_mobil"], line, "o", color=colour)
+                each = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
+                if trained:
+                    axes.plot(each, [line] * len(each), "|", color=COLOURS[1], ms=6, mew=1)
+    one = Line2D([], [], color=COLOURS[1], marker="|", ls="", ms=6, label="one training")
+    names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
+    add_legend(figure, names, [one])
+    return figure
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Learning curves over the decisions: both phases, one line per run, and what the agent earned at the switch."""
+
+    runs: Mapping[str, pl.DataFrame]
+    switch: float
+    at_switch: Sequence[float]
+
+
+def read_transfers(folders: Sequence[str], rows: Sequence[Row]) -> Transfer | None:
+    """The evaluations of training runs with two phases; None without any run.
+
+    Raises:
+        UserError: a folder without evaluations of both phases.
+    """
+    runs: dict[str, pl.DataFrame] = {}
+    switch = 0.0
+    for folder in map(Path, folders):
+        first, second = (
+            read_metrics(part / "evaluation.csv").select("decisions", "mean_reward")
+            for part in (folder / "pretrain", folder)
+        )
+        switch = max(switch, float(first["decisions"][-1]))
+        later = second.with_columns(pl.col("decisions") + first["decisions"][-1])
+        phases = [first.with_columns(phase=pl.lit("first")), later.with_columns(phase=pl.lit("second"))]
+        runs[folder.name] = pl.concat(phases, how="vertical_relaxed")
+    ours = rows_of(rows, ["gan"], ["agent_idm"])
+    return Transfer(runs, switch, [each["mean_reward"] for row in ours for each in row["each"]]) if runs else None
+
+
+@rc_context(STYLE)
+def draw_transfer(transfer: Transfer) -> Figure:
+    """Figure 4: every run, their median, and the range between them; the switch of the traffic is marked."""
+    figure = Figure(figsize=(7.0, 3.4))
+    axes = figure.subplots()
+    axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
+    axes.xaxis.set_major_formatter(EngFormatter())
+    for phase, colour in zip(("first", "second"), COLOURS):
+        lines = [frame.filter(pl.col("phase") == phase) for frame in transfer.runs.values()]
+        x = lines[0]["decisions"].cast(pl.Float64).to_numpy()
+        y = np.stack([np.interp(x, line["decisions"].to_numpy(), line["mean_reward"].to_numpy()) for line in lines])
+        axes.fill_between(x, y.min(axis=0), y.max(axis=0), color=colour, alpha=0.2, lw=0)
+        axes.plot(x, np.median(y, axis=0), color=colour)
+        for line in lines if len(lines) > 1 else []:
+            axes.plot(line["decisions"], line["mean_reward"], color=colour, lw=0.5, alpha=0.6)
+    axes.axvline(transfer.switch, color=FAINT, ls=":")
+    if transfer.at_switch:
+        axes.plot([transfer.switch] * len(transfer.at_switch), transfer.at_switch, "x", color=COLOURS[1])
+    add_legend(figure, {"on idm_mobil": COLOURS[0], "on gan (x: before any training there)": COLOURS[1]})
+    return figure

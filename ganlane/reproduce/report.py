@@ -1,26 +1,43 @@
-"""Tables beside the paper's, figures, and all of it in one page that needs no network."""
+"""The report: a row for each recipe on each traffic, drivers compared, tables beside the paper's, and a page."""
 
 from __future__ import annotations
 
 import html
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
-from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, NullLocator
 
+from ganlane.errors import UserError
+from ganlane.evaluation.rows import FAILURES, SCALE_BOTTOM, SCALE_TOP
+from ganlane.evaluation.statistics import (
+    Array,
+    Estimate,
+    clopper_pearson,
+    difference,
+    entries,
+    interquartile_mean,
+    mcnemar,
+    normalized_over_trainings,
+    over_trainings,
+    probability_of_improvement,
+    rate_over_trainings,
+)
 from ganlane.evaluation.table import NOTHING, Table, number, with_interval
 from ganlane.files import write_bytes
-from ganlane.reproduce.numbers import Row
-from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid, read_metrics, save_figure
+from ganlane.view.figures import save_figure
 
+Row = dict[str, Any]
+#: Recipe and traffic to the episodes of each training, by driver's name.
+Cells = Mapping[tuple[str, str], Mapping[str, pl.DataFrame]]
+#: Rates per 1000 km by name: the ends that they count.
+_RATES = {"crashes": FAILURES[:1], "departures": FAILURES[1:], "failures": FAILURES}
 #: The paper's Table VI: hard and soft crashes on Traffic_IDM, of an unstated number of runs.
 PAPER_VI = {"agent_idm": (19, 2), "agent_gan": (9, 0)}
 #: The paper's Table VII: % of MOBIL, mean reward and its standard deviation on Traffic_GAN, 1000 runs.
@@ -33,8 +50,141 @@ _CSS = (
 )
 
 
-def _plain(row: Row, driver: str) -> bool:
-    return row["driver"] in (driver, f"{driver}+none")
+def recipe_of(driver: str) -> str:
+    """``agent_idm+safe`` of ``agent_idm@3+safe`` and of ``FOLDER/agent_idm.safetensors@3+safe``."""
+    packed = re.fullmatch(r"(?:.*/)?(.+?)(?:\.safetensors)?@\d+(\+.*)?", driver)
+    return driver if packed is None else packed[1] + (packed[2] or "")
+
+
+def seed_of(driver: str) -> int:
+    """3 of ``agent_idm@3+safe``; 0 where no seed is named: ``agent_idm`` is ``agent_idm@0``."""
+    named = re.search(r"@(\d+)(?:\+|$)", driver)
+    return int(named[1]) if named else 0
+
+
+def by_recipe(episodes: pl.DataFrame) -> dict[tuple[str, str], dict[str, pl.DataFrame]]:
+    """The episodes of the matrix by recipe and traffic, in the order in which they first appear."""
+    cells: dict[tuple[str, str], dict[str, pl.DataFrame]] = {}
+    for (driver, traffic), frame in episodes.group_by("agent", "traffic", maintain_order=True):
+        recipe = recipe_of(str(driver))
+        there = cells.setdefault((recipe, str(traffic)), {})
+        there[str(driver)] = frame.sort("episode")
+        if len({seed_of(name) for name in there}) < len(there):
+            raise UserError(f"agents: two of one seed are called {recipe} ({', '.join(there)}); leave one out.")
+    return cells
+
+
+def column(trainings: Mapping[str, pl.DataFrame], value: str | pl.Expr) -> Array:
+    """A column of each training as a table [S, E]."""
+    return np.stack([frame.select(value).to_series().cast(pl.Float64).to_numpy() for frame in trainings.values()])
+
+
+def _ended(reasons: Sequence[str]) -> pl.Expr:
+    return pl.col("reason").is_in(list(reasons))
+
+
+def rows(cells: Cells) -> list[Row]:
+    """One row per recipe and traffic.
+
+    Returns:
+        Per row ``driver, traffic, trainings`` S, ``episodes`` E of each; ``mean_reward``, ``interquartile_mean`` (of
+        the trainings' mean rewards) and ``reward_sd`` (over all episodes); ``minus_mobil`` and
+        ``probability_above_mobil`` (None for MOBIL, the latter for a single training, too); ``normalized_percent``;
+        ``hard_crash``, ``soft_crash`` (episodes with one) and ``out_of_road`` of all trainings together;
+        ``hard_crash_share`` (exact interval of all episodes, as if they were independent); ``crashes``,
+        ``departures`` and ``failures`` (both) ``_per_1000_km``; ``mean_speed_mps, lane_changes_per_km,
+        soft_crash_behind_per_episode``; ``at_fault_share`` of the hard crashes (None without any); and ``each``, mean
+        reward, lead over MOBIL and failures of every training. A key with ``_ci`` holds the 95 % interval of its
+        namesake over trainings and episodes.
+    """
+    return [_row(recipe, traffic, trainings, cells) for (recipe, traffic), trainings in cells.items()]
+
+
+def _row(recipe: str, traffic: str, trainings: Mapping[str, pl.DataFrame], cells: Cells) -> Row:
+    rewards, km = column(trainings, "reward"), column(trainings, pl.col("distance_m") / 1000.0)
+    mobil, random_legal = (cells.get((name, traffic)) for name in (SCALE_TOP, SCALE_BOTTOM))
+    above = None if mobil is None or recipe == SCALE_TOP else column(mobil, "reward")
+    together = pl.concat(trainings.values())
+    crashes = together.filter(_ended(FAILURES[:1]))
+    seconds, driven = float(together["duration_s"].sum()), float(km.sum())
+    score = None
+    if mobil is not None and random_legal is not None:
+        score = normalized_over_trainings(rewards, column(mobil, "reward"), column(random_legal, "reward"))
+    row: Row = {"driver": recipe, "traffic": traffic, "trainings": len(rewards), "episodes": rewards.shape[1]}
+    row |= entries("mean_reward", over_trainings(rewards))
+    row |= entries("interquartile_mean", over_trainings(rewards, interquartile_mean))
+    row["reward_sd"] = float(rewards.std(ddof=1))
+    row |= entries("minus_mobil", None if above is None else difference(rewards, above))
+    row |= entries("probability_above_mobil", None if above is None else _probability(rewards, above))
+    row |= entries("normalized_percent", score)
+    row |= {end: together.filter(_ended([end])).height for end in FAILURES}
+    row["soft_crash"] = int(together["had_soft_crash"].sum())
+    row |= entries("hard_crash_share", clopper_pearson(crashes.height, together.height))
+    for name, ends in _RATES.items():
+        rate = rate_over_trainings(column(trainings, _ended(ends)), km)
+        row |= entries(f"{name}_per_1000_km", None if rate is None else rate.scaled(1000.0))
+    row["mean_speed_mps"] = 1000.0 * driven / seconds if seconds > 0.0 else None
+    row["lane_changes_per_km"] = int(together["lane_changes"].sum()) / driven if driven > 0.0 else None
+    row["soft_crash_behind_per_episode"] = together["soft_crash_behind"].mean()
+    row["at_fault_share"] = crashes["at_fault"].mean() if "at_fault" in crashes.columns else None
+    row["each"] = []
+    for (name, frame), own in zip(trainings.items(), rewards[:, None]):
+        counts = {end: frame.filter(_ended([end])).height for end in FAILURES}
+        lead = entries("minus_mobil", None if above is None else difference(own, above))
+        row["each"].append({"driver": name, **entries("mean_reward", over_trainings(own)), **lead, **counts})
+    return row
+
+
+def comparisons(cells: Cells, pairs: Sequence[tuple[str, str]]) -> list[Row]:
+    """Recipes compared on every traffic that both drove on.
+
+    Returns:
+        Per pair and traffic ``driver, over, traffic, lead`` (difference of mean rewards), ``probability`` (that a
+        training of the first is above one of the second), ``crash_difference_per_1000_episodes``, and ``mcnemar``:
+        for each training of the first that has a namesake of the second (same seed, or the only one) the episodes
+        in which one alone crashed, and the exact probability.
+    """
+    found = []
+    traffics = dict.fromkeys(traffic for _, traffic in cells)
+    for one, other in pairs:
+        for traffic in traffics:
+            first, second = cells.get((one, traffic)), cells.get((other, traffic))
+            if first is None or second is None:
+                continue
+            a, b = column(first, "reward"), column(second, "reward")
+            hit, struck = (column(each, _ended(FAILURES[:1])) for each in (first, second))
+            row: Row = {"driver": one, "over": other, "traffic": traffic}
+            row |= entries("lead", difference(a, b)) | entries("probability", _probability(a, b))
+            row |= entries("crash_difference_per_1000_episodes", _crash_difference(hit, struck).scaled(1000.0))
+            theirs = {seed_of(name): crashed > 0 for name, crashed in zip(second, struck)}
+            if len(theirs) == 1:
+                theirs = dict.fromkeys(map(seed_of, first), struck[0] > 0)
+            row["mcnemar"] = [
+                {"driver": name, **vars(mcnemar(crashed > 0, theirs[seed_of(name)]))}
+                for name, crashed in zip(first, hit)
+                if seed_of(name) in theirs
+            ]
+            found.append(row)
+    return found
+
+
+def _crash_difference(first: Array, second: Array) -> Estimate:
+    """Difference of the shares of episodes with a crash. Where there is none, resampling would leave no doubt."""
+    if first.any() or second.any():
+        return difference(first, second)
+    most = clopper_pearson(0, first.shape[1]).high or 0.0
+    return Estimate(0.0, -most, most)
+
+
+def _probability(first: Array, second: Array) -> Estimate | None:
+    """None where neither has a second training: it says nothing then."""
+    return probability_of_improvement(first, second) if len(first) + len(second) > 2 else None
+
+
+def rows_of(rows: Sequence[Row], traffics: Sequence[str], drivers: Sequence[str]) -> list[Row]:
+    """The rows of ``drivers``, which may say that they have no mask, on ``traffics``."""
+    names = {name for driver in drivers for name in (driver, f"{driver}+none")}
+    return [row for row in rows if row["traffic"] in traffics and row["driver"] in names]
 
 
 def _cell(key: str, digits: int) -> Callable[[Row], str]:
@@ -68,10 +218,7 @@ def table_vi(rows: Sequence[Row]) -> Table:
         "share of hard [95 %, exact]": _cell("hard_crash_share", 4),
         "each training": lambda row: ", ".join(str(each["hard_crash"]) for each in row["each"]),
     }
-    drivers = (*PAPER_VI, "mobil")
-    ours = [
-        row for row in rows if row["traffic"] in ("idm", "idm_mobil") and any(_plain(row, name) for name in drivers)
-    ]
+    ours = rows_of(rows, ["idm", "idm_mobil"], [*PAPER_VI, "mobil"])
     here = Table.of("Table VI: crashes on rule-driven traffic", ours, columns, names=3)
     paper = [
         ["paper", "Traffic_IDM", name, "not stated", *map(str, counts), "", ""] for name, counts in PAPER_VI.items()
@@ -93,8 +240,7 @@ def table_vii(rows: Sequence[Row]) -> Table:
         "% of MOBIL is 100 (R - R_random) / (R_MOBIL - R_random): 0 for random legal driving, 100 for MOBIL; the "
         "paper does not define its own."
     )
-    drivers = (*PAPER_VII, "mobil", "random_legal")
-    ours = [row for row in rows if row["traffic"] == "gan" and any(_plain(row, name) for name in drivers)]
+    ours = rows_of(rows, ["gan"], [*PAPER_VII, "mobil", "random_legal"])
     here = Table.of("Table VII: performance on generated traffic", ours, columns, names=3, notes=[note])
     paper = [
         ["paper", "Traffic_GAN", name, "1000", *(f"{value:.2f}" for value in numbers), ""]
@@ -122,102 +268,6 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         ),
     }
     return Table.of("Drivers compared on the same episodes", rows, columns, names=3)
-
-
-#: Ticks of the leads: linear up to 20, logarithmic beyond.
-_LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
-
-
-@rc_context(STYLE)
-def draw_matrix(rows: Sequence[Row]) -> Figure:
-    """Lead over MOBIL, one panel per traffic: the interval over trainings and episodes, a dot for each training."""
-    drawn = [row for row in rows if row["minus_mobil"] is not None]
-    drivers = list(dict.fromkeys(row["driver"] for row in drawn))
-    traffics = list(dict.fromkeys(row["traffic"] for row in drawn))
-    mobil = {row["traffic"]: row["mean_reward"] for row in rows if row["driver"] == "mobil"}
-    bounds = [bound for row in drawn for bound in row["minus_mobil_ci"] or (row["minus_mobil"],)]
-    lowest, highest = min(-20.0, *bounds), max(20.0, *bounds)
-    figure, grid = panel_grid(len(traffics), 3.4, 1.3 + 0.19 * len(drivers))
-    for place, (axes, traffic) in enumerate(zip(grid, traffics)):
-        axes.axvline(0.0, color=FAINT, lw=0.9)
-        axes.set(title=traffic, xlabel="mean reward minus MOBIL's", ylim=(len(drivers) - 0.5, -0.5))
-        axes.set_xscale("symlog", linthresh=20.0)
-        axes.set_yticks(range(len(drivers)), drivers if place % 3 == 0 else [])
-        axes.set_xticks([x for x in _LEADS if lowest <= x <= highest], minor=False)
-        axes.set_xlim(1.15 * lowest, 1.15 * highest)
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_locator(NullLocator())
-        for row in drawn:
-            if row["traffic"] == traffic:
-                line, trained = drivers.index(row["driver"]), len(row["each"]) > 1
-                colour = COLOURS[0] if trained else INK
-                low, high = row["minus_mobil_ci"] or (row["minus_mobil"],) * 2
-                axes.plot([low, high], [line, line], color=colour, lw=2.2, solid_capstyle="butt")
-                axes.plot(row["minus_mobil"], line, "o", color=colour)
-                each = [training["mean_reward"] - mobil[traffic] for training in row["each"]]
-                if trained:
-                    axes.plot(each, [line] * len(each), "|", color=COLOURS[1], ms=6, mew=1)
-    one = Line2D([], [], color=COLOURS[1], marker="|", ls="", ms=6, label="one training")
-    names = {"a recipe: mean, 95 % over trainings and episodes": COLOURS[0], "a single driver": INK}
-    add_legend(figure, names, [one])
-    return figure
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """Learning curves over the decisions: both phases, one line per run, and what the agent earned at the switch."""
-
-    runs: Mapping[str, pl.DataFrame]
-    switch: float
-    at_switch: Sequence[float]
-
-
-def read_transfers(folders: Sequence[str], rows: Sequence[Row]) -> Transfer | None:
-    """The evaluations of training runs with two phases; None without any run.
-
-    Raises:
-        UserError: a folder without evaluations of both phases.
-    """
-    runs: dict[str, pl.DataFrame] = {}
-    switch = 0.0
-    for folder in map(Path, folders):
-        first, second = (
-            read_metrics(part / "evaluation.csv").select("decisions", "mean_reward")
-            for part in (folder / "pretrain", folder)
-        )
-        switch = max(switch, float(first["decisions"][-1]))
-        later = second.with_columns(pl.col("decisions") + first["decisions"][-1])
-        phases = [first.with_columns(phase=pl.lit("first")), later.with_columns(phase=pl.lit("second"))]
-        runs[folder.name] = pl.concat(phases, how="vertical_relaxed")
-    at_switch = [
-        each["mean_reward"]
-        for row in rows
-        if row["traffic"] == "gan" and _plain(row, "agent_idm")
-        for each in row["each"]
-    ]
-    return Transfer(runs, switch, at_switch) if runs else None
-
-
-@rc_context(STYLE)
-def draw_transfer(transfer: Transfer) -> Figure:
-    """Figure 4: every run, their median, and the range between them; the switch of the traffic is marked."""
-    figure = Figure(figsize=(7.0, 3.4))
-    axes = figure.subplots()
-    axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
-    axes.xaxis.set_major_formatter(EngFormatter())
-    for phase, colour in zip(("first", "second"), COLOURS):
-        lines = [frame.filter(pl.col("phase") == phase) for frame in transfer.runs.values()]
-        x = lines[0]["decisions"].cast(pl.Float64).to_numpy()
-        y = np.stack([np.interp(x, line["decisions"].to_numpy(), line["mean_reward"].to_numpy()) for line in lines])
-        axes.fill_between(x, y.min(axis=0), y.max(axis=0), color=colour, alpha=0.2, lw=0)
-        axes.plot(x, np.median(y, axis=0), color=colour)
-        for line in lines if len(lines) > 1 else []:
-            axes.plot(line["decisions"], line["mean_reward"], color=colour, lw=0.5, alpha=0.6)
-    axes.axvline(transfer.switch, color=FAINT, ls=":")
-    if transfer.at_switch:
-        axes.plot([transfer.switch] * len(transfer.at_switch), transfer.at_switch, "x", color=COLOURS[1])
-    add_legend(figure, {"on idm_mobil": COLOURS[0], "on gan (x: before any training there)": COLOURS[1]})
-    return figure
 
 
 def write_report(

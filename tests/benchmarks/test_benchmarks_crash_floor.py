@@ -21,18 +21,10 @@ from ganlane.traffic import IdmTraffic, TrafficModule
 from ganlane.transforms import RewardTransform
 
 #: Ego at 20 m/s, which wants no more; somebody who never brakes comes from behind; the lane to the right is taken.
-CHASED = (
-    SceneVehicle(0.0, 1, 20.0, 20.0),
-    SceneVehicle(-35.0, 1, 30.0),
-    SceneVehicle(0.0, 0, 20.0, length_m=60.0),
-)
+CHASED = SceneVehicle(0.0, 1, 20.0, 20.0), SceneVehicle(-35.0, 1, 30.0), SceneVehicle(0.0, 0, 20.0, length_m=60.0)
 #: Too fast to stop before a car that stands ahead, and lorries on both sides.
-TRAPPED = (
-    SceneVehicle(0.0, 1, 30.0),
-    SceneVehicle(25.0, 1, 0.0),
-    SceneVehicle(0.0, 0, 30.0, length_m=120.0),
-    SceneVehicle(0.0, 2, 30.0, length_m=120.0),
-)
+LORRIES = [SceneVehicle(0.0, lane, 30.0, length_m=120.0) for lane in (0, 2)]
+TRAPPED = SceneVehicle(0.0, 1, 30.0), SceneVehicle(25.0, 1, 0.0), *LORRIES
 
 
 class Cruise(TrafficModule):
@@ -50,14 +42,9 @@ class Hopeless(FixedScene):
 
 
 def highway(scene=None, rows=4, goal_m=300.0, traffic=Cruise, **others):
-    scenes = None if scene is None else Hopeless(scene)
-    base = HighwayEnv(
-        traffic(Road(), Stream.REPORT),
-        num_envs=rows,
-        scenes=scenes,
-        episode=EpisodeParameters(goal_m=goal_m, timeout_s=60.0),
-        **others,
-    )
+    scenes, episode = None if scene is None else Hopeless(scene), EpisodeParameters(goal_m=goal_m, timeout_s=60.0)
+    model = traffic(Road(), Stream.REPORT)
+    base = HighwayEnv(model, num_envs=rows, scenes=scenes, episode=episode, **others)
     return TransformedEnv(base, RewardTransform())
 
 
@@ -128,26 +115,16 @@ def test_the_answer_depends_neither_on_the_rows_nor_on_the_company(by_reward):
         assert again == [plans[number] for number in asked]
 
 
-def test_every_way_that_was_found_is_driven_again_to_the_same_end():
+def test_every_way_that_was_found_is_driven_again_to_the_same_end_and_earns_no_less_than_keeping_the_lane():
     env = crowded(8)
     plans = beam_search(env, range(12), 1, 8)
     rides = replay(env, {plan.episode: plan.actions for plan in plans}, 1)
     assert [ride.safe for ride in rides] == [plan.found for plan in plans]
     assert [ride.reward for ride in rides] == pytest.approx([plan.reward for plan in plans])
-
-
-def test_choosing_by_reward_earns_no_less_than_keeping_the_lane():
     env = highway(None, 16, 400.0, IdmTraffic, vehicles=9)
     best = beam_search(env, range(4), 0, 4, by_reward=True)
     kept = roll_out(env, KeepLaneDriver(env.base_env.road), range(4), 0)
     assert all(plan.reward >= ride.reward - 1e-3 for plan, ride in zip(best, kept, strict=True))
-
-
-def test_a_search_leaves_automatic_resets_alone():
-    env = crowded(2)
-    env.base_env.last_episodes = (torch.zeros(2).long(), torch.tensor([4, 5]))
-    beam_search(env, [100, 200], 0, 2)
-    assert env.base_env.last_episodes[1].tolist() == [4, 5]
 
 
 def test_the_floor_lies_under_every_driver_and_falls_with_the_beam():
@@ -172,11 +149,12 @@ def test_the_floor_lies_under_every_driver_and_falls_with_the_beam():
     assert row["keeping_lane"] == row["hard_crash"]
 
 
-def test_without_drivers_every_episode_is_searched():
-    ways = search_left(highway(CHASED), ways_of_drivers([], [0, 1]), 0, 4)
+def test_without_drivers_every_episode_is_searched_with_a_beam_and_automatic_resets_are_left_alone():
+    env = highway(CHASED)
+    ways = search_left(env, ways_of_drivers([], [0, 1]), 0, 4)
     assert [way.stage for way in ways] == ["beam 4", "beam 4"]
-
-
-def test_a_search_needs_a_beam():
+    env.base_env.last_episodes = (torch.zeros(4).long(), torch.tensor([4, 5, 6, 7]))
+    beam_search(env, [100, 200], 0, 2)
+    assert env.base_env.last_episodes[1].tolist() == [4, 5, 6, 7]
     with pytest.raises(UserError, match="beam=0"):
-        beam_search(highway(CHASED), [0], 0, 0)
+        beam_search(env, [0], 0, 0)

@@ -59,16 +59,9 @@ def within(found: Largest, allowed: Largest) -> bool:
     return all(value <= limit for value, limit in zip(found, allowed))
 
 
-def plus(one: Largest, other: Largest) -> Largest:
-    return Largest(*(a + b for a, b in zip(one, other)))
-
-
 def need(module: str) -> None:
     if find_spec(module) is None:
         pytest.skip(f"{module} is not installed; pip install 'ganlane[bench]' brings it")
-
-
-# The scenes
 
 
 def test_the_step_takes_one_physics_step_and_the_ramp_five_seconds():
@@ -78,9 +71,6 @@ def test_the_step_takes_one_physics_step_and_the_ramp_five_seconds():
     assert ramp[400] == 20.0
     assert ramp[425] == pytest.approx(15.0)
     assert ramp[450] == 10.0
-
-
-# The model that stands between the simulators
 
 
 @pytest.mark.parametrize("scene", [FREE_ROAD, CONSTANT, OBSTACLE], ids=lambda scene: scene.name)
@@ -102,9 +92,6 @@ def test_a_platoon_at_the_equilibrium_gap_does_not_accelerate(law):
     for v in SETTLED_MPS:
         speed = np.array([v])
         assert abs(acceleration(speed, np.array([equilibrium_gap(v, law)]), speed, law)[0]) < 1e-12
-
-
-# The tolerance
 
 
 @pytest.mark.parametrize("law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"])
@@ -147,9 +134,6 @@ def test_what_has_not_settled_is_told_from_the_motion_left():
     assert 0.01 <= allowed <= 1.1 * MARGIN * 0.01
 
 
-# The command
-
-
 def test_the_command_says_what_is_missing(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(simulators, "find_spec", lambda module: None if module == "libsumo" else object())
     assert compare.main(["--out", str(tmp_path)]) == 2
@@ -174,9 +158,6 @@ def test_the_tables_of_a_page_are_replaced_and_its_words_kept():
         "before\n\n<!-- stops -->\n\n| simulator | final gap, m | lowest speed, m/s |\n| --- | --- | --- |\n"
         "| ours | 1.5000 | 0.0000 |\n\n<!-- end -->\n\nafter <!-- none -->"
     )
-
-
-# The peers themselves
 
 
 @cache
@@ -204,7 +185,7 @@ def test_a_peer_that_reads_the_model_as_we_do_drives_as_we_do(scene, peer):
     """What the empty road's gap of 10 km costs is added: it is the one thing besides the scheme."""
     slower = MARGIN * free_road_speed_mps(FREE_GAP_M) if scene is FREE_ROAD else 0.0
     free = Largest(slower, 0.0, slower * scene.seconds)
-    allowed = plus(tolerance(mine(scene), scene, peer.scheme), free)
+    allowed = Largest(*(a + b for a, b in zip(tolerance(mine(scene), scene, peer.scheme), free)))
     assert within(between(theirs(scene, peer), mine(scene)), allowed)
 
 
@@ -218,21 +199,16 @@ def test_the_scheme_and_the_reading_account_for_all_that_tells_a_peer_from_us(sc
 
 
 @pytest.mark.slow
-@each_peer
+@pytest.mark.parametrize("peer", [None, *simulators.PEERS], ids=lambda peer: "ours" if peer is None else title(peer))
 @pytest.mark.parametrize("speed_mps", SETTLED_MPS)
-def test_a_peers_platoon_settles_at_the_equilibrium_gap(speed_mps, peer):
-    need(peer.module)
-    found = compare.settled(speed_mps, peer.drive, peer.law)
+def test_a_platoon_settles_at_the_equilibrium_gap(speed_mps, peer):
+    if peer is not None:
+        need(peer.module)
+    law = LAW if peer is None else peer.law
+    found = compare.settled(speed_mps, simulators.drive_ours if peer is None else peer.drive, law)
     assert found["away_m"] <= found["allowed_m"] <= 1e-5
-    if not peer.law.offset_m:
+    if not law.offset_m:
         assert found["gap_m"] == pytest.approx(equilibrium_gap(speed_mps), abs=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("speed_mps", SETTLED_MPS)
-def test_our_platoon_settles_at_the_equilibrium_gap(speed_mps):
-    found = compare.settled(speed_mps, simulators.drive_ours, LAW)
-    assert found["away_m"] <= found["allowed_m"] <= 1e-5
 
 
 @pytest.mark.slow

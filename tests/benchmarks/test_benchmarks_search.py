@@ -36,26 +36,19 @@ def sweep(tmp_path):
     return folder
 
 
-def test_only_the_options_that_differ_are_columns(sweep):
+def test_only_the_options_that_differ_are_columns_and_the_agent_of_the_first_phase_is_no_run_of_its_own(sweep):
+    (sweep / "2" / "pretrain").mkdir()
+    (sweep / "2" / "pretrain" / "metrics.csv").write_text("decisions,wall_s\n1,1\n")
+    assert len(read_runs([sweep])) == 2
     assert differing(read_runs([sweep])) == ["agent.gamma", "agent.noisy", "agent.hidden"]
 
 
 def test_runs_are_ranked_by_their_best_evaluation(sweep):
     first, second = table(read_runs([sweep]))
     assert first == {
-        "run": "sweep/10",
-        "agent.gamma": "0.99",
-        "agent.noisy": "false",
-        "agent.hidden": "[64]",
-        "decisions": "1000",
-        "best": "20.0",
-        "best s.e.": "2.5",
-        "best at": "500",
-        "last": "15.0",
-        "last s.e.": "3.0",
-        "crash rate": "0.000",
-        "changes/km": "1.25",
-        "decisions/s": "500",
+        **{"run": "sweep/10", "agent.gamma": "0.99", "agent.noisy": "false", "agent.hidden": "[64]"},
+        **{"decisions": "1000", "best": "20.0", "best s.e.": "2.5", "best at": "500"},
+        **{"last": "15.0", "last s.e.": "3.0", "crash rate": "0.000", "changes/km": "1.25", "decisions/s": "500"},
     }
     assert [second[name] for name in ("run", "best", "last", "decisions/s")] == ["sweep/2", "12.5", "12.5", "250"]
 
@@ -65,44 +58,28 @@ def test_a_reader_sees_only_what_is_unlike_most_runs(sweep):
         make_run(sweep / name, "seed: 0\nenv: {lanes: 3}\nagent: {gamma: 0.98, noisy: true, hidden: [64]}\n")
     runs = read_runs([sweep])
     shown = [row["what differs"] for row in compact(table(runs), differing(runs))]
-    assert shown == [
-        "`agent.gamma=0.99 agent.noisy=false`",
-        "`agent.hidden=[256,256]`",
-        "(the middle)",
-        "(the middle)",
-    ]
+    assert shown == ["`agent.gamma=0.99 agent.noisy=false`", "`agent.hidden=[256,256]`", *["(the middle)"] * 2]
 
 
-def test_a_run_without_an_evaluation_yet_comes_last_with_empty_cells(sweep):
+def test_a_run_without_an_evaluation_or_a_standard_error_has_empty_cells(sweep):
     make_run(sweep / "11", "seed: 0\nagent: {gamma: 0.9}\n", metrics=())
     last = table(read_runs([sweep]))[-1]
     assert last["agent.gamma"] == "0.9"
     assert last["agent.noisy"] == "null"
     assert {last[name] for name in ("best", "best at", "last", "crash rate", "decisions", "decisions/s")} == {""}
-
-
-def test_evaluations_without_a_standard_error_leave_its_cells_empty(sweep):
     (sweep / "2" / "evaluation.csv").write_text("decisions,mean_reward,crash_rate\n500,99,0\n")
     best = table(read_runs([sweep]))[0]
     assert (best["best"], best["best s.e."], best["changes/km"]) == ("99.0", "", "")
 
 
-def test_the_agent_of_the_first_phase_is_not_a_run_of_its_own(sweep):
-    (sweep / "2" / "pretrain").mkdir()
-    (sweep / "2" / "pretrain" / "metrics.csv").write_text("decisions,wall_s\n1,1\n")
-    assert len(read_runs([sweep])) == 2
-
-
 def test_the_table_goes_into_a_document_and_a_csv_file(sweep, tmp_path, capsys):
     page, sheet = tmp_path / "search.md", tmp_path / "search.csv"
-    page.write_text(f"# Search\n\n{BEGIN}\nold\n{END}\n\nThe end.\n")
+    page.write_text(f"# Search\n\n{BEGIN}\nold\n{END}\n")
     assert main([str(sweep), "--report", str(page), "--csv", str(sheet)]) == 0
     lines = page.read_text().splitlines()
     assert lines[3].startswith("| what differs | decisions | best |")
     assert lines[4] == f"|{' --- |' * 10}"
     assert "agent.hidden=[256,256]" in lines[6]
-    assert lines[-1] == "The end."
-    assert "old" not in lines
     with sheet.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["agent.hidden"] for row in rows] == ["[64]", "[256,256]"]

@@ -56,12 +56,7 @@ def test_a_baseline_moves_every_vehicle_and_counts_its_steps(name):
 
 def test_each_counts_at_its_best():
     def row(system, wall, cpu, traffic="Social-GAN"):
-        return {
-            "system": system,
-            "traffic": traffic,
-            "physics_steps_per_s": wall,
-            "physics_steps_per_cpu_s": cpu,
-        }
+        return {"system": system, "traffic": traffic, "physics_steps_per_s": wall, "physics_steps_per_cpu_s": cpu}
 
     rows = [row(TRAFFIC, 900, 400, "gan"), row(TRAFFIC, 600, 600, "gan")]
     rows += [row(name, rate, 10) for name in BASELINES for rate in (20, 30)]

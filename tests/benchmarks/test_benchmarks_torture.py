@@ -64,19 +64,13 @@ def test_a_reader_is_judged_by_how_it_ends(trial):
     assert trial(refuses) == "REFUSED a sentence"
     assert trial(lambda path: path.stat().st_size) == "READ"
     assert trial(lambda path: 1 // 0).startswith("TRACEBACK after flip: ZeroDivisionError")
+    assert trial(lambda path: print("EXECUTED")) == "TRACEBACK the code of a bomb ran"
 
 
 def test_another_content_of_a_sealed_file_must_not_pass_in_silence(trial):
     assert trial(lambda path: path.read_bytes(), sealed=True) == "ACCEPTED after flip, in silence"
     assert trial(lambda path: 3, sealed=True) == "READ"
     assert not same({"a": torch.zeros(2)}, {"a": torch.tensor([0.0, -0.0])})
-
-
-def test_an_executed_pickle_is_seen(trial):
-    def executes(path):
-        print("EXECUTED")
-
-    assert trial(executes) == "TRACEBACK the code of a bomb ran"
 
 
 @pytest.mark.parametrize("way", list(dict.fromkeys(damages.TEXT)), ids=lambda way: way.__name__)

@@ -73,16 +73,12 @@ def test_what_runs_inside_is_counted_for_itself_alone(hands):
     assert clock.shares() == {"a": 3 / 8, "b": 4 / 8, REST: 1 / 8}
 
 
-def test_a_call_that_fails_is_counted_and_left(hands):
+def test_a_call_that_fails_is_counted_and_left_and_afterwards_everything_is_as_it_was(hands):
     worker, clock = Worker(hands), Clock()
     with pytest.raises(ValueError, match="broken"), instrumented([(worker, "broken", "a")], clock):
         worker.broken()
     hands.now += 1.0
     assert clock.shares() == {"a": 3 / 4, REST: 1 / 4}
-
-
-def test_afterwards_everything_is_as_it_was(hands):
-    worker = Worker(hands)
     worker.own = own = lambda: None
     with instrumented([(worker, "outer", "a"), (worker, "own", "b")], Clock()):
         assert "outer" in vars(worker)

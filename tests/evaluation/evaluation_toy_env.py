@@ -66,31 +66,21 @@ class ToyEnv(EnvBase):
         seed, episode, step = (tensordict[name] for name in (keys.SEED, keys.EPISODE, keys.STEP))
         decisions = tensordict["ego", "decisions"] + 1
         chosen = tensordict["action"] == 1
-        speed = torch.where(chosen, episode + 1.0, torch.full_like(episode, 1).float() * 0.5)[:, None]
+        speed = torch.where(chosen, episode + 1.0, 0.5)[:, None]
         done = (decisions >= length(seed, episode))[:, None]
         which = (episode % len(keys.END_EVENTS))[:, None]
         ends = {name: done & (which == i) for i, name in enumerate(keys.END_EVENTS)}
         goal = 100.0 * ends["goal"]
         soft = (decisions % 3 == 0).long()[:, None]
-        n = self.batch_size
+        n, ego = self.batch_size, tensordict["ego"]
+        driven = {"distance": ego["distance"] + 20.0, "lane_changes": ego["lane_changes"] + chosen}
         return TensorDict(
             {
-                keys.SEED: seed,
-                keys.EPISODE: episode,
-                keys.STEP: step + 10,
-                "ego": TensorDict(
-                    {
-                        "distance": tensordict["ego", "distance"] + 20.0,
-                        "lane_changes": tensordict["ego", "lane_changes"] + chosen,
-                        "decisions": decisions,
-                    },
-                    n,
-                ),
+                **{keys.SEED: seed, keys.EPISODE: episode, keys.STEP: step + 10},
+                "ego": TensorDict({**driven, "decisions": decisions}, n),
                 "events": TensorDict({**ends, "soft_crash": soft, "soft_crash_behind": 2 * soft}, n),
                 "reward_terms": TensorDict({"speed": speed, "goal": goal}, n),
-                "reward": speed + goal,
-                "done": done,
-                "terminated": done.clone(),
+                **{"reward": speed + goal, "done": done, "terminated": done.clone()},
             },
             n,
         )

@@ -9,19 +9,23 @@ from evaluation_toy_env import ToyEnv, always, length, reason
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
+from reference.worlds import vehicles
 from tensordict.nn import TensorDictModule
 from torchrl.envs import StepCounter
 from torchrl.envs.utils import ExplorationType, exploration_type, step_mdp
 
 from ganlane import keys
+from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import GanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, ReplayTrafficConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
-from ganlane.evaluation import run_episodes
+from ganlane.evaluation import replay, roll_out, run_episodes
+from ganlane.evaluation.episodes import SIDES, contact_side, ego_at_fault
 from ganlane.parameters.observation import ObservationConfig, SensorParameters
+from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 SEED = 4
@@ -60,22 +64,18 @@ def test_the_batch_size_makes_no_difference(batch, episodes, seed):
     assert_frame_equal(run_episodes(ToyEnv(batch), always(0), episodes, seed), pl.concat(alone))
 
 
-def test_progress_counts_up_to_all_episodes():
-    seen = []
-    run_episodes(ToyEnv(4), always(0), range(6), seed=0, on_progress=lambda done, total: seen.append((done, total)))
-    assert seen == sorted(seen)
-    assert seen[-1] == (6, 6)
-
-
-def test_the_policy_acts_deterministically_and_without_gradients():
-    modes = set()
+def test_the_policy_acts_deterministically_and_without_gradients_while_progress_counts_up():
+    modes, seen = set(), []
 
     def look(step):
         modes.add((exploration_type(), torch.is_grad_enabled()))
         return torch.zeros_like(step)
 
-    run_episodes(ToyEnv(2), TensorDictModule(look, in_keys=["step"], out_keys=["action"]), range(2), seed=0)
+    policy = TensorDictModule(look, in_keys=["step"], out_keys=["action"])
+    run_episodes(ToyEnv(4), policy, range(6), seed=0, on_progress=lambda done, total: seen.append((done, total)))
     assert modes == {(ExplorationType.DETERMINISTIC, False)}
+    assert seen == sorted(seen)
+    assert seen[-1] == (6, 6)
 
 
 def test_an_end_that_the_environment_does_not_name_is_called_other():
@@ -86,11 +86,6 @@ def test_an_end_that_the_environment_does_not_name_is_called_other():
             return after
 
     assert run_episodes(Nameless(1), always(0), [0, 1], seed=0)["reason"].to_list() == ["other", "hard_crash"]
-
-
-def test_no_episodes_is_a_users_mistake():
-    with pytest.raises(UserError, match="episodes"):
-        run_episodes(ToyEnv(2), always(0), [], seed=0)
 
 
 class Remade:
@@ -143,18 +138,10 @@ def sources(recordings):
     }
 
 
-@pytest.mark.parametrize(
-    ("name", "driver"),
-    [
-        ("recycled", "random"),
-        ("late sensors", "agent_idm"),
-        ("replayed", "random"),
-        ("cut short", "random"),
-    ],
-)
-def test_every_episode_is_bit_for_bit_what_it_is_alone(name, driver, recordings, monkeypatch):
+@pytest.mark.parametrize("name", ["recycled", "late sensors", "replayed", "cut short"])
+def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeypatch):
     monkeypatch.setattr("ganlane.evaluation.episodes.CHECK_EVERY", 2)
-    make = sources(recordings)[name]
+    make, driver = sources(recordings)[name], "agent_idm" if name == "late sensors" else "random"
     policy, episodes = make_driver(driver, make.env).policy, [*range(30, 47), 7, 3]
     expected = alone(make, policy, episodes)
     assert_frame_equal(compared(run_episodes(make(5), policy, episodes, SEED)), expected, check_exact=True)
@@ -176,26 +163,15 @@ def test_generated_traffic_is_the_same_up_to_rounding_when_rows_move():
     assert one["distance_m"].to_list() == pytest.approx(other["distance_m"].to_list(), rel=1e-3)
 
 
-def test_the_last_episodes_move_to_ever_smaller_environments():
-    sizes = []
-
-    def smaller(rows):
-        sizes.append(rows)
-        return ToyEnv(rows)
-
-    policy = always(1)
-    policy.rows_must_stay = False
-    frame = run_episodes(ToyEnv(64), policy, range(64), seed=0, make_smaller=smaller)
+@pytest.mark.parametrize("may_move", [True, False])
+def test_the_last_episodes_move_to_ever_smaller_environments_if_the_policy_says_that_they_may(may_move):
+    sizes, policy = [], always(1)
+    if may_move:
+        policy.rows_must_stay = False
+    frame = run_episodes(ToyEnv(64), policy, range(64), 0, make_smaller=lambda n: sizes.append(n) or ToyEnv(n))
     assert frame["decisions"].to_list() == [length(0, e) for e in range(64)]
     # Episodes last 3 to 13 decisions; after 8 of them those of 9 to 13 are left.
-    assert sizes == [sum(length(0, e) > 8 for e in range(64))]
-
-
-def test_a_policy_that_does_not_say_that_rows_may_move_keeps_them():
-    def smaller(rows):
-        raise AssertionError("moved")
-
-    run_episodes(ToyEnv(64), always(1), range(64), seed=0, make_smaller=smaller)
+    assert sizes == ([sum(length(0, e) > 8 for e in range(64))] if may_move else [])
 
 
 class Watchful(IdmTraffic):
@@ -220,14 +196,9 @@ class Watchful(IdmTraffic):
 
 
 def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per_row():
-    def smaller(rows):
-        raise AssertionError("moved")
-
-    traffic = Watchful()
-    make = Remade(IdmTrafficConfig())
-    env = make_env(traffic, SHORT, num_envs=17)
-    policy = make_driver("random", SHORT).policy
-    table = run_episodes(env, policy, range(30), SEED, make_smaller=smaller)
+    traffic, make = Watchful(), Remade(IdmTrafficConfig())
+    env, policy = make_env(traffic, SHORT, num_envs=17), make_driver("random", SHORT).policy
+    table = run_episodes(env, policy, range(30), SEED, make_smaller=lambda rows: pytest.fail("moved"))
     moved = table.filter(pl.col("duration_s") > 0)["episode"]
     assert set(moved) <= set(traffic.begun) <= set(range(30))
     assert_frame_equal(table, run_episodes(make(17), policy, range(30), SEED), check_exact=True)
@@ -247,10 +218,62 @@ def test_masked_rows_start_the_episodes_that_they_are_given():
     assert torch.equal(after["vehicles", "x"][0], start["vehicles", "x"][0])
 
 
-def test_an_environment_that_ignores_the_episodes_it_is_given_is_refused():
+def test_no_episodes_and_an_environment_that_ignores_those_it_is_given_are_refused():
     class Stubborn(ToyEnv):
         def _reset(self, tensordict=None, next_episode=None, **kwargs):
             return super()._reset(tensordict, **kwargs)
 
     with pytest.raises(UserError, match="next_episode"):
         run_episodes(Stubborn(2), always(0), [0, 1, 5, 9], seed=0)
+    with pytest.raises(UserError, match="episodes"):
+        run_episodes(ToyEnv(2), always(0), [], seed=0)
+
+
+def test_a_rollout_is_the_evaluated_episode_and_comes_back_from_its_actions():
+    config = EnvConfig(goal_m=90.0)
+    env = make_env(make_traffic(IdmMobilTrafficConfig(), config), config, num_envs=2)
+    policy = KeepLaneDriver(env.base_env.road)
+    rollouts = roll_out(env, policy, [4, 1, 7], seed=3)
+    table = run_episodes(env, policy, [4, 1, 7], seed=3)
+    assert [each.end for each in rollouts] == table["reason"].to_list()
+    assert [len(each.actions) for each in rollouts] == table["decisions"].to_list()
+    assert [each.reward for each in rollouts] == pytest.approx(table["reward"].to_list(), rel=1e-5)
+    assert replay(env, {each.episode: each.actions for each in rollouts}, seed=3) == sorted(
+        rollouts, key=lambda each: each.episode
+    )
+    assert replay(env, {}, seed=3) == []
+    with pytest.raises(UserError, match="episodes: none were asked for"):
+        roll_out(env, policy, [], seed=3)
+
+
+@pytest.mark.parametrize(
+    ("other", "side"),
+    [
+        ({"x": 4.4, "speed": 10.0}, "ahead"),
+        ({"x": -4.4, "speed": 30.0}, "behind"),
+        ({"y": 2.4, "heading": -0.1}, "side"),
+        ({"x": 4.0, "y": 2.2, "heading": -0.1}, "side"),
+        ({"x": -4.2, "y": 1.0, "speed": 30.0, "heading": 0.1}, "behind"),
+        ({"x": 10.0}, "none"),
+    ],
+)
+def test_where_the_ego_was_hit(other, side):
+    scene = vehicles({"x": 0.0, "y": 0.0, "target_lane": 0}, {"x": 0.0, "y": 0.0, "target_lane": 0, **other})
+    assert SIDES[int(contact_side(scene, Road()))] == side
+
+
+@pytest.mark.parametrize(
+    ("ego", "other", "at_fault"),
+    [
+        ({"speed": 20.0}, {"x": 4.4, "speed": 10.0}, True),  # into the one ahead
+        ({}, {"x": -4.4, "speed": 30.0}, False),  # struck from behind
+        ({}, {"y": 2.4, "heading": -0.1}, False),  # the other changes lanes into the ego
+        ({"heading": 0.1}, {"y": 2.4}, True),  # the ego into the other
+        ({"heading": 0.1}, {"y": 2.4, "heading": -0.05}, True),  # both, the ego faster
+        ({"heading": -0.05}, {"y": -2.4, "heading": 0.1}, False),  # both, the other faster
+        ({"speed": 30.0}, {"x": 10.0}, False),  # nobody was hit
+    ],
+)
+def test_who_moved_into_whom(ego, other, at_fault):
+    same = {"x": 0.0, "y": 0.0, "target_lane": 0}
+    assert bool(ego_at_fault(vehicles({**same, **ego}, {**same, **other}))) == at_fault

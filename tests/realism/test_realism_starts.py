@@ -7,10 +7,9 @@ from reference.recordings import made_by_hand
 from ganlane.data import SyntheticTraffic, synthetic_scenes
 from ganlane.errors import UserError
 from ganlane.realism.card import card_rows
+from ganlane.realism.driving import ConstantVelocity, StartOptions
 from ganlane.realism.long_runs import LongRunParameters
 from ganlane.realism.measures import ceiling
-from ganlane.realism.references import ConstantVelocity
-from ganlane.realism.replay_starts import StartOptions
 from ganlane.realism.starts import Fold, fit_excess, recorded_starts, spawned_frame
 from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
@@ -63,9 +62,6 @@ def test_spawned_trajectories_are_whole_tracks_in_the_schema():
 
 
 def test_the_excess_that_was_used_is_the_one_that_is_fitted():
-    def eager(road):
-        return Eager(road)
-
     class Eager(ConstantVelocity):
         """Drives at its desired speed at once."""
 
@@ -78,4 +74,4 @@ def test_the_excess_that_was_used_is_the_one_that_is_fitted():
     x = 100.0 * np.arange(30) + speed * time
     shown = np.where(np.arange(80)[:, None] == 0, 10.0, speed)
     scene = made_by_hand(x, speed=shown, lanes=1)
-    assert fit_excess(eager, [scene], StartOptions(repeats=1), (1.0, 4.0, 8.0)) == 4.0
+    assert fit_excess(Eager, [scene], StartOptions(repeats=1), (1.0, 4.0, 8.0)) == 4.0

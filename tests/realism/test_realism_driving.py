@@ -11,10 +11,16 @@ from reference.worlds import vehicles as vehicles_of
 from tensordict import TensorDict
 
 from ganlane.generator.closed_loop import balanced_headway
+from ganlane.realism.driving import (
+    ConstantVelocity,
+    HeadwayIdm,
+    RandomDriving,
+    StartOptions,
+    drive_recordings,
+    with_recorded_headways,
+)
 from ganlane.realism.measures import measure_recordings, pooled_distance
 from ganlane.realism.recordings import recorded_frame
-from ganlane.realism.references import ConstantVelocity, HeadwayIdm, RandomDriving
-from ganlane.realism.replay_starts import StartOptions, drive_recordings, with_recorded_headways
 from ganlane.realism.starts import simulate
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.neighbours import perceive
@@ -34,30 +40,22 @@ def steady(**changed):
     return made_by_hand(**fields, lanes=2, name="steady")
 
 
-def test_constant_velocity_repeats_a_recording_of_constant_velocity():
-    there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
-    recorded = recorded_frame([steady()])
-    assert there.height == recorded.height
+def test_constant_velocity_repeats_a_recording_of_constant_velocity_from_the_first_frame_of_a_vehicle_to_its_last():
+    there, recorded = drive_recordings(ConstantVelocity, [steady()], StartOptions()), recorded_frame([steady()])
     joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")
-    assert joined.height == recorded.height
+    assert joined.height == there.height == recorded.height
     assert (joined["x"] - joined["x_recorded"]).abs().max() < 1e-3
     assert (joined["y"] - joined["y_recorded"]).abs().max() < 1e-5
+    frames = there.group_by("vehicle").agg(pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"))
+    assert frames.sort("vehicle").rows() == [(0, 0, 99), (1, 0, 99), (2, 40, 79)]
 
 
 def test_its_distance_is_then_0_in_every_quantity():
-    recordings = [steady()]
-    recorded = measure_recordings(recordings)
-    driven = simulate(ConstantVelocity, recordings, StartOptions())
+    driven, recorded = simulate(ConstantVelocity, [steady()], StartOptions()), measure_recordings([steady()])
     for name in ("speed", "gap", "time_headway"):
         # Speeds of 10 m/s lie on an edge of the bins, which rounding may cross; compare at the middle.
         assert driven.quantile(name, 0.5) == pytest.approx(recorded.quantile(name, 0.5), abs=1e-2)
     assert pooled_distance(driven.counts["gap"], recorded.counts["gap"]) < 0.15
-
-
-def test_a_vehicle_enters_when_it_was_recorded_first_and_leaves_when_last():
-    there = drive_recordings(ConstantVelocity, [steady()], StartOptions())
-    frames = there.group_by("vehicle").agg(pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"))
-    assert frames.sort("vehicle").rows() == [(0, 0, 99), (1, 0, 99), (2, 40, 79)]
 
 
 def test_a_vehicle_waits_while_another_stands_in_its_place():
@@ -102,8 +100,7 @@ def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entr
     drive_recordings(Watcher, [steady()], StartOptions(desired_above_mps=3.0, repeats=50))
     assert not any(bool(vehicles.valid[:, 0].any()) for vehicles in seen)
     excess = (seen[0].desired_speed - seen[0].speed)[:, 1:3]
-    assert excess.min() >= 0.0
-    assert excess.max() <= 6.0
+    assert 0.0 <= excess.min() <= excess.max() <= 6.0
     assert excess.mean() == pytest.approx(3.0, abs=0.5)
 
 
@@ -118,8 +115,7 @@ def test_repeats_differ_and_the_same_seed_repeats_them():
 @pytest.mark.parametrize("make", [IdmMobilTraffic, gan_traffic, gan_calibrated_traffic, RandomDriving])
 def test_every_traffic_stays_finite_from_recorded_starts(make):
     there = drive_recordings(make, recorded_cars(scenes=1, vehicles=8, seconds=5.0), StartOptions())
-    for name in ("x", "y"):
-        assert there[name].is_finite().all()
+    assert all(there[name].is_finite().all() for name in ("x", "y"))
     assert there["lane"].is_between(0, 2).all()
 
 
@@ -143,11 +139,12 @@ def headways(vehicles):
     return balanced_headway(vehicles, ROAD, torch.full_like(vehicles.x, DRAWN))[0, 1:].tolist()
 
 
-def test_a_follower_at_20_m_and_10_m_per_s_shows_a_headway_of_1_74_s():
+def test_a_follower_shows_its_headway_unless_it_is_far_behind_and_none_under_a_tenth_of_a_second():
     behind, ahead = headways(queue([0.0, 24.0]))
-    # (20 m sqrt(1 - (10 / 20)^4) - 2 m) / (10 m/s)
+    # At 20 m and 10 m/s: (20 m sqrt(1 - (10 / 20)^4) - 2 m) / (10 m/s)
     assert behind == pytest.approx((20.0 * math.sqrt(15.0 / 16.0) - 2.0) / 10.0, abs=1e-4)
-    assert ahead == DRAWN
+    assert ahead == headways(queue([0.0, 64.0]))[0] == DRAWN
+    assert headways(queue([0.0, 5.0]))[0] == pytest.approx(0.1)
 
 
 def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
@@ -155,11 +152,6 @@ def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
     shown = balanced_headway(vehicles, ROAD, torch.ones_like(vehicles.x))
     acceleration = following_acceleration(perceive(vehicles, ROAD), headway_s=shown)
     assert acceleration[0, 1:4].abs().max() < 1e-4
-
-
-def test_whoever_is_far_behind_has_shown_none_and_nobody_follows_closer_than_a_tenth_of_a_second():
-    assert headways(queue([0.0, 64.0]))[0] == DRAWN
-    assert headways(queue([0.0, 5.0]))[0] == pytest.approx(0.1)
 
 
 def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are():

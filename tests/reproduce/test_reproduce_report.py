@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from ganlane.errors import UserError
-from ganlane.reproduce.numbers import by_recipe, comparisons, recipe_of, rows
+from ganlane.reproduce.report import by_recipe, comparisons, recipe_of, rows
 
 KM = 5.0
 
@@ -73,24 +73,16 @@ def test_a_row_holds_the_trainings_together_and_each_alone(matrix):
     assert row["normalized_percent"] == pytest.approx(130.0)
     assert [each["mean_reward"] for each in row["each"]] == pytest.approx([120.25, 140.25])
     assert [each["hard_crash"] for each in row["each"]] == [1, 0]
-
-
-def test_crashes_and_departures_are_counted_together_too(matrix):
-    row = row_of(matrix, "agent_idm")
+    assert (row["mean_speed_mps"], row["lane_changes_per_km"]) == (pytest.approx(25.0), pytest.approx(2.0))
     assert row["crashes_per_1000_km"] == row["departures_per_1000_km"] == pytest.approx(1000 / (8 * KM))
     assert row["failures_per_1000_km"] == pytest.approx(2000 / (8 * KM))
-    assert (row["at_fault_share"], row_of(matrix, "mobil")["at_fault_share"]) == (1.0, 0.0)
-    assert row_of(matrix, "random_legal")["at_fault_share"] is None
 
 
-def test_speeds_and_lane_changes_are_those_of_all_kilometres(matrix):
-    row = row_of(matrix, "agent_idm")
-    assert (row["mean_speed_mps"], row["lane_changes_per_km"]) == (pytest.approx(25.0), pytest.approx(2.0))
-
-
-def test_mobil_is_not_compared_with_itself_and_a_single_training_has_no_probability(matrix):
-    assert row_of(matrix, "mobil")["minus_mobil"] is None
-    assert row_of(matrix, "random_legal")["probability_above_mobil"] is None
+def test_what_is_not_known_is_none(matrix):
+    row, mobil, random_legal = (row_of(matrix, name) for name in ("agent_idm", "mobil", "random_legal"))
+    # MOBIL is not compared with itself, a single training has no probability, and no crash has no fault.
+    assert mobil["minus_mobil"] is random_legal["probability_above_mobil"] is random_legal["at_fault_share"] is None
+    assert (row["at_fault_share"], mobil["at_fault_share"]) == (1.0, 0.0)
 
 
 def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):

@@ -1,4 +1,4 @@
-"""Recorded scenes driven by a traffic model: the same vehicles and road, for as long as they were recorded.
+"""Recorded scenes driven by a traffic: the same vehicles and road, for as long as recorded; and reference drivers.
 
 A vehicle is driven from the frame at which it was first recorded to the one at which it was last recorded, or until
 it passes the end of the recorded road. One that appears later waits while another occupies its place, and enters in
@@ -12,13 +12,14 @@ Headways: a driver recorded behind a leader has shown how closely it follows. Wi
 the drivers would begin with hard braking, and the first seconds would measure nothing else. So a traffic with a
 headway per driver (a memory ``headway`` [N, M] in s) starts with those that balance the recorded gaps. Traffic with
 one headway for everybody (IDM, Table V) keeps it.
+
+Two drivers mark the ends of the scale (random driving, constant velocity); :class:`HeadwayIdm` is a control.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import polars as pl
@@ -27,12 +28,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.generator.closed_loop import balanced_headway
+from ganlane.generator.closed_loop import balanced_headway, headway_from_uniform
 from ganlane.realism.recordings import Recording, frame_of
+from ganlane.sim.idm import following_acceleration
 from ganlane.sim.lanes import ENTRY_M
+from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
 from ganlane.sim.state import Road, Vehicles
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.overlays import random_side
 
 #: Makes a traffic model for a road.
 Factory = Callable[[Road], TrafficModule]
@@ -40,15 +44,12 @@ Factory = Callable[[Road], TrafficModule]
 ENTRY_GAP_M = 2.0
 #: Desired speeds are kept within these bounds, m/s.
 SLOWEST_DESIRED_MPS, FASTEST_DESIRED_MPS = 5.0, 35.0
-#: Name of the traffic memory that holds headways.
-HEADWAY: Final = "headway"
 #: Rows times vehicles times vehicles simulated at once; bounds the memory.
 _MOST_PAIRS = 1_000_000
 #: Position of absent vehicles, m.
 _ABSENT_M = -10_000.0
 #: Tolerance of positions, m.
 _ROUNDING_M = 0.01
-_FIELDS = ("x", "y", "speed")
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,7 @@ class StartOptions:
 
 
 def drive_recordings(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> pl.DataFrame:
-    """Drive every recording ``options.repeats`` times; the trajectories as :func:`frame_of` gives them.
-
-    Recordings on equal roads are driven side by side.
-    """
+    """Drive every recording ``options.repeats`` times, those on equal roads side by side; see :func:`frame_of`."""
     roads: dict[tuple[int, float], list[Recording]] = {}
     for each in recordings:
         roads.setdefault((each.lanes, each.lane_width_m), []).append(each)
@@ -97,7 +95,7 @@ def _drive(traffic: TrafficModule, rows: list[Recording], options: StartOptions,
     """Drives a batch of recordings on one road; one frame per row."""
     batch, n = RecordingBatch.of(rows), len(rows)
     counters = {keys.SEED: torch.full((n,), options.seed), keys.EPISODE: first + torch.arange(n)}
-    key = episode_key(traffic.stream, counters[keys.SEED], counters[keys.EPISODE])
+    key = episode_key(traffic.stream, *counters.values())
     u = uniform(key, 0, batch.x.shape[2], [Purpose.SPAWN_DESIRED_SPEED])[..., 0]
     excess = 2.0 * options.desired_above_mps * u
     state = no_vehicles(batch, traffic)
@@ -147,13 +145,11 @@ def _updated_memory(
     if memory is not None and not bool(enters.any()):
         return memory
     fresh = with_recorded_headways(traffic.init_memory(state, key), state, traffic.road, enters)
-    if memory is None:
-        return fresh
 
     def merged(new: Tensor, old: Tensor) -> Tensor:
         return torch.where(enters.reshape(*enters.shape, *[1] * (new.ndim - 2)), new, old)
 
-    return fresh.apply(merged, memory)
+    return fresh if memory is None else fresh.apply(merged, memory)
 
 
 @dataclass(frozen=True)
@@ -183,12 +179,11 @@ class RecordingBatch:
             for index, value in enumerate(values):
                 where = (slice(len(value)), index) if value.ndim == 2 else (index,)
                 whole[(*where, slice(1, value.shape[-1] + 1))] = value
-            made = torch.from_numpy(whole)
-            return made.float() if made.is_floating_point() else made
+            tensor = torch.from_numpy(whole)
+            return tensor.float() if tensor.is_floating_point() else tensor
 
-        x, y, speed = padded("x"), padded("y"), padded("speed")
-        end_m = torch.tensor([[row.end_m] for row in rows])
-        return cls(x, y, speed, padded("present"), padded("length"), padded("driven"), end_m)
+        made = {name: padded(name) for name in ("x", "y", "speed", "present", "length", "driven")}
+        return cls(**made, end_m=torch.tensor([[row.end_m] for row in rows]))
 
 
 def no_vehicles(batch: RecordingBatch, traffic: TrafficModule) -> Vehicles:
@@ -216,8 +211,8 @@ def remove_finished(batch: RecordingBatch, state: Vehicles, step: int) -> Vehicl
     stays = state.valid & batch.present[step] & on_road
     state = state.with_(valid=stays, x=torch.where(stays, state.x, _ABSENT_M))
     replayed = stays & ~batch.driven
-    shown = {name: torch.where(replayed, getattr(batch, name)[step], getattr(state, name)) for name in _FIELDS}
-    return state.with_(**shown)
+    fields = ("x", "y", "speed")
+    return state.with_(**{f: torch.where(replayed, getattr(batch, f)[step], getattr(state, f)) for f in fields})
 
 
 def may_enter(batch: RecordingBatch, state: Vehicles, waiting: Tensor, road: Road, step: int) -> Tensor:
@@ -258,6 +253,73 @@ def with_recorded_headways(memory: TensorDictBase, vehicles: Vehicles, road: Roa
 
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
         last = name if isinstance(name, str) else name[-1]
-        return torch.where(who, balanced_headway(vehicles, road, value), value) if last == HEADWAY else value
+        return torch.where(who, balanced_headway(vehicles, road, value), value) if last == "headway" else value
 
     return memory.named_apply(shown, nested_keys=True)
+
+
+class ConstantVelocity(TrafficModule):
+    """Every vehicle keeps its lane and the speed at which it entered."""
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step along the road."""
+        v = vehicles
+        return v.with_(x=v.x + v.speed * self.dt, acceleration=torch.zeros_like(v.speed)), memory
+
+
+class RandomDriving(TrafficModule):
+    """Drivers that ignore all others: the far end of the scale.
+
+    An acceleration is drawn every second, uniform up to 3 m/s2 either way; a lane change to a random side starts at a
+    constant hazard, every 20 s on average, and takes 4 s. Speeds are never negative.
+    """
+
+    hardest, every_s, change_s = 3.0, 20.0, 4.0
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step: the second's acceleration, and towards the target lane."""
+        v, m, dtype = vehicles, vehicles.x.shape[1], vehicles.x.dtype
+        pace = uniform(key, torch.div(step, 10, rounding_mode="floor"), m, [Purpose.ACCELERATION], dtype)[..., 0]
+        drawn = uniform(key, step, m, [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE], dtype)
+        remaining = self.road.centre_of(v.target_lane, dtype) - v.y
+        starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
+        side = torch.where(starts, random_side(drawn[..., 1], v.target_lane, self.road.lanes), 0)
+        target = v.target_lane + side
+        stride = self.road.lane_width_m * self.dt / self.change_s
+        aside = (remaining / stride).clamp(-1.0, 1.0) * stride
+        speed = (v.speed + self.hardest * (2.0 * pace - 1.0) * self.dt).clamp_min(0.0)
+        moved = v.with_(
+            x=v.x + 0.5 * (v.speed + speed) * self.dt,
+            y=v.y + aside,
+            speed=speed,
+            acceleration=(speed - v.speed) / self.dt,
+            target_lane=target,
+        )
+        return moved, memory
+
+
+class HeadwayIdm(TrafficModule):
+    """IDM without lane changes, each driver with its own headway: generated traffic without its network.
+
+    A control, none of the shipped traffics: Table V gives everybody the same headway. Here they are drawn from the
+    recorded distribution, or taken from a recorded start.
+    """
+
+    memory_fields = {"headway": ((), None)}  # noqa: RUF012
+
+    def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> dict[str, Tensor]:
+        """A random headway for each driver."""
+        u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
+        return {"headway": headway_from_uniform(u)}
+
+    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+        """One step along the road."""
+        v = vehicles
+        wanted = following_acceleration(perceive(v, self.road), headway_s=memory["headway"])
+        speed = (v.speed + wanted * self.dt).clamp_min(0.0)
+        x = v.x + 0.5 * (v.speed + speed) * self.dt
+        return v.with_(x=x, speed=speed, acceleration=(speed - v.speed) / self.dt), memory
+
+
+#: Reference drivers at the ends of the scale.
+FLOORS: dict[str, Factory] = {"random": RandomDriving, "constant_velocity": ConstantVelocity}

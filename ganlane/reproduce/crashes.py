@@ -27,9 +27,8 @@ from ganlane.config.env import EnvConfig
 from ganlane.config.schemas import SCHEMAS, made, node_of
 from ganlane.config.traffic import TRAFFICS, TrafficConfig
 from ganlane.errors import UserError
-from ganlane.evaluation.episodes import SIDES
+from ganlane.evaluation.episodes import SIDES, Rollout, replay, roll_out
 from ganlane.evaluation.results import plain
-from ganlane.evaluation.rollouts import Rollout, replay, roll_out
 from ganlane.files import write_json
 from ganlane.parameters import NotNegative, Record, Rule, Seed, Text, one_of
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
@@ -110,8 +109,7 @@ def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> t
     """Drive failed episodes again and list those that end in the same way.
 
     Args:
-        episodes: rows of failed and other episodes: ``agent, traffic, episode, reason, decisions``.
-        config: what they were driven with.
+        episodes: rows of failed and other episodes, driven with ``config``.
         most: episodes per driver and traffic, those with the fewest decisions first.
 
     Returns:

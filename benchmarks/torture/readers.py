@@ -27,7 +27,7 @@ from ganlane.generator.checkpoint import load_generator
 from ganlane.generator.windows import CACHE_VARIABLE, cached
 from ganlane.parameters.data import NgsimParameters
 from ganlane.realism.references import SHIPPED_REFERENCE, Reference
-from ganlane.sim.scene_files import read_scene
+from ganlane.sim.scenarios import read_scene
 from ganlane.training.checkpoint import TrainingState
 from ganlane.training.logs import CsvLog, read_rows
 from ganlane.training.loop import collect

@@ -1,7 +1,7 @@
 """Environments whose episodes start in a given scene: the scenarios that ship, and a scene of your own.
 
-``env=cut_in, stalled_car, blocked_lane, stop_and_go`` are made by :mod:`ganlane.sim.scenarios`, ``env=scene`` is read
-from a file (:mod:`ganlane.sim.scene_files`).
+``env=cut_in, stalled_car, blocked_lane, stop_and_go`` are made, and ``env=scene`` is read from a file, by
+:mod:`ganlane.sim.scenarios`.
 """
 
 from __future__ import annotations
@@ -277,7 +277,7 @@ class FileSceneEnvConfig(SceneEnvConfig):
         super().__post_init__()
 
     def _read(self) -> FixedScene:
-        from ganlane.sim.scene_files import read_scene, with_ego_speed
+        from ganlane.sim.scenarios import read_scene, with_ego_speed
 
         if self.scene.path is None:
             raise ParameterError("{scene.path}: no file; give one, env=scene {scene.path}=my_scene.csv.")

@@ -22,9 +22,8 @@ from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Purpose, episode_key, uniform
-from ganlane.sim.recycle import out_of_range
 from ganlane.sim.scenes import Scenes
-from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.spawn import RandomScenes, out_of_range
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.base import TrafficModule
 
@@ -49,7 +48,7 @@ class HighwayEnv(EnvBase):
         scenes: initial vehicles of an episode and their visibility; None: at random, by ``spawn_parameters``.
         device, dtype: of the simulation's tensors.
         recycle: after every decision move vehicles far behind the ego to far ahead of it, and the reverse
-            (:mod:`ganlane.sim.recycle`), so that the road never empties.
+            (:mod:`ganlane.sim.spawn`), so that the road never empties.
         recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their numbers: a mixture
             of roads that empty and roads that do not.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel (:mod:`ganlane.native`),

@@ -20,12 +20,18 @@ from ganlane.parameters.driving import EgoParameters, IdmParameters
 from ganlane.parameters.episode import EpisodeParameters
 from ganlane.runtime import check_compiler
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.dynamics import SteeringParameters
-from ganlane.sim.ego import Command, apply_action, change_progress, ego_scene, ego_surroundings, move_ego
+from ganlane.sim.dynamics import (
+    Command,
+    SteeringParameters,
+    apply_action,
+    change_progress,
+    ego_scene,
+    ego_surroundings,
+    move_ego,
+)
 from ganlane.sim.idm import following_acceleration
-from ganlane.sim.lanes import lane_change_done
-from ganlane.sim.recycle import recycle
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.spawn import recycle
+from ganlane.sim.state import Road, Vehicles, lane_change_done
 from ganlane.torch_settings import compiled
 from ganlane.traffic.base import TrafficModule, memory_of
 

@@ -16,9 +16,8 @@ from ganlane.generator.segments import OBSERVED_POSITIONS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V
-from ganlane.sim.lanes import ENTRY_M, Visibility
 from ganlane.sim.neighbours import FREE_GAP_M, leader, perceive
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 
 #: Levels of the headway quantiles.
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)

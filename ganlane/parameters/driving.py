@@ -11,7 +11,7 @@ from ganlane.parameters.checks import NotNegative, Positive, Record, below, one_
 
 
 class Visibility(IntEnum):
-    """When others see a vehicle that enters their lane; see :mod:`ganlane.sim.lanes`."""
+    """When others see a vehicle that enters their lane; see :mod:`ganlane.sim.state`."""
 
     CENTRE = 0
     BODY = 1

@@ -29,9 +29,8 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.generator.rollout import balanced_headway
 from ganlane.realism.recordings import Recording, frame_of
-from ganlane.sim.lanes import ENTRY_M
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import ENTRY_M, Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 
 #: Makes a traffic model for a road.

@@ -10,9 +10,8 @@ from torch import Tensor
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import MobilParameters
 from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, acceleration_behind, idm_acceleration
-from ganlane.sim.lanes import lane_change_done
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
-from ganlane.sim.state import Road, Vehicles, compact, reads_are_cheap
+from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 
 
 class DriverMobil(NamedTuple):
@@ -40,7 +39,7 @@ class LaneAccelerations(NamedTuple):
     with_it: Tensor
     without: Tensor
 
-    def of(self, lanes: int | slice) -> LaneAccelerations:
+    def of(self, lanes: slice) -> LaneAccelerations:
         """Some of the lanes."""
         return LaneAccelerations(*(number[..., lanes] for number in self))
 
@@ -81,11 +80,6 @@ def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMob
     return mobil_criterion(there, there, mobil).safe[..., 0]
 
 
-def on_road(lane: Tensor, road: Road) -> Tensor:
-    """Whether ``lane`` exists, bool."""
-    return (lane >= 0) & (lane <= road.lanes - 1)
-
-
 def without_ego(wish: Tensor) -> Tensor:
     """``wish`` [N, M] with the ego's column zeroed: others do not know its intention."""
     return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
@@ -100,10 +94,14 @@ def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyM
     wants, vehicles = wish != 0, scene.vehicles
     if not reads_are_cheap(wish):
         return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
-    rows, columns = compact(wants & (wants.sum(1, keepdim=True) > 1))
+    rivals = wants & (wants.sum(1, keepdim=True) > 1)
+    rows = rivals.any(1).nonzero()[:, 0]
     if len(rows) == 0:
         return wish
-    few, wishes = Vehicles(*(field[rows] for field in vehicles)).columns(columns), wish[rows]
+    # Only their rows, and as many columns as hold all of them.
+    rivals, most = rivals[rows], int(rivals.sum(1).max())
+    columns = rivals.to(torch.uint8).sort(dim=1, descending=True, stable=True).indices[:, :most]
+    few, wishes = Vehicles(*(field[rows].gather(1, columns) for field in vehicles)), wish[rows]
     some = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
     asked = wishes.gather(1, columns)
     kept = torch.where(_gives_way(few, scene.road, asked, some, mobil), 0, asked)
@@ -130,7 +128,7 @@ def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobi
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
     change = mobil_criterion(accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil)
-    exists = torch.stack((on_road(lane + 1.0, road), on_road(lane - 1.0, road)), dim=-1)
+    exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
     gain = torch.where(exists & change.safe & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
     left, right = gain.unbind(-1)
     free = lane_change_done(vehicles, road) & vehicles.valid

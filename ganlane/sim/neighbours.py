@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ganlane.sim.lanes import LaneRange, body_lanes, presence, with_target
-from ganlane.sim.state import Road, Vehicles, reads_are_cheap
+from ganlane.sim.state import LaneRange, Road, Vehicles, body_lanes, presence, reads_are_cheap, with_target
 
 #: Gap in an empty lane, m (Table V's 'maximum gap for empty lane').
 FREE_GAP_M = 10_000.0

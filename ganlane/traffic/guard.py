@@ -14,10 +14,9 @@ from torch import Tensor
 
 from ganlane.parameters.driving import IdmParameters
 from ganlane.sim.idm import TABLE_V, acceleration_behind
-from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import Stream
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, spanned
 from ganlane.traffic.base import Memory, Moved, Overlay
 
 

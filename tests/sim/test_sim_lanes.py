@@ -9,9 +9,8 @@ import torch
 from reference.worlds import DOUBLE, vehicles
 
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.lanes import body_lanes, lane_change_done, presence, with_target
 from ganlane.sim.neighbours import FREE_GAP_M, follower, leader, perceive
-from ganlane.sim.state import Road
+from ganlane.sim.state import Road, body_lanes, lane_change_done, presence, with_target
 
 ROAD = Road(lanes=3)
 

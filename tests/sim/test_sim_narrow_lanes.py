@@ -11,11 +11,10 @@ import torch
 from reference.worlds import DOUBLE
 
 from ganlane.parameters.driving import Visibility
-from ganlane.sim import idm, lanes
+from ganlane.sim import idm
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import idm_acceleration
-from ganlane.sim.lanes import ARRIVED_M, LaneRange, body_lanes, spanned, with_target
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import ARRIVED_M, LaneRange, Road, Vehicles, body_lanes, spanned, with_target
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 CHANGES, SLOWER = 0, 1
@@ -24,7 +23,7 @@ SECONDS = 15
 
 
 def lowest_and_highest(between: LaneRange) -> torch.Tensor:
-    """:func:`ganlane.sim.lanes.spanned` without the lane in the middle."""
+    """:func:`ganlane.sim.state.spanned` without the lane in the middle."""
     return torch.stack((between.low, between.low, between.high), dim=-1)
 
 
@@ -109,4 +108,3 @@ def test_with_the_lowest_and_the_highest_lane_alone_it_would(lane_width_m, befor
 def test_the_lanes_of_a_range_are_its_ends_and_the_one_after_the_lowest():
     low, high = torch.tensor([1.0, 1.0, 1.0]), torch.tensor([1.0, 2.0, 3.0])
     assert spanned(LaneRange(low, high)).tolist() == [[1, 1, 1], [1, 2, 2], [1, 2, 3]]
-    assert lanes.spanned is idm.spanned

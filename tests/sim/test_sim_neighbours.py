@@ -12,7 +12,7 @@ from ganlane.sim import neighbours
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, _gives_way, one_at_a_time
 from ganlane.sim.neighbours import follower, leader, perceive
-from ganlane.sim.recycle import recycle
+from ganlane.sim.spawn import recycle
 from ganlane.sim.state import Road, Vehicles
 
 ROWS = 20

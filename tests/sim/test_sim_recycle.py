@@ -16,7 +16,7 @@ from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.idm import TABLE_V, following_acceleration
 from ganlane.sim.neighbours import perceive
-from ganlane.sim.recycle import RANGE_M, SAFE_DECELERATION, recycle
+from ganlane.sim.spawn import RANGE_M, SAFE_DECELERATION, recycle
 from ganlane.sim.state import Road, Vehicles
 
 ROAD = Road(lanes=3)

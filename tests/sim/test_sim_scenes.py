@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.feasibility import can_brake, highest_speed, least_gap, needed_deceleration
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, can_brake, highest_speed, least_gap, needed_deceleration
 from ganlane.sim.random import Stream, episode_key
-from ganlane.sim.scene_files import read_scene
+from ganlane.sim.scenarios import read_scene
 from ganlane.sim.scenes import FixedScene, SceneVehicle
 from ganlane.sim.spawn import RandomScenes, check_start
 from ganlane.sim.state import Road

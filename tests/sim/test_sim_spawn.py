@@ -17,8 +17,7 @@ from ganlane.errors import UserError
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.feasibility import can_brake
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, can_brake
 from ganlane.sim.mobil import safe_change
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import Purpose, episode_key, uniform

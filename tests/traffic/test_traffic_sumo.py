@@ -16,8 +16,7 @@ from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.lanes import body_lanes
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, body_lanes
 from ganlane.traffic import IdmTraffic, SumoTraffic
 
 LEFT, RIGHT = 1, 2

@@ -15,14 +15,12 @@ from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.parameters.traffic import SumoParameters
-from ganlane.sim.dynamics import STEERING, SteeringParameters
-from ganlane.sim.ego import ego_scene, move_ego
+from ganlane.sim.dynamics import STEERING, SteeringParameters, ego_scene, move_ego
 from ganlane.sim.idm import TABLE_V, following_acceleration
-from ganlane.sim.lanes import body_lanes, presence, with_target
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import TABLE_II, RandomScenes
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, body_lanes, presence, with_target
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.foreign.sumo_roads import Array, Place, SumoDriver, SumoRoads, require_libsumo
 

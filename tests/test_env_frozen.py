@@ -59,7 +59,7 @@ def test_an_ended_row_remembers_no_step_more_than_it_was_driven(chained):
 def test_where_a_look_would_stall_the_device_the_memory_is_the_same(monkeypatch):
     """As on a GPU: the rows are kept as they are in every step."""
     looked = ages(Ageing())
-    monkeypatch.setattr("ganlane.env.physics.readable", lambda flag: False)
+    monkeypatch.setattr("ganlane.env.physics.reads_are_cheap", lambda flag: False)
     monkeypatch.setattr(EndedRows, "keep", None)
     for one, other in zip(looked, ages(Ageing())):
         assert torch.equal(one, other)

@@ -13,7 +13,7 @@ from ganlane import keys
 from ganlane.build import make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.checks import ActionCheck
+from ganlane.env.state import ActionCheck
 from ganlane.errors import UserError
 from ganlane.native.library import why_not
 from ganlane.options import option

@@ -14,10 +14,9 @@ import ganlane
 from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
-from ganlane.env import native_step
+from ganlane.env.highway import say_once, threads_for
 from ganlane.errors import UserError
-from ganlane.native.calls import ROWS_PER_THREAD, threads_allowed
-from ganlane.native.library import why_not
+from ganlane.native.library import ROWS_PER_THREAD, threads_allowed, why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.parameters.driving import EgoParameters, IdmParameters
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, SensorParameters
@@ -88,7 +87,7 @@ def test_two_threads_are_the_kernels_alone_and_change_no_bit():
             state = env.reset()
             for step in range(3):
                 actions = (torch.arange(2 * ROWS_PER_THREAD) + step) % 3
-                with native_step.threads_for(env):
+                with threads_for(env):
                     stepped, state = env.step_and_maybe_reset(state.set("action", actions))
                     seen.append((torch.get_num_threads(), threads_allowed()))
             driven.append(stepped)
@@ -137,7 +136,7 @@ def test_what_the_kernel_cannot_do_it_refuses_in_one_sentence(settings, sentence
 
 
 def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_once_when_it_can(capsys):
-    native_step.say_once.cache_clear()
+    say_once.cache_clear()
     assert environment(kernel="auto").kernel is None
     two = [environment(kernel="auto", dtype=torch.float32) for _ in range(2)]
     assert all(env.kernel is not None for env in two)

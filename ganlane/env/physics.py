@@ -7,6 +7,7 @@ graph (:meth:`Physics.compile`); :func:`run_decision` joins them with the traffi
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -14,24 +15,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.env.state import where
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
-from ganlane.parameters.driving import EgoParameters, IdmParameters
+from ganlane.parameters.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.parameters.episode import EpisodeParameters
 from ganlane.runtime import check_compiler
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.dynamics import (
-    Command,
-    SteeringParameters,
-    apply_action,
-    change_progress,
-    ego_scene,
-    ego_surroundings,
-    move_ego,
-)
+from ganlane.sim.dynamics import Command, apply_action, change_progress, ego_scene, ego_surroundings, move_ego
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.spawn import recycle
-from ganlane.sim.state import Road, Vehicles, lane_change_done
+from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.torch_settings import compiled
 from ganlane.traffic.base import TrafficModule, memory_of
 
@@ -199,14 +191,9 @@ class Physics:
 # A whole decision
 
 
-def readable(flag: Tensor) -> bool:
-    """Whether Python may read ``flag``: cheap on a CPU, where it may save work; a GPU would stall."""
-    return flag.device.type == "cpu"
-
-
 def known_false(flag: Tensor) -> bool:
     """Whether ``flag`` can be read and is false."""
-    return readable(flag) and not bool(flag)
+    return reads_are_cheap(flag) and not bool(flag)
 
 
 class EndedRows:
@@ -247,6 +234,11 @@ def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> T
     return TensorDict._new_unsafe(kept, batch_size=memory.batch_size)
 
 
+def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """``new`` where ``rows`` [N] is true, ``old`` elsewhere."""
+    return torch.where(rows.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
 def run_decision(
     traffic: TrafficModule,
     physics: Physics,
@@ -263,18 +255,13 @@ def run_decision(
     queue, kept in every step.
 
     Args:
-        traffic: moves the other vehicles.
-        physics: moves the ego and finds the events, by ``rules``.
-        rules: of the episodes.
-        state: at the beginning of the decision.
-        start: its first moment.
+        state, start: at the beginning of the decision, and its first moment.
         key: of the episodes, [N] int64.
-        recorder: called after every step.
         substeps: number of physics steps; None: those of the decision period.
     """
     memory, now, ended = memory_of(state), start, EndedRows()
     counters = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.EPISODE_KEY: key}
-    size, can_read = memory.batch_size, readable(now.running)
+    size, can_read = memory.batch_size, reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
     for count in range(rules.episode.substeps() if substeps is None else substeps):
@@ -292,7 +279,7 @@ def run_decision(
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)
         else:
-            memory = where(before.running, after.get(keys.TRAFFIC), memory)
+            memory = after.get(keys.TRAFFIC).apply(partial(_where, before.running), memory)
         if recorder is not None:
             recorder(now.vehicles, before.running)
     return now, ended.restore(memory)

@@ -117,7 +117,7 @@ HORIZON_S = 60.0
 
 
 def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
-    """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead; infinite at 0 m or less."""
+    """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead; infinite at 0 m."""
     closing = (speed - leader_speed).clamp_min(0.0)
     needed = closing * closing / (2.0 * gap.clamp_min(1e-9))
     return torch.where((gap <= 0) & (closing > 0), torch.inf, needed)

@@ -21,8 +21,8 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native.observation import LaneView
 from ganlane.native.settings import NATIVE_FORMS
+from ganlane.native.tensors import LaneView
 from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.torch_settings import compiled

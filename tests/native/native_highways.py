@@ -10,13 +10,15 @@ from tensordict import TensorDictBase
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
-from ganlane.native.decision import EgoState, Kernel, Outcome
+from ganlane.native.tensors import Kernel, Outcome
 from ganlane.parameters.driving import Visibility
 from ganlane.sim.state import Vehicles
 from ganlane.traffic.idm_mobil import IdmMobilTraffic
 
-FLAGS = ("goal", "hard_crash", "out_of_road", "timeout", "soft_crash", "soft_crash_behind")
-EGO_INTEGERS = ("change_direction", "decisions", "lane_changes", "started_change")
+#: Events by the kernel's names, and the ego's memory without the fractions.
+EVENTS = {"soft_crashes": "soft_crash", "soft_crashes_behind": "soft_crash_behind"}
+EVENTS |= {name: name for name in ("goal", "hard_crash", "out_of_road", "timeout")}
+EGO_EXACT = ("change_direction", "decisions", "lane_changes", "started_change", "soft_crash", "soft_crash_behind")
 MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
@@ -79,10 +81,9 @@ def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
 
 def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> Outcome:
     """The decision ``td["action"]`` from the state ``td``."""
-    ego = EgoState(*(td[keys.EGO, name] for name in EgoState._fields))
     recycles = torch.ones_like(td["action"], dtype=torch.bool) if recycle else None
     vehicles = Vehicles.of(td[keys.VEHICLES])
-    return kernel.decide(td["action"], vehicles, td[keys.TRAFFIC, "steering"], ego, td[keys.STEP], recycles)
+    return kernel.decide(td["action"], vehicles, td[keys.TRAFFIC, "steering"], td[keys.EGO], td[keys.STEP], recycles)
 
 
 def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) -> torch.Tensor:
@@ -93,16 +94,14 @@ def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) ->
 
 def differing_rows(out: Outcome, after: TensorDictBase) -> torch.Tensor:
     """Rows [N] in which an event, a flag, a counter or a target lane differs."""
-    differs = (out.target_lane != after[keys.VEHICLES, "target_lane"])[:, :].any(1)
-    for name in FLAGS:
-        differs |= (getattr(out, name) != after[keys.EVENTS, name])[:, 0]
-    for name in EGO_INTEGERS:
-        differs |= getattr(out, name) != after[keys.EGO, name]
+    differs = (out["target_lane"] != after[keys.VEHICLES, "target_lane"]).any(1)
+    for ours, name in EVENTS.items():
+        differs |= (out[ours] != after[keys.EVENTS, name])[:, 0]
+    for name in EGO_EXACT:
+        differs |= out[name] != after[keys.EGO, name]
     for name in ("done", "terminated", "truncated"):
-        differs |= (getattr(out, name) != after[name])[:, 0]
-    for name in ("soft_crash", "soft_crash_behind"):
-        differs |= getattr(out, f"ego_{name}") != after[keys.EGO, name]
-    return differs | (out.step != after[keys.STEP])
+        differs |= (out[name] != after[name])[:, 0]
+    return differs | (out["step"] != after[keys.STEP])
 
 
 def errors(out: Outcome, after: TensorDictBase, rows: torch.Tensor) -> dict[str, float]:
@@ -110,11 +109,11 @@ def errors(out: Outcome, after: TensorDictBase, rows: torch.Tensor) -> dict[str,
     valid = after[keys.VEHICLES, "valid"] & rows[:, None]
     found = {}
     for name in MOTION:
-        found[name] = torch.where(valid, getattr(out, name) - after[keys.VEHICLES, name], 0.0).abs().max().item()
-    steering = torch.where(valid, out.steering - after[keys.TRAFFIC, "steering"], 0.0)
+        found[name] = torch.where(valid, out[name] - after[keys.VEHICLES, name], 0.0).abs().max().item()
+    steering = torch.where(valid, out["steering"] - after[keys.TRAFFIC, "steering"], 0.0)
     found["steering"] = steering.abs().max().item()
     for name in ("mean_acceleration", "change_progress", "distance"):
-        found[name] = torch.where(rows, getattr(out, name) - after[keys.EGO, name], 0.0).abs().max().item()
+        found[name] = torch.where(rows, out[name] - after[keys.EGO, name], 0.0).abs().max().item()
     return found
 
 

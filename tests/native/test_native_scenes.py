@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ganlane.native.library import why_not
-from ganlane.native.scenes import NativeScenes
+from ganlane.native.tensors import NativeScenes
 from ganlane.parameters.driving import Visibility
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.sim.random import episode_key
@@ -36,7 +36,7 @@ def test_every_number_is_that_of_the_tensor_code(name):
     for field, mine, theirs in zip(expected._fields, drawn, expected):
         assert mine.dtype == theirs.dtype, field
         assert torch.equal(mine, theirs), field
-    at_rest = [getattr(out, field) for field in out._fields if field not in {*drawn._fields}]
+    at_rest = [made for name, made in out.items() if name not in {*drawn._fields}]
     assert not any(bool(each.any()) for each in at_rest)
 
 

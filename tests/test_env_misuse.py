@@ -17,8 +17,6 @@ from ganlane.env.state import ActionCheck
 from ganlane.errors import UserError
 from ganlane.native.library import why_not
 from ganlane.options import option
-from ganlane.sim.scenes import LARGEST, MOST_VEHICLES, FixedScene, SceneVehicle
-from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 KERNELS = ["torch", pytest.param("native", marks=pytest.mark.skipif(bool(why_not()), reason="no C++ compiler"))]
@@ -163,17 +161,3 @@ def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_sid
     double = paths(HighwayEnv(model, 2, dtype=torch.float64), actions)
     assert torch.allclose(before.double(), double, atol=1e-3)
     assert torch.equal(paths(HighwayEnv(model, 2), actions), before)
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [
-        tuple(SceneVehicle(30.0 * number, 0) for number in range(MOST_VEHICLES + 1)),
-        (SceneVehicle(0.0, 0), SceneVehicle(10.0 * LARGEST, 0)),
-        (SceneVehicle(0.0, 0), SceneVehicle(40.0, 0, desired_speed_mps=1e-300)),
-    ],
-    ids=["too many", "too far", "too slow"],
-)
-def test_a_scene_beyond_all_bounds_is_refused(rows):
-    with pytest.raises(UserError, match="scene: "):
-        FixedScene(rows, Road(1))

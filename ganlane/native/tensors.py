@@ -170,7 +170,7 @@ class NativeScenes(_Function):
         recycles = torch.zeros(count, dtype=torch.bool)
         scene = [seed, episode, rows, length, width, desired_speed, visibility, valid, recycles]
         self._run(count, scene, tuple(out.values()))
-        moving = (out[name] for name in ("x", "y", "heading", "speed", "acceleration"))
+        moving = (out["x"], out["y"], out["heading"], out["speed"], out["acceleration"])
         return out, Vehicles(*moving, length, width, desired_speed, out["target_lane"], visibility, valid)
 
 

@@ -47,7 +47,7 @@ def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
         ("a.csv", "x_m,lane\n0,0\n30\n", "line 3: 1 cells, the header has 2"),
         ("a.csv", "x_m,lane\n0,0\n\nfar,0\n", "line 4: column x_m: 'far': expected a number"),
         ("a.csv", "x_m,lane\n0,0\n30,0.5\n", "line 3: column lane: '0.5': expected a whole number"),
-        ("a.csv", "x_m,lane,visibility\n0,0,\n30,0,bright\n", "line 3: column visibility: 'bright': expected one of centre"),
+        ("a.csv", "x_m,lane,visibility\n0,0,\n3,0,bad\n", "line 3: column visibility: 'bad': expected one of centre"),
         ("a.csv", "x_m,lane\n0,0\n3,0\n", "the ego (line 2) and vehicle 1 (line 3) overlap"),
         ("a.csv", "x_m,lane\n0,0\ninf,0\n", "vehicle 1 (line 3): x_m=inf: expected a number from -1e+06 to 1e+06"),
         ("a.csv", b"\xff\xfe\x00", "not a text file"),

@@ -166,11 +166,11 @@ def outcome(rules: Rules, end: Substep, command: Command) -> tuple[dict[str, Ten
 
 
 class Physics:
-    """The functions above, not compiled until :meth:`compile`."""
+    """The functions above and recycling, not compiled until :meth:`compile`."""
 
     def __init__(self) -> None:
         self.compiled = False
-        self.begin, self.remember, self.recycle, self._advance = begin, remember, recycle, advance
+        self.begin, self.remember, self.recycle, self.advance = begin, remember, recycle, advance
 
     def compile(self) -> None:
         """Compile each function to a graph.
@@ -180,12 +180,8 @@ class Physics:
         """
         check_compiler()
         self.compiled = True
-        for name in ("begin", "remember", "recycle", "_advance"):
+        for name in ("begin", "remember", "recycle", "advance"):
             setattr(self, name, compiled(getattr(self, name)))
-
-    def advance(self, rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -> Substep:
-        """As the function. In a graph the copies cost nothing, so one graph serves both cases."""
-        return self._advance(rules, before, moved, all_running and not self.compiled)
 
 
 # A whole decision
@@ -273,7 +269,8 @@ def run_decision(
         vehicles = TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size)
         fields = {keys.VEHICLES: vehicles, keys.TRAFFIC: memory, **counters, keys.STEP: start.step + count}
         after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
-        all_running = known_false((~before.running).any())
+        # In a graph the copies cost nothing, so one graph serves both cases.
+        all_running = not physics.compiled and known_false((~before.running).any())
         now = physics.advance(rules, before, Vehicles.of(after.get(keys.MOVED)), all_running)
         if can_read:
             memory = after.get(keys.TRAFFIC)

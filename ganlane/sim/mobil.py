@@ -44,13 +44,6 @@ class LaneAccelerations(NamedTuple):
         return LaneAccelerations(*(number[..., lanes] for number in self))
 
 
-class Change(NamedTuple):
-    """Incentive of a change into a lane, m/s2, and whether it is safe."""
-
-    incentive: Tensor
-    safe: Tensor
-
-
 def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelerations:
     """The :class:`LaneAccelerations` of each observer in ``lanes`` [N, K, L] (float).
 
@@ -67,17 +60,18 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
     return LaneAccelerations(own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0))
 
 
-def mobil_criterion(there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil) -> Change:
-    """MOBIL's incentive and safety criterion for a change from ``here`` [N, K, 1] to ``there`` [N, K, L]."""
+def mobil_criterion(there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil) -> tuple[Tensor, Tensor]:
+    """MOBIL's incentive, m/s2, of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], and whether it is safe."""
     burden, relief = there.with_it - there.without, here.without - here.with_it
     incentive = there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
-    return Change(incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration)
+    return incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration
 
 
 def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
     there = lane_accelerations(scene, lane[..., None], idm)
-    return mobil_criterion(there, there, mobil).safe[..., 0]
+    _, safe = mobil_criterion(there, there, mobil)
+    return safe[..., 0]
 
 
 def without_ego(wish: Tensor) -> Tensor:
@@ -127,10 +121,9 @@ def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobi
     lane = vehicles.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    change = mobil_criterion(accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil)
+    incentive, safe = mobil_criterion(accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil)
     exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
-    gain = torch.where(exists & change.safe & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
-    left, right = gain.unbind(-1)
+    left, right = torch.where(exists & safe & (incentive > mobil.threshold), incentive, -torch.inf).unbind(-1)
     free = lane_change_done(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)

@@ -182,11 +182,9 @@ class RandomScenes:
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """One random scene per key."""
-        lanes, width = self.road.lanes, self.road.lane_width_m
-        assert not isinstance(lanes, Tensor)
-        assert not isinstance(width, Tensor)
+        road = (int(self.road.lanes), float(self.road.lane_width_m))
         visibility = (self.ego_visibility, self.others_visibility)
-        return spawn(key, self.vehicles, lanes, float(width), self.parameters, dtype, *visibility)
+        return spawn(key, self.vehicles, *road, self.parameters, dtype, *visibility)
 
 
 def _described(road: Road) -> str:

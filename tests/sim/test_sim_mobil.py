@@ -23,7 +23,6 @@ from ganlane.sim import mobil as mobil_module
 from ganlane.sim.idm import TABLE_V, idm_acceleration
 from ganlane.sim.mobil import (
     TABLE_IV,
-    Change,
     lane_accelerations,
     mobil_changes,
     mobil_criterion,
@@ -51,14 +50,13 @@ def wish(*cars, lanes: int = 2, mobil: MobilParameters = TABLE_IV) -> int:
     return mobil_wishes(perceive(vehicles(*cars), road), road, mobil=mobil)[0, 0].item()
 
 
-def change_to_the_left(scene) -> Change:
-    """Of the first car, from lane 0 to lane 1."""
+def change_to_the_left(scene) -> tuple[float, bool]:
+    """Incentive for the first car to change from lane 0 to lane 1, and whether that is safe."""
     lanes = torch.tensor([0.0, 1.0]).expand(*scene.vehicles.x.shape, 2)
     both = lane_accelerations(scene, lanes, TABLE_V)
     assert both.own[0, 0, 0].item() == pytest.approx(OWN, abs=1e-5)
-    return Change(
-        *(number[..., 0] for number in mobil_criterion(both.of(slice(1, 2)), both.of(slice(0, 1)), TABLE_IV))
-    )
+    incentive, safe = mobil_criterion(both.of(slice(1, 2)), both.of(slice(0, 1)), TABLE_IV)
+    return incentive[0, 0, 0].item(), safe[0, 0, 0].item()
 
 
 def fast_follower(gap: float) -> dict:
@@ -68,9 +66,9 @@ def fast_follower(gap: float) -> dict:
 
 def test_an_empty_lane_beside_a_slow_leader_is_worth_the_gain_in_acceleration():
     scene = perceive(vehicles(SUBJECT, SLOW), Road(lanes=2))
-    change = change_to_the_left(scene)
-    assert change.incentive[0, 0].item() == pytest.approx(FREE - OWN, abs=1e-5)  # 1.784604
-    assert change.safe[0, 0]
+    incentive, safe = change_to_the_left(scene)
+    assert incentive == pytest.approx(FREE - OWN, abs=1e-5)  # 1.784604
+    assert safe
     assert wish(SUBJECT, SLOW) == 1
 
 
@@ -86,8 +84,8 @@ def test_the_incentive_weighs_both_followers():
     old = {"x": -34.5, "lane": 0, "speed": 20.0, "desired_speed": 25.0}
     cars = (SUBJECT, SLOW, fast_follower(60.0), old)
     scene = perceive(vehicles(*cars), Road(lanes=2))
-    change = change_to_the_left(scene)
-    assert change.incentive[0, 0].item() == pytest.approx(0.004678, abs=1e-5)
+    incentive, _ = change_to_the_left(scene)
+    assert incentive == pytest.approx(0.004678, abs=1e-5)
     # 0.0047 is under the threshold of 0.1, over one of 0, and under it again without the old follower's relief.
     assert wish(*cars) == 0
     assert wish(*cars, mobil=MobilParameters(threshold=0.0)) == 1

@@ -206,3 +206,42 @@ def same_bits(one: TensorDictBase, other: TensorDictBase) -> list[str]:
     """Names of the entries that are missing in one or differ in any bit."""
     a, b = dict(leaves(one)), dict(leaves(other))
     return [str(name) for name in {**a, **b} if name not in a or name not in b or not torch.equal(a[name], b[name])]
+
+
+Track = list[torch.Tensor]
+
+
+def tracks(
+    env: HighwayEnv,
+    decisions: int,
+    act: Callable[[TensorDictBase], torch.Tensor],
+    episodes: Sequence[int] | None = None,
+) -> dict[int, Track]:
+    """Episode to its states, over a run with automatic resets; unfinished episodes are left out.
+
+    ``episodes`` [N] are those that it begins with; None: the environment's first ones. A state is all that there is
+    of a row, exactly (a float32 and a small integer fit into a float64).
+    """
+    td = env.reset()
+    if episodes is not None:
+        td = env.reset(td.select(keys.SEED, keys.EPISODE).set(keys.EPISODE, torch.tensor(episodes)))
+    found: dict[int, Track] = {}
+    finished = set()
+    for _ in range(decisions):
+        stepped, td = env.step_and_maybe_reset(td.set("action", act(td)))
+        after = stepped["next"].exclude("reward", "action")
+        numbers = [value.reshape(len(after), -1).double() for name, value in leaves(after) if name != keys.EPISODE]
+        states = torch.cat(numbers, dim=1)
+        for row, episode in enumerate(after[keys.EPISODE].tolist()):
+            found.setdefault(episode, []).append(states[row])
+            if after["done"][row]:
+                finished.add(episode)
+    return {episode: found[episode] for episode in finished}
+
+
+def assert_same_tracks(some: dict[int, Track], others: dict[int, Track], at_least: int) -> None:
+    """That so many episodes are in both, and the same bit for bit."""
+    common = some.keys() & others.keys()
+    assert len(common) >= at_least
+    for episode in common:
+        assert torch.equal(torch.stack(some[episode]), torch.stack(others[episode])), episode

@@ -98,11 +98,9 @@ def test_what_is_found_on_another_device_is_told_in_a_later_step():
 
 @pytest.mark.parametrize("state", [{}, {keys.ACTION: torch.ones(1, dtype=torch.int64)}], ids=["nothing", "action"])
 def test_a_step_before_a_reset_is_refused(state):
-    for env in (made(), ganlane.make_env("idm")):
+    for env in (made(), ganlane.make_env("idm").base_env):
         with pytest.raises(UserError, match="call reset"):
-            env.base_env.step(TensorDict(state, [1])) if hasattr(env, "base_env") else env.step(
-                TensorDict(state, [1])
-            )
+            env.step(TensorDict(state, [1]))
 
 
 @pytest.mark.parametrize("counters", [{keys.EPISODE: torch.zeros(2)}, {keys.EPISODE: torch.zeros(2).long()}])
@@ -153,10 +151,7 @@ def test_autocast_changes_no_traffic(traffic, dtype):
 
 
 def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_side_by_side():
-    model, actions = (
-        make_traffic(option("traffic", "gan_calibrated"), EnvConfig()),
-        torch.zeros(3, 2, dtype=torch.int64),
-    )
+    model, actions = make_traffic(option("traffic", "gan_calibrated"), EnvConfig()), torch.zeros(3, 2).long()
     before = paths(HighwayEnv(model, 2), actions)
     double = paths(HighwayEnv(model, 2, dtype=torch.float64), actions)
     assert torch.allclose(before.double(), double, atol=1e-3)

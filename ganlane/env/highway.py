@@ -51,10 +51,8 @@ class HighwayEnv(EnvBase):
         traffic: moves the other vehicles; its road is the environment's.
         num_envs: N, the batch size.
         vehicles: M, the ego included; None: as many as ``scenes`` has, 9 without.
-        spawn_parameters: Table II.
-        ego: the ego's lane changes and visibility.
-        episode: decision period, goal and time-out.
-        idm, steering: the ego's car following (Table V) and steering.
+        spawn_parameters, episode: Table II; decision period, goal and time-out.
+        ego, idm, steering: the ego's lane changes and visibility, car following (Table V) and steering.
         stream: family of episodes (training, selection, report); by default, and at most, the traffic's.
         seed: base of the random numbers; ``set_seed`` changes it for the next full reset.
         first_episode: row i starts with episode ``first_episode + i`` and continues in steps of N.
@@ -215,24 +213,19 @@ class HighwayEnv(EnvBase):
         """All rows at the start of their episodes; EnvBase keeps the rows that are not to be reset."""
         seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
         mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = None if mask is None else mask.reshape(-1)
         if self._native_scenes is not None:
-            drawn = None if mask is None else mask.reshape(-1)
-            return outcome_state(seed, episode, *self._native_scenes.start(seed, episode, drawn))
-        rows = self._rows_to_draw(mask)
-        if rows is None:
+            return outcome_state(seed, episode, *self._native_scenes.start(seed, episode, mask))
+        if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
+            return self._start(seed, episode)
+        rows = mask.nonzero()[:, 0]
+        if not 0 < len(rows) <= len(mask) // FEW_ROWS:
             return self._start(seed, episode)
         # The other rows keep what they have: here they repeat one of those drawn, which is quicker than their own.
         place = torch.zeros_like(seed)
         place[rows] = torch.arange(len(rows))
         started = self._start(seed[rows], episode[rows])[place]
         return started.set(keys.SEED, seed).set(keys.EPISODE, episode)
-
-    def _rows_to_draw(self, mask: Tensor | None) -> Tensor | None:
-        """The rows to be reset, where to draw them alone saves time; None: draw all."""
-        if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
-            return None
-        rows = mask.reshape(-1).nonzero()[:, 0]
-        return rows if 0 < len(rows) <= self.batch_size[0] // FEW_ROWS else None
 
     def _start(self, seed: Tensor, episode: Tensor) -> TensorDictBase:
         """The first states of episodes [K]."""
@@ -264,13 +257,8 @@ class HighwayEnv(EnvBase):
         end, memory = run_decision(self.traffic, self.physics, rules, tensordict, start, key, self.recorder)
         ego = self.physics.remember(rules, ego, start, end, command)
         events, flags = outcome(rules, end, command)
-        rest = {
-            keys.SEED: seed,
-            keys.EPISODE: episode,
-            keys.STEP: end.step,
-            keys.REWARD: torch.zeros_like(ego["distance"])[:, None],
-            **flags,
-        }
+        reward = torch.zeros_like(ego["distance"])[:, None]  # which a transform writes
+        rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: end.step, keys.REWARD: reward, **flags}
         if self.traffic.own_roads:
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
         vehicles = end.vehicles

@@ -195,8 +195,8 @@ def known_false(flag: Tensor) -> bool:
 class EndedRows:
     """The traffic's memory of the rows that end within a decision, kept as it was when they ended.
 
-    Meanwhile the traffic still computes these rows, in vain. Restoring their memory in every physics step would
-    copy that of all rows each time, and generated traffic's is large.
+    The traffic goes on computing them, in vain: restoring their memory in every physics step would copy that of all
+    rows each time, and generated traffic's is large.
     """
 
     def __init__(self) -> None:

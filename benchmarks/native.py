@@ -31,8 +31,8 @@ from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
-from ganlane.native.decision import EgoState, Kernel, Outcome
 from ganlane.native.library import VARIANTS, best_variant
+from ganlane.native.tensors import Kernel, empty_outcome
 from ganlane.parameters.episode import SpawnParameters
 from ganlane.parameters.observation import ObservationConfig
 from ganlane.sim import neighbours
@@ -69,9 +69,9 @@ def contenders(
 ) -> dict[str, Callable]:
     """Name to a decision of all rows from the same state."""
     rows = td.batch_size[0]
-    ego = EgoState(*(td[keys.EGO, name] for name in EgoState._fields))
-    vehicles, steering, step = Vehicles.of(td[keys.VEHICLES]), td[keys.TRAFFIC, "steering"], td[keys.STEP]
-    out = Outcome.empty(rows, env.vehicles)
+    ego, vehicles = td[keys.EGO], Vehicles.of(td[keys.VEHICLES])
+    steering, step = td[keys.TRAFFIC, "steering"], td[keys.STEP]
+    out = empty_outcome(rows, env.vehicles)
     made: dict[str, Callable] = {}
     for variant in variants:
         kernel = Kernel(env.road, env.vehicles, env.episode, env.ego, mobil=env.traffic.mobil, variant=variant)

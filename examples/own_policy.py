@@ -14,7 +14,7 @@ from ganlane.agents.drivers import Driver
 from ganlane.evaluation import text_table
 from ganlane.keys import KEEP, LEFT, RIGHT
 from ganlane.sim import Road, Stream, leader, safe_change
-from ganlane.sim.ego import ego_scene
+from ganlane.sim.dynamics import ego_scene
 
 
 class LargestGap(Driver):

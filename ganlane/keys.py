@@ -9,7 +9,7 @@ N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI un
 ``vehicles.length, width``                 [N, M]      m, fixed for an episode
 ``vehicles.desired_speed``                 [N, M]      m/s, fixed for an episode
 ``vehicles.target_lane``                   [N, M] i64  the lane it keeps or is moving to; 0 is the rightmost
-``vehicles.visibility``                    [N, M] i64  0 centre, 1 body, 2 signalled (:mod:`ganlane.sim.lanes`)
+``vehicles.visibility``                    [N, M] i64  0 centre, 1 body, 2 signalled (:mod:`ganlane.sim.state`)
 ``vehicles.valid``                         [N, M] b    false is padding: never seen, hit or counted
 ``ego.*``                                  [N]         the environment's memory of the ego
 ``traffic.*``                              free        the traffic module's memory

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import pytest
 import torch
 from reference.worlds import environment, step
@@ -20,14 +18,6 @@ MEANT_MPS = 25.0
 #: Rows of one batch, all of which keep their lane: normal; wanting 1 m/s; wanting 0.1 m/s; behind a column at 1 m/s.
 NORMAL, CRAWLING, PARKING, STUCK = slice(0, 4), slice(4, 6), slice(6, 8), slice(8, 11)
 ROWS = 11
-
-
-class Totals(NamedTuple):
-    """Of every row's episode, each [ROWS]."""
-
-    paid: torch.Tensor
-    seconds: torch.Tensor
-    goal: torch.Tensor
 
 
 def slowed(env: HighwayEnv):
@@ -49,7 +39,8 @@ def pay(td) -> torch.Tensor:
     return sum(RewardTransform(1.0).terms(meant).values())[:, 0]
 
 
-def drive(goal_m: float, timeout_s: float) -> Totals:
+def drive(goal_m: float, timeout_s: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """What every row's episode paid, its seconds, and whether it reached the goal, each [ROWS]."""
     others = {"mobil": False, "dtype": torch.float32, "stream": Stream.REPORT}
     env = environment(num_envs=ROWS, goal_m=goal_m, timeout_s=timeout_s, **others)
     td, driving = slowed(env), torch.ones(ROWS, dtype=torch.bool)
@@ -61,35 +52,31 @@ def drive(goal_m: float, timeout_s: float) -> Totals:
         seconds += driving
         goal |= driving & td[keys.EVENTS, "goal"][:, 0]
         driving &= ~td["done"][:, 0]
-    return Totals(paid, seconds, goal)
+    return paid, seconds, goal
 
 
-def check(goal_m: float, timeout_s: float) -> Totals:
+@pytest.mark.parametrize(
+    ("goal_m", "timeout_s", "normal", "slow"),
+    [
+        (1000.0, 200.0, 50.0, -200.0),  # a fifth of the way, in a fifth of the time
+        pytest.param(5000.0, 1000.0, 200.0, -1350.0, marks=pytest.mark.slow),
+    ],
+)
+def test_who_crawls_stands_or_waits_behind_a_stalled_column_earns_far_less_than_who_keeps_its_lane(
+    goal_m, timeout_s, normal, slow
+):
     """At v m/s a crawl earns (v - 15) / 10 a second."""
-    totals = drive(goal_m, timeout_s)
-    assert totals.goal.tolist() == [True] * 4 + [False] * 7
-    assert (totals.seconds[4:] == timeout_s).all()
+    paid, seconds, goal = drive(goal_m, timeout_s)
+    assert goal.tolist() == [True] * 4 + [False] * 7
+    assert (seconds[4:] == timeout_s).all()
     for rows, speed in ((CRAWLING, 1.0), (PARKING, 0.1), (STUCK, 1.0)):
         expected = timeout_s * (speed - 15.0) / 10.0
         # It starts at 10 to 15 m/s, and the first seconds cost less; -10 for a soft crash behind the column.
-        assert ((totals.paid[rows] - expected).abs() < 30.0).all()
+        assert ((paid[rows] - expected).abs() < 30.0).all()
     # Known weakness: below 15 m/s every second costs, so leaving the road at once is cheaper than living on.
-    assert (totals.paid[4:] < RewardParameters().out_of_road).all()
-    return totals
-
-
-def test_who_crawls_stands_or_waits_behind_a_stalled_column_earns_far_less_than_who_keeps_its_lane():
-    """On a fifth of the way, in a fifth of the time."""
-    totals = check(goal_m=1000.0, timeout_s=200.0)
-    assert (totals.paid[NORMAL] > 50.0).all()
-    assert (totals.paid[4:] < -200.0).all()
-
-
-@pytest.mark.slow
-def test_so_it_is_over_the_whole_1000_s():
-    totals = check(goal_m=5000.0, timeout_s=1000.0)
-    assert (totals.paid[NORMAL] > 200.0).all()
-    assert (totals.paid[4:] < -1350.0).all()
+    assert (paid[4:] < RewardParameters().out_of_road).all()
+    assert (paid[NORMAL] > normal).all()
+    assert (paid[4:] < slow).all()
 
 
 def test_an_ego_meant_to_drive_no_faster_than_15_mps_would_be_paid_for_crawling_and_is_refused():

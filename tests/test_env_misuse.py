@@ -13,12 +13,10 @@ from ganlane import keys
 from ganlane.build import make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.checks import ActionCheck
+from ganlane.env.state import ActionCheck
 from ganlane.errors import UserError
 from ganlane.native.library import why_not
 from ganlane.options import option
-from ganlane.sim.scenes import LARGEST, MOST_VEHICLES, FixedScene, SceneVehicle
-from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic
 
 KERNELS = ["torch", pytest.param("native", marks=pytest.mark.skipif(bool(why_not()), reason="no C++ compiler"))]
@@ -100,11 +98,9 @@ def test_what_is_found_on_another_device_is_told_in_a_later_step():
 
 @pytest.mark.parametrize("state", [{}, {keys.ACTION: torch.ones(1, dtype=torch.int64)}], ids=["nothing", "action"])
 def test_a_step_before_a_reset_is_refused(state):
-    for env in (made(), ganlane.make_env("idm")):
+    for env in (made(), ganlane.make_env("idm").base_env):
         with pytest.raises(UserError, match="call reset"):
-            env.base_env.step(TensorDict(state, [1])) if hasattr(env, "base_env") else env.step(
-                TensorDict(state, [1])
-            )
+            env.step(TensorDict(state, [1]))
 
 
 @pytest.mark.parametrize("counters", [{keys.EPISODE: torch.zeros(2)}, {keys.EPISODE: torch.zeros(2).long()}])
@@ -155,25 +151,8 @@ def test_autocast_changes_no_traffic(traffic, dtype):
 
 
 def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_side_by_side():
-    model, actions = (
-        make_traffic(option("traffic", "gan_calibrated"), EnvConfig()),
-        torch.zeros(3, 2, dtype=torch.int64),
-    )
+    model, actions = make_traffic(option("traffic", "gan_calibrated"), EnvConfig()), torch.zeros(3, 2).long()
     before = paths(HighwayEnv(model, 2), actions)
     double = paths(HighwayEnv(model, 2, dtype=torch.float64), actions)
     assert torch.allclose(before.double(), double, atol=1e-3)
     assert torch.equal(paths(HighwayEnv(model, 2), actions), before)
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [
-        tuple(SceneVehicle(30.0 * number, 0) for number in range(MOST_VEHICLES + 1)),
-        (SceneVehicle(0.0, 0), SceneVehicle(10.0 * LARGEST, 0)),
-        (SceneVehicle(0.0, 0), SceneVehicle(40.0, 0, desired_speed_mps=1e-300)),
-    ],
-    ids=["too many", "too far", "too slow"],
-)
-def test_a_scene_beyond_all_bounds_is_refused(rows):
-    with pytest.raises(UserError, match="scene: "):
-        FixedScene(rows, Road(1))

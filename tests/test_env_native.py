@@ -14,10 +14,9 @@ import ganlane
 from ganlane import keys
 from ganlane.build import make_env
 from ganlane.config.env import EnvConfig
-from ganlane.env import native_step
+from ganlane.env.highway import say_once, threads_for
 from ganlane.errors import UserError
-from ganlane.native.calls import ROWS_PER_THREAD, threads_allowed
-from ganlane.native.library import why_not
+from ganlane.native.library import ROWS_PER_THREAD, threads_allowed, why_not
 from ganlane.native.settings import NATIVE_FORMS
 from ganlane.parameters.driving import EgoParameters, IdmParameters
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, SensorParameters
@@ -65,19 +64,6 @@ def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share)
     assert ended > 16
 
 
-def test_a_rollout_is_the_same_bit_for_bit_in_another_batch():
-    whole, part = native(24, seed=5), native(5, seed=5)
-    actions = torch.arange(12)[:, None] * 0 + torch.tensor([0, 1, 0, 0, 2] * 5)[:24]
-    states = []
-    for env in (whole, part):
-        td = env.reset()
-        for row in actions:
-            td["action"] = row[: env.batch_size[0]].clone()
-            td = env.step(td)["next"].exclude("reward")
-        states.append(td[:5])
-    assert (states[0] == states[1]).all()
-
-
 def test_two_threads_are_the_kernels_alone_and_change_no_bit():
     """Around the kernel torch computes on one thread, and has both again afterwards."""
     driven, seen, before = [], [], torch.get_num_threads()
@@ -88,7 +74,7 @@ def test_two_threads_are_the_kernels_alone_and_change_no_bit():
             state = env.reset()
             for step in range(3):
                 actions = (torch.arange(2 * ROWS_PER_THREAD) + step) % 3
-                with native_step.threads_for(env):
+                with threads_for(env):
                     stepped, state = env.step_and_maybe_reset(state.set("action", actions))
                     seen.append((torch.get_num_threads(), threads_allowed()))
             driven.append(stepped)
@@ -105,15 +91,6 @@ def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
     state = env.reset().set("_reset", torch.tensor([[True], [False]]))
     with pytest.raises(UserError, match=r"next_episode is \[.*; give next_episode as int64 of shape \[2\]"):
         env.reset(state, next_episode=wrong)
-
-
-def test_what_goes_into_a_step_stays_as_it_is():
-    env = native()
-    td = env.reset()
-    td["action"] = torch.ones(8, dtype=torch.int64)
-    before = td.clone()
-    env.step_and_maybe_reset(td.clone(recurse=False))
-    assert (td == before).all()
 
 
 class Cruise(TrafficModule):
@@ -137,7 +114,7 @@ def test_what_the_kernel_cannot_do_it_refuses_in_one_sentence(settings, sentence
 
 
 def test_auto_takes_the_tensor_code_where_the_kernel_cannot_and_says_once_when_it_can(capsys):
-    native_step.say_once.cache_clear()
+    say_once.cache_clear()
     assert environment(kernel="auto").kernel is None
     two = [environment(kernel="auto", dtype=torch.float32) for _ in range(2)]
     assert all(env.kernel is not None for env in two)
@@ -164,18 +141,27 @@ def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
     assert (copied(env).step(td.clone())["next"] == env.step(td)["next"]).all()
 
 
+SENSORS = pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+
+
+def driven(env, decisions):
+    """States of a drive with automatic resets and lane changes in a third of the rows."""
+    td, rows = env.reset(), torch.arange(env.batch_size[0])
+    for decision in range(decisions):
+        yield td
+        td["action"] = (rows + decision) % 20 % 3 * (rows % 3 == decision % 3)
+        td = env.step_and_maybe_reset(td)[1]
+
+
 @pytest.mark.parametrize("form", sorted(NATIVE_FORMS))
-@pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+@SENSORS
 def test_the_lane_view_is_that_of_the_tensor_code(form, sensors):
     """Up to the rounding of the exponential function; with lorries, and with what the sensors deliver."""
     config = EnvConfig(kernel="native", vehicles=20, spread_m=300.0, min_spacing_m=25.0, truck_share=0.3)
     env = make_env(IdmMobilTraffic(Road()), config, ObservationConfig(form=form, sensors=sensors), num_envs=64)
     plain = ObservationTransform(Road(), 20, form)
-    td = env.reset()
-    for decision in range(40):
+    for td in driven(env, 40):
         assert torch.allclose(td["observation"], plain(td.clone())["observation"], atol=1e-6)
-        td["action"] = (torch.arange(64) + decision) % 20 % 3 * (torch.arange(64) % 3 == decision % 3)
-        td = env.step_and_maybe_reset(td)[1]
 
 
 def test_rows_that_are_reset_alone_start_as_all_do():
@@ -190,22 +176,18 @@ def test_rows_that_are_reset_alone_start_as_all_do():
 
 
 @pytest.mark.parametrize("abort", [False, True])
-@pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+@SENSORS
 def test_the_safe_actions_are_those_of_the_tensor_code(abort, sensors):
     config = EnvConfig(kernel="native", vehicles=20, spread_m=150.0, ego=EgoParameters(abort_lane_change=abort))
     form = ObservationConfig(form="lane_view", sensors=sensors)
     env = make_env(IdmMobilTraffic(Road()), config, form, num_envs=128, mask=MaskParameters(form="safe"))
     plain = ActionMaskTransform(Road(), "safe", abort=abort)
-    td, refused, hopeless = env.reset(), 0, 0
-    for decision in range(40):
+    refused, hopeless = 0, 0
+    for td in driven(env, 40):
         expected = plain(td.clone())
         assert torch.equal(td[keys.ACTION_MASK], expected[keys.ACTION_MASK])
         assert torch.equal(td[keys.NO_SAFE_ACTION], expected[keys.NO_SAFE_ACTION])
-        refused, hopeless = (
-            refused + int((~td[keys.ACTION_MASK]).sum()),
-            hopeless + int(td[keys.NO_SAFE_ACTION].sum()),
-        )
-        td["action"] = (torch.arange(128) + decision) % 20 % 3 * (torch.arange(128) % 3 == decision % 3)
-        td = env.step_and_maybe_reset(td)[1]
+        refused += int((~td[keys.ACTION_MASK]).sum())
+        hopeless += int(td[keys.NO_SAFE_ACTION].sum())
     assert refused > 1000
     assert hopeless > 0

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.worlds import environment, packed, same_bits, step
+from reference.worlds import drawing, environment, packed, same_bits, step, vehicles_at
 from torchrl.envs import Compose, TransformedEnv
 
 from ganlane import keys
@@ -61,46 +61,28 @@ def check_motion(env: HighwayEnv, plan: list[list[int]], tolerance_m: float = 1e
     frames: list[Vehicles] = []
     env.recorder = lambda vehicles, running: frames.append(vehicles)
     td = env.reset()
-    start = Vehicles.of(td[keys.VEHICLES])
+    start = last = Vehicles.of(td[keys.VEHICLES])
     for action in plan:
-        before = Vehicles.of(td[keys.VEHICLES])
         td = step(env, td, action)
-        last = check_frames(env, frames, before, start, tolerance_m, slides)
-        check_between(env, last, Vehicles.of(td[keys.VEHICLES]))
+        for after in frames:
+            moved = torch.hypot(after.x - last.x, after.y - last.y)
+            if slides:
+                moved[:, 1:] = (after.x - last.x)[:, 1:].abs()
+            assert (after.speed >= 0.0).all()
+            assert (moved <= torch.maximum(last.speed, after.speed) * keys.PHYSICS_STEP_S + tolerance_m).all()
+            assert ((after.target_lane >= 0) & (after.target_lane < env.road.lanes)).all()
+            assert ((after.target_lane - last.target_lane).abs() <= 1).all()
+            assert all(torch.equal(getattr(after, name), getattr(start, name)) for name in FIXED)
+            last = after
         frames.clear()
-
-
-def check_between(env: HighwayEnv, last: Vehicles, now: Vehicles) -> None:
-    """After a decision nothing changes but the positions of recycled vehicles: from beyond 200 m, by 400 m."""
-    for name in keys.VEHICLE_FIELDS:
-        assert name == "x" or torch.equal(getattr(now, name), getattr(last, name))
-    distance = last.x - last.x[:, :1]
-    recycled = last.x - 400.0 * torch.sign(distance)
-    may_go = (distance.abs() > 200.0) & env.recycle
-    assert ((now.x == last.x) | (may_go & (now.x == recycled))).all()
-
-
-def check_frames(
-    env: HighwayEnv,
-    frames: list[Vehicles],
-    before: Vehicles,
-    start: Vehicles,
-    tolerance_m: float,
-    slides: bool,
-) -> Vehicles:
-    """The physics steps of a decision, from ``before``; gives the last one."""
-    for after in frames:
-        moved = torch.hypot(after.x - before.x, after.y - before.y)
-        if slides:
-            moved[:, 1:] = (after.x - before.x)[:, 1:].abs()
-        assert (after.speed >= 0.0).all()
-        assert (moved <= torch.maximum(before.speed, after.speed) * keys.PHYSICS_STEP_S + tolerance_m).all()
-        assert ((after.target_lane >= 0) & (after.target_lane < env.road.lanes)).all()
-        assert ((after.target_lane - before.target_lane).abs() <= 1).all()
-        for name in FIXED:
-            assert torch.equal(getattr(after, name), getattr(start, name))
-        before = after
-    return before
+        # After a decision nothing changes but the positions of recycled vehicles: from beyond 200 m, by 400 m.
+        now = Vehicles.of(td[keys.VEHICLES])
+        distance = last.x - last.x[:, :1]
+        recycled = last.x - 400.0 * torch.sign(distance)
+        may_go = (distance.abs() > 200.0) & env.recycle
+        assert ((now.x == last.x) | (may_go & (now.x == recycled))).all()
+        last = last.with_(x=now.x)
+        assert all(map(torch.equal, now, last))
 
 
 @settings(max_examples=10)
@@ -176,22 +158,16 @@ def test_a_vehicle_that_is_not_valid_is_in_no_observation(data, form, lanes, oth
 
 def any_vehicles(count: int, lanes: int, seed: int) -> Vehicles:
     """One row of vehicles anywhere on 600 m of road, at any speed."""
-    generator = torch.Generator().manual_seed(seed)
-    u = torch.rand((6, 1, count), generator=generator, dtype=torch.float64)
-    lane = (u[1] * lanes).long()
-    zero = torch.zeros_like(u[0])
-    return Vehicles(
-        x=600.0 * u[0] - 300.0,
-        y=4.0 * lane + 2.0 * u[2] - 1.0,
-        heading=0.2 * u[3] - 0.1,
-        speed=40.0 * u[4],
-        acceleration=zero,
-        length=zero + 4.5,
-        width=zero + 2.5,
-        desired_speed=15.0 + 20.0 * u[5],
-        target_lane=lane,
+    between = drawing((1, count), seed)
+    lane = between(0, lanes).long()
+    return vehicles_at(
+        between(-300, 300),
+        lane,
+        y=4.0 * lane + between(-1, 1),
+        heading=between(-0.1, 0.1),
+        speed=between(0, 40),
+        desired_speed=between(15, 35),
         visibility=lane % 3,
-        valid=lane >= 0,
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
-from reference.worlds import same_bits, step
+from reference.worlds import Track, assert_same_tracks, step, tracks
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -127,23 +127,14 @@ def test_the_observation_knows_the_row_s_own_lanes(recordings):
 
 
 def test_an_episode_is_the_same_bits_in_every_batch_and_after_automatic_resets(recordings):
-    wide, narrow = make(recordings, 24), make(recordings, 1)
-    ends = {}
-    for env, decisions in ((wide, 12), (narrow, 60)):
-        td, driver, tracks = env.reset(), MobilDriver(env.road), {}
-        for _ in range(decisions):
-            stepped, td = env.step_and_maybe_reset(driver(td))
-            after = stepped["next"].exclude("reward", "action")
-            for row, number in enumerate(after[keys.EPISODE].tolist()):
-                tracks.setdefault(number, []).append(after[row : row + 1].clone())
-        ends[env.batch_size[0]] = tracks
-    common = sorted(set(ends[24]) & set(ends[1]))[:-1]
-    assert len(common) >= 4
-    for number in common:
-        pairs = list(zip(ends[24][number], ends[1][number]))
-        assert len(pairs) >= 4
-        for one, other in pairs:
-            assert same_bits(one, other) == [], number
+    def driven(rows: int, decisions: int) -> dict[int, Track]:
+        env = make(recordings, rows)
+        driver = MobilDriver(env.road)
+        return tracks(env, decisions, lambda td: driver(td)["action"])
+
+    wide = driven(24, 12)
+    assert min(len(track) for track in wide.values()) >= 4
+    assert_same_tracks(driven(1, 60), wide, at_least=4)
 
 
 def test_scenes_given_by_hand_come_before_the_recorded_ones(recordings):

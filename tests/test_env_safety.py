@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 import torch
-from reference.worlds import environment
+from reference.worlds import environment, placed, step, vehicles
 
 from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver, MobilDriver
@@ -20,24 +20,19 @@ from ganlane.sim.state import Vehicles
 ROWS = 16
 
 
-@dataclass
 class Log:
-    """What a recorder saw: vehicle-km, steps with overlaps, vehicles off the road, the lowest speed."""
+    """What a recorder saw: vehicle-km, steps with overlaps; nobody leaves the road or drives backwards."""
 
-    vehicle_km: float = 0.0
-    overlaps: int = 0
-    off_road: int = 0
-    slowest_mps: float = 0.0
+    def __init__(self) -> None:
+        self.vehicle_km, self.overlaps = 0.0, 0
 
     def watch(self, env: HighwayEnv) -> None:
-        edges = env.road.right_edge_m(), env.road.left_edge_m()
-
         def record(vehicles: Vehicles, running: torch.Tensor) -> None:
             driven = vehicles.speed * (vehicles.valid & running[:, None])
             self.vehicle_km += driven.sum().item() * keys.PHYSICS_STEP_S / 1000.0
             self.overlaps += pair_overlaps(vehicles)[running].sum().item() // 2
-            self.off_road += ((vehicles.y < edges[0]) | (vehicles.y > edges[1])).sum().item()
-            self.slowest_mps = min(self.slowest_mps, vehicles.speed.min().item())
+            assert ((vehicles.y >= env.road.right_edge_m()) & (vehicles.y <= env.road.left_edge_m())).all()
+            assert (vehicles.speed >= 0.0).all()
 
         env.recorder = record
 
@@ -101,8 +96,6 @@ def drive_for(vehicle_km: float, roads: int, most_vehicles: int, duration_s: flo
         drive(rng, log, most_vehicles, duration_s)
         roads -= 1
     assert log.overlaps == 0
-    assert log.off_road == 0
-    assert log.slowest_mps >= 0.0
 
 
 def test_no_overlap_in_100_vehicle_km():
@@ -116,16 +109,11 @@ def test_no_overlap_in_10_000_vehicle_km():
 
 def test_the_recorder_would_see_an_overlap():
     """A car that nobody sees coming: the ego changes lanes into one beside it."""
-    env = environment(vehicles=2, mobil=False)
-    log = Log()
+    env, log = environment(vehicles=2, mobil=False), Log()
     log.watch(env)
-    td = env.reset()
-    td[keys.VEHICLES, "x"][0, 1] = td[keys.VEHICLES, "x"][0, 0]
-    td[keys.VEHICLES, "speed"][0] = 20.0
-    for car, lane in enumerate((0, 1)):
-        td[keys.VEHICLES, "y"][0, car], td[keys.VEHICLES, "target_lane"][0, car] = 4.0 * lane, lane
-    td["action"] = torch.tensor([keys.LEFT])
-    for _ in range(3):
-        td = env.step(td)["next"]
-        td["action"] = torch.tensor([keys.KEEP])
+    td = placed(
+        env, vehicles({"x": 0.0, "visibility": Visibility.BODY}, {"x": 0.0, "lane": 1, "desired_speed": 18.0})
+    )
+    for action in (keys.LEFT, keys.KEEP, keys.KEEP):
+        td = step(env, td, action)
     assert log.overlaps > 0

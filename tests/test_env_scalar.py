@@ -7,7 +7,7 @@ import random
 import pytest
 import torch
 from reference import scalar
-from reference.worlds import DOUBLE, environment, packed, placed, rules_of, scalar_state, step
+from reference.worlds import DOUBLE, disturbed, environment, packed, placed, rules_of, scalar_state, step
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -34,27 +34,6 @@ def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
         abort=rng.random() < 0.3,
         spawn=packed(spread, spacing),
         seed=rng.randrange(10**9),
-    )
-
-
-def disturbed(scene: Vehicles, lanes: int, generator: torch.Generator) -> Vehicles:
-    """The scene with everything a little off: in mid-change, at odd angles, seen in all ways or not at all."""
-
-    def between(low: float, high: float) -> torch.Tensor:
-        return low + (high - low) * torch.rand(scene.x.shape, generator=generator, dtype=DOUBLE)
-
-    changing = between(0, 1) < 0.3
-    side = (between(0, 2).long() * 2 - 1) * changing
-    return scene.with_(
-        y=scene.y + between(-0.5, 0.5) + 0.5 * side * between(0, 4),
-        heading=between(-0.03, 0.03),
-        speed=between(0, 30) * (between(0, 1) < 0.9),
-        length=between(4, 6),
-        width=between(1.8, 2.6),
-        desired_speed=between(15, 35),
-        target_lane=(scene.target_lane + side).clamp(0, lanes - 1),
-        visibility=between(0, 3).long(),
-        valid=(between(0, 1) < 0.9) | (torch.arange(scene.x.shape[1]) == 0),
     )
 
 

@@ -42,8 +42,7 @@ from ganlane._version import __version__
 from ganlane.errors import UserError
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V, IdmParameters
-from ganlane.sim.lanes import Visibility
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, Visibility
 from ganlane.traffic.idm_mobil import IdmTraffic
 
 

@@ -14,7 +14,7 @@ import torch
 
 from benchmarks.torture.tally import Tally
 from ganlane.config.command_line import check
-from ganlane.env.checks import ActionCheck
+from ganlane.env.state import ActionCheck
 from ganlane.traffic.base import TrafficModule
 from ganlane.training import checkpoint
 from ganlane.training.checkpoint import Checkpointer, TrainingState

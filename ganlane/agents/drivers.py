@@ -13,7 +13,7 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.keys import EGO_INDEX, LEFT, RIGHT
 from ganlane.parameters.driving import IdmParameters, MobilParameters
-from ganlane.sim.ego import ego_scene
+from ganlane.sim.dynamics import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, mobil_wishes
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform

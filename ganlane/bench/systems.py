@@ -26,7 +26,7 @@ from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
-from ganlane.env.native_step import as_state, native_decision, threads_for
+from ganlane.env.highway import native_decision, threads_for
 from ganlane.env.physics import run_decision
 from ganlane.parameters.observation import ObservationConfig, RewardParameters
 from ganlane.sim.random import episode_key
@@ -94,8 +94,7 @@ def _start_native_physics(scenario: Scenario, batch: int) -> Runner:
     def run(decisions: int) -> int:
         state = first
         for _ in range(decisions):
-            out, vehicles = native_decision(env.base_env.kernel, state, keep, recycles)
-            state = as_state(state.get(keys.SEED), state.get(keys.EPISODE), out, vehicles)
+            state = native_decision(env.base_env.kernel, state, keep, recycles)
         return int((state.get(keys.STEP) - first.get(keys.STEP)).sum())
 
     return run

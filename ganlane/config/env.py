@@ -2,7 +2,7 @@
 
 ``env=highway`` and ``env=dense`` start with random scenes. ``env=cut_in, stalled_car, blocked_lane, stop_and_go``
 start with a scene made by :mod:`ganlane.sim.scenarios`, ``env=scene`` with one from a file
-(:mod:`ganlane.sim.scene_files`).
+(:mod:`ganlane.sim.scenarios`).
 """
 
 from __future__ import annotations
@@ -383,7 +383,7 @@ class FileSceneEnvConfig(SceneEnvConfig):
         super().__post_init__()
 
     def _read(self) -> FixedScene:
-        from ganlane.sim.scene_files import read_scene, with_ego_speed
+        from ganlane.sim.scenarios import read_scene, with_ego_speed
 
         if self.scene.path is None:
             raise ParameterError("{scene.path}: no file; give one, env=scene {scene.path}=my_scene.csv.")

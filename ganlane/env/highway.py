@@ -1,7 +1,10 @@
-"""HighwayEnv as a TorchRL environment: specs, reset, step."""
+"""HighwayEnv as a TorchRL environment: specs, reset, and step, by the tensor code or by the native kernel."""
 
 from __future__ import annotations
 
+import sys
+from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -12,21 +15,30 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.arguments import checked_arguments, seed_number, whole_number
-from ganlane.env.checks import ActionCheck, check_counter, usable_device
-from ganlane.env.native_step import NATIVE_TAKEN, as_state, make_kernel, make_scenes, native_decision, say_once
 from ganlane.env.physics import Physics, Recorder, Rules, known_false, outcome, run_decision
-from ganlane.env.state import DONE_FLAGS, done_spec, fresh_ego, no_events, pack, state_spec
+from ganlane.env.state import (
+    ActionCheck,
+    check_counter,
+    done_spec,
+    first_state,
+    outcome_state,
+    pack,
+    state_spec,
+    usable_device,
+)
 from ganlane.errors import UserError
+from ganlane.native.library import torch_on_one_thread, why_not
+from ganlane.native.tensors import Kernel, NativeScenes, moved
 from ganlane.parameters.driving import EgoParameters, IdmParameters, Visibility
-from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
+from ganlane.parameters.episode import KERNELS, EpisodeParameters, SpawnParameters
 from ganlane.sim.dynamics import STEERING, SteeringParameters
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.random import Purpose, episode_key, uniform
-from ganlane.sim.recycle import out_of_range
 from ganlane.sim.scenes import Scenes
-from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.spawn import RandomScenes, out_of_range
 from ganlane.sim.state import Road, Vehicles, road_in
 from ganlane.traffic.base import TrafficModule
+from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmTraffic
 
 #: An automatic reset draws the scenes of the ended rows alone where they are at most one in so many.
 FEW_ROWS = 4
@@ -39,17 +51,15 @@ class HighwayEnv(EnvBase):
         traffic: moves the other vehicles; its road is the environment's.
         num_envs: N, the batch size.
         vehicles: M, the ego included; None: as many as ``scenes`` has, 9 without.
-        spawn_parameters: Table II.
-        ego: the ego's lane changes and visibility.
-        episode: decision period, goal and time-out.
-        idm, steering: the ego's car following (Table V) and steering.
+        spawn_parameters, episode: Table II; decision period, goal and time-out.
+        ego, idm, steering: the ego's lane changes and visibility, car following (Table V) and steering.
         stream: family of episodes (training, selection, report); by default, and at most, the traffic's.
         seed: base of the random numbers; ``set_seed`` changes it for the next full reset.
         first_episode: row i starts with episode ``first_episode + i`` and continues in steps of N.
         scenes: initial vehicles of an episode and their visibility; None: at random, by ``spawn_parameters``.
         device, dtype: of the simulation's tensors.
         recycle: after every decision move vehicles far behind the ego to far ahead of it, and the reverse
-            (:mod:`ganlane.sim.recycle`), so that the road never empties.
+            (:mod:`ganlane.sim.spawn`), so that the road never empties.
         recycle_share: share of the episodes in which ``recycle`` applies, 0 to 1, chosen by their numbers: a mixture
             of roads that empty and roads that do not.
         kernel: what drives a decision: ``torch``, the tensor code; ``native``, the kernel (:mod:`ganlane.native`),
@@ -120,7 +130,9 @@ class HighwayEnv(EnvBase):
         #: The native kernel; None: the tensor code drives.
         self.kernel = make_kernel(kernel, traffic, self.rules, self.vehicles, self.device, dtype)
         self._kernel_must = kernel == "native"
-        self._native_scenes = make_scenes(self.kernel, self.scenes, self.stream)
+        self._native_scenes: NativeScenes | None = None
+        if self.kernel is not None and type(self.scenes) is RandomScenes:
+            self._native_scenes = NativeScenes(self.scenes, self.stream)
         self._check_action = ActionCheck(self.batch_size[0], self.device)
         self._make_specs()
 
@@ -201,11 +213,13 @@ class HighwayEnv(EnvBase):
         """All rows at the start of their episodes; EnvBase keeps the rows that are not to be reset."""
         seed, episode = self.last_episodes = self._episodes(tensordict, next_episode)
         mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = None if mask is None else mask.reshape(-1)
         if self._native_scenes is not None:
-            drawn = None if mask is None else mask.reshape(-1)
-            return as_state(seed, episode, *self._native_scenes.start(seed, episode, drawn))
-        rows = self._rows_to_draw(mask)
-        if rows is None:
+            return outcome_state(seed, episode, *self._native_scenes.start(seed, episode, mask))
+        if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
+            return self._start(seed, episode)
+        rows = mask.nonzero()[:, 0]
+        if not 0 < len(rows) <= len(mask) // FEW_ROWS:
             return self._start(seed, episode)
         # The other rows keep what they have: here they repeat one of those drawn, which is quicker than their own.
         place = torch.zeros_like(seed)
@@ -213,24 +227,15 @@ class HighwayEnv(EnvBase):
         started = self._start(seed[rows], episode[rows])[place]
         return started.set(keys.SEED, seed).set(keys.EPISODE, episode)
 
-    def _rows_to_draw(self, mask: Tensor | None) -> Tensor | None:
-        """The rows to be reset, where to draw them alone saves time; None: draw all."""
-        if mask is None or self.device.type != "cpu" or self.traffic.rows_must_stay:
-            return None
-        rows = mask.reshape(-1).nonzero()[:, 0]
-        return rows if 0 < len(rows) <= self.batch_size[0] // FEW_ROWS else None
-
     def _start(self, seed: Tensor, episode: Tensor) -> TensorDictBase:
         """The first states of episodes [K]."""
         key = episode_key(self.stream, seed, episode)
         vehicles, memory = self.traffic.enter(self.scenes(key, self.dtype).with_finite_padding(), key, episode)
-        zero = torch.zeros(seed.shape, dtype=self.dtype, device=self.device)
-        rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
-        rest |= {name: zero[:, None].bool() for name in DONE_FLAGS}
+        state = first_state(seed, episode, vehicles, memory)
         if self.traffic.own_roads:
             road = self.traffic.road_of(key, self.dtype)
-            rest[keys.ROAD] = TensorDict({"lanes": road.lanes, "lane_width_m": road.lane_width_m}, seed.shape)
-        return pack(vehicles, fresh_ego(zero), memory, no_events(zero), rest)
+            state.set(keys.ROAD, TensorDict({"lanes": road.lanes, "lane_width_m": road.lane_width_m}, seed.shape))
+        return state
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One decision."""
@@ -252,13 +257,8 @@ class HighwayEnv(EnvBase):
         end, memory = run_decision(self.traffic, self.physics, rules, tensordict, start, key, self.recorder)
         ego = self.physics.remember(rules, ego, start, end, command)
         events, flags = outcome(rules, end, command)
-        rest = {
-            keys.SEED: seed,
-            keys.EPISODE: episode,
-            keys.STEP: end.step,
-            keys.REWARD: torch.zeros_like(ego["distance"])[:, None],
-            **flags,
-        }
+        reward = torch.zeros_like(ego["distance"])[:, None]  # which a transform writes
+        rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: end.step, keys.REWARD: reward, **flags}
         if self.traffic.own_roads:
             rest[keys.ROAD] = tensordict.get(keys.ROAD)
         vehicles = end.vehicles
@@ -274,18 +274,17 @@ class HighwayEnv(EnvBase):
         if self.recorder is not None:
             raise UserError("env.kernel=native shows no physics steps to a recorder; set env.kernel=torch.")
         if not self._kernel_must:
-            say_once(NATIVE_TAKEN)
+            say_once("env.kernel=auto: the native kernel")
         recycles = None
         if self.recycle:
             seed, episode = tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)
             recycles = self._recycling_rows(episode_key(self.stream, seed, episode))
         try:
-            decided = native_decision(self.kernel, tensordict, action, recycles)
+            after = native_decision(self.kernel, tensordict, action, recycles)
         except ValueError:
             self._check_action.values(action)  # says which
             raise
-        after = as_state(tensordict.get(keys.SEED), tensordict.get(keys.EPISODE), *decided)
-        return after.set(keys.REWARD, torch.zeros_like(decided[0].distance)[:, None])  # which a transform writes
+        return after.set(keys.REWARD, torch.zeros_like(after.get(keys.EGO).get("distance"))[:, None])
 
     def _recycling_rows(self, key: Tensor) -> Tensor:
         """The rows [N] bool whose episodes, with ``key`` [N], recycle."""
@@ -293,3 +292,67 @@ class HighwayEnv(EnvBase):
             return torch.ones_like(key, dtype=torch.bool)
         chosen = uniform(key, -1, 1, [Purpose.RECYCLED_EPISODE], torch.float64)[..., 0].reshape(key.shape)
         return chosen < self.recycle_share
+
+
+# The native kernel
+
+
+def threads_for(env: EnvBase) -> AbstractContextManager[None]:
+    """:func:`~ganlane.native.library.torch_on_one_thread` for steps of an ``env`` that the kernel drives."""
+    base: Any = env
+    while hasattr(base, "base_env"):
+        base = base.base_env
+    return nullcontext() if getattr(base, "kernel", None) is None else torch_on_one_thread()
+
+
+@lru_cache(maxsize=8)
+def say_once(line: str) -> None:
+    """Print a line to the standard error stream, the first time that it is given."""
+    print(line, file=sys.stderr)
+
+
+def make_kernel(
+    wanted: str, traffic: TrafficModule, rules: Rules, vehicles: int, device: torch.device, dtype: torch.dtype
+) -> Kernel | None:
+    """The kernel for ``wanted`` (``torch``, ``native`` or ``auto``); None: the tensor code drives.
+
+    Raises:
+        UserError: an unknown name, or ``native`` where the kernel cannot do what is asked or cannot be built.
+    """
+    if wanted not in KERNELS:
+        raise UserError(f"env.kernel={wanted}: expected one of {', '.join(KERNELS)}; choose one of them.")
+    if wanted == "torch":
+        return None
+    reason, missing = _why_not(traffic, rules, device, dtype), why_not()
+    if wanted == "native" and (reason or missing):
+        raise UserError(f"env.kernel=native {reason or missing}; set env.kernel=torch.")
+    if reason:
+        return None
+    if missing:
+        say_once(f"env.kernel=auto: the tensor code, since the native kernel {missing}")
+        return None
+    assert isinstance(traffic, IdmTraffic)
+    mobil = traffic.mobil if isinstance(traffic, IdmMobilTraffic) else None
+    return Kernel(rules.road, vehicles, rules.episode, rules.ego, rules.idm, rules.steering, mobil)
+
+
+def _why_not(traffic: TrafficModule, rules: Rules, device: torch.device, dtype: torch.dtype) -> str | None:
+    """What the kernel cannot do of this, as the end of a sentence; None: it can do all."""
+    if type(traffic) not in (IdmTraffic, IdmMobilTraffic):
+        return f"drives the traffics idm and idm_mobil alone, not {type(traffic).__name__}"
+    assert isinstance(traffic, IdmTraffic)
+    if device.type != "cpu" or dtype != torch.float32:
+        return f"runs on a CPU in float32, not on {device} in {dtype}"
+    if rules.road.ring_m is not None:
+        return "has no ring"
+    if (traffic.idm, traffic.steering) != (rules.idm, rules.steering):
+        return "has one set of parameters of car following and steering for the ego and the others"
+    return None
+
+
+def native_decision(kernel: Kernel, state: TensorDictBase, action: Tensor, recycles: Tensor | None) -> TensorDictBase:
+    """The state after the decision ``action`` [N] in ``state``, without a reward; ``recycles`` [N] bool or None."""
+    vehicles, memory = Vehicles.of(state.get(keys.VEHICLES)), state.get(keys.TRAFFIC)
+    ego = dict(state.get(keys.EGO).items())
+    out = kernel.decide(action, vehicles, memory.get("steering"), ego, state.get(keys.STEP), recycles)
+    return outcome_state(state.get(keys.SEED), state.get(keys.EPISODE), out, moved(vehicles, out))

@@ -7,6 +7,7 @@ graph (:meth:`Physics.compile`); :func:`run_decision` joins them with the traffi
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -14,18 +15,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ganlane import keys
-from ganlane.env.state import where
 from ganlane.keys import EGO_INDEX, PHYSICS_STEP_S
-from ganlane.parameters.driving import EgoParameters, IdmParameters
+from ganlane.parameters.driving import EgoParameters, IdmParameters, SteeringParameters
 from ganlane.parameters.episode import EpisodeParameters
 from ganlane.runtime import check_compiler
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.dynamics import SteeringParameters
-from ganlane.sim.ego import Command, apply_action, change_progress, ego_scene, ego_surroundings, move_ego
+from ganlane.sim.dynamics import Command, apply_action, change_progress, ego_scene, ego_surroundings, move_ego
 from ganlane.sim.idm import following_acceleration
-from ganlane.sim.lanes import lane_change_done
-from ganlane.sim.recycle import recycle
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.spawn import recycle
+from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 from ganlane.torch_settings import compiled
 from ganlane.traffic.base import TrafficModule, memory_of
 
@@ -168,11 +166,11 @@ def outcome(rules: Rules, end: Substep, command: Command) -> tuple[dict[str, Ten
 
 
 class Physics:
-    """The functions above, not compiled until :meth:`compile`."""
+    """The functions above and recycling, not compiled until :meth:`compile`."""
 
     def __init__(self) -> None:
         self.compiled = False
-        self.begin, self.remember, self.recycle, self._advance = begin, remember, recycle, advance
+        self.begin, self.remember, self.recycle, self.advance = begin, remember, recycle, advance
 
     def compile(self) -> None:
         """Compile each function to a graph.
@@ -182,32 +180,23 @@ class Physics:
         """
         check_compiler()
         self.compiled = True
-        for name in ("begin", "remember", "recycle", "_advance"):
+        for name in ("begin", "remember", "recycle", "advance"):
             setattr(self, name, compiled(getattr(self, name)))
-
-    def advance(self, rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -> Substep:
-        """As the function. In a graph the copies cost nothing, so one graph serves both cases."""
-        return self._advance(rules, before, moved, all_running and not self.compiled)
 
 
 # A whole decision
 
 
-def readable(flag: Tensor) -> bool:
-    """Whether Python may read ``flag``: cheap on a CPU, where it may save work; a GPU would stall."""
-    return flag.device.type == "cpu"
-
-
 def known_false(flag: Tensor) -> bool:
     """Whether ``flag`` can be read and is false."""
-    return readable(flag) and not bool(flag)
+    return reads_are_cheap(flag) and not bool(flag)
 
 
 class EndedRows:
     """The traffic's memory of the rows that end within a decision, kept as it was when they ended.
 
-    Meanwhile the traffic still computes these rows, in vain. Restoring their memory in every physics step would
-    copy that of all rows each time, and generated traffic's is large.
+    The traffic goes on computing them, in vain: restoring their memory in every physics step would copy that of all
+    rows each time, and generated traffic's is large.
     """
 
     def __init__(self) -> None:
@@ -241,6 +230,11 @@ def _with_rows(memory: TensorDictBase, rows: Tensor, other: TensorDictBase) -> T
     return TensorDict._new_unsafe(kept, batch_size=memory.batch_size)
 
 
+def _where(rows: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """``new`` where ``rows`` [N] is true, ``old`` elsewhere."""
+    return torch.where(rows.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
 def run_decision(
     traffic: TrafficModule,
     physics: Physics,
@@ -257,18 +251,13 @@ def run_decision(
     queue, kept in every step.
 
     Args:
-        traffic: moves the other vehicles.
-        physics: moves the ego and finds the events, by ``rules``.
-        rules: of the episodes.
-        state: at the beginning of the decision.
-        start: its first moment.
+        state, start: at the beginning of the decision, and its first moment.
         key: of the episodes, [N] int64.
-        recorder: called after every step.
         substeps: number of physics steps; None: those of the decision period.
     """
     memory, now, ended = memory_of(state), start, EndedRows()
     counters = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.EPISODE_KEY: key}
-    size, can_read = memory.batch_size, readable(now.running)
+    size, can_read = memory.batch_size, reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
     for count in range(rules.episode.substeps() if substeps is None else substeps):
@@ -280,13 +269,14 @@ def run_decision(
         vehicles = TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size)
         fields = {keys.VEHICLES: vehicles, keys.TRAFFIC: memory, **counters, keys.STEP: start.step + count}
         after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
-        all_running = known_false((~before.running).any())
+        # In a graph the copies cost nothing, so one graph serves both cases.
+        all_running = not physics.compiled and known_false((~before.running).any())
         now = physics.advance(rules, before, Vehicles.of(after.get(keys.MOVED)), all_running)
         if can_read:
             memory = after.get(keys.TRAFFIC)
             ended.keep(before.running & ~now.running, memory)
         else:
-            memory = where(before.running, after.get(keys.TRAFFIC), memory)
+            memory = after.get(keys.TRAFFIC).apply(partial(_where, before.running), memory)
         if recorder is not None:
             recorder(now.vehicles, before.running)
     return now, ended.restore(memory)

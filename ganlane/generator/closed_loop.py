@@ -33,9 +33,8 @@ from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, Segments
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.generator import CalibratedConfig
 from ganlane.sim.idm import TABLE_V, IdmParameters, following_acceleration
-from ganlane.sim.lanes import ENTRY_M, Visibility
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, leader, perceive
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3

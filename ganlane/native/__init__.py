@@ -4,8 +4,7 @@
 many environments at once as a vector holds, ``observation.cpp`` writes the lane view, ``mask.cpp`` the action mask,
 ``spawn.cpp`` the first scenes, and ``step.cpp`` makes a whole step of them, with the reward.
 
-:mod:`~ganlane.native.library` builds and loads them. :mod:`~ganlane.native.decision`, :mod:`~ganlane.native.scenes`,
-:mod:`~ganlane.native.observation` and :mod:`~ganlane.native.mask` call them on tensors, for the TorchRL environment;
-:mod:`~ganlane.native.batch` calls the whole step on NumPy arrays, for gymnasium, and needs no torch. The tensor code
-stays the reference: tests hold all of them together.
+:mod:`~ganlane.native.library` builds, loads and calls them: :mod:`~ganlane.native.tensors` on tensors, for the
+TorchRL environment, and :mod:`~ganlane.native.batch` on NumPy arrays, a whole step at once, for gymnasium and without
+torch. The tensor code stays the reference: tests hold all of them together.
 """

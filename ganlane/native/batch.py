@@ -8,46 +8,21 @@ the TorchRL environment with ``env.kernel=native``.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ganlane.native.calls import addresses, in_threads
-from ganlane.native.library import load
-from ganlane.native.settings import reward_of, safe_settings, settings_of, spawn_of, view_of
+from ganlane.native import settings
+from ganlane.native.library import addresses, in_threads, load
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters, largest_number
 
 #: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
 SPEED_RATIO_LIMIT = 4.0
-_FLOAT, _INTEGER, _FLAG = np.float32, np.int64, np.bool_
-_VEHICLE = {
-    **dict.fromkeys(("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed"), _FLOAT),
-    **dict.fromkeys(("target_lane", "visibility"), _INTEGER),
-    "valid": _FLAG,
-    "steering": _FLOAT,
-}
-_ROW = {
-    **dict.fromkeys(("seed", "episode", "action", "change_direction", "decisions", "lane_changes", "step"), _INTEGER),
-    **dict.fromkeys(("soft_crashes", "soft_crashes_behind"), _INTEGER),
-    **dict.fromkeys(("ego_steering", "mean_acceleration", "change_progress", "distance", "reward"), _FLOAT),
-    **dict.fromkeys(("soft_crash", "soft_crash_behind", "started_change", "recycles", "fresh"), _FLAG),
-    **dict.fromkeys(("goal", "hard_crash", "out_of_road", "timeout", "done", "terminated", "truncated"), _FLAG),
-}  # fmt: skip
-# The structures of arrays.hpp, observation.cpp and mask.cpp, in their order.
-_EGO = ("ego_steering", "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind")
-_INPUTS = ("action", *_VEHICLE, *_EGO, "step", "recycles")
-_OUTPUTS = (
-    "x", "y", "heading", "speed", "acceleration", "target_lane", "steering",
-    "ego_steering", "mean_acceleration", "change_progress", "distance",
-    "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind", "started_change",
-    "step", "goal", "hard_crash", "out_of_road", "timeout", "soft_crashes", "soft_crashes_behind",
-    "done", "terminated", "truncated",
-)  # fmt: skip
-_SCENE = ("seed", "episode", "fresh", "length", "width", "desired_speed", "visibility", "valid", "recycles")
+# The structures of observation.cpp and mask.cpp, in their order.
 _VIEW = ("speed", "desired_speed", "length", "y", "x", "y", "speed", "valid", "change_progress", "change_direction")
 _MASK = (
     "x", "y", "heading", "speed", "length", "width", "desired_speed", "target_lane", "visibility", "valid",
@@ -87,9 +62,7 @@ class NativeBatch:
         rows: N.
         lanes, lane_width_m: of the road.
         vehicles: M, the ego included.
-        spawn: Table II.
-        ego: the ego's lane changes and visibility.
-        episode: decision period, goal and time-out.
+        spawn, ego, episode: the first scene, what is special about the ego, and the episode's end.
         idm: car following of all.
         mobil: lane changes of the others; None: they keep their lanes.
         recycle_share: share of the episodes in which vehicles left behind return ahead; None: of none.
@@ -130,41 +103,38 @@ class NativeBatch:
         idm, mask = idm or IdmParameters(), mask or MaskParameters()
         road = (lanes, lane_width_m, vehicles)
         self.rows, self.lanes, self.lane_width_m, self.terms = rows, lanes, lane_width_m, reward.term_names
-        view = view_of(*road, observation.scale(), observation.form)
+        view = settings.view_of(*road, observation.scale(), observation.form)
         self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
         self.state: dict[str, npt.NDArray[Any]] = {
-            **{name: np.zeros((rows, vehicles), kind) for name, kind in _VEHICLE.items()},
-            **{name: np.zeros(rows, kind) for name, kind in _ROW.items()},
+            **{name: np.zeros((rows, vehicles), kind) for name, kind in settings.VEHICLE_ARRAYS.items()},
+            **{name: np.zeros(rows, kind) for name, kind in (settings.ROW_ARRAYS | settings.EVENT_ARRAYS).items()},
         }
-        self.observation = np.zeros((rows, view.numbers()), _FLOAT)
-        self.mask = np.ones((rows, 3), _FLAG)
-        self._term_values = np.zeros((rows, len(self.terms)), _FLOAT)
-        self._no_safe_action = np.zeros(rows, _FLAG)
+        self.observation = np.zeros((rows, view.numbers()), np.float32)
+        self.mask = np.ones((rows, 3), np.bool_)
+        self._term_values = np.zeros((rows, len(self.terms)), np.float32)
+        self._no_safe_action = np.zeros(rows, np.bool_)
         self._library = load(variant)
         visible = Visibility.named(ego.visibility)
         pointed = {
-            "settings": settings_of(*road, episode, ego, idm, mobil=mobil),
-            "inputs": self._pointers(_INPUTS),
-            "outputs": self._pointers(_OUTPUTS),
-            "spawn": spawn_of(*road, spawn, stream, visible, Visibility.SIGNALLED, recycle_share),
-            "scene": self._pointers(_SCENE),
-            "reward_settings": reward_of(reward, episode.decision_period_s),
+            "settings": settings.settings_of(*road, episode, ego, idm, mobil=mobil),
+            "inputs": self._pointers(settings.INPUTS),
+            "outputs": self._pointers(settings.OUTPUTS),
+            "spawn": settings.spawn_of(*road, spawn, stream, visible, Visibility.SIGNALLED, recycle_share),
+            "scene": self._pointers(settings.SCENE),
+            "reward_settings": settings.reward_of(reward, episode.decision_period_s),
             "view": view,
             "view_inputs": self._pointers(_VIEW),
-            "mask_settings": safe_settings(*road, idm, mask.safe_deceleration, ego.abort_lane_change),
+            "mask_settings": settings.safe_settings(*road, idm, mask.safe_deceleration, ego.abort_lane_change),
             "mask_inputs": self._pointers(_MASK),
-            "mask_outputs": addresses([self.mask, self._no_safe_action], 2),
+            "mask_outputs": addresses([self.mask, self._no_safe_action]),
         }
         self._pointed = pointed  # kept, since the structure holds no more than their addresses
-        arrays = {
-            "reward": self.state["reward"],
-            "terms": self._term_values,
-            "observation": self.observation,
-            "mask": self.mask,
-        }
         self._batch = _Batch(
             **{name: ctypes.addressof(each) for name, each in pointed.items()},
-            **{name: each.ctypes.data for name, each in arrays.items()},
+            reward=self.state["reward"].ctypes.data,
+            terms=self._term_values.ctypes.data,
+            observation=self.observation.ctypes.data,
+            mask=self.mask.ctypes.data,
             lowest=self.bounds[0],
             highest=self.bounds[1],
             fastest=SPEED_RATIO_LIMIT,
@@ -192,7 +162,7 @@ class NativeBatch:
         return [*self.state.values(), self.observation, self.mask, self._term_values, self._no_safe_action]
 
     def _pointers(self, names: Sequence[str]) -> ctypes.Array[ctypes.c_void_p]:
-        return addresses([self.state[name] for name in names], len(names))
+        return addresses([self.state[name] for name in names])
 
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None) -> None:
         """Begin the episodes [N] of the seeds [N], each perhaps one number for all, in ``rows`` [N] (None: all)."""
@@ -201,15 +171,17 @@ class NativeBatch:
         fresh[:] = True if rows is None else rows
         np.copyto(state["seed"], seed, where=fresh)
         np.copyto(state["episode"], episode, where=fresh)
-        start, batch = self._library.ganlane_start, self._address
-        in_threads(self.rows, lambda first, last: start(batch, first, last))
+        self._in_threads(self._library.ganlane_start)
 
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
         """One decision of every row, by the actions [N]; no row is reset."""
         self.state["action"][:] = actions
-        step, batch = self._library.ganlane_step, self._address
-        in_threads(self.rows, lambda first, last: step(batch, first, last))
+        self._in_threads(self._library.ganlane_step)
         return self._stepped
+
+    def _in_threads(self, function: Callable[..., int]) -> None:
+        batch = self._address
+        in_threads(self.rows, lambda first, last: function(batch, first, last))
 
     def reward_terms(self) -> dict[str, npt.NDArray[np.float32]]:
         """The terms of the last reward by name, each [N]."""

@@ -5,7 +5,7 @@
 
 #include "vectors.hpp"
 
-// As ganlane/native/observation.py declares them.
+// As ganlane/native/settings.py declares them.
 struct View {
     float range, speed_scale, lane_width, nearness_m, overlap_m;
     int32_t lanes, vehicles, drift, overlap;

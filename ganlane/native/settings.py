@@ -1,14 +1,49 @@
-"""The kernel's settings as C structures, from the parameters of the environment. Imports no torch."""
+"""What the kernel works on: its arrays by name, and its settings as C structures. Imports no torch.
+
+The settings' fields are named as those of the parameters that they come from.
+"""
 
 from __future__ import annotations
 
 import ctypes
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final, TypeVar
 
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, SteeringParameters
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
+
+_FLOAT, _INTEGER, _FLAG = "float32", "int64", "bool"
+#: Arrays [rows, vehicles] and their types.
+VEHICLE_ARRAYS: Final = {
+    **dict.fromkeys(("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed"), _FLOAT),
+    **dict.fromkeys(("target_lane", "visibility"), _INTEGER),
+    "valid": _FLAG,
+    "steering": _FLOAT,
+}
+#: Events and done flags, [rows].
+EVENT_ARRAYS: Final = {
+    **dict.fromkeys(("goal", "hard_crash", "out_of_road", "timeout"), _FLAG),
+    **dict.fromkeys(("soft_crashes", "soft_crashes_behind"), _INTEGER),
+    **dict.fromkeys(("done", "terminated", "truncated"), _FLAG),
+}
+#: The other arrays [rows].
+ROW_ARRAYS: Final = {
+    **dict.fromkeys(("seed", "episode", "action", "change_direction", "decisions", "lane_changes", "step"), _INTEGER),
+    **dict.fromkeys(("ego_steering", "mean_acceleration", "change_progress", "distance", "reward"), _FLOAT),
+    **dict.fromkeys(("soft_crash", "soft_crash_behind", "started_change", "recycles", "fresh"), _FLAG),
+}
+# The structures of arrays.hpp, in their order.
+_EGO = ("ego_steering", "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind")
+INPUTS: Final = ("action", *VEHICLE_ARRAYS, *_EGO, "step", "recycles")
+OUTPUTS: Final = (
+    "x", "y", "heading", "speed", "acceleration", "target_lane", "steering",
+    "ego_steering", "mean_acceleration", "change_progress", "distance",
+    "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind", "started_change",
+    "step", *EVENT_ARRAYS,
+)  # fmt: skip
+SCENE: Final = ("seed", "episode", "fresh", "length", "width", "desired_speed", "visibility", "valid", "recycles")
 
 #: The observations that the kernel computes: whether with drift, and with overlap.
 NATIVE_FORMS: Final = {
@@ -23,10 +58,10 @@ class Settings(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_float) for name in (
-            "min_gap", "headway", "per_brake_scale", "min_acceleration", "max_acceleration",
-            "threshold", "politeness_rear", "politeness_side", "safe_deceleration", "exclusive",
-            "per_near_s", "per_far_s", "gain_far", "gain_near", "gain_integral", "slow", "max_angle",
-            "soft_crash_ttc", "soft_crash_gap", "goal", "lane_width", "per_lane_width",
+            "min_gap_m", "headway_s", "per_brake_scale", "min_acceleration", "max_acceleration",
+            "threshold", "politeness_rear", "politeness_side", "safe_deceleration", "exclusive_m",
+            "per_near_s", "per_far_s", "gain_far", "gain_near", "gain_integral", "slow_mps", "max_angle_rad",
+            "soft_crash_ttc_s", "soft_crash_gap_m", "goal_m", "lane_width_m", "per_lane_width",
         )),
         *((name, ctypes.c_int32) for name in (
             "lanes", "vehicles", "substeps", "timeout_steps", "mobil", "abort_lane_change",
@@ -38,7 +73,7 @@ class View(ctypes.Structure):
     """``View`` of observation.cpp."""
 
     _fields_ = (
-        *((name, ctypes.c_float) for name in ("range", "speed_scale", "lane_width", "nearness_m", "overlap_m")),
+        *((name, ctypes.c_float) for name in ("range_m", "speed_mps", "lane_width_m", "nearness_m", "overlap_m")),
         *((name, ctypes.c_int32) for name in ("lanes", "vehicles", "drift", "overlap")),
     )
 
@@ -60,11 +95,11 @@ class Spawn(ctypes.Structure):
         ("recycle_share", ctypes.c_double),
         ("stream", ctypes.c_int64),
         *((name, Range) for name in (
-            "front_speed", "rear_speed", "ego_speed", "desired_speed", "truck_desired_speed",
+            "front_speed_mps", "rear_speed_mps", "ego_speed_mps", "desired_speed_mps", "truck_desired_speed_mps",
         )),
         *((name, ctypes.c_float) for name in (
-            "spread", "spacing", "ego_desired_speed", "truck_share", "length", "width", "truck_length", "truck_width",
-            "lane_width",
+            "spread_m", "spacing_m", "ego_desired_speed_mps", "truck_share", "length_m", "width_m", "truck_length_m",
+            "truck_width_m", "lane_width_m",
         )),
         *((name, ctypes.c_int32) for name in (
             "vehicles", "lanes", "capacity", "ego_visibility", "others_visibility", "recycle",
@@ -77,11 +112,19 @@ class Reward(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_float) for name in (
-            "period", "base_speed", "low_acceleration",
+            "decision_period_s", "base_speed_mps", "low_acceleration",
             "lane_change", "out_of_road", "hard_crash", "soft_crash", "goal", "soft_crash_behind",
         )),
         *((name, ctypes.c_int32) for name in ("literal_low_acceleration", "terms")),
     )  # fmt: skip
+
+
+Structure = TypeVar("Structure", bound=ctypes.Structure)
+
+
+def _filled(kind: type[Structure], given: Mapping[str, Any]) -> Structure:
+    """A structure with those of the ``given`` numbers that it has."""
+    return kind(**{field[0]: given[field[0]] for field in kind._fields_})
 
 
 def settings_of(
@@ -96,37 +139,19 @@ def settings_of(
 ) -> Settings:
     """The numbers of road, driving and episode; ``mobil=None``: the others keep their lanes."""
     episode, ego = episode or EpisodeParameters(), ego or EgoParameters()
-    idm, steering, lane_changes = idm or IdmParameters(), steering or SteeringParameters(), mobil or MobilParameters()
-    return Settings(
-        min_gap=idm.min_gap_m,
-        headway=idm.headway_s,
-        per_brake_scale=1.0 / idm.brake_scale(),
-        min_acceleration=idm.min_acceleration,
-        max_acceleration=idm.max_acceleration,
-        threshold=lane_changes.threshold,
-        politeness_rear=lane_changes.politeness_rear,
-        politeness_side=lane_changes.politeness_side,
-        safe_deceleration=lane_changes.safe_deceleration,
-        exclusive=lane_changes.exclusive_m,
-        per_near_s=1.0 / steering.near_s,
-        per_far_s=1.0 / steering.far_s,
-        gain_far=steering.gain_far,
-        gain_near=steering.gain_near,
-        gain_integral=steering.gain_integral,
-        slow=steering.slow_mps,
-        max_angle=steering.max_angle_rad,
-        soft_crash_ttc=ego.soft_crash_ttc_s,
-        soft_crash_gap=ego.soft_crash_gap_m,
-        goal=episode.goal_m,
-        lane_width=lane_width_m,
-        per_lane_width=1.0 / lane_width_m,
-        lanes=lanes,
-        vehicles=vehicles,
-        substeps=episode.substeps(),
-        timeout_steps=round(episode.timeout_s / PHYSICS_STEP_S),
-        mobil=mobil is not None,
-        abort_lane_change=ego.abort_lane_change,
-    )
+    idm, steering = idm or IdmParameters(), steering or SteeringParameters()
+    given = {
+        **(vars(episode) | vars(ego) | vars(idm) | vars(steering) | vars(mobil or MobilParameters())),
+        **{"lanes": lanes, "lane_width_m": lane_width_m, "vehicles": vehicles},
+        "per_brake_scale": 1.0 / idm.brake_scale(),
+        "per_near_s": 1.0 / steering.near_s,
+        "per_far_s": 1.0 / steering.far_s,
+        "per_lane_width": 1.0 / lane_width_m,
+        "substeps": episode.substeps(),
+        "timeout_steps": round(episode.timeout_s / PHYSICS_STEP_S),
+        "mobil": mobil is not None,
+    }
+    return _filled(Settings, given)
 
 
 def safe_settings(
@@ -140,10 +165,8 @@ def safe_settings(
 
 def view_of(lanes: int, lane_width_m: float, vehicles: int, scale: ObservationScale, form: str) -> View:
     """The numbers of an observation in :data:`NATIVE_FORMS`."""
-    drift, overlap = NATIVE_FORMS[form]
-    return View(
-        scale.range_m, scale.speed_mps, lane_width_m, NEARNESS_M, OVERLAP_M, lanes, vehicles, drift, overlap
-    )  # fmt: skip
+    road = (lane_width_m, NEARNESS_M, OVERLAP_M, lanes, vehicles)
+    return View(scale.range_m, scale.speed_mps, *road, *NATIVE_FORMS[form])
 
 
 def spawn_of(
@@ -158,40 +181,22 @@ def spawn_of(
 ) -> Spawn:
     """The numbers of Table II; ``recycle_share`` of the episodes recycle their vehicles, None: no episode does."""
 
-    def span(bounds: tuple[float, float]) -> Range:
-        return Range(bounds[0], bounds[1] - bounds[0])
+    def of_struct(value: Any) -> Any:
+        return value if isinstance(value, int | float) else Range(value[0], value[1] - value[0])
 
-    return Spawn(
-        recycle_share=recycle_share or 0.0,
-        stream=stream,
-        front_speed=span(spawn.front_speed_mps),
-        rear_speed=span(spawn.rear_speed_mps),
-        ego_speed=span(spawn.ego_speed_mps),
-        desired_speed=span(spawn.desired_speed_mps),
-        truck_desired_speed=span(spawn.truck_desired_speed_mps),
-        spread=spawn.spread_m,
-        spacing=spawn.spacing_m,
-        ego_desired_speed=spawn.ego_desired_speed_mps,
-        truck_share=spawn.truck_share,
-        length=spawn.length_m,
-        width=spawn.width_m,
-        truck_length=spawn.truck_length_m,
-        truck_width=spawn.truck_width_m,
-        lane_width=lane_width_m,
-        vehicles=vehicles,
-        lanes=lanes,
-        capacity=spawn.lane_capacity(),
-        ego_visibility=ego_visibility,
-        others_visibility=others_visibility,
-        recycle=recycle_share is not None,
-    )
+    given = {
+        **{name: of_struct(value) for name, value in vars(spawn).items()},
+        **{"lanes": lanes, "lane_width_m": lane_width_m, "vehicles": vehicles, "stream": stream},
+        **{"ego_visibility": ego_visibility, "others_visibility": others_visibility},
+        "spacing_m": spawn.spacing_m,
+        "capacity": spawn.lane_capacity(),
+        "recycle": recycle_share is not None,
+        "recycle_share": recycle_share or 0.0,
+    }
+    return _filled(Spawn, given)
 
 
 def reward_of(reward: RewardParameters, decision_period_s: float) -> Reward:
     """The numbers of the reward, and of how many terms it is the sum."""
-    return Reward(
-        decision_period_s, reward.base_speed_mps, reward.low_acceleration,
-        reward.lane_change, reward.out_of_road, reward.hard_crash, reward.soft_crash, reward.goal,
-        reward.soft_crash_behind,
-        reward.literal_low_acceleration, len(reward.term_names),
-    )  # fmt: skip
+    given = {**vars(reward), "decision_period_s": decision_period_s, "terms": len(reward.term_names)}
+    return _filled(Reward, given)

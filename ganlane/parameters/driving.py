@@ -28,7 +28,7 @@ from ganlane.parameters import (
 
 
 class Visibility(IntEnum):
-    """When others see a vehicle that enters their lane; see :mod:`ganlane.sim.lanes`."""
+    """When others see a vehicle that enters their lane; see :mod:`ganlane.sim.state`."""
 
     CENTRE = 0
     BODY = 1

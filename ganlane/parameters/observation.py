@@ -137,8 +137,8 @@ class RewardParameters(Record):
         hard_crash: a collision.
         soft_crash: per onset of somebody dangerously close ahead.
         goal: the goal reached.
-        soft_crash_behind: per onset of a soft crash *behind* (:func:`ganlane.sim.ego.ego_surroundings`), at most 0.
-            The paper has no such term; at 0 it is not there.
+        soft_crash_behind: per onset of a soft crash *behind* (:func:`ganlane.sim.dynamics.ego_surroundings`), at most
+            0. The paper has no such term; at 0 it is not there.
     """
 
     base_speed_mps: Number = 15.0

@@ -31,10 +31,9 @@ from ganlane import keys
 from ganlane.generator.closed_loop import balanced_headway, headway_from_uniform
 from ganlane.realism.recordings import Recording, frame_of
 from ganlane.sim.idm import following_acceleration
-from ganlane.sim.lanes import ENTRY_M
 from ganlane.sim.neighbours import perceive
 from ganlane.sim.random import Purpose, absorb, episode_key, uniform
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import ENTRY_M, Road, Vehicles
 from ganlane.traffic.base import TrafficModule
 from ganlane.traffic.overlays import random_side
 

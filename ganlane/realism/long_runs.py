@@ -21,11 +21,10 @@ from ganlane.evaluation.statistics import entries, poisson_interval
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.realism.driving import Factory, step_traffic
 from ganlane.sim.collisions import pair_overlaps
-from ganlane.sim.lanes import lateral_half_extent
 from ganlane.sim.neighbours import leader, perceive
 from ganlane.sim.random import absorb, episode_key
 from ganlane.sim.spawn import TABLE_II, SpawnParameters, spawn
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, lateral_half_extent
 from ganlane.traffic import Guard, TrafficModule
 
 #: Times at which speeds are summarised, s; and the distance of the goal, m.

@@ -11,22 +11,6 @@ from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
 FEW = 1000
 
 
-def _separated(
-    along: Tensor,
-    across: Tensor,
-    half_length: Tensor,
-    half_width: Tensor,
-    other_length: Tensor,
-    other_width: Tensor,
-    cos: Tensor,
-    sin: Tensor,
-) -> Tensor:
-    """Whether an axis of the first box separates it from the other, whose axes are turned by (cos, sin)."""
-    reach_along = half_length + other_length * cos + other_width * sin
-    reach_across = half_width + other_length * sin + other_width * cos
-    return (along.abs() >= reach_along) | (across.abs() >= reach_across)
-
-
 def boxes_overlap(
     dx: Tensor,
     dy: Tensor,
@@ -47,10 +31,16 @@ def boxes_overlap(
     oc, os = torch.cos(other_heading), torch.sin(other_heading)
     # Of the angle between the two boxes.
     cos, sin = (c * oc + s * os).abs(), (c * os - s * oc).abs()
-    own = (0.5 * length, 0.5 * width)
-    other = (0.5 * other_length, 0.5 * other_width)
-    by_own = _separated(dx * c + dy * s, dy * c - dx * s, *own, *other, cos, sin)
-    by_other = _separated(dx * oc + dy * os, dy * oc - dx * os, *other, *own, cos, sin)
+    boxes = [(0.5 * length, 0.5 * width), (0.5 * other_length, 0.5 * other_width)]
+
+    def separated(along: Tensor, across: Tensor, own: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> Tensor:
+        """Whether an axis of a box separates it from the other; half lengths and widths."""
+        reach_along = own[0] + other[0] * cos + other[1] * sin
+        reach_across = own[1] + other[0] * sin + other[1] * cos
+        return (along.abs() >= reach_along) | (across.abs() >= reach_across)
+
+    by_own = separated(dx * c + dy * s, dy * c - dx * s, *boxes)
+    by_other = separated(dx * oc + dy * os, dy * oc - dx * os, *reversed(boxes))
     return ~(by_own | by_other)
 
 
@@ -66,32 +56,22 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
             return torch.zeros_like(both)
         if dx.numel() >= FEW:
             ego, near = (Vehicles(*(field[row, which] for field in v)) for which in (0, column + 1))
-            return torch.zeros_like(both).index_put((row, column), _ego_hits(dx[row, column], ego, near)) & both
-    return _ego_hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
-
-
-def _ego_hits(dx: Tensor, ego: Vehicles, others: Vehicles) -> Tensor:
-    """Whether the boxes of others, ``dx`` m ahead of the ego, overlap its own."""
-    return boxes_overlap(
-        dx, others.y - ego.y, ego.heading, ego.length, ego.width, others.heading, others.length, others.width
-    )
+            return torch.zeros_like(both).index_put((row, column), _hits(dx[row, column], ego, near)) & both
+    return _hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
 
 
 def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     """Whether vehicles i and j overlap, bool [N, M, M], false on the diagonal."""
-    v = vehicles
-    hit = boxes_overlap(
-        road.distance_ahead(v.x[:, :, None], v.x[:, None]),
-        v.y[:, None] - v.y[:, :, None],
-        v.heading[:, :, None],
-        v.length[:, :, None],
-        v.width[:, :, None],
-        v.heading[:, None],
-        v.length[:, None],
-        v.width[:, None],
+    one, other = (Vehicles(*(field.unsqueeze(axis) for field in vehicles)) for axis in (2, 1))
+    hit = _hits(road.distance_ahead(one.x, other.x), one, other) & other.valid & one.valid
+    return hit & ~torch.eye(vehicles.x.shape[1], dtype=torch.bool, device=vehicles.x.device)
+
+
+def _hits(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
+    """Whether the boxes of ``other``, ``dx`` m ahead of ``one``, overlap its box."""
+    return boxes_overlap(
+        dx, other.y - one.y, one.heading, one.length, one.width, other.heading, other.length, other.width
     )
-    both = v.valid[:, None] & v.valid[:, :, None]
-    return hit & both & ~torch.eye(v.x.shape[1], dtype=torch.bool, device=v.x.device)
 
 
 def dangerously_close(gap: Tensor, closing_speed: Tensor, ttc_s: float = 1.5, gap_m: float = 2.0) -> Tensor:

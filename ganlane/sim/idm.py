@@ -1,15 +1,20 @@
-"""Car following by the Intelligent Driver Model (Treiber et al. 2000) with the paper's Table V."""
+"""Car following by the Intelligent Driver Model (Treiber et al. 2000) with the paper's Table V.
+
+And whom it can save: whether a follower avoids a leader that brakes at the limit.
+"""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
+from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import IdmParameters
-from ganlane.sim.lanes import spanned
 from ganlane.sim.neighbours import Neighbour, Scene, leader
+from ganlane.sim.state import spanned
 
 
 class DriverIdm(NamedTuple):
@@ -41,10 +46,7 @@ SMALLEST_GAP_M = 0.1
 
 
 def desired_gap(
-    speed: Tensor,
-    closing_speed: Tensor,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
+    speed: Tensor, closing_speed: Tensor, parameters: AnyIdm = TABLE_V, headway_s: Tensor | float | None = None
 ) -> Tensor:
     """Desired gap in metres at ``speed`` behind a leader that is approached at ``closing_speed`` (m/s).
 
@@ -66,10 +68,9 @@ def idm_acceleration(
     """Acceleration in m/s2, within Table V's bounds; all tensors broadcast against each other.
 
     Args:
-        speed: own speed, m/s, at least 0.
-        desired_speed: own desired speed, m/s, above 0.
-        gap: net gap to the leader (bumper to bumper), m; Table V's 10 000 m without a leader.
-            A gap of 0 or less (an overlap) gives the hardest braking.
+        speed, desired_speed: own ones, m/s, at least 0 and above 0.
+        gap: to the leader, bumper to bumper, m; Table V's 10 000 m without a leader. A gap of 0 or less (an overlap)
+            gives the hardest braking.
         leader_speed: m/s; without a leader it only enters the (negligible) approach term.
         parameters: common to all drivers, or per driver (:class:`DriverIdm`).
         headway_s: time headway per vehicle, s, instead of Table V's.
@@ -90,19 +91,12 @@ def equilibrium_gap(speed: Tensor, desired_speed: Tensor | float, parameters: Id
 
 
 def acceleration_behind(
-    scene: Scene,
-    ahead: Neighbour,
-    parameters: AnyIdm = TABLE_V,
-    headway_s: Tensor | float | None = None,
+    scene: Scene, ahead: Neighbour, parameters: AnyIdm = TABLE_V, headway_s: Tensor | float | None = None
 ) -> Tensor:
-    """IDM acceleration of each observer behind ``ahead`` ([N, K], or [N, K, L] in L lanes), m/s2, of that shape."""
-    own = scene.observers
-    speed, desired = own.speed, own.desired_speed
-    if ahead.gap.ndim == 3:
-        speed, desired = speed[..., None], desired[..., None]
-        headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
-        parameters = parameters.per_lane()
-    return idm_acceleration(speed, desired, ahead.gap, ahead.speed, parameters, headway_s)
+    """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2, of that shape."""
+    speed, desired = scene.observers.speed[..., None], scene.observers.desired_speed[..., None]
+    headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
+    return idm_acceleration(speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s)
 
 
 def following_acceleration(
@@ -114,3 +108,65 @@ def following_acceleration(
     """
     ahead = leader(scene, spanned(scene.attention))
     return acceleration_behind(scene, ahead, parameters, headway_s).amin(-1)
+
+
+# Can a follower avoid a leader that brakes at the limit?
+
+#: Simulated time, s: enough for a stop from 60 m/s at 1 m/s2.
+HORIZON_S = 60.0
+
+
+def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
+    """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead; infinite at 0 m."""
+    closing = (speed - leader_speed).clamp_min(0.0)
+    needed = closing * closing / (2.0 * gap.clamp_min(1e-9))
+    return torch.where((gap <= 0) & (closing > 0), torch.inf, needed)
+
+
+def _survives(gap: Tensor, speed: Tensor, leader_speed: float, desired_speed: float, idm: IdmParameters) -> Tensor:
+    """Whether followers at ``speed`` (m/s) avoid a leader that from now on brakes at ``idm.min_acceleration``.
+
+    Two vehicles, IDM, steps of 0.1 s. This leader is the worst of all that brake no harder than
+    ``idm.min_acceleration``: any other is always ahead of it and no slower. So a driver that avoids this one also
+    avoids crashes in a queue, where each leader may have to brake for its own.
+    """
+    leader_now = torch.tensor(leader_speed, dtype=torch.float64)
+    gap, speed, leader_now = torch.broadcast_tensors(gap, speed, leader_now)
+    smallest = start = gap
+    for _ in range(round(HORIZON_S / PHYSICS_STEP_S)):
+        acceleration = idm_acceleration(speed, desired_speed, gap, leader_now, idm)
+        next_speed = (speed + acceleration * PHYSICS_STEP_S).clamp_min(0.0)
+        next_leader = (leader_now + idm.min_acceleration * PHYSICS_STEP_S).clamp_min(0.0)
+        gap = gap + 0.5 * PHYSICS_STEP_S * (leader_now + next_leader - speed - next_speed)
+        speed, leader_now = next_speed, next_leader
+        smallest = torch.minimum(smallest, gap)
+    return smallest >= start.clamp(1e-9, SMALLEST_GAP_M)
+
+
+@lru_cache(maxsize=1024)
+def can_brake(
+    gap_m: float, speed_mps: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
+) -> bool:
+    """Whether a follower at ``speed_mps`` avoids a leader that brakes at the limit, with 0.1 m for rounding."""
+    gap, speed = (torch.tensor([value], dtype=torch.float64) for value in (gap_m, speed_mps))
+    return bool(_survives(gap, speed, leader_speed_mps, desired_speed_mps, idm)[0])
+
+
+def least_gap(
+    speed_mps: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
+) -> float:
+    """Smallest gap (m, in steps of 0.1 m) for which :func:`can_brake` is true at this and every larger gap."""
+    stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
+    gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
+    speed = torch.full_like(gaps, speed_mps)
+    crashes = ~_survives(gaps, speed, leader_speed_mps, desired_speed_mps, idm)
+    return 0.1 * (1 + int(crashes.nonzero().max()) + 1) if bool(crashes.any()) else 0.1
+
+
+def highest_speed(
+    gap_m: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
+) -> float:
+    """Highest speed (m/s, in steps of 0.1 m/s) for which :func:`can_brake` is true at this and every lower speed."""
+    speeds = torch.arange(0, 1000).double() * 0.1
+    crashes = ~_survives(torch.full_like(speeds, gap_m), speeds, leader_speed_mps, desired_speed_mps, idm)
+    return 0.1 * max(0, int(crashes.nonzero().min()) - 1) if bool(crashes.any()) else float(speeds[-1])

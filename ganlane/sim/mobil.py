@@ -10,9 +10,8 @@ from torch import Tensor
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import MobilParameters
 from ganlane.sim.idm import TABLE_V, AnyIdm, DriverIdm, acceleration_behind, idm_acceleration
-from ganlane.sim.lanes import lane_change_done
 from ganlane.sim.neighbours import FREE_GAP_M, Scene, compare, follower, leader
-from ganlane.sim.state import Road, Vehicles, compact, reads_are_cheap
+from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
 
 
 class DriverMobil(NamedTuple):
@@ -40,16 +39,9 @@ class LaneAccelerations(NamedTuple):
     with_it: Tensor
     without: Tensor
 
-    def of(self, lanes: int | slice) -> LaneAccelerations:
+    def of(self, lanes: slice) -> LaneAccelerations:
         """Some of the lanes."""
         return LaneAccelerations(*(number[..., lanes] for number in self))
-
-
-class Change(NamedTuple):
-    """Incentive of a change into a lane, m/s2, and whether it is safe."""
-
-    incentive: Tensor
-    safe: Tensor
 
 
 def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelerations:
@@ -68,22 +60,18 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
     return LaneAccelerations(own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0))
 
 
-def mobil_criterion(there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil) -> Change:
-    """MOBIL's incentive and safety criterion for a change from ``here`` [N, K, 1] to ``there`` [N, K, L]."""
+def mobil_criterion(there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil) -> tuple[Tensor, Tensor]:
+    """MOBIL's incentive, m/s2, of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], and whether it is safe."""
     burden, relief = there.with_it - there.without, here.without - here.with_it
     incentive = there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
-    return Change(incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration)
+    return incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration
 
 
 def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
     """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
     there = lane_accelerations(scene, lane[..., None], idm)
-    return mobil_criterion(there, there, mobil).safe[..., 0]
-
-
-def on_road(lane: Tensor, road: Road) -> Tensor:
-    """Whether ``lane`` exists, bool."""
-    return (lane >= 0) & (lane <= road.lanes - 1)
+    _, safe = mobil_criterion(there, there, mobil)
+    return safe[..., 0]
 
 
 def without_ego(wish: Tensor) -> Tensor:
@@ -100,10 +88,14 @@ def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyM
     wants, vehicles = wish != 0, scene.vehicles
     if not reads_are_cheap(wish):
         return torch.where(_gives_way(vehicles, scene.road, wish, idm, mobil), 0, wish)
-    rows, columns = compact(wants & (wants.sum(1, keepdim=True) > 1))
+    rivals = wants & (wants.sum(1, keepdim=True) > 1)
+    rows = rivals.any(1).nonzero()[:, 0]
     if len(rows) == 0:
         return wish
-    few, wishes = Vehicles(*(field[rows] for field in vehicles)).columns(columns), wish[rows]
+    # Only their rows, and as many columns as hold all of them.
+    rivals, most = rivals[rows], int(rivals.sum(1).max())
+    columns = rivals.to(torch.uint8).sort(dim=1, descending=True, stable=True).indices[:, :most]
+    few, wishes = Vehicles(*(field[rows].gather(1, columns) for field in vehicles)), wish[rows]
     some = idm.of(rows, columns) if isinstance(idm, DriverIdm) else idm
     asked = wishes.gather(1, columns)
     kept = torch.where(_gives_way(few, scene.road, asked, some, mobil), 0, asked)
@@ -129,10 +121,9 @@ def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobi
     lane = vehicles.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    change = mobil_criterion(accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil)
-    exists = torch.stack((on_road(lane + 1.0, road), on_road(lane - 1.0, road)), dim=-1)
-    gain = torch.where(exists & change.safe & (change.incentive > mobil.threshold), change.incentive, -torch.inf)
-    left, right = gain.unbind(-1)
+    incentive, safe = mobil_criterion(accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil)
+    exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
+    left, right = torch.where(exists & safe & (incentive > mobil.threshold), incentive, -torch.inf).unbind(-1)
     free = lane_change_done(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)

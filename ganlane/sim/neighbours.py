@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ganlane.sim.lanes import LaneRange, body_lanes, presence, with_target
-from ganlane.sim.state import Road, Vehicles, reads_are_cheap
+from ganlane.sim.state import LaneRange, Road, Vehicles, body_lanes, presence, reads_are_cheap, with_target
 
 #: Gap in an empty lane, m (Table V's 'maximum gap for empty lane').
 FREE_GAP_M = 10_000.0
@@ -39,8 +38,8 @@ _NOBODY = 0x7F800000 << 32
 class Neighbour(NamedTuple):
     """The nearest vehicle of a kind, per observer and lane.
 
-    ``gap`` is bumper to bumper, m, :data:`FREE_GAP_M` without a neighbour, negative for an overlap along
-    the road; ``speed`` in m/s, the observer's speed without a neighbour.
+    ``gap`` is bumper to bumper, m, :data:`FREE_GAP_M` without a neighbour, negative for an overlap along the road;
+    ``speed`` in m/s, the observer's own without a neighbour.
     """
 
     gap: Tensor
@@ -48,8 +47,7 @@ class Neighbour(NamedTuple):
 
 
 class Follower(NamedTuple):
-    """The nearest vehicle behind, per observer and lane: gap (m), speed and desired speed (m/s), and whether it
-    exists."""
+    """The nearest vehicle behind, per observer and lane: gap, m, speeds, m/s, and whether it exists."""
 
     gap: Tensor
     speed: Tensor
@@ -79,19 +77,12 @@ class Pairs(NamedTuple):
         return _only(-self.distance - self.bumpers, self.order < 0)
 
 
-class Queue(NamedTuple):
-    """The vehicles in the order of the road, int64 [N, M]: whose ``turn`` it is, the foremost first, and everybody's
-    ``place`` in that order."""
-
-    turn: Tensor
-    place: Tensor
-
-
 class Scene(NamedTuple):
     """M vehicles as K observers see them, computed once per step.
 
     ``observers`` and their lane ranges ``body`` and ``attention`` are [N, K]; ``presence`` [N, M] holds the lanes in
-    which others see each vehicle. With a ``queue`` neighbours are found by sorting.
+    which others see each vehicle. With a ``queue`` neighbours are found by sorting: int64 [N, M], the vehicles in the
+    order of the road, the foremost first, and everybody's place in that order.
     """
 
     which: slice
@@ -101,7 +92,7 @@ class Scene(NamedTuple):
     body: LaneRange
     attention: LaneRange
     presence: LaneRange
-    queue: Queue | None
+    queue: tuple[Tensor, Tensor] | None
     known: Pairs | None
 
     @property
@@ -136,8 +127,16 @@ def compare(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Pairs
 def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scene:
     """The :class:`Scene` of ``vehicles`` on ``road``, as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
-    attention = with_target(body, vehicles)
-    sorts = which == slice(None) and _sorts(vehicles, road)
+    attention, x = with_target(body, vehicles), vehicles.x
+    # Where sorting is faster, and possible: a ring has no first vehicle, a key holds two numbers of 32 bits.
+    sorts = (
+        which == slice(None)
+        and x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM
+        and reads_are_cheap(x)
+        and x.dtype == torch.float32
+        and road.ring_m is None
+        and not (x.requires_grad or vehicles.speed.requires_grad)
+    )
     return Scene(
         which=which,
         observers=vehicles.columns(which),
@@ -146,7 +145,7 @@ def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scen
         body=body.columns(which),
         attention=attention.columns(which),
         presence=presence(vehicles, road, body, attention),
-        queue=_queue(vehicles.x) if sorts else None,
+        queue=_queue(x) if sorts else None,
         known=None if sorts else compare(vehicles, road, which),
     )
 
@@ -211,26 +210,14 @@ def _gap(scene: Scene, end: Tensor, side: int) -> Tensor:
     return torch.sub(distance, o.length[..., None], alpha=0.5).clamp_max(FREE_GAP_M)
 
 
-def _sorts(vehicles: Vehicles, road: Road) -> bool:
-    """Whether sorting is faster and possible: a ring has no first vehicle, a key holds two numbers of 32 bits."""
-    x = vehicles.x
-    return (
-        x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM
-        and reads_are_cheap(x)
-        and x.dtype == torch.float32
-        and road.ring_m is None
-        and not (x.requires_grad or vehicles.speed.requires_grad)
-    )
-
-
-def _queue(x: Tensor) -> Queue:
-    """The :class:`Queue` of vehicles at ``x`` [N, M]; of two at the same x the one with the lower index is ahead."""
+def _queue(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Of vehicles at ``x`` [N, M]; of two at the same x the one with the lower index is ahead."""
     turn = x.sort(dim=1, descending=True, stable=True).indices
     numbers = torch.arange(x.shape[1], device=x.device).expand_as(turn)
-    return Queue(turn, torch.empty_like(turn).scatter_(1, turn, numbers))
+    return (turn, torch.empty_like(turn).scatter_(1, turn, numbers))
 
 
-def _nearest_key(scene: Scene, queue: Queue, lane: Tensor, side: int, second: Tensor) -> Tensor:
+def _nearest_key(scene: Scene, queue: tuple[Tensor, Tensor], lane: Tensor, side: int, second: Tensor) -> Tensor:
     """The key of the vehicle with the nearest end in each lane [N, K, L], ahead (``side`` 1) or behind (-1).
 
     A key is 64 bits long: first the end as in :func:`_candidates`, then ``second``, which decides between level
@@ -239,7 +226,7 @@ def _nearest_key(scene: Scene, queue: Queue, lane: Tensor, side: int, second: Te
     v, m = scene.vehicles, lane.shape[1]
     lanes = int(scene.road.lanes.max()) if isinstance(scene.road.lanes, Tensor) else scene.road.lanes
     key = (_ordered(side * v.x - 0.5 * v.length) << 32) | second
-    turn, passed = (queue.turn, queue.place) if side > 0 else (queue.turn.flip(1), m - 1 - queue.place)
+    turn, passed = queue if side > 0 else (queue[0].flip(1), m - 1 - queue[1])
     low, high, key = (each.gather(1, turn) for each in (*scene.presence, key))
     number = torch.arange(lanes, device=v.x.device)[:, None, None]
     key = torch.where((low <= number) & (number <= high), key, _NOBODY)

@@ -6,6 +6,7 @@ are checked for impossible numbers, overlaps and unavoidable crashes; errors nam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Protocol
@@ -18,8 +19,7 @@ from ganlane.keys import PHYSICS_STEP_S
 from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.dynamics import advance, steer
-from ganlane.sim.feasibility import needed_deceleration
-from ganlane.sim.idm import following_acceleration
+from ganlane.sim.idm import following_acceleration, needed_deceleration
 from ganlane.sim.neighbours import in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import STRAIGHT, Road, Vehicles
@@ -98,11 +98,11 @@ class FixedScene:
     """The same initial scene in every episode, or with small random variations; the first vehicle is the ego.
 
     Args:
-        rows: the vehicles; the ego's x becomes 0, and the others keep their distance to it. road: the road;
-        straight, the same in all episodes. jitter_m: largest random shift of the others' x, forwards or backwards,
-        per episode, m. jitter_mps: largest random change of each speed, m/s, never below 0; stopped vehicles stay
-        stopped. Both depend
-            on (stream, seed, episode) only.
+        rows: the vehicles; the ego's x becomes 0, and the others keep their distance to it.
+        road: straight, the same in all episodes.
+        jitter_m: largest random shift of the others' x, forwards or backwards, m.
+        jitter_mps: largest random change of each speed, m/s, never below 0; stopped vehicles stay stopped. Both
+            depend on (stream, seed, episode) only.
         ego_visibility, others_visibility: for vehicles without a visibility of their own.
         name: of the scene, for messages.
 
@@ -146,9 +146,8 @@ class FixedScene:
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """The scene once per key [N], varied by the jitter."""
-        base = self.base(dtype, key.device)
         n, m = key.shape[0], self.vehicles
-        whole = Vehicles(*(value.expand(n, m).clone() for value in base.as_dict().values()))
+        whole = Vehicles(*(value.expand(n, m).clone() for value in self.base(dtype, key.device)))
         if self.jitter_m == 0 and self.jitter_mps == 0:
             return whole
         u = 2.0 * uniform(key, 0, m, [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED], dtype) - 1.0
@@ -161,10 +160,12 @@ class FixedScene:
         """The scene without jitter, fields [1, M]."""
         rows, road = self.rows, self.road
 
-        def column(values: list[float], kind: torch.dtype = dtype) -> Tensor:
+        def column(values: Sequence[float], kind: torch.dtype = dtype) -> Tensor:
             return torch.tensor([values], dtype=kind, device=device)
 
-        lanes = [row.lane_on(road) for row in rows]
+        targets = [row.lane_on(road) if row.target_lane is None else row.target_lane for row in rows]
+        usual = [self.ego_visibility] + [self.others_visibility] * (len(rows) - 1)
+        seen = [kind if row.visibility is None else row.visibility for row, kind in zip(rows, usual)]
         zero = column([0.0] * len(rows))
         return Vehicles(
             x=column([row.x_m - rows[0].x_m for row in rows]),
@@ -175,18 +176,10 @@ class FixedScene:
             length=column([row.length_m for row in rows]),
             width=column([row.width_m for row in rows]),
             desired_speed=column([row.desired_speed_mps for row in rows]),
-            target_lane=column(
-                [lane if row.target_lane is None else row.target_lane for row, lane in zip(rows, lanes, strict=True)],
-                torch.int64,
-            ),
-            visibility=column([int(self._seen(index)) for index in range(len(rows))], torch.int64),
+            target_lane=column(targets, torch.int64),
+            visibility=column(seen, torch.int64),
             valid=torch.ones_like(zero, dtype=torch.bool),
         )
-
-    def _seen(self, index: int) -> int:
-        own = self.rows[index].visibility
-        usual = self.ego_visibility if index == 0 else self.others_visibility
-        return usual if own is None else own
 
     def label(self, index: int) -> str:
         """Name of a vehicle in messages: ``the ego``, ``vehicle 3 (line 5)``."""
@@ -234,10 +227,6 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     for name in ("desired_speed_mps", "length_m", "width_m"):
         if getattr(row, name) < SMALLEST:
             return f"{name}={getattr(row, name):g}: expected a number above 0"
-    return _misplaced(row, road)
-
-
-def _misplaced(row: SceneVehicle, road: Road) -> str:
     lanes = int(road.lanes)
     if row.lane is None and row.y_m is None:
         return "neither lane nor y_m is given; give one of them"
@@ -310,22 +299,15 @@ def _first_overlap(scene: FixedScene, idm: IdmParameters) -> tuple[int, int, flo
     most = max(1, MOST_VEHICLES**2 // scene.vehicles**2)
     rows = min(DRIVES, most) if scene.jitter_m or scene.jitter_mps else 1
     numbers = torch.arange(rows)
-    vehicles = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
-    steering = torch.zeros_like(vehicles.x)
+    v = scene(episode_key(Stream.TRAIN, torch.zeros_like(numbers), numbers), torch.float64)
+    steering, centre = torch.zeros_like(v.x), scene.road.centre_of(v.target_lane, v.y.dtype)
     for step in range(1, round(DRIVE_S / PHYSICS_STEP_S) + 1):
-        vehicles, steering = _follow(vehicles, steering, scene.road, idm)
-        hits = pair_overlaps(vehicles, scene.road)
+        acceleration = following_acceleration(perceive(v, scene.road), idm)
+        steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
+        pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
+        v = v.with_(**pose._asdict())
+        hits = pair_overlaps(v, scene.road)
         if bool(hits.any()):
             _, one, other = hits.nonzero()[0].tolist()
             return one, other, step * PHYSICS_STEP_S
     return None
-
-
-def _follow(vehicles: Vehicles, steering: Tensor, road: Road, idm: IdmParameters) -> tuple[Vehicles, Tensor]:
-    """All vehicles after a physics step of IDM and steering, without new lane changes."""
-    v = vehicles
-    acceleration = following_acceleration(perceive(v, road), idm)
-    centre = road.centre_of(v.target_lane, v.y.dtype)
-    steering = steer(steering, v.y, v.heading, v.speed, centre, PHYSICS_STEP_S)
-    pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, PHYSICS_STEP_S)
-    return v.with_(**pose._asdict()), steering

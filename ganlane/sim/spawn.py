@@ -1,4 +1,10 @@
-"""Random initial scenes (section IV.A, Table II), built without a rejection loop."""
+"""Who is on the road: random initial scenes (section IV.A, Table II), and vehicles that return.
+
+A scene is built without a rejection loop. Recycling moves vehicles far behind the ego to far ahead of it, and the
+reverse, so that the road never empties: one more than ``range_m`` from the ego is moved by twice the range to the
+other side, as if the road were a ring around the ego; lane, speed, driver and internal state are kept. It is moved
+only when there is room, that is, when no vehicle would have to brake harder than is safe because of it.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +14,22 @@ import torch
 from torch import Tensor
 
 from ganlane.errors import ParameterError, UserError
+from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.feasibility import can_brake, highest_speed, least_gap
-from ganlane.sim.idm import TABLE_V
+from ganlane.sim.idm import TABLE_V, can_brake, highest_speed, idm_acceleration, least_gap
+from ganlane.sim.neighbours import Scene, perceive
 from ganlane.sim.random import Purpose, draw_keys, uniform
-from ganlane.sim.state import STRAIGHT, Road, Vehicles
+from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
 
-#: Purposes of the draws for every vehicle, in the order of the columns.
-_DRAWN: list[int] = [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED, Purpose.SPAWN_DESIRED_SPEED, Purpose.SPAWN_TRUCK]
 TABLE_II = SpawnParameters()
+#: Range of the positions in Table III, m.
+RANGE_M = 200.0
+#: Largest deceleration that a moved vehicle may require of any vehicle: MOBIL's safe deceleration, m/s2.
+SAFE_DECELERATION = 4.0
+#: Vehicles with less room than this between their sides count as being in one lane, m: who changes lanes drives at an
+#: angle, and its corners reach further than its lanes say.
+SIDE_M = 0.4
 
 
 def check_start(parameters: SpawnParameters, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V) -> None:
@@ -36,28 +48,19 @@ def check_start(parameters: SpawnParameters, vehicles: int, lanes: int, idm: Idm
             f"({{spread_m}}={p.spread_m:g}, {{min_spacing_m}}={p.min_spacing_m:g}{lorries}) "
             f"hold {lanes * capacity}; use fewer vehicles, more lanes or a larger {{spread_m}}."
         )
-    if vehicles > 1:
-        for follower in p.worst_followers():
-            _check_braking(p, *follower, idm)
-
-
-def _check_braking(
-    p: SpawnParameters, field: str, speed: float, leader: float, desired: float, idm: IdmParameters
-) -> None:
-    """The fastest vehicle must avoid the slowest leader, at the smallest gap, when it brakes at the limit.
-
-    The gap does not depend on which vehicles are lorries (:attr:`SpawnParameters.spacing_m`).
-    """
+    # The fastest vehicle must avoid the slowest leader, at the smallest gap, when it brakes at the limit. That gap is
+    # the same whichever vehicles are lorries (SpawnParameters.spacing_m).
     gap = p.min_spacing_m - p.length_m
-    if not can_brake(gap, speed, leader, desired, idm):
-        spacing = p.length_m + least_gap(speed, leader, desired, idm)
-        slower = highest_speed(gap, leader, desired, idm)
-        raise ParameterError(
-            f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to {speed:g} m/s: a gap "
-            f"of {gap:g} m is too short to avoid a leader of {leader:g} m/s that brakes at "
-            f"{{idm.min_acceleration}}={idm.min_acceleration:g} m/s2; raise {{min_spacing_m}} to {spacing:.1f} or "
-            f"lower {{{field}}} to {slower:.1f}."
-        )
+    for field, speed, leader, desired in p.worst_followers() if vehicles > 1 else ():
+        if not can_brake(gap, speed, leader, desired, idm):
+            spacing = p.length_m + least_gap(speed, leader, desired, idm)
+            slower = highest_speed(gap, leader, desired, idm)
+            raise ParameterError(
+                f"{{min_spacing_m}}={p.min_spacing_m:g} is too little for {{{field}}} up to {speed:g} m/s: a gap "
+                f"of {gap:g} m is too short to avoid a leader of {leader:g} m/s that brakes at "
+                f"{{idm.min_acceleration}}={idm.min_acceleration:g} m/s2; raise {{min_spacing_m}} to {spacing:.1f} "
+                f"or lower {{{field}}} to {slower:.1f}."
+            )
 
 
 def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
@@ -93,10 +96,6 @@ def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
     return x - x[:, :1], lane
 
 
-def _between(u: Tensor, bounds: tuple[float, float]) -> Tensor:
-    return bounds[0] + u * (bounds[1] - bounds[0])
-
-
 def spawn(
     key: Tensor,
     vehicles: int,
@@ -108,16 +107,21 @@ def spawn(
     others_visibility: int = Visibility.SIGNALLED,
 ) -> Vehicles:
     """A random scene per episode key [N]; the ego is at index 0, the others follow by position."""
+
+    def between(column: int, bounds: tuple[float, float]) -> Tensor:
+        return bounds[0] + u[..., column] * (bounds[1] - bounds[0])
+
     p = parameters
-    u = uniform(key, 0, vehicles, _DRAWN, dtype)
+    drawn = [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED, Purpose.SPAWN_DESIRED_SPEED, Purpose.SPAWN_TRUCK]
+    u = uniform(key, 0, vehicles, [int(purpose) for purpose in drawn], dtype)
     lane = draw_lanes(key, vehicles, lanes, p.lane_capacity())
     x, lane = ego_first(place_in_lanes(lane, u[..., 0], p.spread_m, p.spacing_m), lane)
     is_ego = torch.arange(vehicles, device=key.device) == 0
-    speed = torch.where(x > 0, _between(u[..., 1], p.front_speed_mps), _between(u[..., 1], p.rear_speed_mps))
-    speed = torch.where(is_ego, _between(u[..., 1], p.ego_speed_mps), speed)
+    speed = torch.where(x > 0, between(1, p.front_speed_mps), between(1, p.rear_speed_mps))
+    speed = torch.where(is_ego, between(1, p.ego_speed_mps), speed)
     is_truck = (u[..., 3] < p.truck_share) & ~is_ego
-    desired = torch.where(is_ego, p.ego_desired_speed_mps, _between(u[..., 2], p.desired_speed_mps))
-    desired = torch.where(is_truck, _between(u[..., 2], p.truck_desired_speed_mps), desired)
+    desired = torch.where(is_ego, p.ego_desired_speed_mps, between(2, p.desired_speed_mps))
+    desired = torch.where(is_truck, between(2, p.truck_desired_speed_mps), desired)
     visibility = torch.where(is_ego, int(ego_visibility), int(others_visibility))
     zero = torch.zeros_like(x)
     return Vehicles(
@@ -137,7 +141,7 @@ def spawn(
 
 @dataclass(frozen=True)
 class RandomScenes:
-    """Table II: random positions and speeds (:func:`ganlane.sim.spawn.spawn`)."""
+    """Table II: random positions and speeds (:func:`spawn`)."""
 
     road: Road = STRAIGHT
     vehicles: int = 9
@@ -146,31 +150,23 @@ class RandomScenes:
     others_visibility: int = Visibility.SIGNALLED
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """See :func:`ganlane.sim.spawn.check_start`; the road must be the scene's, wide and long enough."""
-        if isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
+        """See :func:`check_start`; the road must be the scene's, wide enough, and as a ring long enough."""
+        p, lane_width_m, ring_m = self.parameters, road.lane_width_m, road.ring_m
+        if isinstance(road.lanes, Tensor) or isinstance(lane_width_m, Tensor):
             return  # a road for each row: its vehicles come from recordings
         if road != self.road:
             raise UserError(
                 f"scenes: laid out on {_described(self.road)}, the traffic drives on {_described(road)}; give both "
                 "the same road."
             )
-        check_start(self.parameters, self.vehicles, road.lanes, idm)
-        self._check_room(road.lane_width_m, road.ring_m)
-
-    @property
-    def longest_m(self) -> float:
-        """Length of the longest vehicle of all episodes, m."""
-        return self.parameters.longest_m
-
-    def _check_room(self, lane_width_m: float, ring_m: float | None) -> None:
-        """Check the room side by side, and where a ring closes: there the last vehicle is the first one's leader."""
-        p = self.parameters
+        check_start(p, self.vehicles, road.lanes, idm)
         if lane_width_m <= p.widest_m:
             wide = "width_m" if p.width_m == p.widest_m else "truck_width_m"
             raise UserError(
                 f"env.lane_width_m={lane_width_m:g}: expected more than env.{wide}={p.widest_m:g}, or vehicles in "
                 "neighbouring lanes touch; widen the lanes."
             )
+        # Where a ring closes, the last vehicle is the first one's leader.
         if ring_m is not None and p.spread_m + p.spacing_m > ring_m:
             more = f" ({p.spacing_m:g} with lorries)" if p.spacing_m > p.min_spacing_m else ""
             raise UserError(
@@ -179,15 +175,68 @@ class RandomScenes:
                 "or lower env.spread_m."
             )
 
+    @property
+    def longest_m(self) -> float:
+        """Length of the longest vehicle of all episodes, m."""
+        return self.parameters.longest_m
+
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
         """One random scene per key."""
-        lanes, width = self.road.lanes, self.road.lane_width_m
-        assert not isinstance(lanes, Tensor)
-        assert not isinstance(width, Tensor)
+        road = (int(self.road.lanes), float(self.road.lane_width_m))
         visibility = (self.ego_visibility, self.others_visibility)
-        return spawn(key, self.vehicles, lanes, float(width), self.parameters, dtype, *visibility)
+        return spawn(key, self.vehicles, *road, self.parameters, dtype, *visibility)
 
 
 def _described(road: Road) -> str:
     shape = "a straight road" if road.ring_m is None else f"a ring of {road.ring_m:g} m"
     return f"{shape} of {road.lanes} lanes of {road.lane_width_m} m"
+
+
+# Recycling
+
+
+def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Tensor:
+    """Whether a vehicle is more than ``range_m`` ahead of the ego or behind it, bool [N, M]."""
+    distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
+    return (distance.abs() > range_m) & vehicles.valid
+
+
+def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
+    """Whether each of the first M vehicles requires no deceleration above ``safe`` in any pair, bool [N, M].
+
+    ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the result holds
+    whichever of the others move too.
+    """
+    own, other, (low, high) = there.observers, there.vehicles, there.attention
+    shares = (low[..., None] <= high.repeat(1, 2)[:, None, :]) & (low.repeat(1, 2)[:, None, :] <= high[..., None])
+    sides = 0.5 * own.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
+    shares |= (own.y[..., None] - other.y[:, None, :]).abs() < sides
+    pairs = there.pairs
+    itself = torch.eye(own.x.shape[1], dtype=torch.bool, device=own.x.device).repeat(1, 2)
+    counts = shares & other.valid[:, None, :] & ~itself
+    speed, desired = own.speed[..., None], own.desired_speed[..., None]
+    behind = idm_acceleration(speed, desired, pairs.ahead, other.speed[:, None, :], idm)
+    before = idm_acceleration(other.speed[:, None, :], other.desired_speed[:, None, :], pairs.behind, speed, idm)
+    asked = torch.where(pairs.order > 0, behind, before)
+    return (~counts | (asked >= -safe)).all(-1)
+
+
+def recycle(
+    vehicles: Vehicles,
+    road: Road,
+    idm: IdmParameters,
+    range_m: float = RANGE_M,
+    safe_deceleration: float = SAFE_DECELERATION,
+) -> Vehicles:
+    """``vehicles`` with those out of range moved to the other side of the ego, where there is room.
+
+    Room is tested against every other vehicle at its current *and* at its new position.
+    """
+    away = out_of_range(vehicles, road, range_m)
+    if reads_are_cheap(away) and not bool(away.any()):
+        return vehicles
+    distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
+    moved = vehicles.with_(x=torch.where(away, vehicles.x - 2.0 * range_m * torch.sign(distance), vehicles.x))
+    both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))
+    room = _room(perceive(both, road, slice(0, vehicles.x.shape[1])), idm, safe_deceleration)
+    return vehicles.with_(x=torch.where(away & room, moved.x, vehicles.x))

@@ -15,9 +15,8 @@ from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
-from ganlane.sim.lanes import lane_change_done
 from ganlane.sim.random import Purpose, Stream, uniform
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, lane_change_done
 from ganlane.traffic.base import Memory, Moved, Overlay, TrafficModule, TrafficSequential
 
 #: A step shorter than this has no direction of its own, m: the vehicle then moves along its heading.

@@ -13,8 +13,7 @@ from ganlane.keys import EGO_INDEX
 from ganlane.parameters import Range
 from ganlane.parameters.driving import IdmParameters, MobilParameters, RandomDrivers
 from ganlane.sim.dynamics import STEERING, SteeringParameters, advance, steer
-from ganlane.sim.feasibility import needed_deceleration
-from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration
+from ganlane.sim.idm import TABLE_V, DriverIdm, following_acceleration, needed_deceleration
 from ganlane.sim.mobil import TABLE_IV, DriverMobil, mobil_changes
 from ganlane.sim.neighbours import Scene, in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, absorb, uniform

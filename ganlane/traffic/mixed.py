@@ -15,9 +15,8 @@ from torch import Tensor
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
-from ganlane.sim.lanes import VISIBILITY_OF_EPISODE
 from ganlane.sim.random import Purpose, absorb, uniform
-from ganlane.sim.state import Vehicles
+from ganlane.sim.state import VISIBILITY_OF_EPISODE, Vehicles
 from ganlane.traffic.base import TrafficModule, TrafficParts, key_of, memory_of
 
 #: Compiled graphs get the rows of a part padded, so that there are at most about this many sizes.

@@ -15,11 +15,10 @@ from torch import Tensor
 
 from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.sim.idm import TABLE_V, acceleration_behind
-from ganlane.sim.lanes import lane_change_done, spanned
 from ganlane.sim.mobil import one_at_a_time, safe_change, without_ego
 from ganlane.sim.neighbours import Scene, leader, perceive
 from ganlane.sim.random import Purpose, Stream, normal, uniform
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, lane_change_done, spanned
 from ganlane.traffic.base import Memory, Moved, Overlay
 
 

@@ -15,14 +15,12 @@ from ganlane.errors import UserError
 from ganlane.keys import EGO_INDEX
 from ganlane.parameters.driving import IdmParameters, SumoParameters, Visibility
 from ganlane.parameters.episode import SpawnParameters
-from ganlane.sim.dynamics import STEERING, SteeringParameters
-from ganlane.sim.ego import ego_scene, move_ego
+from ganlane.sim.dynamics import STEERING, SteeringParameters, ego_scene, move_ego
 from ganlane.sim.idm import TABLE_V, following_acceleration
-from ganlane.sim.lanes import body_lanes, presence, with_target
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.scenes import Scenes
 from ganlane.sim.spawn import TABLE_II, RandomScenes
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, body_lanes, presence, with_target
 from ganlane.traffic.base import Memory, Moved, TrafficModule, require
 from ganlane.traffic.sumo_roads import LIBSUMO, Array, Place, SumoDriver, SumoRoads
 

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.agents import Rainbow
-from ganlane.env.native_step import threads_for
+from ganlane.env.highway import threads_for
 
 
 class Collector(ABC):

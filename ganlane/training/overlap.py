@@ -25,7 +25,7 @@ from torchrl.envs import EnvBase
 
 from ganlane import keys
 from ganlane.agents import Rainbow
-from ganlane.env.native_step import threads_for
+from ganlane.env.highway import threads_for
 from ganlane.errors import UserError
 from ganlane.training.collectors import Collector, SingleCollector, pack, unpack
 from ganlane.training.signals import shielded_children

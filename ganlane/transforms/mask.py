@@ -21,10 +21,10 @@ from torchrl.data.tensor_specs import Binary
 from ganlane import keys
 from ganlane.errors import UserError
 from ganlane.keys import ACTIONS, EGO_INDEX
-from ganlane.native.mask import SafeActions
+from ganlane.native.tensors import SafeActions
 from ganlane.parameters.driving import IdmParameters
 from ganlane.parameters.observation import MASKS
-from ganlane.sim.ego import ego_scene
+from ganlane.sim.dynamics import ego_scene
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import lane_accelerations
 from ganlane.sim.state import Road, Vehicles, road_in

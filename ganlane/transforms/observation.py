@@ -35,8 +35,8 @@ from torchrl.envs import Transform
 
 from ganlane import keys
 from ganlane.errors import UserError
-from ganlane.native.observation import LaneView
 from ganlane.native.settings import NATIVE_FORMS
+from ganlane.native.tensors import LaneView
 from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale, SensorParameters
 from ganlane.sim.random import Purpose, Stream, episode_key, normal, uniform
 from ganlane.sim.state import Road, Vehicles, road_in

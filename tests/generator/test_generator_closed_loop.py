@@ -13,8 +13,7 @@ from ganlane.generator.networks import Generator
 from ganlane.generator.windows import cut_segments
 from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 from ganlane.sim.idm import IdmParameters, equilibrium_gap, idm_acceleration
-from ganlane.sim.lanes import Visibility
-from ganlane.sim.state import Road
+from ganlane.sim.state import Road, Visibility
 
 ROAD = Road(3, 4.0)
 

@@ -342,14 +342,3 @@ def decide(state: State, action: int, rules: Rules) -> Outcome:
         remaining = abs(ego.y - ego.target_lane * rules.lane_width) / rules.lane_width
         outcome.progress = min(1.0, max(0.0, 1.0 - remaining))
     return outcome
-
-
-def simulate(state: State, actions: list[int], rules: Rules) -> list[tuple[State, Outcome]]:
-    """State and outcome after each decision, until the episode ends."""
-    record = []
-    for action in actions:
-        outcome = decide(state, action, rules)
-        record.append((replace(state, cars=list(state.cars)), outcome))
-        if outcome.reasons:
-            break
-    return record

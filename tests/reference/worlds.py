@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -42,6 +42,69 @@ def vehicles(*cars: dict, lane_width_m: float = 4.0, dtype: torch.dtype = DOUBLE
         kind = dtype if name in keys.VEHICLE_FLOATS else torch.bool if name in keys.VEHICLE_FLAGS else torch.int64
         columns[name] = torch.tensor([[car[name] for car in filled]], dtype=kind)
     return Vehicles(**columns)
+
+
+def drawing(
+    shape: Sequence[int], seed: int | torch.Generator, dtype: torch.dtype = DOUBLE
+) -> Callable[[float, float], torch.Tensor]:
+    """``between(low, high)``, which draws uniform numbers of that shape."""
+    generator = torch.Generator().manual_seed(seed) if isinstance(seed, int) else seed
+    return lambda low, high: low + (high - low) * torch.rand(shape, generator=generator, dtype=dtype)
+
+
+def vehicles_at(x: torch.Tensor, target_lane: torch.Tensor, **others: torch.Tensor) -> Vehicles:
+    """Cars [N, M] in the middle of their target lanes, straight ahead and signalled, but for the ``others``."""
+    zero = torch.zeros_like(x)
+    fields = {
+        **{"x": x, "y": 4.0 * target_lane.to(x.dtype), "heading": zero, "acceleration": zero},
+        **{"length": zero + 4.5, "width": zero + 2.5, "target_lane": target_lane},
+        **{"visibility": torch.full_like(target_lane, int(Visibility.SIGNALLED)), "valid": target_lane >= 0},
+    }
+    return Vehicles(**{**fields, **others})
+
+
+def random_scenes(rows: int, cars: int, lanes: int, seed: int) -> Vehicles:
+    """On 400 m, at 0 to 35 m/s, one in five in the middle of a change, all of them signalled."""
+    between = drawing((rows, cars), seed)
+    lane = between(0, lanes).long()
+    side = (between(0, 2).long() * 2 - 1) * (between(0, 1) < 0.2)
+    target = (lane + side).clamp(0, lanes - 1)
+    speed = between(0, 35)
+    x, y = between(0, 400), 4.0 * (lane + (target - lane) * between(0, 1))
+    desired = torch.maximum(between(10, 40), 0.9 * speed)
+    return vehicles_at(x, target, y=y, speed=speed, desired_speed=desired)
+
+
+def moves(
+    traffic: TrafficModule,
+    cars: Vehicles,
+    steps: int,
+    change: Callable[[Vehicles, Vehicles], Vehicles] = lambda before, after: after,
+) -> Iterator[Vehicles]:
+    """The cars after each physics step of rule-driven traffic, and what ``change`` makes of it."""
+    clock = torch.zeros(cars.x.shape[0], dtype=torch.int64)
+    memory = traffic.fresh_memory(cars, clock)
+    for _ in range(steps):
+        after, memory = traffic.move(cars, memory, clock, clock)
+        cars = change(cars, after)
+        yield cars
+
+
+def disturbed(scene: Vehicles, lanes: int, generator: torch.Generator) -> Vehicles:
+    """The scene with everything a little off: in mid-change, at odd angles, seen in all ways or not at all."""
+    between = drawing(scene.x.shape, generator, scene.x.dtype)
+    side = (between(0, 1) < 0.3) * (between(0, 2).long() * 2 - 1)
+    return scene.with_(
+        y=scene.y + between(-0.5, 0.5) + 0.5 * side * between(0, 4),
+        heading=between(-0.03, 0.03),
+        speed=between(0, 30) * (between(0, 1) < 0.9),
+        length=between(4, 6),
+        width=between(1.8, 2.6),
+        desired_speed=between(15, 35),
+        target_lane=(scene.target_lane + side).clamp(0, lanes - 1),
+        visibility=between(0, 3).long(),
+        valid=(between(0, 1) < 0.9) | (torch.arange(scene.x.shape[1]) == 0),
+    )
 
 
 def packed(spread_m: float, spacing_m: float) -> SpawnParameters:
@@ -143,3 +206,42 @@ def same_bits(one: TensorDictBase, other: TensorDictBase) -> list[str]:
     """Names of the entries that are missing in one or differ in any bit."""
     a, b = dict(leaves(one)), dict(leaves(other))
     return [str(name) for name in {**a, **b} if name not in a or name not in b or not torch.equal(a[name], b[name])]
+
+
+Track = list[torch.Tensor]
+
+
+def tracks(
+    env: HighwayEnv,
+    decisions: int,
+    act: Callable[[TensorDictBase], torch.Tensor],
+    episodes: Sequence[int] | None = None,
+) -> dict[int, Track]:
+    """Episode to its states, over a run with automatic resets; unfinished episodes are left out.
+
+    ``episodes`` [N] are those that it begins with; None: the environment's first ones. A state is all that there is
+    of a row, exactly (a float32 and a small integer fit into a float64).
+    """
+    td = env.reset()
+    if episodes is not None:
+        td = env.reset(td.select(keys.SEED, keys.EPISODE).set(keys.EPISODE, torch.tensor(episodes)))
+    found: dict[int, Track] = {}
+    finished = set()
+    for _ in range(decisions):
+        stepped, td = env.step_and_maybe_reset(td.set("action", act(td)))
+        after = stepped["next"].exclude("reward", "action")
+        numbers = [value.reshape(len(after), -1).double() for name, value in leaves(after) if name != keys.EPISODE]
+        states = torch.cat(numbers, dim=1)
+        for row, episode in enumerate(after[keys.EPISODE].tolist()):
+            found.setdefault(episode, []).append(states[row])
+            if after["done"][row]:
+                finished.add(episode)
+    return {episode: found[episode] for episode in finished}
+
+
+def assert_same_tracks(some: dict[int, Track], others: dict[int, Track], at_least: int) -> None:
+    """That so many episodes are in both, and the same bit for bit."""
+    common = some.keys() & others.keys()
+    assert len(common) >= at_least
+    for episode in common:
+        assert torch.equal(torch.stack(some[episode]), torch.stack(others[episode])), episode

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from reference import scalar
-from reference.worlds import DOUBLE, vehicles
+from reference.worlds import DOUBLE, drawing, vehicles
 
 from ganlane.sim.collisions import boxes_overlap, dangerously_close, ego_overlaps, pair_overlaps
 
@@ -16,11 +16,7 @@ GRID_M = 0.08
 
 def random_pairs(count: int) -> tuple[torch.Tensor, ...]:
     """dx, dy, heading, length, width, and the other's heading, length, width."""
-    generator = torch.Generator().manual_seed(11)
-
-    def between(low: float, high: float) -> torch.Tensor:
-        return low + (high - low) * torch.rand(count, generator=generator, dtype=DOUBLE)
-
+    between = drawing((count,), 11)
     angle, sizes = (-math.pi, math.pi), ((3.0, 6.0), (1.6, 2.6))
     one = between(*angle), *(between(*size) for size in sizes)
     other = between(*angle), *(between(*size) for size in sizes)
@@ -43,8 +39,7 @@ def test_boxes_overlap_where_a_sampler_finds_a_common_point():
     """A sampled point proves an overlap; one that is left after both boxes shrink is deep enough to be sampled."""
     pairs = random_pairs(600)
     dx, dy, heading, length, width, other_heading, other_length, other_width = pairs
-    found = [a_point_in_both(*(value.item() for value in pair)) for pair in zip(*pairs)]
-    found = torch.tensor(found)
+    found = torch.tensor([a_point_in_both(*(value.item() for value in pair)) for pair in zip(*pairs)])
     said = boxes_overlap(*pairs)
     shrunk = boxes_overlap(
         dx, dy, heading, length - 0.3, width - 0.3, other_heading, other_length - 0.3, other_width - 0.3
@@ -61,20 +56,12 @@ def test_overlap_is_the_same_from_either_side():
 
 
 def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
+    def car(x: float, y: float, heading: float, length: float, width: float) -> scalar.Car:
+        return scalar.Car(x, y, heading, 0.0, 0.0, length, width, 25.0, 0, 0, True)
+
     pairs = random_pairs(2000)
-    said = boxes_overlap(*pairs)
-    rest = {
-        "speed": 0.0,
-        "acceleration": 0.0,
-        "desired_speed": 25.0,
-        "target_lane": 0,
-        "visibility": 0,
-        "valid": True,
-    }
-    for index, (dx, dy, heading, length, width, *other) in enumerate(zip(*(value.tolist() for value in pairs))):
-        one = scalar.Car(x=0.0, y=0.0, heading=heading, length=length, width=width, **rest)
-        two = scalar.Car(x=dx, y=dy, heading=other[0], length=other[1], width=other[2], **rest)
-        assert scalar.overlap(one, two) == said[index]
+    for said, dx, dy, *boxes in zip(boxes_overlap(*pairs).tolist(), *(value.tolist() for value in pairs)):
+        assert scalar.overlap(car(0.0, 0.0, *boxes[:3]), car(dx, dy, *boxes[3:])) == said
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,34 @@
-"""IDM and car following against values worked by hand."""
+"""IDM against values worked by hand, whom it can save, and against the linear theory on platoons and rings.
+
+The theory is that of ``tests/reference/stability.py``; the simulation is the package's own traffic.
+"""
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+
+import numpy as np
 import pytest
 import torch
-from reference.worlds import DOUBLE, vehicles
+from reference import stability
+from reference.worlds import DOUBLE, moves, vehicles, vehicles_at
 
-from ganlane.sim.idm import desired_gap, equilibrium_gap, following_acceleration, idm_acceleration
+from ganlane.keys import PHYSICS_STEP_S
+from ganlane.sim.idm import (
+    TABLE_V,
+    can_brake,
+    desired_gap,
+    equilibrium_gap,
+    following_acceleration,
+    highest_speed,
+    idm_acceleration,
+    least_gap,
+    needed_deceleration,
+)
 from ganlane.sim.neighbours import FREE_GAP_M, perceive
-from ganlane.sim.state import Road
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.idm_mobil import IdmTraffic
 
 # 2 sqrt(a b) = 2 sqrt(0.7 * 1.7) = 2.181742423; (20 / 25)^4 = 0.4096
 BY_HAND = [
@@ -25,16 +45,20 @@ BY_HAND = [
 ]
 
 
+def doubles(*values: float) -> list[torch.Tensor]:
+    return [torch.tensor(value, dtype=DOUBLE) for value in values]
+
+
 @pytest.mark.parametrize(("speed", "desired", "gap", "leader", "expected"), BY_HAND)
 def test_idm_gives_the_values_worked_by_hand(speed, desired, gap, leader, expected):
-    speed, gap, leader = (torch.tensor(value, dtype=DOUBLE) for value in (speed, gap, leader))
+    speed, gap, leader = doubles(speed, gap, leader)
     assert idm_acceleration(speed, desired, gap, leader).item() == pytest.approx(expected, abs=2e-7)
 
 
 def test_the_desired_gap_at_20_mps_is_the_headway_plus_two_metres():
-    speed = torch.tensor(20.0, dtype=DOUBLE)
-    assert desired_gap(speed, torch.zeros_like(speed)).item() == pytest.approx(2.0 + 1.6 * 20.0)
-    assert desired_gap(speed, torch.zeros_like(speed), headway_s=0.8).item() == pytest.approx(2.0 + 0.8 * 20.0)
+    speed, closing = doubles(20.0, 0.0)
+    assert desired_gap(speed, closing).item() == pytest.approx(2.0 + 1.6 * 20.0)
+    assert desired_gap(speed, closing, headway_s=0.8).item() == pytest.approx(2.0 + 0.8 * 20.0)
 
 
 def test_nobody_accelerates_at_the_equilibrium_gap():
@@ -46,10 +70,196 @@ def test_nobody_accelerates_at_the_equilibrium_gap():
 
 
 def test_in_the_middle_of_a_change_the_more_demanding_leader_counts():
-    near = {"x": 30.0, "lane": 1, "speed": 10.0}
-    far = {"x": 60.0, "lane": 0, "speed": 20.0}
-    alone = idm_acceleration(*(torch.tensor(v, dtype=DOUBLE) for v in (20.0, 25.0, 25.5, 10.0)))
+    near, far = {"x": 30.0, "lane": 1, "speed": 10.0}, {"x": 60.0, "lane": 0, "speed": 20.0}
+    alone = idm_acceleration(*doubles(20.0, 25.0, 25.5, 10.0))
     changing = vehicles({"x": 0.0, "y": 0.0, "target_lane": 1}, near, far)
     assert following_acceleration(perceive(changing, Road(lanes=2)))[0, 0] == alone
     keeping = vehicles({"x": 0.0, "lane": 0}, near, far)
     assert following_acceleration(perceive(keeping, Road(lanes=2)))[0, 0] > alone
+
+
+# Braking
+
+
+def test_a_stop_needs_speed_squared_over_twice_the_gap():
+    assert needed_deceleration(*doubles(20.0, 0.0, 10.0)).item() == pytest.approx(20.0)
+    assert needed_deceleration(*doubles(10.0, 20.0, 0.5)).item() == 0.0
+
+
+@pytest.mark.parametrize("speed", [2.0, 5.0, 12.0, 25.0, 36.0])
+def test_idm_stops_within_the_kinematic_distance_and_a_step(speed):
+    """At a closer gap the hardest braking cannot help; IDM asks for it from the first step on."""
+    kinematic = speed * speed / (-2.0 * TABLE_V.min_acceleration)
+    found = least_gap(speed, 0.0, 36.0)
+    assert kinematic <= found <= kinematic + 0.05 * speed + 0.2
+    assert not can_brake(0.95 * kinematic - 0.05, speed, 0.0, 36.0)
+
+
+def test_a_leader_that_brakes_at_once_gives_away_its_own_braking_distance():
+    assert least_gap(25.0, 0.0, 36.0) - least_gap(25.0, 10.0, 36.0) == pytest.approx(10.0**2 / 40.0, abs=0.15)
+
+
+def test_highest_speed_and_least_gap_are_each_others_inverse():
+    for gap in (1.5, 7.5, 20.5):
+        speed = highest_speed(gap, 0.0, 36.0)
+        assert can_brake(gap, speed, 0.0, 36.0)
+        assert not can_brake(gap, speed + 0.2, 0.0, 36.0)
+        assert least_gap(speed, 0.0, 36.0) <= gap + 0.11
+
+
+# Platoons behind a leader of constant speed settle at the analytic equilibrium gap, every one of their cars. How long
+# that takes follows from the linear theory, not from a look at the run.
+
+DESIRED, FOLLOWERS, LENGTH_M = 25.0, 9, 4.5
+SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0, 18.0, 20.0)
+#: Start of every platoon: bumper to bumper gap, m, and speed, m/s (or the leader's, if that is lower).
+START_GAP_M, START_SPEED = 40.0, 12.0
+TOLERANCE_M = 1e-6
+
+
+def leaders_wish(speed: torch.Tensor) -> torch.Tensor:
+    """Desired speed with which IDM on an empty lane holds ``speed``: ``1 = (v/v0)^4 + (s*/10 000 m)^2``."""
+    interaction = desired_gap(speed, torch.zeros_like(speed)) / FREE_GAP_M
+    return speed / (1.0 - interaction * interaction) ** 0.25
+
+
+def platoons() -> Vehicles:
+    """One platoon per speed, [len(SPEEDS), 1 + FOLLOWERS]; the leader already drives its speed."""
+    speed = torch.tensor(SPEEDS, dtype=DOUBLE)[:, None]
+    order = torch.arange(1 + FOLLOWERS).expand(len(SPEEDS), -1)
+    leads = order == 0
+    return vehicles_at(
+        -(START_GAP_M + LENGTH_M) * order.to(DOUBLE),
+        torch.zeros_like(order),
+        speed=torch.where(leads, speed, speed.clamp_max(START_SPEED)),
+        desired_speed=torch.where(leads, leaders_wish(speed), DESIRED),
+    )
+
+
+def settling_steps(speed: float) -> int:
+    """Steps after which a deviation as large as at the start is below a tenth of the tolerance."""
+    away_m = np.arange(1, FOLLOWERS + 1) * (START_GAP_M - stability.equilibrium(speed, DESIRED))
+    away_mps = np.full(FOLLOWERS, speed - min(speed, START_SPEED))
+    start = float(np.linalg.norm(np.concatenate((away_m, away_mps))))
+    matrix, steps = stability.step_matrix(speed, DESIRED, FOLLOWERS, PHYSICS_STEP_S, ring=False), 100
+    # By how much so many steps multiply a platoon's deviations (m, m/s) from equilibrium, at most.
+    while np.linalg.norm(np.linalg.matrix_power(matrix, steps), 2) * start > 0.1 * TOLERANCE_M:
+        steps = round(1.2 * steps)
+    return steps
+
+
+@pytest.fixture(scope="module")
+def settled() -> Vehicles:
+    """The platoons after the settling time of the slowest; before they are near, they get a minute."""
+    steps = 600 + max(settling_steps(speed) for speed in SPEEDS)
+    return list(moves(IdmTraffic(Road(lanes=1)), platoons(), steps))[-1]
+
+
+@pytest.mark.parametrize("row", range(len(SPEEDS)), ids=[f"{speed:g} m/s" for speed in SPEEDS])
+def test_every_car_of_a_platoon_settles_at_the_equilibrium_gap(settled, row):
+    gaps = settled.x[row, :-1] - settled.x[row, 1:] - LENGTH_M
+    expected = stability.equilibrium(SPEEDS[row], DESIRED)
+    assert (gaps - expected).abs().max() < TOLERANCE_M
+    assert (settled.speed[row] - SPEEDS[row]).abs().max() < TOLERANCE_M
+
+
+def test_nobody_touches_the_car_ahead_on_the_way_there():
+    """From far more than the equilibrium gap, and from far less: a tenth of it."""
+    start = platoons()
+    gaps = torch.tensor([0.1 * stability.equilibrium(v, DESIRED) for v in SPEEDS], dtype=DOUBLE)[:, None]
+    order = torch.arange(1 + FOLLOWERS, dtype=DOUBLE)
+    start = start.with_(x=-(gaps + LENGTH_M) * order, speed=start.speed[:, :1].expand_as(start.speed).clone())
+    for cars in moves(IdmTraffic(Road(lanes=1)), start, 600):
+        assert (cars.x[:, :-1] - cars.x[:, 1:] - LENGTH_M).min() > 0.0
+
+
+# On a ring road, below the speed that linear theory gives, Table V's drivers turn any disturbance into waves.
+
+CARS = 50
+SPACING_M = 45.0
+#: (desired speed, speed), 1.5 m/s below and above the critical speed of each.
+CASES = [(v0, stability.critical_speed(v0) + side) for v0 in (18.0, 25.0) for side in (-1.5, 1.5)]
+RING = IdmTraffic(Road(lanes=1, ring_m=CARS * SPACING_M))
+
+
+def disturbed_rings(displacement: np.ndarray, speed: np.ndarray) -> Vehicles:
+    """The four cases, [4, CARS], each in equilibrium but for a displacement (m) and a speed (m/s).
+
+    All rings are of the same length: where the gap is smaller the cars are longer. Only gaps enter IDM.
+    """
+    desired, cruise = torch.tensor(CASES, dtype=DOUBLE).T[:, :, None].expand(2, 4, CARS)
+    gaps = torch.tensor([stability.equilibrium(v, v0) for v0, v in CASES], dtype=DOUBLE)
+    return vehicles_at(
+        -SPACING_M * torch.arange(CARS, dtype=DOUBLE) + torch.from_numpy(displacement),
+        torch.zeros((4, CARS), dtype=torch.int64),
+        speed=cruise + torch.from_numpy(speed),
+        length=SPACING_M - gaps[:, None].expand(4, CARS),
+        desired_speed=desired,
+    )
+
+
+def deviations(cars: Vehicles, steps: int) -> list[np.ndarray]:
+    """(displacement, speed) from the equilibrium after every one of the steps, [4, 2 CARS]."""
+    cruise, found = torch.tensor([[v] for _, v in CASES], dtype=DOUBLE), []
+    for step, after in enumerate(moves(RING, cars, steps), 1):
+        there = -SPACING_M * torch.arange(CARS, dtype=DOUBLE) + cruise * (step * PHYSICS_STEP_S)
+        found.append(torch.cat((after.x - there, after.speed - cruise), dim=1).numpy())
+    return found
+
+
+@pytest.mark.parametrize(("desired", "speed"), CASES)
+def test_the_slopes_of_the_theory_are_those_of_the_package(desired, speed):
+    values = (stability.equilibrium(speed, desired), speed, speed)
+    gap, own, leader = (torch.tensor(value, dtype=DOUBLE, requires_grad=True) for value in values)
+    idm_acceleration(own, desired, gap, leader).backward()
+    assert (gap.grad.item(), own.grad.item(), leader.grad.item()) == pytest.approx(stability.slopes(speed, desired))
+
+
+@pytest.mark.parametrize(("desired", "critical"), [(18.0, 12.1), (25.0, 17.3)])
+def test_the_critical_speed_of_linear_theory(desired, critical):
+    """Neither the time step nor the size of the ring moves it by as much as is tested below."""
+    found = stability.critical_speed(desired)
+    assert found == pytest.approx(critical, abs=0.05)
+    # One change of sign: unstable all the way down.
+    signs = [stability.instability(v, desired) > 0.0 for v in np.linspace(0.1, 0.99 * desired, 200)]
+    assert sum(one != other for one, other in pairwise(signs)) == 1
+    # 400 cars in steps of 0.1 s: within 0.01 m/s. 50 are too few for the longest waves: 0.2 to 0.3 lower.
+    for cars, tolerance in ((400, 0.01), (CARS, 0.35)):
+
+        def growth(v: float, cars: int = cars) -> float:
+            return stability.growth_rate(v, desired, cars, PHYSICS_STEP_S)[0]
+
+        assert stability.zero_of(growth, found - 1.5, found + 1.5) == pytest.approx(found, abs=tolerance)
+
+
+def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():
+    """The fastest wave of each case, alone, of 0.1 mm: after 60 s its size and phase are those of its eigenvalue."""
+    steps, size = 600, 1e-4
+    numbers, waves = np.arange(CARS), []
+    for desired, speed in CASES:
+        k = 2.0 * math.pi * stability.growth_rate(speed, desired, CARS, PHYSICS_STEP_S)[1] / CARS
+        waves.append((np.exp(1j * k * numbers), *stability.wave(speed, desired, k, PHYSICS_STEP_S)))
+    shape, factor, ratio = (np.array(column) for column in zip(*waves))
+    cars = disturbed_rings((size * shape).real, (size * ratio[:, None] * shape).real)
+    after = deviations(cars, steps)[-1][:, :CARS]
+    amplitude = 2.0 / CARS * (after * shape.conj()).sum(1) / size
+    # The next order of the disturbance is smaller by its size over the gap: 1e-4 m / 20 m.
+    np.testing.assert_allclose(amplitude, factor**steps, rtol=2e-5)
+    grown = np.abs(amplitude) > 1.0
+    assert grown.tolist() == [True, False, True, False]
+
+
+@pytest.mark.slow
+def test_in_1500_s_a_small_disturbance_grows_below_the_critical_speed_and_dies_above_it():
+    """Random displacements of all cars; the outcome is the linear theory's, car by car."""
+    steps = 15_000
+    displacement = 1e-4 * np.random.default_rng(0).standard_normal((4, CARS))
+    found = deviations(disturbed_rings(displacement, np.zeros_like(displacement)), steps)
+    for case, (desired, speed) in enumerate(CASES):
+        matrix = stability.step_matrix(speed, desired, CARS, PHYSICS_STEP_S, ring=True)
+        expected = np.linalg.matrix_power(matrix, steps) @ np.append(displacement[case], np.zeros(CARS))
+        error = np.abs(found[-1][case] - expected).max()
+        assert error < 0.01 * np.abs(expected).max()
+    growth = found[-1][:, CARS:].std(axis=1) / found[2999][:, CARS:].std(axis=1)
+    assert (growth[[0, 2]] > 2.0).all()
+    assert (growth[[1, 3]] < 0.5).all()

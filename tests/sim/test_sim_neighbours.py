@@ -1,4 +1,4 @@
-"""Sorting finds the neighbours that comparing every pair finds, bit for bit, whatever stands level or abreast."""
+"""Whom a driver finds ahead and behind: by hand, against a loop, and by sorting bit for bit as by comparing pairs."""
 
 from __future__ import annotations
 
@@ -6,38 +6,95 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.worlds import DOUBLE, drawing, vehicles, vehicles_at
 
 from ganlane.parameters.driving import Visibility
 from ganlane.sim import neighbours
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.mobil import TABLE_IV, _gives_way, one_at_a_time
-from ganlane.sim.neighbours import follower, leader, perceive
-from ganlane.sim.recycle import recycle
+from ganlane.sim.neighbours import FREE_GAP_M, follower, leader, perceive
 from ganlane.sim.state import Road, Vehicles
 
+ROAD = Road(lanes=3)
 ROWS = 20
 SORT, PAIRS = 0, 10**12
 
 
+def lane(number: float, scene) -> torch.Tensor:
+    return torch.full_like(scene.x, number)
+
+
+def test_leader_and_follower_are_the_nearest_in_the_lane_asked_for():
+    scene = vehicles(
+        {"x": 0.0, "lane": 1},
+        {"x": 30.0, "lane": 1, "speed": 11.0},
+        {"x": 60.0, "lane": 1},
+        {"x": 20.0, "lane": 0, "speed": 12.0},
+        {"x": -25.0, "lane": 1, "speed": 13.0, "desired_speed": 33.0},
+        {"x": -70.0, "lane": 1},
+    )
+    seen = perceive(scene, ROAD)
+    ahead, behind = leader(seen, lane(1.0, scene)), follower(seen, lane(1.0, scene))
+    assert (ahead.gap[0, 0], ahead.speed[0, 0]) == (30.0 - 4.5, 11.0)
+    assert (behind.gap[0, 0], behind.speed[0, 0], behind.desired_speed[0, 0]) == (25.0 - 4.5, 13.0, 33.0)
+    right = leader(seen, lane(0.0, scene))
+    assert (right.gap[0, 0], right.speed[0, 0]) == (20.0 - 4.5, 12.0)
+    assert not follower(seen, lane(0.0, scene)).exists[0, 0]
+
+
+def test_an_empty_lane_is_free_for_ten_kilometres_and_moves_with_the_driver():
+    scene = vehicles({"x": 0.0, "lane": 1, "speed": 17.0}, {"x": 5.0, "lane": 0})
+    ahead = leader(perceive(scene, ROAD), lane(2.0, scene))
+    assert (ahead.gap[0, 0], ahead.speed[0, 0]) == (FREE_GAP_M, 17.0)
+
+
+def test_an_invalid_car_is_nobodys_leader():
+    scene = vehicles({"x": 0.0, "lane": 1}, {"x": 10.0, "lane": 1, "valid": False}, {"x": 50.0, "lane": 1})
+    assert leader(perceive(scene, ROAD), lane(1.0, scene)).gap[0, 0] == 45.5
+
+
+def test_side_by_side_in_two_lanes_the_one_of_lower_index_is_ahead():
+    """So that of two who would enter one gap exactly one gives way."""
+    scene = vehicles({"x": 0.0, "lane": 0}, {"x": 0.0, "lane": 0})
+    seen = perceive(scene, ROAD)
+    ahead, behind = leader(seen, lane(0.0, scene)), follower(seen, lane(0.0, scene))
+    assert ahead.gap[0].tolist() == [FREE_GAP_M, -4.5]
+    assert behind.gap[0].tolist() == [-4.5, FREE_GAP_M]
+
+
+def test_followers_keep_off_the_rear_of_a_lorry_and_not_off_its_middle():
+    """Centres 30 m apart, so 21.75 m are free; the lorry itself is 30 - 8.25 m behind the car ahead of it."""
+    scene = perceive(vehicles({"x": 0.0}, {"x": 30.0, "length": 12.0}, {"x": 60.0}), ROAD)
+    assert leader(scene, scene.body.low).gap[0, :2].tolist() == pytest.approx([21.75, 21.75])
+
+
+def test_the_view_of_the_ego_alone_is_the_first_row_of_everybodys():
+    generator = torch.Generator().manual_seed(3)
+    scene = vehicles(*({"x": 10.0 * k, "lane": k % 3} for k in (3, 0, 1, 2, 4, 5)))
+    scene = scene.with_(y=scene.y + torch.randn(scene.y.shape, generator=generator, dtype=DOUBLE))
+    all_of_them, ego = perceive(scene, ROAD), perceive(scene, ROAD, slice(0, 1))
+    for number in range(3):
+        whole, alone = leader(all_of_them, lane(number, scene)), leader(ego, torch.full((1, 1), float(number)))
+        assert torch.equal(whole.gap[:, :1], alone.gap)
+        assert torch.equal(whole.speed[:, :1], alone.speed)
+
+
+# Any scene
+
+
 def scenes(cars: int, lanes: int, seed: int, grid_m: float, dtype: torch.dtype) -> Vehicles:
     """Cars, lorries and empty places, every third in a lane change; on a coarse grid many stand level."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def between(low: float, high: float) -> torch.Tensor:
-        return low + (high - low) * torch.rand((ROWS, cars), generator=generator, dtype=dtype)
-
-    lane, zero = between(0, lanes).long(), torch.zeros((ROWS, cars), dtype=dtype)
-    target = (lane + between(-1.5, 1.5).round().long()).clamp(0, lanes - 1)
-    return Vehicles(
-        x=(between(-150, 150) / grid_m).round() * grid_m,
-        y=4.0 * (lane + (target - lane) * between(0, 1)),
+    between = drawing((ROWS, cars), seed, dtype)
+    here = between(0, lanes).long()
+    target = (here + between(-1.5, 1.5).round().long()).clamp(0, lanes - 1)
+    return vehicles_at(
+        (between(-150, 150) / grid_m).round() * grid_m,
+        target,
+        y=4.0 * (here + (target - here) * between(0, 1)),
         heading=between(-0.1, 0.1),
         speed=between(0, 4).round() * 7.3,
-        acceleration=zero,
         length=torch.where(between(0, 1) < 0.3, 12.0, 4.5).to(dtype),
-        width=zero + 2.5,
         desired_speed=between(15, 35),
-        target_lane=target,
         visibility=between(-0.5, len(Visibility) - 0.5).round().long(),
         valid=between(0, 1) < 0.9,
     )
@@ -63,7 +120,7 @@ def test_both_ways_find_the_same_neighbours(cars, lanes, seed, grid_m, own_roads
             assert (scene.queue is not None) == (way == SORT)
             found[way] = leader(scene, asked), follower(scene, asked)
     for ours, theirs in zip(*found.values()):
-        exists = ours.gap < neighbours.FREE_GAP_M
+        exists = ours.gap < FREE_GAP_M
         assert torch.equal(ours.gap, theirs.gap)
         assert torch.equal(ours.speed[exists], theirs.speed[exists])
     (_, behind), (_, others) = found.values()
@@ -72,8 +129,8 @@ def test_both_ways_find_the_same_neighbours(cars, lanes, seed, grid_m, own_roads
 
 def test_the_leader_has_the_nearest_rear_and_is_the_slowest_of_those():
     """Against a loop over the vehicles; gaps are of today's formula, up to rounding."""
-    vehicles, lanes = scenes(12, 3, seed=4, grid_m=2.5, dtype=torch.float64), 3
-    scene = perceive(vehicles, Road(lanes))
+    vehicles = scenes(12, 3, seed=4, grid_m=2.5, dtype=DOUBLE)
+    scene = perceive(vehicles, ROAD)
     number = vehicles.target_lane.double()
     found, (low, high) = leader(scene, number), scene.presence
     for row in range(ROWS):
@@ -83,12 +140,12 @@ def test_the_leader_has_the_nearest_rear_and_is_the_slowest_of_those():
                 for j in range(12)
                 if scene.pairs.order[row, i, j] > 0 and low[row, j] <= number[row, i] <= high[row, j]
             ]
-            expected = min(ahead, default=(neighbours.FREE_GAP_M, vehicles.speed[row, i].item()))
+            expected = min(ahead, default=(FREE_GAP_M, vehicles.speed[row, i].item()))
             assert (found.gap[row, i].item(), found.speed[row, i].item()) == expected
 
 
 def test_on_a_ring_the_first_has_the_last_as_its_leader():
-    vehicles = scenes(8, 1, seed=1, grid_m=1.0, dtype=torch.float64)
+    vehicles = scenes(8, 1, seed=1, grid_m=1.0, dtype=DOUBLE)
     vehicles = vehicles.with_(valid=torch.ones_like(vehicles.valid), length=torch.full_like(vehicles.x, 4.5))
     gap = leader(perceive(vehicles, Road(1, ring_m=300.0)), torch.zeros_like(vehicles.x)).gap
     first = vehicles.x.argmax(1, keepdim=True)
@@ -100,15 +157,9 @@ def test_on_a_ring_the_first_has_the_last_as_its_leader():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_among_the_few_who_wish_the_same_give_way_as_among_all(seed):
-    vehicles, road = scenes(20, 3, seed, grid_m=0.25, dtype=torch.float32), Road(3)
+    vehicles = scenes(20, 3, seed, grid_m=0.25, dtype=torch.float32)
     wish = torch.randint(-1, 2, (ROWS, 20), generator=torch.Generator().manual_seed(seed)) * (vehicles.speed > 20)
-    kept = one_at_a_time(perceive(vehicles, road), wish)
-    assert torch.equal(kept, torch.where(_gives_way(vehicles, road, wish, TABLE_V, TABLE_IV), 0, wish))
+    kept = one_at_a_time(perceive(vehicles, ROAD), wish)
+    assert torch.equal(kept, torch.where(_gives_way(vehicles, ROAD, wish, TABLE_V, TABLE_IV), 0, wish))
     assert (kept != wish).any()
     assert (kept != 0).any()
-
-
-def test_recycling_leaves_those_in_range_where_they_are():
-    vehicles = scenes(9, 3, seed=2, grid_m=0.25, dtype=torch.float32)
-    near = vehicles.with_(x=0.5 * vehicles.x)
-    assert torch.equal(recycle(near, Road(3), TABLE_V).x, near.x)

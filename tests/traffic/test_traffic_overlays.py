@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.sim import Road, Vehicles, pair_overlaps
-from ganlane.sim.lanes import lateral_half_extent
+from ganlane.sim.state import lateral_half_extent
 from ganlane.traffic import (
     AccelerationOverlay,
     CalibratedLaneChange,

@@ -15,7 +15,7 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.generator import shipped_generator
 from ganlane.sim import Road, Vehicles, pair_overlaps
-from ganlane.sim.lanes import lateral_half_extent
+from ganlane.sim.state import lateral_half_extent
 from ganlane.traffic import Guard
 from ganlane.traffic.presets import SIMULATED_ANCHOR, gan_calibrated_traffic, gan_traffic, sudden_accelerations
 from ganlane.weights import load_weights, save_weights

@@ -16,8 +16,7 @@ from ganlane.env import EpisodeParameters, HighwayEnv
 from ganlane.errors import UserError
 from ganlane.evaluation import run_episodes
 from ganlane.parameters.driving import Visibility
-from ganlane.sim.lanes import body_lanes
-from ganlane.sim.state import Road, Vehicles
+from ganlane.sim.state import Road, Vehicles, body_lanes
 from ganlane.traffic import IdmTraffic, SumoTraffic
 from ganlane.traffic.sumo_roads import ORIGIN_M
 

@@ -12,16 +12,17 @@ from reference.worlds import DOUBLE
 
 from ganlane.sim.dynamics import WHEELBASE_M, advance, slip_angle, steer
 
+ZERO = torch.zeros(1, dtype=DOUBLE)
+
 
 def number(value: float) -> torch.Tensor:
     return torch.tensor([value], dtype=DOUBLE)
 
 
-def drive(speed: float, steering: float, duration_s: float, dt: float):
-    zero = number(0.0)
-    pose = x, y, heading, v, _ = zero, zero, zero, number(speed), zero
+def drive(speed: float, steering: float, duration_s: float, dt: float, acceleration: float = 0.0):
+    x, y, heading, v = ZERO, ZERO, ZERO, number(speed)
     for _ in range(round(duration_s / dt)):
-        pose = x, y, heading, v, _ = advance(x, y, heading, v, zero, number(steering), dt)
+        pose = x, y, heading, v, _ = advance(x, y, heading, v, number(acceleration), number(steering), dt)
     return pose
 
 
@@ -61,11 +62,8 @@ def test_the_slip_angle_is_half_the_wheel_s_for_small_angles():
 
 
 def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
-    x = v = number(0.0)
-    for _ in range(100):
-        x, _, _, v, _ = advance(x, number(0.0), number(0.0), v, number(0.7), number(0.0), 0.1)
-    assert x.item() == pytest.approx(0.5 * 0.7 * 10.0**2)
-    pose = advance(number(0.0), number(0.0), number(0.0), number(1.0), number(-20.0), number(0.0), 0.1)
+    assert drive(0.0, 0.0, 10.0, 0.1, acceleration=0.7).x.item() == pytest.approx(0.5 * 0.7 * 10.0**2)
+    pose = drive(1.0, 0.0, 0.1, 0.1, acceleration=-20.0)
     assert pose.speed.item() == 0.0
     assert pose.x.item() == pytest.approx(0.05)
     assert pose.acceleration.item() == pytest.approx(-10.0)  # what was realised, not what was asked for
@@ -78,9 +76,7 @@ def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
     heading=st.floats(-1.5, 1.5),
 )
 def test_nobody_goes_farther_than_its_speed_allows_nor_backwards(speed, acceleration, steering, heading):
-    pose = advance(
-        number(0.0), number(0.0), number(heading), number(speed), number(acceleration), number(steering), 0.1
-    )
+    pose = advance(ZERO, ZERO, *map(number, (heading, speed, acceleration, steering)), 0.1)
     moved = math.hypot(pose.x.item(), pose.y.item())
     assert pose.speed.item() >= 0.0
     assert moved <= max(speed, pose.speed.item()) * 0.1 + 1e-12
@@ -113,31 +109,23 @@ def test_a_lane_change_takes_two_to_five_seconds_at_every_speed_without_overshoo
     assert remaining[-1].abs().max() < 1e-3
 
 
-def test_a_standing_car_does_not_turn_its_wheels():
-    zero = number(0.0)
-    assert steer(zero, zero, zero, zero, number(4.0), 0.1).item() == 0.0
-
-
 def test_a_crawling_car_changes_lanes_over_the_distance_of_one_at_3_mps():
     """Below 3 m/s the path is the same, only slower."""
     slow, fast = lane_change(number(1.5), 4.0)[1::2], lane_change(number(3.0), 4.0)[:150]
     assert (slow - fast).abs().max() < 0.1
 
 
-def test_a_car_in_the_middle_of_its_lane_goes_straight_on():
-    zero = number(0.0)
-    assert steer(zero, number(4.0), zero, number(20.0), number(4.0), 0.1).item() == 0.0
-
-
-def test_steering_by_hand():
-    """20 m/s, 1 m right of the centre, straight wheels: near point at 20 m, far point at 80 m.
-
-    Nothing turns yet, so only the integral counts: 2.7 / 20 * 3.375 * atan(1 / 20) * 0.1 = 0.00227623 rad.
-    """
-    zero = number(0.0)
-    assert steer(zero, number(-1.0), zero, number(20.0), zero, 0.1).item() == pytest.approx(0.00227623, abs=1e-8)
-
-
-def test_the_wheels_turn_at_most_half_a_radian():
-    zero = number(0.0)
-    assert steer(number(0.45), number(-50.0), number(-1.0), number(3.0), zero, 0.1).item() == 0.5
+@pytest.mark.parametrize(
+    ("steering", "y", "heading", "speed", "expected"),
+    [
+        (0.0, -4.0, 0.0, 0.0, 0.0),  # a standing car does not turn its wheels
+        (0.0, 0.0, 0.0, 20.0, 0.0),  # in the middle of its lane it goes straight on
+        # 20 m/s, 1 m right of the centre, straight wheels: near point at 20 m, far point at 80 m. Nothing turns yet,
+        # so only the integral counts: 2.7 / 20 * 3.375 * atan(1 / 20) * 0.1 = 0.00227623 rad.
+        (0.0, -1.0, 0.0, 20.0, 0.00227623),
+        (0.45, -50.0, -1.0, 3.0, 0.5),  # at most half a radian
+    ],
+)
+def test_steering_by_hand(steering, y, heading, speed, expected):
+    turned = steer(*map(number, (steering, y, heading, speed)), ZERO, 0.1).item()
+    assert turned == (pytest.approx(expected, abs=1e-8) if expected == 0.00227623 else expected)

@@ -1,0 +1,318 @@
+"""The native kernel on tensors, on random highways in float32: against the tensor code, and against itself."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import torch
+from reference import scalar
+from reference.worlds import disturbed, drawing, environment, leaves, packed, rules_of, scalar_state
+from tensordict import TensorDictBase
+
+from ganlane import keys
+from ganlane.env import HighwayEnv
+from ganlane.errors import UserError
+from ganlane.native.library import VARIANTS, best_variant, why_not
+from ganlane.native.tensors import Kernel, NativeScenes, Outcome, moved
+from ganlane.parameters.driving import Visibility
+from ganlane.parameters.episode import SpawnParameters
+from ganlane.sim.random import episode_key
+from ganlane.sim.spawn import RandomScenes
+from ganlane.sim.state import Road, Vehicles
+from ganlane.traffic.idm_mobil import IdmMobilTraffic
+
+pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"the kernel {why_not()}")
+RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
+#: Events by the kernel's names, and what the ego remembers without the fractions.
+EVENTS = {name: name for name in ("goal", "hard_crash", "out_of_road", "timeout")}
+EVENTS |= {"soft_crashes": "soft_crash", "soft_crashes_behind": "soft_crash_behind"}
+EGO_EXACT = ("change_direction", "decisions", "lane_changes", "started_change", "soft_crash", "soft_crash_behind")
+MOTION = ("x", "y", "heading", "speed", "acceleration")
+
+
+def random_highway(rng: random.Random, rows: int, most_vehicles: int) -> HighwayEnv:
+    """1 to 6 lanes, 2 to 60 vehicles, dense and sparse, with and without MOBIL, all periods and visibilities."""
+    lanes, vehicles = rng.randint(1, 6), rng.randint(2, most_vehicles)
+    spacing = rng.choice([8.0, 12.0, 25.0])
+    return environment(
+        lanes,
+        rows,
+        vehicles,
+        mobil=rng.random() < 0.75,
+        period_s=rng.choice([0.1, 0.5, 1.0]),
+        goal_m=rng.choice([60.0, 5000.0]),
+        timeout_s=rng.choice([4.0, 1000.0]),
+        abort=rng.random() < 0.3,
+        visibility=Visibility(rng.randint(0, 2)),
+        spawn=packed(max(60.0, 1.5 * spacing * vehicles / lanes + spacing), spacing),
+        seed=rng.randrange(10**9),
+        dtype=torch.float32,
+        recycle=rng.random() < 0.5,
+    )
+
+
+def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBase:
+    """A first state with everything a little off: in mid-change, at angles, wheels turned, some of all kinds."""
+    td = env.reset()
+    scene = Vehicles.of(td[keys.VEHICLES])
+    off, between = disturbed(scene, env.road.lanes, generator), drawing(scene.x.shape, generator, env.dtype)
+    off = off.with_(
+        x=off.x * (1 + 3 * (between(0, 1) < 0.05)),
+        heading=off.heading * (1 + 20 * (between(0, 1) < 0.02)),
+        length=off.length + 8 * (between(0, 1) < 0.1),
+    )
+    for name, value in off.as_dict().items():
+        td[keys.VEHICLES, name] = value
+    td[keys.EGO, "change_direction"] = (off.target_lane - scene.target_lane)[:, 0]
+    td[keys.TRAFFIC, "steering"] = between(-0.02, 0.02)
+    td[keys.EGO, "steering"] = td[keys.TRAFFIC, "steering"][:, 0]
+    return td
+
+
+def kernel_of(env: HighwayEnv, variant: str | None = None) -> Kernel:
+    """The kernel for the environment's road, rules and traffic."""
+    mobil = env.traffic.mobil if isinstance(env.traffic, IdmMobilTraffic) else None
+    return Kernel(env.road, env.vehicles, env.episode, env.ego, mobil=mobil, variant=variant)
+
+
+def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> Outcome:
+    """The decision ``td["action"]`` from the state ``td``."""
+    recycles = torch.ones_like(td["action"], dtype=torch.bool) if recycle else None
+    vehicles, steering = Vehicles.of(td[keys.VEHICLES]), td[keys.TRAFFIC, "steering"]
+    return kernel.decide(td["action"], vehicles, steering, td[keys.EGO], td[keys.STEP], recycles)
+
+
+def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) -> torch.Tensor:
+    """Random actions [N], mostly to keep the lane."""
+    drawn = torch.rand(env.batch_size, generator=generator)
+    return torch.where(drawn < 0.5 * change, keys.LEFT, torch.where(drawn < change, keys.RIGHT, keys.KEEP))
+
+
+def differing_rows(out: Outcome, after: TensorDictBase) -> torch.Tensor:
+    """Rows [N] in which an event, a flag, a counter or a target lane differs."""
+    differs = (out["target_lane"] != after[keys.VEHICLES, "target_lane"]).any(1)
+    for ours, name in EVENTS.items():
+        differs |= (out[ours] != after[keys.EVENTS, name])[:, 0]
+    for name in EGO_EXACT:
+        differs |= out[name] != after[keys.EGO, name]
+    for name in ("done", "terminated", "truncated"):
+        differs |= (out[name] != after[name])[:, 0]
+    return differs | (out["step"] != after[keys.STEP])
+
+
+def errors(out: Outcome, after: TensorDictBase, rows: torch.Tensor) -> dict[str, float]:
+    """The largest difference of every number in ``rows``, of valid vehicles."""
+    expected = {name: after[keys.VEHICLES, name] for name in MOTION} | {"steering": after[keys.TRAFFIC, "steering"]}
+    expected |= {name: after[keys.EGO, name] for name in ("mean_acceleration", "change_progress", "distance")}
+    valid = after[keys.VEHICLES, "valid"] & rows[:, None]
+    differences = {name: (out[name] - value).abs() for name, value in expected.items()}
+    return {
+        name: torch.where(valid if value.ndim == 2 else rows, value, 0.0).max().item()
+        for name, value in differences.items()
+    }
+
+
+def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
+    """Whether the decision of ``row`` hangs by a rounding: 64 states a rounding beside it lead to different ones."""
+    copies = 64
+    exact = HighwayEnv(
+        env.traffic, copies, env.vehicles, env.spawn_parameters, env.ego, env.episode,
+        dtype=torch.float64, recycle=env.recycle,
+    )  # fmt: skip
+    state = td[row : row + 1].expand(copies).clone()
+    between = drawing((copies, env.vehicles), 0)
+    for name, size in (("x", 2e-5), ("y", 2e-6), ("speed", 4e-6), ("heading", 2e-7)):
+        state[keys.VEHICLES, name] = state[keys.VEHICLES, name].double() + size * between(-1.0, 1.0)
+    for name in ("acceleration", "length", "width", "desired_speed"):
+        state[keys.VEHICLES, name] = state[keys.VEHICLES, name].double()
+    for group in (keys.TRAFFIC, keys.EGO):
+        state[group, "steering"] = state[group, "steering"].double()
+    after = exact.step(state)["next"]
+    whole = [value.reshape(copies, -1) for _, value in leaves(after) if not value.is_floating_point()]
+    return any(bool((value != value[:1]).any()) for value in whole)
+
+
+# As the tensor code
+
+
+def compare_random_highways(highways: int, rows: int, decisions: int, seed: int, vehicles: int) -> None:
+    """Both decide from every state of the tensor code's episodes."""
+    rng, generator = random.Random(seed), torch.Generator().manual_seed(seed)
+    compared, at_threshold = 0, 0
+    for highway in range(highways):
+        env = random_highway(rng, rows, vehicles)
+        kernel = kernel_of(env)
+        td = disturbed_start(env, generator) if highway % 2 else env.reset()
+        for _ in range(decisions):
+            td["action"] = actions(env, generator)
+            out = by_kernel(kernel, td, env.recycle)
+            stepped, following = env.step_and_maybe_reset(td.clone())
+            differs = differing_rows(out, stepped["next"])
+            for row in differs.nonzero()[:, 0].tolist():
+                assert within_rounding(env, td, row), (seed, highway, row)
+            worst = errors(out, stepped["next"], ~differs)
+            assert max(worst.values()) < 1e-3, worst
+            compared, at_threshold = compared + rows, at_threshold + int(differs.sum())
+            td = following
+    assert at_threshold <= max(1, compared // 100_000), (at_threshold, compared)
+
+
+def test_it_decides_as_the_tensor_code_on_random_highways():
+    compare_random_highways(highways=40, rows=16, decisions=6, seed=3, vehicles=25)
+
+
+@pytest.mark.slow
+def test_it_decides_as_the_tensor_code_on_a_million_decisions():
+    compare_random_highways(highways=800, rows=128, decisions=10, seed=4, vehicles=60)
+
+
+def test_it_recycles_as_the_tensor_code():
+    """Over a minute slow vehicles fall behind and fast ones run away."""
+    env = environment(num_envs=32, recycle=True, dtype=torch.float32)
+    kernel, td = kernel_of(env), env.reset()
+    jumped = 0
+    for _ in range(60):
+        td["action"] = torch.zeros(32, dtype=torch.int64)
+        out = by_kernel(kernel, td, recycle=True)
+        after = env.step(td)["next"]
+        jumped += int(((out["x"] - td[keys.VEHICLES, "x"]).abs() > 100).sum())
+        assert not differing_rows(out, after).any()
+        assert max(errors(out, after, torch.ones(32, dtype=torch.bool)).values()) < 1e-3
+        td = after.exclude("reward")
+    assert jumped > 20
+
+
+def drive(kernel: Kernel, td, chosen: list[torch.Tensor]) -> list[Outcome]:
+    """Decision after decision by the kernel alone; rows that have ended are driven on."""
+    td, outcomes = td.clone(), []
+    for action in chosen:
+        td["action"] = action
+        outcomes.append(out := by_kernel(kernel, td))
+        for name, value in moved(Vehicles.of(td[keys.VEHICLES]), out).as_dict().items():
+            td[keys.VEHICLES, name] = value
+        td[keys.TRAFFIC, "steering"], td[keys.STEP] = out["steering"], out["step"]
+        for name in ("decisions", "lane_changes", "change_direction", "soft_crash", "soft_crash_behind"):
+            td[keys.EGO, name] = out[name]
+        td[keys.EGO, "steering"] = out["ego_steering"]
+    return outcomes
+
+
+def test_after_30_s_on_their_own_they_are_within_a_millimetre():
+    env = environment(num_envs=64, dtype=torch.float32, seed=5)
+    generator = torch.Generator().manual_seed(5)
+    td = disturbed_start(env, generator)
+    chosen = [actions(env, generator, change=0.05) for _ in range(30)]
+    ours = drive(kernel_of(env), td, chosen)
+    same = torch.ones(64, dtype=torch.bool)
+    for action, out in zip(chosen, ours):
+        td["action"] = action
+        after = env.step(td)["next"]
+        same &= ~differing_rows(out, after)
+        worst = errors(out, after, same)
+        assert max(worst["x"], worst["y"]) < 1e-3
+        same &= ~after["done"][:, 0]
+        td = after.exclude("reward")
+    assert int(same.sum()) > 20
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_agrees_with_the_scalar_twin(seed):
+    rng, generator = random.Random(seed), torch.Generator().manual_seed(seed)
+    for highway in range(6):
+        env = random_highway(rng, 4, most_vehicles=15)
+        env.recycle = False
+        td = disturbed_start(env, generator) if highway % 2 else env.reset()
+        td["action"] = actions(env, generator, change=0.5)
+        out = by_kernel(kernel_of(env), td)
+        for row in range(4):
+            state = scalar_state(td, row)
+            outcome = scalar.decide(state, int(td["action"][row]), rules_of(env))
+            found = {name: values[row] for name, values in out.items()}
+            for name in MOTION:
+                expected = torch.tensor([getattr(car, name) for car in state.cars])
+                assert found[name] == pytest.approx(expected, abs=1e-3), (name, row)
+            assert found["target_lane"].tolist() == [car.target_lane for car in state.cars]
+            assert [name for name in keys.END_EVENTS[:4] if found[name]] == outcome.reasons
+            counts = (outcome.soft_crash, outcome.soft_crash_behind, state.step)
+            assert tuple(int(found[name]) for name in ("soft_crashes", "soft_crashes_behind", "step")) == counts
+            assert found["mean_acceleration"].item() == pytest.approx(outcome.mean_acceleration, abs=1e-3)
+            assert found["change_progress"].item() == pytest.approx(outcome.progress, abs=1e-4)
+
+
+def test_a_ring_is_refused_in_one_sentence():
+    with pytest.raises(UserError, match="must be straight"):
+        Kernel(Road(3, ring_m=500.0), 9)
+
+
+# The same bits
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["idm_mobil", "idm"])
+def crowd(request):
+    """4096 rows in motion, and what one call makes of them."""
+    env = environment(num_envs=4096, mobil=request.param, dtype=torch.float32, seed=9)
+    td = disturbed_start(env, torch.Generator().manual_seed(9))
+    td["action"] = actions(env, torch.Generator().manual_seed(10))
+    return env, td, by_kernel(kernel_of(env), td, recycle=True)
+
+
+def assert_same_bits(some: Outcome, whole: Outcome, rows: slice = slice(None)) -> None:
+    for name, one in some.items():
+        assert torch.equal(one, whole[name][rows]), name
+
+
+@pytest.mark.parametrize("batch", [1, 7, 64])
+def test_a_row_is_the_same_bit_for_bit_in_any_batch(crowd, batch):
+    env, td, whole = crowd
+    kernel = kernel_of(env)
+    for start in range(0, 60 * batch if batch < 64 else 4096, batch):
+        rows = slice(start, start + batch)
+        assert_same_bits(by_kernel(kernel, td[rows], recycle=True), whole, rows)
+
+
+@pytest.mark.parametrize("variant", RUNNABLE)
+def test_every_instruction_set_gives_the_same_bits(crowd, variant):
+    env, td, whole = crowd
+    assert_same_bits(by_kernel(kernel_of(env, variant), td, recycle=True), whole)
+
+
+def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous(crowd):
+    env, td, whole = crowd
+    before = td.clone()
+    strided = td.apply(lambda value: value.repeat_interleave(2, dim=0)[::2], batch_size=[4096])
+    assert_same_bits(by_kernel(kernel_of(env), strided, recycle=True), whole)
+    assert (td == before).all()
+
+
+# First scenes
+
+
+@pytest.mark.parametrize(
+    "scenes",
+    [
+        RandomScenes(),
+        RandomScenes(parameters=SpawnParameters(truck_share=0.4)),
+        RandomScenes(Road(lanes=1, lane_width_m=3.2), 5),
+        RandomScenes(Road(lanes=5), 40, SpawnParameters(spread_m=400.0), Visibility.SIGNALLED, Visibility.BODY),
+    ],
+    ids=["the paper's", "lorries", "one lane", "a crowd"],
+)
+def test_every_number_of_a_first_scene_is_that_of_the_tensor_code(scenes):
+    seed, episode = torch.full((200,), 7), torch.arange(200) * 13 - 50
+    out, drawn = NativeScenes(scenes, 2).start(seed, episode)
+    expected = scenes(episode_key(2, seed, episode), torch.float32)
+    for field, mine, theirs in zip(expected._fields, drawn, expected):
+        assert mine.dtype == theirs.dtype, field
+        assert torch.equal(mine, theirs), field
+    assert not any(bool(made.any()) for name, made in out.items() if name not in drawn._fields)
+
+
+def test_rows_that_are_not_asked_for_stay_empty():
+    seed, episode = torch.zeros(600, dtype=torch.int64), torch.arange(600)
+    rows = torch.arange(600) % 7 == 3
+    kernel = NativeScenes(RandomScenes(), 2)
+    (_, some), (_, every) = kernel.start(seed, episode, rows), kernel.start(seed, episode)
+    assert torch.equal(some.x[rows], every.x[rows])
+    assert not some.valid[~rows].any()
+    assert not some.x[~rows].any()

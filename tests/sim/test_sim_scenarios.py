@@ -1,0 +1,74 @@
+"""Scenes from files; what drivers do in the scenarios stands in tests/test_env_scenarios.py."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from ganlane.errors import UserError
+from ganlane.parameters.driving import Visibility
+from ganlane.sim.scenarios import read_scene
+from ganlane.sim.scenes import SceneVehicle
+from ganlane.sim.state import Road
+
+CSV = """# cut in
+x_m, lane, speed_mps, desired_speed_mps, target_lane, visibility
+10, 0, 20, 25, ,
+50, 1, 18, 18, 0, body
+-40, 0, 20, , , signalled
+"""
+
+
+def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
+    (tmp_path / "a.csv").write_text(CSV)
+    cars = [
+        {"x_m": 10, "lane": 0, "speed_mps": 20, "desired_speed_mps": 25},
+        {"x_m": 50, "lane": 1, "speed_mps": 18, "desired_speed_mps": 18, "target_lane": 0, "visibility": "body"},
+        {"x_m": -40, "lane": 0, "speed_mps": 20, "visibility": "signalled"},
+    ]
+    (tmp_path / "a.json").write_text(json.dumps({"lanes": 2, "vehicles": cars}))
+    from_csv, from_json = read_scene(tmp_path / "a.csv"), read_scene(tmp_path / "a.json")
+    assert from_csv.rows == from_json.rows
+    assert from_csv.road == from_json.road == Road(2)
+    assert from_csv.rows[1] == SceneVehicle(50.0, 1, 18.0, 18.0, target_lane=0, visibility=Visibility.BODY)
+    assert from_csv.label(1) == "vehicle 1 (line 4)"
+    assert read_scene(tmp_path / "a.csv", lanes=3).road.lanes == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("a.csv", "", "empty"),
+        ("a.csv", "x_m,lane\n0,0\n", "1 vehicles; a scene needs the ego and at least one other"),
+        ("a.csv", "x_m,speed_mps\n0,1\n", "line 1: columns x_m and lane (or y_m) are needed"),
+        ("a.csv", "x_m,lane,sped\n0,0,1\n", "line 1: unknown column 'sped'"),
+        ("a.csv", "x_m,lane,lane\n0,0,1\n", "line 1: column lane is given twice"),
+        ("a.csv", "x_m,lane\n0,0\n30\n", "line 3: 1 cells, the header has 2"),
+        ("a.csv", "x_m,lane\n0,0\n\nfar,0\n", "line 4: column x_m: 'far': expected a number"),
+        ("a.csv", "x_m,lane\n0,0\n30,0.5\n", "line 3: column lane: '0.5': expected a whole number"),
+        ("a.csv", "x_m,lane,visibility\n0,0,\n3,0,bad\n", "line 3: column visibility: 'bad': expected one of centre"),
+        ("a.csv", "x_m,lane\n0,0\n3,0\n", "the ego (line 2) and vehicle 1 (line 3) overlap"),
+        ("a.csv", "x_m,lane\n0,0\ninf,0\n", "vehicle 1 (line 3): x_m=inf: expected a number from -1e+06 to 1e+06"),
+        ("a.csv", b"\xff\xfe\x00", "not a text file"),
+        ("a.json", "[{", "not JSON"),
+        ("a.json", "3", "expected a list of vehicles"),
+        ("a.json", '{"cars": []}', "expected a list of vehicles"),
+        ("a.json", '{"lanes": 0, "vehicles": []}', "lanes=0: expected a finite number above 0"),
+        ("a.json", '{"roads": 1, "vehicles": []}', "unknown key 'roads'"),
+        ("a.json", "[[1, 2]]", "vehicles entry 1: expected an object"),
+        ("a.json", '[{"x_m": 0, "lane": 0}, {"lane": 0}]', "vehicles entry 2: column x_m: no value"),
+        ("a.json", '[{"x_m": 0, "lane": true}]', "vehicles entry 1: column lane: True: expected a whole number"),
+        ("a.json", '{"lanes": 2, "vehicles": []}', "lanes is 2 in the file and 3 was asked for"),
+        ("a.yaml", "x", "expected a scene as .csv or .json"),
+        ("a.csv", None, "no such file"),
+    ],
+)
+def test_a_fault_in_a_file_is_named_by_line_or_entry_and_column(tmp_path, name, content, what):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(UserError) as refused:
+        read_scene(path, lanes=3 if "asked for" in what else None)
+    assert what in str(refused.value)
+    assert str(path) in str(refused.value)

@@ -1,0 +1,173 @@
+"""Which lanes a vehicle is in, and the road: cases worked by hand; and bodies that stand in three lanes at once."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from reference.worlds import drawing, moves, vehicles, vehicles_at
+
+from ganlane.parameters.driving import Visibility
+from ganlane.sim import idm
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.idm import idm_acceleration
+from ganlane.sim.state import (
+    ARRIVED_M,
+    LaneRange,
+    Road,
+    Vehicles,
+    body_lanes,
+    lane_change_done,
+    presence,
+    spanned,
+    with_target,
+)
+from ganlane.traffic.idm_mobil import IdmTraffic
+
+ROAD = Road(lanes=3)
+
+
+def seen_in(**car) -> tuple[float, float]:
+    """Lowest and highest lane in which the others see a car."""
+    scene = vehicles({"x": 0.0, **car})
+    body = body_lanes(scene, ROAD)
+    low, high = presence(scene, ROAD, body, with_target(body, scene))
+    return low.item(), high.item()
+
+
+@pytest.mark.parametrize(
+    ("y", "lanes"),
+    # A lane's edge is 2 m from its centre; half a body is 1.25 m; 0.1 m over the edge does not count.
+    [(0.0, (0, 0)), (0.84, (0, 0)), (0.86, (0, 1)), (2.0, (0, 1)), (3.14, (0, 1)), (3.16, (1, 1)), (4.0, (1, 1))],
+)
+def test_a_body_is_in_every_lane_that_it_enters_by_more_than_a_tenth_of_a_metre(y, lanes):
+    assert seen_in(y=y, target_lane=1, visibility=Visibility.BODY) == lanes
+
+
+def test_a_turned_body_takes_more_room():
+    # half extent at 0.2 rad: (2.5 cos 0.2 + 4.5 sin 0.2) / 2 = 1.672; over the edge by 0.1 from y = 0.428 on
+    assert 0.5 * (2.5 * math.cos(0.2) + 4.5 * math.sin(0.2)) == pytest.approx(1.672, abs=1e-3)
+    for heading in (0.2, -0.2):
+        assert seen_in(y=0.42, heading=heading, target_lane=0, visibility=Visibility.BODY) == (0, 0)
+        assert seen_in(y=0.44, heading=heading, target_lane=0, visibility=Visibility.BODY) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("y", "lanes"), [(0.0, (0, 0)), (1.9, (0, 0)), (2.1, (1, 1)), (-3.0, (0, 0)), (30.0, (2, 2))]
+)
+def test_seen_by_its_centre_a_car_is_in_one_lane_of_the_road(y, lanes):
+    assert seen_in(y=y, target_lane=1, visibility=Visibility.CENTRE) == lanes
+
+
+def test_a_signalled_car_is_in_its_target_lane_from_the_command_on():
+    assert seen_in(y=0.0, target_lane=1, visibility=Visibility.SIGNALLED) == (0, 1)
+    assert seen_in(y=0.0, target_lane=1, visibility=Visibility.BODY) == (0, 0)
+    assert seen_in(y=3.9, target_lane=1, visibility=Visibility.SIGNALLED) == (1, 1)
+    assert seen_in(y=4.0, target_lane=0, visibility=Visibility.SIGNALLED) == (0, 1)
+
+
+def test_an_invalid_car_is_nowhere():
+    low, high = seen_in(lane=1, valid=False)
+    assert low > high
+
+
+def test_a_change_is_complete_within_0_3_m_of_the_centre():
+    scene = vehicles(*({"x": 0.0, "y": y, "target_lane": 1} for y in (3.69, 3.71, 4.29, 4.31)))
+    assert lane_change_done(scene, ROAD).tolist() == [[False, True, True, False]]
+
+
+def test_the_lanes_of_a_range_are_its_ends_and_the_one_after_the_lowest():
+    low, high = torch.tensor([1.0, 1.0, 1.0]), torch.tensor([1.0, 2.0, 3.0])
+    assert spanned(LaneRange(low, high)).tolist() == [[1, 1, 1], [1, 2, 2], [1, 2, 3]]
+
+
+# The road
+
+
+def test_lane_zero_is_the_rightmost_and_lanes_end_at_the_edges():
+    y = torch.tensor([-9.0, -1.9, 1.9, 2.1, 8.0, 99.0])
+    assert ROAD.lane_of(y).tolist() == [0, 0, 0, 1, 2, 2]
+    assert ROAD.centre_of(torch.tensor([0, 1, 2])).tolist() == [0.0, 4.0, 8.0]
+    assert (ROAD.right_edge_m(), ROAD.left_edge_m()) == (-2.0, 10.0)
+
+
+def test_every_row_may_have_a_road_of_its_own():
+    road = Road(lanes=torch.tensor([[1], [4]]), lane_width_m=torch.tensor([[3.0], [4.0]]))
+    assert road.lane_of(torch.tensor([[6.1], [6.1]])).tolist() == [[0.0], [2.0]]
+
+
+def test_on_a_ring_distances_take_the_nearer_way_round():
+    ring = Road(lanes=1, ring_m=100.0)
+    start, end = torch.tensor([95.0, 5.0, 0.0, 0.0]), torch.tensor([5.0, 95.0, 210.0, 40.0])
+    assert ring.distance_ahead(start, end).tolist() == [10.0, -10.0, 10.0, 40.0]
+
+
+# In narrow lanes a body that is turned stands in three lanes at once, and its driver looks into all of them: a second
+# change right after a first one, the rear still in the lane that it comes from, and a slow car in the lane between.
+
+CHANGES, SLOWER = 0, 1
+DESIRED_MPS = 25.0
+
+
+def first_changes(lane_width_m: float, length_m: float, scenes: int = 20_000) -> Vehicles:
+    """One changes from lane 0 to lane 1, where a slower one is 2 to 32 m ahead; IDM asks for less than 4 m/s2."""
+    between = drawing((scenes,), 0)
+    speed = between(0.5, 12.0)
+    slower = (speed - between(0.0, 6.0)).clamp_min(0.05)
+    gap = 2.0 + between(0.0, 30.0)
+    calm = idm_acceleration(speed, torch.full_like(speed, DESIRED_MPS), gap, slower) > -4.0
+    speed, slower, gap = speed[calm], slower[calm], gap[calm]
+    lane = torch.tensor([0, 1]).expand(len(gap), 2)
+    return vehicles_at(
+        torch.stack((torch.zeros_like(gap), gap + length_m), dim=1),
+        torch.ones_like(lane),
+        y=lane * lane_width_m,
+        speed=torch.stack((speed, slower), dim=1),
+        length=torch.full(lane.shape, length_m, dtype=torch.float64),
+        desired_speed=torch.stack((torch.full_like(slower, DESIRED_MPS), slower + 0.01), dim=1),
+    )
+
+
+def drive(lane_width_m: float, length_m: float = 4.5) -> tuple[int, int, int]:
+    """Over 15 s: scenes, those in which the two overlap, those in which the first stands in three lanes at once."""
+
+    def on_to_lane_2(before: Vehicles, cars: Vehicles) -> Vehicles:
+        """In the moment that the change to lane 1 counts as complete."""
+        arrived = (cars.y - lane_width_m).abs() < ARRIVED_M
+        goes_on = arrived & (cars.target_lane == 1) & (torch.arange(2) == CHANGES)
+        return cars.with_(target_lane=torch.where(goes_on, 2, cars.target_lane))
+
+    road, start = Road(lanes=3, lane_width_m=lane_width_m), first_changes(lane_width_m, length_m)
+    hit = three = torch.zeros(len(start.x), dtype=torch.bool)
+    for cars in moves(IdmTraffic(road), start, 150, on_to_lane_2):
+        hit = hit | pair_overlaps(cars)[:, CHANGES, SLOWER]
+        attends = with_target(body_lanes(cars, road), cars)
+        three = three | (attends.high - attends.low >= 2)[:, CHANGES]
+    return len(hit), int(hit.sum()), int(three.sum())
+
+
+@pytest.mark.parametrize(
+    ("lane_width_m", "length_m"),
+    [
+        (2.55, 4.5),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((3.5, 12.0), (2.7, 4.5), (2.9, 4.5), (3.0, 4.5))),
+    ],
+)
+def test_who_changes_two_lanes_in_a_row_does_not_touch_the_slower_car_in_between(lane_width_m, length_m):
+    scenes, overlaps, three = drive(lane_width_m, length_m)
+    assert scenes > 15_000
+    assert three > 1000
+    assert overlaps == 0
+
+
+@pytest.mark.parametrize(
+    ("lane_width_m", "before"),
+    [(2.55, 229), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2.7, 157), (2.9, 66), (3.0, 7)))],
+)
+def test_with_the_lowest_and_the_highest_lane_alone_it_would(lane_width_m, before, monkeypatch):
+    """The figures of docs/simulator.md: so the test above can fail."""
+    monkeypatch.setattr(idm, "spanned", lambda lanes: torch.stack((lanes.low, lanes.low, lanes.high), dim=-1))
+    scenes, overlaps, _ = drive(lane_width_m)
+    assert scenes == 15_937
+    assert overlaps == pytest.approx(before, abs=3)

@@ -1,0 +1,166 @@
+"""The physics of a decision: what is remembered of rows that have ended, and compiled graphs."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import torch
+from reference.worlds import environment, leaves, same_bits, step
+from tensordict import TensorDict, TensorDictBase
+
+from ganlane import build, keys, runtime
+from ganlane.agents.drivers import MobilDriver
+from ganlane.config.env import EnvConfig
+from ganlane.config.traffic import IdmTrafficConfig
+from ganlane.env import HighwayEnv
+from ganlane.env.physics import EndedRows, run_decision
+from ganlane.errors import UserError
+from ganlane.parameters.driving import Visibility
+from ganlane.traffic import IdmTraffic, Overlay, TrafficModule, TrafficSequential
+
+# What traffic remembers of a row that has ended is what it remembered when the row ended.
+
+
+class Ageing(IdmTraffic):
+    """Counts the physics steps that it was asked for."""
+
+    memory_fields = {"age": ((), torch.int64), **IdmTraffic.memory_fields}  # noqa: RUF012
+
+    def fresh_memory(self, vehicles, key):
+        return {"age": torch.zeros_like(vehicles.target_lane), **super().fresh_memory(vehicles, key)}
+
+    def move(self, vehicles, memory, key, step):
+        moved, kept = super().move(vehicles, {"steering": memory["steering"]}, key, step)
+        return moved, {"age": memory["age"] + 1, **kept}
+
+
+class Forgetful(Overlay):
+    """Remembers nothing."""
+
+    def rewrite(self, vehicles, moved, memory, key, step):
+        return moved, memory
+
+
+def ages(traffic: TrafficModule, *name: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """After a decision in which rows end at all of its moments: ages, physics steps and who ended, [N]."""
+    env = environment(num_envs=64, traffic=traffic, goal_m=100.0, visibility=Visibility.CENTRE)
+    td = env.reset()
+    to_go = torch.linspace(0.5, 30.0, 64, dtype=torch.float64)
+    td[keys.VEHICLES, "x"] = td[keys.VEHICLES, "x"] + (100.0 - to_go)[:, None]
+    action = torch.where(torch.arange(64) % 9 == 4, keys.RIGHT, keys.KEEP)
+    before = td.clone()
+    after = step(env, td, action)
+    assert same_bits(td, before) == []
+    return after[(keys.TRAFFIC, *name, "age")], after[keys.STEP], after["done"][:, 0]
+
+
+@pytest.mark.parametrize("chained", [False, True])
+def test_an_ended_row_remembers_no_step_more_than_it_was_driven(chained):
+    traffic = TrafficSequential({"base": Ageing(), "top": Forgetful()}) if chained else Ageing()
+    age, steps, done = ages(traffic, *(["base"] if chained else []))
+    assert set(range(11)) <= set(steps.tolist())
+    assert done.any()
+    assert not done.all()
+    assert torch.equal(age, steps[:, None].expand_as(age))
+
+
+def test_where_a_look_would_stall_the_device_the_memory_is_the_same(monkeypatch):
+    """As on a GPU: the rows are kept as they are in every step."""
+    looked = ages(Ageing())
+    monkeypatch.setattr("ganlane.env.physics.reads_are_cheap", lambda flag: False)
+    monkeypatch.setattr(EndedRows, "keep", None)
+    for one, other in zip(looked, ages(Ageing())):
+        assert torch.equal(one, other)
+
+
+def test_a_decision_without_steps_leaves_everything_as_it_is():
+    env = environment(num_envs=3)
+    td = env.reset()
+    start, _ = env.physics.begin(
+        env.rules,
+        torch.tensor([0, 2, 1]),
+        env.scenes(torch.arange(3), env.dtype),
+        dict(td[keys.EGO].items()),
+        td[keys.STEP],
+    )
+    _, memory = run_decision(env.traffic, env.physics, env.rules, td, start, torch.arange(3), substeps=0)
+    assert same_bits(memory, td[keys.TRAFFIC]) == []
+
+
+def test_a_row_that_never_ran_and_one_that_ended_may_differ_in_empty_parts():
+    # Between decisions TorchRL drops parts without a memory, which come back in the first step.
+    age = torch.arange(3)
+    before = TensorDict({"a": TensorDict({"age": age}, [3])}, [3])
+    after = TensorDict({"a": TensorDict({"age": age + 10}, [3]), "b": TensorDict({}, [3])}, [3])
+    ended = EndedRows()
+    ended.keep(torch.tensor([True, False, False]), before)
+    ended.keep(torch.tensor([False, True, False]), after)
+    assert ended.restore(after.clone())["a", "age"].tolist() == [0, 11, 12]
+
+
+# HighwayEnv.compile(): the same drive to rounding, and one sentence where it cannot be
+
+
+def test_without_a_compiler_on_the_path_one_sentence_says_so(monkeypatch):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(UserError, match=r"^compile=true needs a C\+\+ compiler, and there is none \(looked"):
+        runtime.check_compiler()
+    with pytest.raises(UserError, match="apt install"):
+        environment(vehicles=3).compile()
+
+
+def test_the_compiler_that_cxx_names_is_the_one_that_is_looked_for(monkeypatch):
+    monkeypatch.setenv("CXX", "my-compiler")
+    monkeypatch.setattr(shutil, "which", lambda name: "/bin/g++" if name == "g++" else None)
+    with pytest.raises(UserError, match="looked for CXX=my-compiler"):
+        runtime.check_compiler()
+    monkeypatch.delenv("CXX")
+    runtime.check_compiler()
+
+
+def test_arguments_of_torchrls_version_are_refused():
+    with pytest.raises(UserError, match="takes no arguments, not mode, dynamic"):
+        environment(vehicles=3).compile(mode="reduce-overhead", dynamic=True)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_env_compile_reaches_the_environment_and_the_observation(asked, monkeypatch):
+    seen = []
+    monkeypatch.setattr(HighwayEnv, "compile", lambda env: seen.append("environment"))
+    monkeypatch.setattr(build.ObservationTransform, "compile_graphs", lambda transform: seen.append("observation"))
+    config = EnvConfig(vehicles=3, compile=asked)
+    build.make_env(build.make_traffic(IdmTrafficConfig(), config), config)
+    assert seen == (["environment", "observation"] if asked else [])
+
+
+def test_torchrls_keyword_calls_it_too(monkeypatch):
+    seen = []
+    monkeypatch.setattr(HighwayEnv, "compile", lambda env, **given: seen.append(given) or env)
+    HighwayEnv(environment(vehicles=3).traffic, vehicles=3, compile=True)
+    assert seen == [{}]
+
+
+def drive(env: HighwayEnv, decisions: int) -> list[TensorDictBase]:
+    """States of a drive with automatic resets."""
+    td, driver, states = env.reset(), MobilDriver(env.road), []
+    for _ in range(decisions):
+        stepped, td = env.step_and_maybe_reset(driver(td))
+        states.append(stepped["next"].clone())
+    return states
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, runtime.COMPILERS)), reason="no C++ compiler")
+def test_a_compiled_environment_drives_as_the_eager_one_to_rounding():
+    """In float64: 20 decisions of 4 rows, several episodes each, with vehicles that return."""
+    settings = {"num_envs": 4, "vehicles": 4, "goal_m": 150.0, "recycle": True}
+    eager, compiled = environment(**settings), environment(**settings)
+    assert compiled.compile() is compiled
+    pairs = list(zip(drive(eager, 20), drive(compiled, 20)))
+    assert sum(int(one["done"].sum()) for one, _ in pairs) >= 4
+    assert pairs[-1][0][keys.EPISODE].max() >= 4
+    for one, other in pairs:
+        for name, a in leaves(one.exclude("action")):
+            torch.testing.assert_close(a, other[name], rtol=1e-9, atol=1e-9)

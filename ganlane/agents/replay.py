@@ -64,8 +64,8 @@ def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     tensors = {key if isinstance(key, str) else ".".join(key): rows.get(key) for key in stored}
     if len(buffer) < buffer.storage.max_size:  # a view would be saved with all of the storage behind it
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
-    state = {"rows": tensors, "cursor": buffer.writer._cursor, "sampler": buffer.sampler.state_dict()}
-    return {**state, "writes": buffer.write_count}
+    writer = {"cursor": buffer.writer._cursor, "writes": buffer.write_count}
+    return {"rows": tensors, **writer, "sampler": buffer.sampler.state_dict()}
 
 
 def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:

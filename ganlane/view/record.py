@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
-from ganlane.agents.policy import GreedyPolicy
+from ganlane.agents.drivers import GreedyPolicy
 from ganlane.errors import UserError
 from ganlane.evaluation.episodes import start_of
 from ganlane.sim.collisions import pair_overlaps

@@ -20,9 +20,10 @@ from ganlane.parameters.observation import ObservationConfig
 from ganlane.training import TrainingConfig, train
 from ganlane.training.checkpoint import TrainingState
 from ganlane.training.loop import collect
-from ganlane.training.phases import cluster_collector, identity, make_collector, phases_of
+from ganlane.training.phases import identity, make_collector, phases_of
 from ganlane.training.workers import (
     EPISODES_PER_WORKER,
+    ClusterCollector,
     ProcessCollector,
     WorkerCollector,
     noise_seed,
@@ -184,9 +185,8 @@ def test_a_phase_collects_as_the_option_says(monkeypatch):
 
 def test_a_missing_ray_is_named_with_the_command_that_mends_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "ganlane.training.cluster", raising=False)
     with pytest.raises(UserError, match=r"pip install 'ganlane\[ray\]'"):
-        cluster_collector(toy, RayCollectorConfig())
+        ClusterCollector(toy, RayCollectorConfig())
 
 
 # --- device=cuda

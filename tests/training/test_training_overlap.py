@@ -21,8 +21,7 @@ from ganlane.config.traffic import IdmTrafficConfig
 from ganlane.config.train import CollectorConfig, OverlapCollectorConfig, TrainConfig
 from ganlane.errors import ParameterError, UserError
 from ganlane.training.checkpoint import load_checkpoint
-from ganlane.training.collectors import SingleCollector
-from ganlane.training.overlap import OverlapCollector, work
+from ganlane.training.collectors import OverlapCollector, SingleCollector, work
 from ganlane.training.phases import identity, make_collector, phases_of
 
 

@@ -19,9 +19,8 @@ from training.toy import agent, gone, road, steps
 from ganlane import keys
 from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig
 from ganlane.errors import UserError
-from ganlane.training.phases import cluster_collector
-from ganlane.training.signals import shielded_children
-from ganlane.training.workers import ProcessCollector, check_reachable
+from ganlane.training.collectors import shielded_children
+from ganlane.training.workers import ClusterCollector, ProcessCollector, check_reachable
 
 ROOT = Path(__file__).resolve().parents[2]
 NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)")
@@ -102,7 +101,7 @@ def carried_along():
 @NO_RAY
 @pytest.mark.slow
 def test_two_ray_workers_collect_and_a_dead_one_is_told_in_one_sentence(carried_along):
-    source, learner = cluster_collector(road, RayCollectorConfig(2, 2, 8)), agent()
+    source, learner = ClusterCollector(road, RayCollectorConfig(2, 2, 8)), agent()
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     try:
         seen = steps(source, learner, 6)
@@ -135,7 +134,7 @@ def test_nobody_at_an_address_is_found_out_at_once():
 @NO_RAY
 @pytest.mark.slow
 def test_an_address_without_a_cluster_is_named(carried_along):
-    source = cluster_collector(road, RayCollectorConfig(1, 1, 1, address="127.0.0.1:1"))
+    source = ClusterCollector(road, RayCollectorConfig(1, 1, 1, address="127.0.0.1:1"))
     with pytest.raises(UserError, match=r"no Ray cluster answers at collector.address=127.0.0.1:1"):
         source.step(agent())
     source.close()

@@ -35,8 +35,8 @@ _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_l
 class NetworkConfig:
     """Shape and options of a :class:`QNetwork`; defaults and meaning as in :class:`RainbowConfig`.
 
-    ``observation_size`` D and ``actions`` A come from the environment. ``v_min`` and ``v_max`` bound the discounted
-    return, with ``atoms`` points between; without ``distributional`` they are ignored.
+    ``observation_size`` D and ``actions`` A come from the environment. Without ``distributional`` the support
+    (``atoms`` points from ``v_min`` to ``v_max``) is ignored.
     """
 
     observation_size: int
@@ -58,8 +58,7 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}
-        sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
-        for name, size in sizes.items():
+        for name, size in (sizes | {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}).items():
             if not isinstance(size, int) or not 1 <= size <= LARGEST:
                 raise UserError(f"network {name}={size!r}: expected a whole number from 1 to {LARGEST}.")
         for name in ("noisy", "dueling", "distributional"):

@@ -78,17 +78,13 @@ class TrainingState:
         resumed run starts the next episodes and is not bit-exact. The same holds for collectors that are not exact.
         """
         exact = with_replay and self.collector.exact
+        counters = ("decisions", "pending_decisions", "wall_s", "best")
         return {
             "agent": self.agent.state_dict(with_replay),
             "window": self.window.state_dict() if exact else None,
             "env_state": self.collector.state_dict(exact),
             "stats": self.stats.state_dict() if exact else None,
-            "counters": {
-                "decisions": self.decisions,
-                "pending_decisions": self.pending_decisions,
-                "wall_s": self.wall_s,
-                "best": self.best,
-            },
+            "counters": {name: getattr(self, name) for name in counters},
             "identity": self.identity,
         }
 
@@ -191,9 +187,8 @@ def save_checkpoint(path: str | Path, state: Any) -> None:
 def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: str = "resume") -> Any:
     """Read a file of :func:`save_checkpoint`, with present names; never executes code.
 
-    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`).
-
-    ``key`` is the configuration key of ``path``, for error messages.
+    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`). ``key`` is the
+    configuration key of ``path``, for error messages.
 
     Raises:
         UserError: the file is absent, damaged in any byte, holds weights that are not finite, or is no training
@@ -263,21 +258,18 @@ def check_parts(
     A damaged part would do harm later: Adam writes beyond moments that are too short, and a replay buffer that
     samples rows it does not hold returns arbitrary memory.
 
-    Args:
-        state: of the checkpoint.
-        agent: with Adam's moments already loaded from the checkpoint.
-        environments: state of the environments of a new run.
-        stats: of a new run.
+    ``agent`` has Adam's moments from the checkpoint already; ``environments`` (their state) and ``stats`` are those
+    of the new run.
 
     Raises:
         ValueError: a part has another structure, shape or type, or impossible numbers.
         TypeError, KeyError, AttributeError: a part has another type altogether.
     """
-    network, counters, replay = agent.network, state["counters"], state["agent"]["replay"]
+    network, counters, replay = agent.network.config, state["counters"], state["agent"]["replay"]
     moments = agent.optimizer.state_dict()["state"]
     adam = {
         row: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
-        for row, value in enumerate(network.parameters())
+        for row, value in enumerate(agent.network.parameters())
     }
     check_like(moments, adam if moments else {}, "optimizer")
     check_like(state["agent"]["updates"], 0, "updates")
@@ -285,17 +277,28 @@ def check_parts(
     check_like(counters, {"decisions": 0, "pending_decisions": 0, "wall_s": 0.0, "best": best}, "counters")
     if replay is not None:
         _check_replay(replay, agent)
-    if state["window"] is not None:  # the resumed run will be exact
-        check_like(state["env_state"], environments, "env_state")
-        mask = environments["items"].get(keys.ACTION_MASK)
-        if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
-            raise ValueError("replay: its masks are those of another run")
-        _check_window(state["window"]["steps"], agent, len(stats.returns), mask)
-        _check_stats(state["stats"], stats)
+    if state["window"] is None:  # the resumed run will not be exact
+        return
+    check_like(state["env_state"], environments, "env_state")
+    mask = environments["items"].get(keys.ACTION_MASK)
+    if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
+        raise ValueError("replay: its masks are those of another run")
+    rows, steps = transitions(len(stats.returns), network), state["window"]["steps"]
+    observation, end = rows["observation"], rows["next.terminated"]
+    step = Step(observation, rows["action"], rows["next.reward"], observation, end, end, mask)._asdict()
+    check_like(steps, [step] * min(len(steps), agent.config.n_step - 1), "window")
+    for step in steps:
+        _check_actions(step["action"], network)
+    saved, one = state["stats"], torch.zeros((), dtype=torch.float64)
+    sums = {name: one.expand(len(stats.actions)) if name == "actions" else one for name in saved["sums"]}
+    updates = dict.fromkeys(saved["updates"], torch.zeros(()))
+    check_like(saved, {**stats.state_dict(), "sums": sums, "updates": updates}, "stats")
+    if updates and saved["update_count"] == 0:
+        raise ValueError("stats: sums over no update")
 
 
 def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
-    rows, cursor, capacity = replay["rows"], replay["cursor"], agent.config.capacity
+    rows, cursor, config = replay["rows"], replay["cursor"], agent.config
     count = len(rows["action"]) if rows else 0
     check_like(replay, {"cursor": 0, "writes": 0}, "replay")
     if rows:
@@ -303,34 +306,16 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
         check_like(rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay")
         _check_actions(rows["action"], agent.network.config)
         steps = rows["steps_to_next_obs"]
-        if ((steps < 1) | (steps > agent.config.n_step)).any():
+        if ((steps < 1) | (steps > config.n_step)).any():
             raise ValueError("replay: transitions of more steps than the run's")
-    if not (cursor == count < capacity or cursor < count == capacity):
-        raise ValueError(f"replay: {count} rows of {capacity}, the next one is {cursor}")
-    if agent.config.prioritised:
+    if not (cursor == count < config.capacity or cursor < count == config.capacity):
+        raise ValueError(f"replay: {count} rows of {config.capacity}, the next one is {cursor}")
+    if config.prioritised:
         own = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
         expected: dict[str, Any] = {"priorities": own.float(), "largest": torch.zeros(()), "beta": 0.0}
         check_like(replay["sampler"], expected, "replay.sampler")
         if not torch.equal(replay["sampler"]["priorities"] > 0, own):
             raise ValueError("replay: priorities of rows that do not exist")
-
-
-def _check_window(steps: list[dict[str, Any]], agent: Rainbow, environments: int, mask: Tensor | None) -> None:
-    rows = transitions(environments, agent.network.config)
-    observation, end = rows["observation"], rows["next.terminated"]
-    step = Step(observation, rows["action"], rows["next.reward"], observation, end, end, mask)._asdict()
-    check_like(steps, [step] * min(len(steps), agent.config.n_step - 1), "window")
-    for step in steps:
-        _check_actions(step["action"], agent.network.config)
-
-
-def _check_stats(saved: Mapping[str, Any], fresh: EpisodeStats) -> None:
-    one, shares = torch.zeros((), dtype=torch.float64), torch.zeros(len(fresh.actions), dtype=torch.float64)
-    sums = {name: shares if name == "actions" else one for name in saved["sums"]}
-    updates = dict.fromkeys(saved["updates"], torch.zeros(()))
-    check_like(saved, {**fresh.state_dict(), "sums": sums, "updates": updates}, "stats")
-    if updates and saved["update_count"] == 0:
-        raise ValueError("stats: sums over no update")
 
 
 def _check_actions(taken: Tensor, network: NetworkConfig) -> None:

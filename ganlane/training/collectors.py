@@ -159,12 +159,8 @@ class OverlapCollector(Collector):
     choose an action lack the updates of one step, compared with ``collector=single``. The result does not depend on
     which side is faster, and nothing is in flight between two steps: runs are deterministic and resume bit for bit.
 
-    Row ``w * rows + i`` of a step is row i of worker w, which starts with episode ``w * 2**40 + i``.
-
-    Args:
-        make_env: makes the environments of one worker.
-        workers: processes, with one thread each.
-        environments: of all workers, a multiple of their number.
+    The ``environments`` are shared out evenly: row ``w * rows + i`` of a step is row i of worker w, which starts with
+    episode ``w * 2**40 + i``. A worker has one thread.
     """
 
     name, exact, overlaps = "overlap", True, True
@@ -214,7 +210,6 @@ class OverlapCollector(Collector):
 
     def begin(self, agent: Rainbow) -> None:
         """Choose the actions with the agent's current weights and send them to the workers."""
-        self.open()
         if self._seen is None:
             self._seen = torch.cat(self._ask("look"))
         self._given = agent.policy(self._seen.to(agent.device))

@@ -71,10 +71,6 @@ class WorkerCollector(Collector):
     The workers make ``config.steps`` steps with the same weights, then wait for the learner. They are started by
     :meth:`open` or the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is row i of worker w, which
     starts with episode ``w * 2**40 + i``.
-
-    Args:
-        make_env: makes the environments of one worker.
-        config: number of workers and environments, and steps between new weights.
     """
 
     exact = False

@@ -7,7 +7,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane.agents import Rainbow, RainbowConfig
-from ganlane.agents.network import duel
 from ganlane.errors import UserError
 
 SIZE = 4
@@ -30,14 +29,6 @@ def observations(rows=2000):
     return TensorDict({"observation": torch.randn(rows, SIZE, generator=torch.Generator().manual_seed(9))}, [rows])
 
 
-# --- the network
-
-
-def test_dueling_takes_the_mean_advantage_off():
-    rows = torch.tensor([[10.0], [1.0], [2.0], [6.0]])
-    assert duel(rows).flatten().tolist() == [8.0, 9.0, 13.0]
-
-
 # --- exploration
 
 
@@ -49,22 +40,14 @@ def test_the_noise_is_drawn_anew_at_every_step():
 
 
 @pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN])
-def test_under_deterministic_exploration_the_policy_is_greedy(kind):
-    explorer = agent(noisy_sigma=3.0)
-    data = observations()
-    with set_exploration_type(kind):
-        actions = [explorer.policy(data.clone())["action"] for _ in range(2)]
+def test_under_deterministic_exploration_the_policy_is_greedy_which_has_no_noise_whatever_the_context(kind):
+    explorer, data = agent(noisy_sigma=3.0), observations()
     greedy = explorer.greedy(data.clone())["action"]
-    assert all(torch.equal(action, greedy) for action in actions)
-
-
-def test_the_greedy_policy_has_no_noise_whatever_the_context():
-    explorer = agent(noisy_sigma=3.0)
-    data = observations()
-    expected = explorer.greedy(data.clone())["action"]
-    explorer.policy(data.clone())
+    explorer.policy(data.clone())  # leaves its noise in the network
+    with set_exploration_type(kind):
+        assert all(torch.equal(explorer.policy(data.clone())["action"], greedy) for _ in range(2))
     with set_exploration_type(ExplorationType.RANDOM):
-        assert torch.equal(explorer.greedy(data.clone())["action"], expected)
+        assert torch.equal(explorer.greedy(data.clone())["action"], greedy)
 
 
 def test_the_policy_writes_the_action_and_what_it_thinks_it_worth():
@@ -154,12 +137,14 @@ def test_the_objective_is_the_mean_of_weight_times_loss():
     torch.testing.assert_close(objective, (seen["weight"] * seen["terms"]["loss"]).mean().detach())
 
 
-def test_an_update_gives_the_drawn_items_their_new_priority():
+def test_an_update_gives_the_drawn_items_their_new_priority_and_metrics_without_dimensions():
     learner = agent()
     learner.store(transitions(SIZE))
     before = learner.replay.sampler.priorities.clone()
-    learner.update()
+    metrics = learner.update()
     assert not torch.equal(before, learner.replay.sampler.priorities)
+    assert {"loss", "mean_q", "clamped_fraction", "priority", "gradient_norm"} == set(metrics)
+    assert all(value.shape == () and not value.requires_grad for value in metrics.values())
 
 
 SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
@@ -174,14 +159,6 @@ def test_each_component_can_be_switched_off_and_the_rest_learns(off):
     for _ in range(80):
         learner.update()
     assert learner.loss(transitions(SIZE))["loss"].mean() < 0.95 * before
-
-
-def test_metrics_are_tensors_without_dimensions():
-    learner = agent()
-    learner.store(transitions(SIZE))
-    metrics = learner.update()
-    assert {"loss", "mean_q", "clamped_fraction", "priority", "gradient_norm"} == set(metrics)
-    assert all(value.shape == () and not value.requires_grad for value in metrics.values())
 
 
 def test_the_agent_learns_the_values_of_a_known_chain():
@@ -206,16 +183,11 @@ def test_the_agent_learns_the_values_of_a_known_chain():
 # --- randomness and saving
 
 
-def test_the_global_random_state_is_left_alone():
-    before = torch.get_rng_state()
-    learner = trained()
-    learner.policy(observations(5))
-    assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_the_seed_decides_everything_and_the_global_one_nothing():
+def test_the_seed_decides_everything_and_the_global_random_state_is_left_alone():
     torch.manual_seed(1)
-    first = trained()
+    before, first = torch.get_rng_state(), trained()
+    first.policy(observations(5))
+    assert torch.equal(torch.get_rng_state(), before)
     torch.manual_seed(2)
     assert same_weights(first, trained())
     assert not same_weights(first, trained(seed=1))

@@ -167,7 +167,7 @@ class Progress:
     """Shows decisions per second, remaining time, mean return and ends of episodes: a bar, or a line per row.
 
     Figures that a row lacks, because no episode ended in its interval, keep their last value. Of the ``total``
-    decisions of the run, ``done`` have been made before. A ``stream`` (default stderr) that is a terminal gets the bar.
+    decisions of the run, ``done`` have been made before. A terminal as ``stream`` (default stderr) gets the bar.
     """
 
     def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:

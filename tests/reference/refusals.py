@@ -28,3 +28,19 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def is_one_sentence(err: str, command: str) -> bool:
     """One line that names the command and ends in a full stop; no traceback."""
     return err.startswith(f"ganlane {command}: ") and err.endswith(".\n") and err.count("\n") == 1
+
+
+class Bomb:
+    """Unpickling it makes a file named ``executed``."""
+
+    def __reduce__(self):
+        return open, ("executed", "w")
+
+
+def run_folder(overrides: str, checkpoint: bytes = b"", config: str = "compile: auto\n") -> None:
+    """What a stopped training run leaves in the folder ``run``, as far as resuming reads it."""
+    folder = Path("run")
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints" / "last.pt").write_bytes(checkpoint)
+    (folder / "overrides.yaml").write_text(overrides)
+    (folder / "config.yaml").write_text(config)

@@ -17,9 +17,14 @@ def agent(seed=0, **options):
     return Rainbow(RainbowConfig(**{**SMALL, **options}), SIZE, seed=seed)
 
 
-def trained(updates=5, **options):
+def filled(**options):
     result = agent(**options)
     result.store(transitions(SIZE))
+    return result
+
+
+def trained(updates=5, **options):
+    result = filled(**options)
     for _ in range(updates):
         result.update()
     return result
@@ -34,8 +39,7 @@ def observations(rows=2000):
 
 def test_the_noise_is_drawn_anew_at_every_step():
     explorer = agent(noisy_sigma=3.0)
-    data = observations()
-    first, second = (explorer.policy(data.clone())["action"] for _ in range(2))
+    first, second = (explorer.policy(observations())["action"] for _ in range(2))
     assert not torch.equal(first, second)
 
 
@@ -79,9 +83,7 @@ def test_a_share_epsilon_of_the_actions_is_random_and_legal():
 
 
 def test_the_learning_rate_falls_in_a_straight_line_and_stays():
-    falling = Rainbow(
-        RainbowConfig(**SMALL, learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_decisions=100), SIZE
-    )
+    falling = agent(learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_decisions=100)
     rates = []
     for decisions in (0, 50, 100, 200):
         falling.anneal(decisions)
@@ -92,15 +94,14 @@ def test_the_learning_rate_falls_in_a_straight_line_and_stays():
 @pytest.mark.parametrize("half", [{"learning_rate_end": 1e-4}, {"learning_rate_decisions": 100}])
 def test_half_of_a_falling_learning_rate_is_refused(half):
     with pytest.raises(UserError, match="give both or neither"):
-        Rainbow(RainbowConfig(**SMALL, **half), SIZE)
+        agent(**half)
 
 
 # --- updates
 
 
 def test_the_target_is_copied_exactly_every_period():
-    learner = agent(target_period=3)
-    learner.store(transitions(SIZE))
+    learner = filled(target_period=3)
     copied = []
     for _ in range(9):
         learner.update()
@@ -110,8 +111,7 @@ def test_the_target_is_copied_exactly_every_period():
 
 
 def test_every_update_draws_the_noise_of_both_networks_anew():
-    learner = agent()
-    learner.store(transitions(SIZE))
+    learner = filled()
     modules = (learner.network, learner.loss.target_network)
     before = [module.head.weight_epsilon.clone() for module in modules]
     learner.update()
@@ -121,8 +121,7 @@ def test_every_update_draws_the_noise_of_both_networks_anew():
 
 
 def test_the_objective_is_the_mean_of_weight_times_loss():
-    learner = agent(beta_start=1.0)
-    learner.store(transitions(SIZE))
+    learner = filled(beta_start=1.0)
     learner.replay.update_priority(torch.arange(64), torch.linspace(0.1, 5.0, 64))
     learner.replay.sample()
     seen = {}
@@ -138,8 +137,7 @@ def test_the_objective_is_the_mean_of_weight_times_loss():
 
 
 def test_an_update_gives_the_drawn_items_their_new_priority_and_metrics_without_dimensions():
-    learner = agent()
-    learner.store(transitions(SIZE))
+    learner = filled()
     before = learner.replay.sampler.priorities.clone()
     metrics = learner.update()
     assert not torch.equal(before, learner.replay.sampler.priorities)
@@ -152,9 +150,7 @@ SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
 
 @pytest.mark.parametrize("off", [[name] for name in SWITCHES] + [SWITCHES])
 def test_each_component_can_be_switched_off_and_the_rest_learns(off):
-    options = {"learning_rate": 3e-3, "target_period": 1000, "noisy_sigma": 0.1}
-    learner = agent(**{name: False for name in off}, **options)
-    learner.store(transitions(SIZE))
+    learner = filled(**dict.fromkeys(off, False), learning_rate=3e-3, target_period=1000, noisy_sigma=0.1)
     before = learner.loss(transitions(SIZE))["loss"].mean()
     for _ in range(80):
         learner.update()

@@ -32,10 +32,12 @@ class Step(NamedTuple):
     def copied(cls, step: TensorDictBase) -> Step:
         """The tensors of a step, copied: the environment may write into its own afterwards."""
         after = step.get("next")
+        observation, action = (step.get(name).clone() for name in ("observation", "action"))
+        reward, following, terminated, done = (
+            after.get(name).clone() for name in ("reward", "observation", "terminated", "done")
+        )
         mask = after.get(keys.ACTION_MASK, None)
-        outcome = (after.get(name) for name in ("reward", "observation", "terminated", "done"))
-        given = [each.clone() for each in (step.get("observation"), step.get("action"), *outcome)]
-        return cls(*given, following_mask=None if mask is None else mask.clone())
+        return cls(observation, action, reward, following, terminated, done, None if mask is None else mask.clone())
 
 
 class NStepWindow:

@@ -206,32 +206,41 @@ import sys
 import torch
 torch.set_num_threads(1)
 sys.path[:0] = [{tests!r}]
-from training.test_training_collectors import OverlapCollector, run, toy, settings
+from training.test_training_collectors import OverlapCollector, SingleCollector, ToyRoad, agent, settings, toy, train
 import ganlane.training.checkpoint as checkpoint
-import training.test_training_collectors as here
 checkpoint.PATIENCE = 0.0
-here.settings = lambda decisions: settings(decisions, checkpoint_every_s=0.0)
 if __name__ == "__main__":
-    run(OverlapCollector(toy, 2, 8), 10**9, {folder!r})
+    train({source}, agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
 """
+#: What a killed run collects with, and its like in this process.
+SOURCES = {
+    "SingleCollector(ToyRoad(8))": lambda: SingleCollector(ToyRoad(8)),
+    "OverlapCollector(toy, 2, 8)": lambda: HereCollector(toy, 2, 8),
+}
+SINGLE, OVERLAP = SOURCES
+ATTEMPTS = [(SINGLE, 0, 0.0), (SINGLE, 0, 0.53), (OVERLAP, 160, 0.1), (OVERLAP, 160, 0.7)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("after_s", [0.1, 0.7])
-def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights_and_leaves_no_process(after_s, tmp_path):
-    folder, tests = tmp_path / "parts", Path(__file__).resolve().parent.parent
-    script = tmp_path / "killed.py"
-    script.write_text(KILLED.format(tests=str(tests), folder=str(folder)))
+@pytest.mark.parametrize(
+    ("source", "decisions", "after_s"),
+    [(SINGLE, 0, 0.11), *(pytest.param(*attempt, marks=pytest.mark.slow) for attempt in ATTEMPTS)],
+)
+def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights_and_leaves_no_process(
+    source, decisions, after_s, tmp_path
+):
+    """Killed so many seconds after its checkpoint of so many ``decisions``."""
+    folder, tests, script = tmp_path / "parts", Path(__file__).resolve().parent.parent, tmp_path / "killed.py"
+    script.write_text(KILLED.format(tests=str(tests), folder=str(folder), source=source))
     process = subprocess.Popen([sys.executable, str(script)], cwd=tests.parent, start_new_session=True)
     last = folder / "checkpoints" / "last.pt"
-    while not last.exists() or load_checkpoint(last)["counters"]["decisions"] < 160:
+    while not last.exists() or load_checkpoint(last)["counters"]["decisions"] < decisions:
         assert process.poll() is None
-        time.sleep(0.05)
+        time.sleep(0.01)
     time.sleep(after_s)
     process.kill()
     process.wait()
     assert gone(process.pid)
     reached = int(load_checkpoint(last)["counters"]["decisions"])
-    resumed, _ = run(HereCollector(toy, 2, 8), reached + 400, folder, seed=5, resume=last)
-    whole, _ = run(HereCollector(toy, 2, 8), reached + 400, tmp_path / "whole")
+    resumed, _ = run(SOURCES[source](), reached + 400, folder, seed=5, resume=last)
+    whole, _ = run(SOURCES[source](), reached + 400, tmp_path / "whole")
     assert same(whole, resumed)

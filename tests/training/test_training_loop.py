@@ -3,10 +3,7 @@
 import csv
 import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,7 +15,7 @@ from ganlane.agents import Rainbow, RainbowConfig, load_agent
 from ganlane.errors import UserError
 from ganlane.training import TrainingConfig
 from ganlane.training import train as train_until_stopped
-from ganlane.training.checkpoint import Checkpointer, TrainingState, load_checkpoint
+from ganlane.training.checkpoint import Checkpointer, TrainingState
 
 SMALL = {
     "hidden": (32, 32),
@@ -186,36 +183,3 @@ def test_writing_checkpoints_takes_at_most_a_fiftieth_of_the_time(tmp_path, monk
     saver.save()
     assert saver.pause_s > 5.0
     assert not saver.due()
-
-
-KILLED = """
-import sys
-import torch
-torch.set_num_threads(1)
-sys.path[:0] = [{tests!r}]
-from training.test_training_loop import ToyRoad, agent, settings, train
-import ganlane.training.checkpoint as checkpoint
-checkpoint.PATIENCE = 0.0
-train(ToyRoad(8), agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
-"""
-
-
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize("after_s", [pytest.param(0.0, marks=SLOW), 0.11, pytest.param(0.53, marks=SLOW)])
-def test_a_run_killed_at_any_moment_leaves_a_checkpoint_to_go_on_from(after_s, tmp_path):
-    folder, tests = tmp_path / "parts", Path(__file__).resolve().parent.parent
-    script = KILLED.format(tests=str(tests), folder=str(folder))
-    process = subprocess.Popen([sys.executable, "-c", script], cwd=tests.parent)
-    while not (folder / "checkpoints" / "last.pt").exists():
-        assert process.poll() is None
-        time.sleep(0.01)
-    time.sleep(after_s)
-    process.kill()
-    process.wait()
-    resumed, whole = agent(), agent()
-    reached = int(load_checkpoint(folder / "checkpoints" / "last.pt")["counters"]["decisions"])
-    train(ToyRoad(8), resumed, settings(reached + 400), folder, resume=folder / "checkpoints" / "last.pt")
-    train(ToyRoad(8), whole, settings(reached + 400), tmp_path / "whole")
-    assert same(whole, resumed)

@@ -18,8 +18,7 @@ from torchrl.envs import Compose, TransformedEnv
 from ganlane import keys
 from ganlane.agents import load_agent
 from ganlane.agents.checkpoint import SHIPPED, names_agent, with_seeds
-from ganlane.agents.drivers import DRIVERS
-from ganlane.agents.policy import MaskedPolicy
+from ganlane.agents.drivers import DRIVERS, MaskedPolicy
 from ganlane.arguments import call_with, import_target, is_import_path
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import TrafficConfig

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from reference.refusals import everything_below, is_one_sentence, refusal
+from reference.refusals import Bomb, everything_below, is_one_sentence, refusal, run_folder
 from safetensors.torch import save
 
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
@@ -36,13 +36,6 @@ def here(tmp_path, monkeypatch):
 
 
 # --- checkpoints
-
-
-class Bomb:
-    """Unpickling it makes a file named ``exploded``."""
-
-    def __reduce__(self):
-        return open, ("exploded", "w")
 
 
 def damages(good: Path) -> dict[str, bytes]:
@@ -79,6 +72,8 @@ def saved(content: Any) -> bytes:
     return written(lambda path: torch.save(content, path))
 
 
+#: The command line of a stopped run.
+IDM = "[traffic=idm]"
 KIND = "ganlane training checkpoint"
 DAMAGED = {good: damages(good) for good in (AGENT, GENERATOR)}
 #: Where an agent's or a generator's file can stand on a command line.
@@ -88,10 +83,7 @@ PLACES = {
     "render agent": (AGENT, ["render", "agent=broken.safetensors"]),
     "train init": (AGENT, ["train", "traffic=idm", "init.path=broken.safetensors", "evaluation.agents=[mobil]"]),
     "train generator": (GENERATOR, ["train", "traffic=gan", "generator.path=broken.safetensors"]),
-    "evaluate generator": (
-        GENERATOR,
-        ["evaluate", "agents=[mobil]", "traffics=[gan]", "generator.path=broken.safetensors"],
-    ),
+    "evaluate generator": (GENERATOR, ["evaluate", "traffics=[gan]", "generator.path=broken.safetensors"]),
 }
 
 
@@ -111,7 +103,7 @@ def test_a_broken_checkpoint_is_refused(place, damage, here, capsys):
     for name in ("broken.safetensors", "broken.pt"):
         (here / name).write_bytes(content)
     assert "broken." in refusal(capsys, *arguments) or damage == "other weights"
-    assert not (here / "exploded").exists()
+    assert not (here / "executed").exists()
 
 
 #: What the description of an agent's network could say by mistake or malice.
@@ -130,29 +122,19 @@ NETWORKS = {
 def test_an_agent_with_an_impossible_network_is_refused(name, value, capsys):
     weights, metadata = load_weights(AGENT, "agent")
     del metadata["kind"]
-    save_weights(
-        "broken.safetensors", "agent", weights, {**metadata, "network": {**metadata["network"], name: value}}
-    )
+    metadata["network"][name] = value
+    save_weights("broken.safetensors", "agent", weights, metadata)
     short = ("traffics=[idm]", "episodes=1", "env.goal_m=20")
     assert "broken.safetensors" in refusal(capsys, "evaluate", "agents=[broken.safetensors]", *short)
-
-
-def run_folder(checkpoint: bytes, overrides: str = "[traffic=idm]") -> Path:
-    """What a stopped training run leaves."""
-    folder = Path("run")
-    (folder / "checkpoints").mkdir(parents=True)
-    (folder / "checkpoints" / "last.pt").write_bytes(checkpoint)
-    (folder / "overrides.yaml").write_text(overrides)
-    return folder
 
 
 @pytest.mark.parametrize(
     "damage", [kind for kind in DAMAGED[AGENT] if kind not in ("no description", "other weights")]
 )
 def test_a_broken_resume_checkpoint_is_refused(damage, here, capsys):
-    run_folder(DAMAGED[AGENT][damage])
+    run_folder(IDM, DAMAGED[AGENT][damage])
     assert "last.pt" in refusal(capsys, "train", "resume=run")
-    assert not (here / "exploded").exists()
+    assert not (here / "executed").exists()
 
 
 @pytest.mark.parametrize(
@@ -171,7 +153,7 @@ def test_a_broken_resume_checkpoint_is_refused(damage, here, capsys):
 def test_a_resume_checkpoint_with_other_things_in_it_is_refused(content, capsys, tmp_path):
     (tmp_path / "other.pt").write_bytes(saved(content))
     seal_archive(tmp_path / "other.pt")  # without a checksum there is a note besides the sentence
-    run_folder((tmp_path / "other.pt").read_bytes())
+    run_folder(IDM, (tmp_path / "other.pt").read_bytes())
     assert "resume" in refusal(capsys, "train", "resume=run")
 
 
@@ -181,7 +163,7 @@ def test_a_resume_checkpoint_with_other_things_in_it_is_refused(content, capsys,
     ids=repr,
 )
 def test_a_run_whose_command_line_is_damaged_is_not_resumed(overrides, capsys):
-    run_folder(b"", overrides)
+    run_folder(overrides)
     # The checkpoint would be refused as well: the sentence has to be about the command line.
     named = "env.lanes=many" if "env.lanes" in overrides else "overrides.yaml"
     assert named in refusal(capsys, "train", "resume=run")
@@ -229,13 +211,7 @@ READERS = {
     "prepare": ["prepare", "data.path=broken.csv"],
     "train_generator": ["train_generator", "data.path=broken.csv"],
     "realism": ["realism", "data.path=broken.csv", "quick=true"],
-    "replay": [
-        "evaluate",
-        "agents=[mobil]",
-        "traffics=[replay]",
-        "traffic_options.replay.path=broken.csv",
-        "episodes=1",
-    ],
+    "replay": ["evaluate", "traffics=[replay]", "traffic_options.replay.path=broken.csv"],
 }
 
 
@@ -313,11 +289,7 @@ def test_a_broken_scene_is_refused(name, here, capsys):
 
 #: In a process of its own, once for a value and once for either kind of file;
 #: a number out of range is in `test_entry_commands`.
-WHOLE = (
-    "prepare data=ngsim",
-    "evaluate agents=[broken.safetensors] traffics=[idm]",
-    "train resume=run",
-)
+WHOLE = ("prepare data=ngsim", "evaluate agents=[broken.safetensors] traffics=[idm]", "train resume=run")
 
 
 @pytest.mark.parametrize("line", [WHOLE[0], *(pytest.param(line, marks=pytest.mark.slow) for line in WHOLE[1:])])
@@ -325,7 +297,7 @@ def test_a_whole_command_ends_with_status_2(line, here):
     if "broken.safetensors" in line:
         Path("broken.safetensors").write_bytes(DAMAGED[AGENT]["pickle"])
     if "resume=run" in line:
-        run_folder(DAMAGED[AGENT]["torch pickle"])
+        run_folder(IDM, DAMAGED[AGENT]["torch pickle"])
     before = everything_below(here)
     environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(here)}
     environment["GANLANE_CACHE"] = str(cache_folder().parent)  # where the kernel is built already

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from ganlane._version import __version__
+from ganlane.agents.drivers import GreedyPolicy
 from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
-from ganlane.agents.policy import GreedyPolicy
 from ganlane.agents.rainbow import Rainbow
 from ganlane.errors import UserError, as_typed
 from ganlane.files import CHECKPOINTS
@@ -30,13 +30,14 @@ SUPPORT = ("atoms", "v_min", "v_max")
 
 def _place(name: str | Path) -> tuple[Path, int | None]:
     """File of an agent, and its seed if the file holds several trainings."""
-    recipe, at, digits = str(name).rpartition("@")
-    if not (at and digits.isdecimal() and (recipe in SHIPPED or recipe.endswith(".safetensors"))):
-        return CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name), None
-    seed = int(digits)
-    if recipe not in SHIPPED:
-        return Path(recipe), seed
-    return (_seeds_file(recipe), seed) if seed else (CHECKPOINTS / f"{recipe}.safetensors", None)
+    recipe, _, digits = str(name).rpartition("@")
+    if digits.isdecimal() and (recipe in SHIPPED or recipe.endswith(".safetensors")):
+        if recipe not in SHIPPED:
+            return Path(recipe), int(digits)
+        if int(digits):
+            return _seeds_file(recipe), int(digits)
+        name = recipe
+    return CHECKPOINTS / f"{name}.safetensors" if name in SHIPPED else Path(name), None
 
 
 def _seeds_file(recipe: str) -> Path:
@@ -96,13 +97,10 @@ def agent_file(name: str | Path) -> Path:
 
 
 def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) -> None:
-    """Write the agent's online network atomically.
+    """Write the agent's online network atomically, as a ``.safetensors`` file.
 
-    Args:
-        path: ``.safetensors`` file.
-        agent: whose weights to write.
-        metadata: JSON-serialisable; by convention ``observation`` (the name of the observation) and ``training``
-            (traffic, decisions, results). The network's config and the code version are added here.
+    ``metadata`` is JSON-serialisable; by convention ``observation`` (the name of the observation) and ``training``
+    (traffic, decisions, results). The network's config and the code version are added here.
     """
     header = {**metadata, "network": asdict(agent.network.config), "code_version": __version__}
     save_weights(path, "agent", agent.weights(), header)
@@ -113,11 +111,8 @@ def save_agents(
 ) -> None:
     """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
 
-    The scales of the noise are kept in half precision, everything that a greedy agent computes with as it is.
-
-    Args:
-        path: ``.safetensors`` file.
-        agents: seed to what :func:`read_agent` gives.
+    ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half precision,
+    everything that a greedy agent computes with as it is.
     """
     tensors = {
         f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
@@ -208,17 +203,16 @@ def warm_start(
     differing = [key for key in here if here[key] != trained[key] and key not in ignored]
     if differing:
         adopt = "give init.support=trained, " if set(differing) <= set(SUPPORT) else ""
+        own, theirs = (
+            " ".join(f"agent.{key}={as_typed(config[key])}" for key in differing) for config in (here, trained)
+        )
         raise UserError(
-            f"agent {name}: it has another network than this run (here: {_options(here, differing)}); {adopt}set "
-            f"{_options(trained, differing)}, or start with init=none."
+            f"agent {name}: it has another network than this run (here: {own}); {adopt}set {theirs}, or start with "
+            "init=none."
         )
     agent.load_weights(weights)
     if moments is not None:
         load_moments(agent, moments)
-
-
-def _options(network: Mapping[str, Any], names: list[str]) -> str:
-    return " ".join(f"agent.{name}={as_typed(network[name])}" for name in names)
 
 
 def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) -> None:
@@ -244,6 +238,6 @@ def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) ->
             "init.optimizer=true: the moments in the checkpoint are not those of its network; give another one or "
             "init.optimizer=false."
         )
-    # Adam works in place on what it is given.
+    # Copies: Adam works in place on what it is given.
     own = {row: {name: value.clone() for name, value in moments[row].items()} for row in shapes}
     agent.optimizer.load_state_dict({**agent.optimizer.state_dict(), "state": own})

@@ -1,13 +1,22 @@
-"""TorchRL's DQN losses with a lean forward on plain tensors.
+"""The loss of a batch of transitions, and a whole update of Rainbow as one function.
 
 :class:`LeanDistributionalLoss` equals :class:`torchrl.objectives.DistributionalDQNLoss` (Bellemare et al. 2017,
-double) to 1e-6 and takes half of its time; :class:`LeanDQNLoss` does the same for the plain DQN loss. Both keep
-TorchRL's parameter containers, so a TorchRL user finds ``value_network_params`` and the target where expected.
+double) to 1e-6 and takes half of its time, by a lean forward on plain tensors; :class:`LeanDQNLoss` does the same for
+the plain DQN loss. Both keep TorchRL's parameter containers, so a TorchRL user finds ``value_network_params`` and the
+target where expected.
+
+:func:`update` is what :meth:`ganlane.agents.rainbow.Rainbow.update` does with the first of them, autograd,
+``clip_grad_norm_`` and Adam, here without any of these, for the agent with all six components: noise is part of the
+weights, the backward pass is written out, and the duel is folded into the head, since ``Q_a = V + A_a - mean(A)`` is
+linear in its weights. :class:`UpdateGraph` compiles it to one graph. Equal to the other way up to rounding
+(tests/agents/test_agents_loss.py), and faster on a CPU (docs/performance.md).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from copy import deepcopy
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,9 +26,13 @@ from torchrl.modules import DistributionalQValueActor, QValueActor
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
 from ganlane import keys
-from ganlane.agents.network import QNetwork, Weights
-from ganlane.agents.policy import allowed_values
+from ganlane.agents.network import QNetwork, Weights, allowed_values, matrix_product, noise_of
 from ganlane.parameters.agent import RainbowConfig
+from ganlane.torch_settings import compiled
+
+#: Parameters of a noisy layer.
+_PARAMETERS = ("weight_mu", "weight_sigma", "bias_mu", "bias_sigma")
+_BETA_1, _BETA_2 = 0.9, 0.999
 
 
 class _WithTarget:
@@ -92,10 +105,8 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         choosing = self.network.logits(following, weights) if self.double else target_logits
         values = allowed_values(self.network.expected(choosing), batch.get(("next", keys.ACTION_MASK), None))
         best, action = values.max(-1)
-        probabilities = pick(target_logits, action).softmax(-1)
-        values = bellman(batch, self.gamma, support)
-        clamped = outside_support(values, probabilities, support)
-        return project(values, probabilities, support), clamped, best.mean()
+        returns = bellman(batch, self.gamma, support)
+        return *projected(returns, pick(target_logits, action).softmax(-1), support), best.mean()
 
 
 class LeanDQNLoss(_WithTarget, DQNLoss):
@@ -118,29 +129,18 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
 
     def forward(self, batch: TensorDictBase) -> TensorDict:
         """Huber loss per transition; keys as in :meth:`LeanDistributionalLoss.forward`, ``td_error`` is |error|."""
+        following = batch.get(("next", "observation"))
         with torch.no_grad():
-            target, mean_q = self._target(batch)
+            target_values = self.target_network(following)
+            values = self.network(following) if self.double_dqn else target_values
+            best, action = allowed_values(values, batch.get(("next", keys.ACTION_MASK), None)).max(-1)
+            target = bellman(batch, self.discount, target_values.gather(-1, action[:, None])).squeeze(-1)
+            mean_q = best.mean()
         values = self.network(batch.get("observation"))
         value = values.gather(-1, batch.get("action")[:, None]).squeeze(-1)
         loss = nn.functional.smooth_l1_loss(value, target, reduction="none")
         batch.set("td_error", (target - value.detach()).abs()[:, None])
         return TensorDict({"loss": loss, "clamped_fraction": torch.zeros_like(mean_q), "mean_q": mean_q})
-
-    def _target(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Bellman targets [B] and the mean value of the best next action."""
-        following = batch.get(("next", "observation"))
-        target_values = self.target_network(following)
-        values = self.network(following) if self.double_dqn else target_values
-        best, action = allowed_values(values, batch.get(("next", keys.ACTION_MASK), None)).max(-1)
-        value = target_values.gather(-1, action[:, None])
-        return bellman(batch, self.discount, value).squeeze(-1), best.mean()
-
-
-def make_loss(network: QNetwork, config: RainbowConfig) -> LeanDistributionalLoss | LeanDQNLoss:
-    """The loss that ``config`` asks for."""
-    if config.distributional:
-        return LeanDistributionalLoss(network, config.gamma, config.double, config.kl_priority)
-    return LeanDQNLoss(network, config.gamma, config.double)
 
 
 def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
@@ -166,12 +166,210 @@ def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
     return projected.scatter_add_(1, index + 1, share)
 
 
-def outside_support(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
-    """Probability mass that :func:`project` clamps, averaged over the batch, 0-dim."""
+def projected(values: Tensor, probabilities: Tensor, support: Tensor) -> tuple[Tensor, Tensor]:
+    """What :func:`project` gives, and the mass that it clamps, averaged over the batch, 0-dim."""
     outside = (values < support[0]) | (values > support[-1])
-    return (probabilities * outside).sum(-1).mean()
+    return project(values, probabilities, support), (probabilities * outside).sum(-1).mean()
 
 
 def pick(rows: Tensor, action: Tensor) -> Tensor:
     """Rows [B, K] of ``rows`` [B, A, K] at the actions [B]."""
     return rows.gather(1, action.view(-1, 1, 1).expand(-1, 1, rows.shape[-1])).squeeze(1)
+
+
+# --- a whole update as one function
+
+
+class Batch(NamedTuple):
+    """Transitions: ``observation`` and ``following`` [B, D], ``allowed`` [B, A] bool (following), the rest [B]."""
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    following: Tensor
+    alive: Tensor
+    steps: Tensor
+    weight: Tensor
+    allowed: Tensor
+
+
+class Learned(NamedTuple):
+    """``priority`` [B]; 0-dim: the weighted ``loss``, ``mean_q``, ``clamped_fraction``, ``gradient_norm``."""
+
+    priority: Tensor
+    loss: Tensor
+    mean_q: Tensor
+    clamped_fraction: Tensor
+    gradient_norm: Tensor
+
+
+class Settings(NamedTuple):
+    """What does not change during a training."""
+
+    actions: int
+    atoms: int
+    gamma: float
+    gradient_clip: float
+    adam_eps: float
+
+
+def composed(parameters: Sequence[Tensor], noise: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Weight [O, I] and bias [O] of a noisy layer (Fortunato et al. 2017); ``noise`` of its inputs and outputs."""
+    weight_mu, weight_sigma, bias_mu, bias_sigma = parameters
+    inputs, outputs = noise
+    return weight_mu + weight_sigma * torch.outer(outputs, inputs), bias_mu + bias_sigma * outputs
+
+
+def folded(part: Tensor, actions: int) -> Tensor:
+    """Weight [(1 + A) K, H] or bias [(1 + A) K] of the head with the duel in it, [A K, H] or [A K]."""
+    rows = part.unflatten(0, (1 + actions, -1))
+    return (rows[:1] + rows[1:] - rows[1:].mean(0, keepdim=True)).flatten(0, 1)
+
+
+def unfolded(gradient: Tensor, actions: int) -> Tensor:
+    """Gradient of the head from that of the folded head: the transpose of :func:`folded`."""
+    rows = gradient.unflatten(0, (actions, -1))
+    return torch.cat((rows.sum(0, keepdim=True), rows - rows.mean(0, keepdim=True))).flatten(0, 1)
+
+
+def forward(layers: Weights, x: Tensor) -> list[Tensor]:
+    """The input of every layer, and the output of the last."""
+    inputs = [x]
+    for number, (weight, bias) in enumerate(layers):
+        inputs.append(matrix_product(inputs[-1], weight, bias, relu=number < len(layers) - 1))
+    return inputs
+
+
+def gradients(
+    layers: Weights, noise: Sequence[Sequence[Tensor]], inputs: Sequence[Tensor], of_logits: Tensor, actions: int
+) -> list[Tensor]:
+    """Of all parameters, in the layers' order, from that of the folded head's output [B, A K]."""
+    found: list[Tensor] = []
+    behind = of_logits
+    for number in reversed(range(len(layers))):
+        of_weight, of_bias = matrix_product(behind.t(), inputs[number].t()), behind.sum(0)
+        if number == len(layers) - 1:
+            of_weight, of_bias = unfolded(of_weight, actions), unfolded(of_bias, actions)
+        drawn_in, drawn_out = noise[number]
+        found = [of_weight, of_weight * torch.outer(drawn_out, drawn_in), of_bias, of_bias * drawn_out, *found]
+        if number:
+            behind = torch.where(inputs[number] > 0, matrix_product(behind, layers[number][0].t()), 0.0)
+    return found
+
+
+def update(
+    settings: Settings,
+    support: Tensor,
+    online: list[Tensor],
+    target: list[Tensor],
+    mean: list[Tensor],
+    square: list[Tensor],
+    noise: Sequence[Sequence[Tensor]],
+    target_noise: Sequence[Sequence[Tensor]],
+    batch: Batch,
+    rate: Tensor,
+    corrections: Tensor,
+) -> Learned:
+    """Change ``online`` and Adam's moments ``mean`` and ``square`` in place by one step on ``batch``.
+
+    Args:
+        settings: fixed numbers.
+        support: of the distribution, [K].
+        online, target: parameters, four per layer.
+        mean, square: as ``online``.
+        noise, target_noise: of each layer's inputs and outputs.
+        batch: B transitions.
+        rate: learning rate, 0-dim.
+        corrections: of Adam's two moments for their start at zero, [2].
+    """
+    actions, atoms = settings.actions, settings.atoms
+    networks = []
+    for parameters, drawn in ((online, noise), (target, target_noise)):
+        layers = [composed(parameters[4 * i : 4 * i + 4], drawn[i]) for i in range(len(drawn))]
+        weight, bias = layers[-1]
+        networks.append([*layers[:-1], (folded(weight, actions), folded(bias, actions))])
+    layers, target_layers = networks
+    rows = len(batch.action)
+    inputs = forward(layers, torch.cat((batch.observation, batch.following)))
+    logits = inputs.pop().unflatten(-1, (actions, atoms))
+    best, chosen = allowed_values(logits[rows:].softmax(-1) @ support, batch.allowed).max(-1)
+    target_logits = forward(target_layers, batch.following)[-1].unflatten(-1, (actions, atoms))
+    discount = torch.pow(settings.gamma, batch.steps)
+    values = batch.reward[:, None] + (batch.alive * discount)[:, None] * support
+    wanted, clamped = projected(values, pick(target_logits, chosen).softmax(-1), support)
+    log_p = pick(logits[:rows], batch.action).log_softmax(-1)
+    loss = -(wanted * log_p).sum(-1)
+    priority = (loss - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
+
+    of_chosen = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * (batch.weight / rows)[:, None]
+    is_chosen = batch.action[:, None] == torch.arange(actions, device=support.device)
+    of_logits = torch.where(is_chosen[..., None], of_chosen[:, None, :], 0.0).flatten(1)
+    found = gradients(layers, noise, [each[:rows] for each in inputs], of_logits, actions)
+    norm = torch.stack([(each * each).sum() for each in found]).sum().sqrt()
+    scale = (settings.gradient_clip / (norm + 1e-6)).clamp_max(1.0)
+    for parameter, gradient, first, second in zip(online, found, mean, square):
+        clipped = gradient * scale
+        first.lerp_(clipped, 1.0 - _BETA_1)
+        second.mul_(_BETA_2).addcmul_(clipped, clipped, value=1.0 - _BETA_2)
+        step = first * corrections[0] / ((second * corrections[1]).sqrt() + settings.adam_eps)
+        parameter.sub_(rate * step)
+    return Learned(priority, (batch.weight * loss).mean(), best.mean(), clamped, norm)
+
+
+class UpdateGraph:
+    """The compiled update of an agent (or, without ``compile``, the same function, eager).
+
+    It works on the tensors of the agent's networks and of its optimiser.
+    """
+
+    def __init__(
+        self,
+        network: QNetwork,
+        loss: LeanDistributionalLoss,
+        optimizer: torch.optim.Adam,
+        config: RainbowConfig,
+        compile: bool = True,
+    ) -> None:
+        self.network, self.target, self.optimizer = network, loss.target_network, optimizer
+        own, eps = network.config, optimizer.param_groups[0]["eps"]
+        self.settings = Settings(own.actions, own.atoms, config.gamma, config.gradient_clip, eps)
+        self._update: Callable[..., Learned] = compiled(update) if compile else update
+
+    def __call__(self, batch: TensorDictBase, generator: torch.Generator) -> Learned:
+        """One update on ``batch`` (keys as in :class:`LeanDistributionalLoss`); noise from ``generator``."""
+        online, target = (
+            [getattr(layer, name) for layer in (*network.trunk, network.head) for name in _PARAMETERS]
+            for network in (self.network, self.target)
+        )
+        moments = [self._moments(parameter) for parameter in online]
+        torch._foreach_add_([each["step"] for each in moments], 1.0)
+        step, (group,) = float(moments[0]["step"]), self.optimizer.param_groups
+        corrections = torch.tensor([1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)])
+        noise, target_noise = (noise_of(network, generator) for network in (self.network, self.target))
+        following, action = batch.get("next"), batch.get("action")
+        allowed = following.get(keys.ACTION_MASK, None)
+        given = Batch(
+            batch.get("observation"),
+            action,
+            following.get("reward")[:, 0],
+            following.get("observation"),
+            (~following.get("terminated")[:, 0]).float(),
+            batch.get("steps_to_next_obs")[:, 0].float(),
+            batch.get("priority_weight"),
+            torch.ones((len(action), self.settings.actions), dtype=torch.bool) if allowed is None else allowed,
+        )
+        rate = torch.tensor(float(group["lr"]))
+        mean, square = ([each[name] for each in moments] for name in ("exp_avg", "exp_avg_sq"))
+        with torch.no_grad():
+            return self._update(
+                self.settings, self.network.support, [value.detach() for value in online],
+                [value.detach() for value in target], mean, square, noise, target_noise, given, rate, corrections,
+            )  # fmt: skip
+
+    def _moments(self, parameter: Tensor) -> dict[str, Any]:
+        """Adam's state of a parameter, made as Adam makes it at its first step."""
+        state = self.optimizer.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        return state

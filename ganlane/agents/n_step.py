@@ -32,16 +32,12 @@ class Step(NamedTuple):
     def copied(cls, step: TensorDictBase) -> Step:
         """The tensors of a step, copied: the environment may write into its own afterwards."""
         after = step.get("next")
-        mask = after.get(keys.ACTION_MASK, None)
-        return cls(
-            step.get("observation").clone(),
-            step.get("action").clone(),
-            after.get("reward").clone(),
-            after.get("observation").clone(),
-            after.get("terminated").clone(),
-            after.get("done").clone(),
-            None if mask is None else mask.clone(),
+        observation, action = (step.get(name).clone() for name in ("observation", "action"))
+        reward, following, terminated, done = (
+            after.get(name).clone() for name in ("reward", "observation", "terminated", "done")
         )
+        mask = after.get(keys.ACTION_MASK, None)
+        return cls(observation, action, reward, following, terminated, done, None if mask is None else mask.clone())
 
 
 class NStepWindow:
@@ -71,10 +67,8 @@ class NStepWindow:
         if len(self.steps) < self.n:
             return None
         first, *later = self.steps
-        reward, following, terminated = first.reward, first.following, first.terminated
-        mask = first.following_mask
-        length = torch.ones_like(reward)
-        running = ~first.done
+        reward, following, terminated, mask = first.reward, first.following, first.terminated, first.following_mask
+        length, running = torch.ones_like(reward), ~first.done
         for power, after in enumerate(later, start=1):
             reward = reward + running * (self.gamma**power * after.reward)
             following = torch.where(running, after.following, following)
@@ -87,9 +81,8 @@ class NStepWindow:
         end = {"observation": following, "reward": reward, "terminated": terminated}
         if mask is not None:
             end[keys.ACTION_MASK] = mask
-        rows = reward.shape[:1]
-        content = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length}
-        return TensorDict({**content, "next": TensorDict(end, rows)}, rows)
+        begin = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length}
+        return TensorDict({**begin, "next": TensorDict(end, reward.shape[:1])}, reward.shape[:1])
 
     def state_dict(self) -> dict[str, Any]:
         """The steps in the window, as plain dictionaries of tensors."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from itertools import pairwise
 from math import isfinite
 from typing import Any
@@ -26,6 +27,7 @@ from ganlane.parameters.agent import RainbowConfig
 Weights = list[tuple[Tensor, Tensor]]
 #: Largest width of a layer: a damaged file must not ask for all memory.
 LARGEST = 65536
+#: Whether there is oneDNN's linear layer, an operator that PyTorch's own compiler emits.
 _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
@@ -33,8 +35,8 @@ _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_l
 class NetworkConfig:
     """Shape and options of a :class:`QNetwork`; defaults and meaning as in :class:`RainbowConfig`.
 
-    ``observation_size`` D and ``actions`` A come from the environment. ``v_min`` and ``v_max`` bound the discounted
-    return, with ``atoms`` points between; without ``distributional`` they are ignored.
+    ``observation_size`` D and ``actions`` A come from the environment. Without ``distributional`` the support
+    (``atoms`` points from ``v_min`` to ``v_max``) is ignored.
     """
 
     observation_size: int
@@ -56,8 +58,7 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}
-        sizes |= {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
-        for name, size in sizes.items():
+        for name, size in (sizes | {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}).items():
             if not isinstance(size, int) or not 1 <= size <= LARGEST:
                 raise UserError(f"network {name}={size!r}: expected a whole number from 1 to {LARGEST}.")
         for name in ("noisy", "dueling", "distributional"):
@@ -85,16 +86,11 @@ class QNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
+        layer = partial(NoisyLinear, std_init=config.noisy_sigma) if config.noisy else nn.Linear
         widths = (config.observation_size, *config.hidden)
-        self.trunk = nn.ModuleList(self._linear(*pair) for pair in pairwise(widths))
-        rows = config.actions + int(config.dueling)
-        self.head = self._linear(widths[-1], rows * config.outputs)
+        self.trunk = nn.ModuleList(layer(*pair) for pair in pairwise(widths))
+        self.head = layer(widths[-1], (config.actions + config.dueling) * config.outputs)
         self.register_buffer("support", torch.linspace(config.v_min, config.v_max, config.atoms), persistent=False)
-
-    def _linear(self, inputs: int, outputs: int) -> nn.Linear:
-        if self.config.noisy:
-            return NoisyLinear(inputs, outputs, std_init=self.config.noisy_sigma)
-        return nn.Linear(inputs, outputs)
 
     def weights(self) -> Weights:
         """Weight and bias of every layer, the head last, with the present noise added."""
@@ -115,19 +111,20 @@ class QNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """What TorchRL's actors and losses expect: log-probabilities [*, atoms, A], or values [*, A]."""
         logits = self.logits(observation)
-        if self.config.distributional:
-            return logits.log_softmax(-1).transpose(-1, -2)
-        return logits.squeeze(-1)
+        return logits.log_softmax(-1).transpose(-1, -2) if self.config.distributional else logits.squeeze(-1)
 
     def expected(self, logits: Tensor) -> Tensor:
         """Action values [*, A] of the ``logits`` [*, A, atoms]."""
-        if self.config.distributional:
-            return logits.softmax(-1) @ self.support
-        return logits.squeeze(-1)
+        return logits.softmax(-1) @ self.support if self.config.distributional else logits.squeeze(-1)
 
     def values(self, observation: Tensor) -> Tensor:
         """Action values [*, A]: expected discounted returns."""
         return self.expected(self.logits(observation))
+
+
+def allowed_values(values: Tensor, mask: Tensor | None) -> Tensor:
+    """Action values [*, A] with minus infinity where ``mask`` [*, A] forbids; unchanged without a mask."""
+    return values if mask is None else values.masked_fill(~mask, -torch.inf)
 
 
 def duel(rows: Tensor) -> Tensor:
@@ -149,8 +146,7 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
         UserError: names or shapes differ.
     """
     own = dict(network.named_parameters())
-    shapes = {name: tuple(value.shape) for name, value in own.items()}
-    given = {name: tuple(value.shape) for name, value in weights.items()}
+    shapes, given = ({name: tuple(value.shape) for name, value in each.items()} for each in (own, weights))
     if shapes != given:
         name = min(name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name))
         raise UserError(
@@ -188,14 +184,12 @@ def noisy_layers(network: nn.Module) -> list[NoisyLinear]:
     return [layer for layer in network.modules() if isinstance(layer, NoisyLinear)]
 
 
-# A linear layer that goes through oneDNN on a CPU. PyTorch sends float32 products to MKL, which uses half the vector
-# width on AMD processors; oneDNN computes the same in full precision in half the time there, and in no more time
-# elsewhere. The operator is one that PyTorch's own compiler emits; where it is missing, and on every other device or
-# type, `linear` is `torch.nn.functional.linear`.
-
-
 def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
-    """``x @ weight.T + bias`` for ``x`` [*, I], ``weight`` [O, I] and ``bias`` [O]; then a ReLU, if asked for."""
+    """``x @ weight.T + bias`` for ``x`` [*, I], ``weight`` [O, I] and ``bias`` [O]; then a ReLU, if asked for.
+
+    By oneDNN on a CPU: PyTorch sends float32 products to MKL, which uses half the vector width on AMD processors;
+    oneDNN computes the same in full precision in half the time there, and in no more time elsewhere.
+    """
     fast = _ONEDNN and x.device.type == "cpu" and x.dtype == torch.float32 and x.dim() == 2
     if fast and not torch.is_grad_enabled():
         return _product(x, weight, bias, relu)

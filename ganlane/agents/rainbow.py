@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from ganlane.agents.loss import make_loss
+from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, LegalActions
+from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, Learned, UpdateGraph
 from ganlane.agents.n_step import NStepWindow
 from ganlane.agents.network import (
     NetworkConfig,
@@ -20,9 +21,7 @@ from ganlane.agents.network import (
     parameters_of,
     redraw_noise,
 )
-from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, LegalActions
 from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
-from ganlane.agents.update_graph import UpdateGraph, can_graph
 from ganlane.errors import ParameterError, UserError
 from ganlane.parameters.agent import RainbowConfig, without_removed
 
@@ -38,9 +37,9 @@ class Rainbow:
         actions: A.
         seed: of weights, noise, random actions and replay.
         device: of everything.
-        legal: legal actions for random exploration, see :class:`~ganlane.agents.policy.ExploringPolicy`.
-        compile: whether an update runs as one compiled graph (:mod:`ganlane.agents.update_graph`), where that can do
-            what ``config`` says; the same up to rounding, and faster on a CPU.
+        legal: legal actions for random exploration, see :class:`~ganlane.agents.drivers.ExploringPolicy`.
+        compile: whether an update runs as one compiled graph (:class:`ganlane.agents.loss.UpdateGraph`), where that
+            can do what ``config`` says; the same up to rounding, and faster on a CPU.
     """
 
     def __init__(
@@ -67,7 +66,11 @@ class Rainbow:
             torch.default_generator.manual_seed(seed)
             network = QNetwork(NetworkConfig.of(config, observation_size, actions))
         self.network = network.to(self.device)
-        self.loss = make_loss(self.network, config)
+        self.loss = (
+            LeanDistributionalLoss(self.network, config.gamma, config.double, config.kl_priority)
+            if config.distributional
+            else LeanDQNLoss(self.network, config.gamma, config.double)
+        )
         adam_eps = 0.005 / config.batch_size if config.adam_eps is None else config.adam_eps
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=config.learning_rate, eps=adam_eps, fused=True
@@ -77,7 +80,8 @@ class Rainbow:
         self.greedy = GreedyPolicy(self.network)
         self.updates = 0
         self.graph: UpdateGraph | None = None
-        if compile and can_graph(config, self.device):
+        parts = (config.distributional, config.double, config.dueling, config.noisy, config.prioritised)
+        if compile and all(parts) and self.device.type == "cpu":
             self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
         self.anneal(0)
 
@@ -110,37 +114,28 @@ class Rainbow:
         if config.prioritised:
             self.replay.sampler.beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
         batch = draw(self.replay)
-        if self.graph is not None:
-            learned = self.graph(batch, self.generators["learn"])
+        learned = (self._descend if self.graph is None else self.graph)(batch, self.generators["learn"])
+        if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
-            self._count()
-            return {**learned._asdict(), "priority": learned.priority.mean()}
+        self.updates += 1
+        if self.updates % config.target_period == 0:
+            self.loss.update_target()
+        return {**learned._asdict(), "priority": learned.priority.mean()}
+
+    def _descend(self, batch: TensorDict, generator: torch.Generator) -> Learned:
+        """What :class:`~ganlane.agents.loss.UpdateGraph` does, for every ``config`` and device."""
         for module in (self.network, self.loss.target_network):
-            redraw_noise(module, self.generators["learn"])
+            redraw_noise(module, generator)
         terms = self.loss(batch)
         weight = batch.get("priority_weight", None)
         # Rainbow's mean of w * loss; TorchRL's own 'mean' divides by the sum of the weights.
         objective = (terms["loss"] if weight is None else weight * terms["loss"]).mean()
         self.optimizer.zero_grad(set_to_none=True)
         objective.backward()
-        gradient_norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip)
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
-        if config.prioritised:
-            self.replay.sampler.update_priority(batch.get("index"), batch.get("td_error"))
-        self._count()
-        return {
-            "loss": objective.detach(),
-            "mean_q": terms["mean_q"],
-            "clamped_fraction": terms["clamped_fraction"],
-            "priority": batch.get("td_error").mean(),
-            "gradient_norm": gradient_norm,
-        }
-
-    def _count(self) -> None:
-        """One update more; now and then the target follows."""
-        self.updates += 1
-        if self.updates % self.config.target_period == 0:
-            self.loss.update_target()
+        priority = batch.get("td_error")[:, 0]
+        return Learned(priority, objective.detach(), terms["mean_q"], terms["clamped_fraction"], norm)
 
     def sigma(self) -> Tensor:
         """Mean absolute noise parameter over the weights of the noisy layers, 0-dim; 0 without noise."""

@@ -35,10 +35,10 @@ ROW = 64
 def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDictReplayBuffer:
     """The replay buffer that ``config`` asks for, on the generator's device; ``sample()`` draws a batch."""
     capacity, device = config.capacity, generator.device
-    sampler = RowSampler(capacity, config.alpha, config.beta_start, device=device) if config.prioritised else None
+    prioritised = config.prioritised
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
-        sampler=sampler or RandomSampler(),
+        sampler=RowSampler(capacity, config.alpha, config.beta_start, device) if prioritised else RandomSampler(),
         batch_size=config.batch_size,
         generator=generator,
         priority_key="td_error",
@@ -60,38 +60,34 @@ def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
     """The transitions in use (tensors by dotted key), the place of the next one, the sampler: plain data."""
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
-    stored = [key for key in (*TRANSITION_KEYS, MASK_KEY) if rows.get(key, None) is not None]
-    tensors = {key if isinstance(key, str) else ".".join(key): rows.get(key) for key in stored}
+    tensors = dict(rows.select(*TRANSITION_KEYS, MASK_KEY, strict=False).flatten_keys(".").items())
     if len(buffer) < buffer.storage.max_size:  # a view would be saved with all of the storage behind it
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
-    state = {"rows": tensors, "cursor": buffer.writer._cursor, "sampler": buffer.sampler.state_dict()}
-    return {**state, "writes": buffer.write_count}
+    writer = {"cursor": buffer.writer._cursor, "writes": buffer.write_count}
+    return {"rows": tensors, **writer, "sampler": buffer.sampler.state_dict()}
 
 
 def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> None:
     """Restore :func:`replay_state` into a buffer of the same capacity."""
     buffer.empty()
     if state["rows"]:
-        rows = {tuple(name.split(".")): tensor for name, tensor in state["rows"].items()}
-        buffer.extend(TensorDict(rows, batch_size=[len(state["rows"]["action"])]))
+        buffer.extend(TensorDict(state["rows"], [len(state["rows"]["action"])]).unflatten_keys("."))
     buffer.writer._cursor = state["cursor"]
     buffer.writer._write_count = state["writes"]
     buffer.sampler.load_state_dict(state["sampler"])
 
 
 class RowSampler(PrioritizedSampler):
-    """Draws item i with probability ``(p_i + eps)^alpha / sum``; weights ``(P_i N)^-beta`` over the batch's largest.
+    """Draws item i with probability ``(p_i + 1e-8)^alpha / sum``; weights ``(P_i N)^-beta`` over the batch's largest.
 
     As in Dopamine, the largest weight is the batch's: the one of the whole buffer belongs to an outlier that is
     hardly ever drawn, and would shrink every step. New items get the largest priority seen. Draws come from the
     generator of the replay buffer (``generator=`` at its construction) and from no other.
     """
 
-    def __init__(
-        self, max_capacity: int, alpha: float, beta: float, eps: float = 1e-8, device: torch.device | None = None
-    ) -> None:
+    def __init__(self, max_capacity: int, alpha: float, beta: float, device: torch.device) -> None:
         # Not the parent's constructor: it warns of the missing C++ extension, which is not needed here.
-        self._max_capacity, self._alpha, self._beta, self._eps = max_capacity, alpha, beta, eps
+        self._max_capacity, self._alpha, self._beta, self._eps = max_capacity, alpha, beta, 1e-8
         self._device, self.dtype, self.reduction = device, torch.float32, "max"
         self._max_priority_within_buffer = False
         self._init()

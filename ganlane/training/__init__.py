@@ -2,9 +2,8 @@
 
 :mod:`~ganlane.training.loop` is the algorithm; read it first. :mod:`~ganlane.training.phases` makes of a config what
 it works on, :mod:`~ganlane.training.collectors` and :mod:`~ganlane.training.workers` step the environments,
-:mod:`~ganlane.training.stats` sums up what happens, :mod:`~ganlane.training.logs` writes and shows it,
-:mod:`~ganlane.training.checkpoint` saves and resumes it, and :mod:`~ganlane.training.signals` turns Ctrl-C
-into a clean end.
+:mod:`~ganlane.training.stats` sums up what happens, :mod:`~ganlane.training.logs` writes and shows it, and
+:mod:`~ganlane.training.checkpoint` saves and resumes it.
 """
 
 from ganlane.training.checkpoint import TrainingState

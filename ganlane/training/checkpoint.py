@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import mmap
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ganlane.agents import Rainbow, save_agent
+from ganlane import keys
+from ganlane.agents import NetworkConfig, Rainbow, save_agent
+from ganlane.agents.n_step import Step
+from ganlane.agents.replay import MASK_KEY, ROW
 from ganlane.config.runs import LAST
 from ganlane.errors import UserError
 from ganlane.files import atomic_path, has_checksum, note_without_checksum, seal_archive
 from ganlane.training.collectors import Collector, SingleCollector
-from ganlane.training.parts import check_parts
 from ganlane.training.stats import EpisodeStats
 
 KIND = "ganlane training checkpoint"
@@ -31,6 +35,10 @@ COMPUTED_BY = ("env.compile",)
 PATIENCE = 50.0
 #: Parts of a checkpoint in which every number must be finite.
 FINITE = ("network", "target", "optimizer", "replay", "window", "stats")
+#: Upper bound of the decisions, updates and rows of a run.
+MOST = 2**53
+#: Name of the action masks in the rows of the replay buffer, if there are masks.
+MASK = ".".join(MASK_KEY)
 
 
 class TrainingState:
@@ -69,17 +77,13 @@ class TrainingState:
         resumed run starts the next episodes and is not bit-exact. The same holds for collectors that are not exact.
         """
         exact = with_replay and self.collector.exact
+        counters = ("decisions", "pending_decisions", "wall_s", "best")
         return {
             "agent": self.agent.state_dict(with_replay),
             "window": self.window.state_dict() if exact else None,
             "env_state": self.collector.state_dict(exact),
             "stats": self.stats.state_dict() if exact else None,
-            "counters": {
-                "decisions": self.decisions,
-                "pending_decisions": self.pending_decisions,
-                "wall_s": self.wall_s,
-                "best": self.best,
-            },
+            "counters": {name: getattr(self, name) for name in counters},
             "identity": self.identity,
         }
 
@@ -98,9 +102,15 @@ class TrainingState:
             raise UserError(f"resume={path}: parts of the run are missing in it; give another checkpoint.")
         if not isinstance(state["identity"], dict):
             raise UserError(f"resume={path}: it does not say what run it is of; give another checkpoint.")
-        self._refuse_another_run(path, state["identity"])
+        before, now = (flat({**self.defaults, **flat(each)}) for each in (state["identity"], self.identity))
+        for name in (*now, *before):
+            if name not in COMPUTED_BY and before.get(name) != now.get(name):
+                raise UserError(
+                    f"resume={path}: {name}={now.get(name)}, but the run was started with {before.get(name)}; "
+                    "go on with that, or start a new run."
+                )
         try:
-            missing = self._take_over(state, path)
+            return self._take_over(state, path)
         except UserError:
             raise
         except Exception as error:  # damaged parts can fail in any way
@@ -108,7 +118,6 @@ class TrainingState:
             raise UserError(
                 f"resume={path}: a part of the run is damaged in it ({reason}); give another checkpoint."
             ) from error
-        return missing
 
     def _take_over(self, state: Mapping[str, Any], path: str | Path) -> str | None:
         """Restore everything from ``state``; see :meth:`restore`."""
@@ -132,26 +141,12 @@ class TrainingState:
             return "the replay buffer: it is filled again before the next update"
         return None if exact else "the episodes that were under way: the workers begin the next ones"
 
-    def _refuse_another_run(self, path: str | Path, saved: Mapping[str, Any]) -> None:
-        """Raise :class:`UserError` unless ``saved`` is the identity of this run."""
-        before, now = (flat({**self.defaults, **flat(each)}) for each in (saved, self.identity))
-        for name in (*now, *before):
-            if name not in COMPUTED_BY and before.get(name) != now.get(name):
-                raise UserError(
-                    f"resume={path}: {name}={now.get(name)}, but the run was started with {before.get(name)}; "
-                    "go on with that, or start a new run."
-                )
-
 
 class Checkpointer:
     """Writes ``checkpoints/last.pt`` (to resume), ``last.safetensors`` and ``best.safetensors`` (to drive).
 
-    Args:
-        state: to be saved.
-        folder: of the run.
-        every_s: least seconds between two checkpoints.
-        with_replay: save the replay buffer too.
-        metadata: for the agent's files; the progress of the training is added under ``training``.
+    ``every_s`` are the least seconds between two checkpoints. To the ``metadata`` of the agent's files the progress
+    of the training is added, under ``training``.
     """
 
     def __init__(
@@ -191,12 +186,8 @@ def save_checkpoint(path: str | Path, state: Any) -> None:
 def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: str = "resume") -> Any:
     """Read a file of :func:`save_checkpoint`, with present names; never executes code.
 
-    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`).
-
-    Args:
-        path: of the file.
-        device: for its tensors.
-        key: the configuration key of ``path``, for error messages.
+    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`). ``key`` is the
+    configuration key of ``path``, for error messages.
 
     Raises:
         UserError: the file is absent, damaged in any byte, holds weights that are not finite, or is no training
@@ -224,20 +215,20 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
     agent = state.get("agent") if isinstance(state, dict) else None
     parts = {**state, **agent} if isinstance(agent, dict) else {}
     for name in FINITE:
-        if not all(tensor.isfinite().all() for tensor in _tensors(parts.get(name))):
+        if not _finite(parts.get(name)):
             raise UserError(f"{given}: numbers of its {name} are not finite; give a checkpoint of another run.")
     if not whole:
         note_without_checksum(given)
     return state
 
 
-def _tensors(state: Any) -> Iterator[torch.Tensor]:
-    """All tensors in nested plain data."""
-    if isinstance(state, torch.Tensor):
-        yield state
-    elif isinstance(state, dict | list | tuple):
-        for value in state.values() if isinstance(state, dict) else state:
-            yield from _tensors(value)
+def _finite(state: Any) -> bool:
+    """Whether all numbers in the tensors of nested plain data are finite."""
+    if isinstance(state, Tensor):
+        return bool(state.isfinite().all())
+    if isinstance(state, dict):
+        return all(map(_finite, state.values()))
+    return not isinstance(state, list | tuple) or all(map(_finite, state))
 
 
 def _renamed(names: Any) -> Any:
@@ -253,3 +244,112 @@ def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
         else:
             names[f"{above}{name}"] = list(value) if isinstance(value, tuple) else value
     return names
+
+
+# --- parts of a checkpoint that are those of this run
+
+
+def check_parts(
+    state: Mapping[str, Any], agent: Rainbow, environments: Mapping[str, Any], stats: EpisodeStats
+) -> None:
+    """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run, before it is used.
+
+    A damaged part would do harm later: Adam writes beyond moments that are too short, and a replay buffer that
+    samples rows it does not hold returns arbitrary memory.
+
+    ``agent`` has Adam's moments from the checkpoint already; ``environments`` (their state) and ``stats`` are those
+    of the new run.
+
+    Raises:
+        ValueError: a part has another structure, shape or type, or impossible numbers.
+        TypeError, KeyError, AttributeError: a part has another type altogether.
+    """
+    network, counters, replay = agent.network.config, state["counters"], state["agent"]["replay"]
+    moments = agent.optimizer.state_dict()["state"]
+    adam = {
+        row: {"step": torch.zeros(()), "exp_avg": value, "exp_avg_sq": value}
+        for row, value in enumerate(agent.network.parameters())
+    }
+    check_like(moments, adam if moments else {}, "optimizer")
+    check_like(state["agent"]["updates"], 0, "updates")
+    best = None if counters["best"] is None else 0.0
+    check_like(counters, {"decisions": 0, "pending_decisions": 0, "wall_s": 0.0, "best": best}, "counters")
+    if replay is not None:
+        _check_replay(replay, agent)
+    if state["window"] is None:  # the resumed run will not be exact
+        return
+    check_like(state["env_state"], environments, "env_state")
+    mask = environments["items"].get(keys.ACTION_MASK)
+    if replay["rows"] and (MASK in replay["rows"]) != (mask is not None):
+        raise ValueError("replay: its masks are those of another run")
+    rows, steps = transitions(len(stats.returns), network), state["window"]["steps"]
+    observation, end = rows["observation"], rows["next.terminated"]
+    step = Step(observation, rows["action"], rows["next.reward"], observation, end, end, mask)._asdict()
+    check_like(steps, [step] * min(len(steps), agent.config.n_step - 1), "window")
+    for step in steps:
+        _check_actions(step["action"], network)
+    saved, one = state["stats"], torch.zeros((), dtype=torch.float64)
+    sums = {name: one.expand(len(stats.actions)) if name == "actions" else one for name in saved["sums"]}
+    updates = dict.fromkeys(saved["updates"], torch.zeros(()))
+    check_like(saved, {**stats.state_dict(), "sums": sums, "updates": updates}, "stats")
+    if updates and saved["update_count"] == 0:
+        raise ValueError("stats: sums over no update")
+
+
+def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
+    rows, cursor, config = replay["rows"], replay["cursor"], agent.config
+    count = len(rows["action"]) if rows else 0
+    check_like(replay, {"cursor": 0, "writes": 0}, "replay")
+    if rows:
+        like = transitions(count, agent.network.config)
+        check_like(rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay")
+        _check_actions(rows["action"], agent.network.config)
+        steps = rows["steps_to_next_obs"]
+        if ((steps < 1) | (steps > config.n_step)).any():
+            raise ValueError("replay: transitions of more steps than the run's")
+    if not (cursor == count < config.capacity or cursor < count == config.capacity):
+        raise ValueError(f"replay: {count} rows of {config.capacity}, the next one is {cursor}")
+    if config.prioritised:
+        own = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
+        expected: dict[str, Any] = {"priorities": own.float(), "largest": torch.zeros(()), "beta": 0.0}
+        check_like(replay["sampler"], expected, "replay.sampler")
+        if not torch.equal(replay["sampler"]["priorities"] > 0, own):
+            raise ValueError("replay: priorities of rows that do not exist")
+
+
+def _check_actions(taken: Tensor, network: NetworkConfig) -> None:
+    if ((taken < 0) | (taken >= network.actions)).any():
+        raise ValueError("actions out of range")
+
+
+def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
+    """Shapes and types of the rows of the replay buffer as meta tensors, by dotted key."""
+    number = torch.empty(rows, 1, device="meta")
+    observation = number.expand(rows, network.observation_size)
+    after = {"next.observation": observation, "next.reward": number, "next.terminated": number.bool()}
+    after[MASK] = number.expand(rows, network.actions).bool()
+    return {"observation": observation, "action": number[:, 0].long(), "steps_to_next_obs": number, **after}
+
+
+def check_like(found: Any, like: Any, name: str) -> None:
+    """Raise :class:`ValueError` unless ``found`` has at least the keys of ``like``, its lengths, shapes and types.
+
+    Numbers outside tensors must be finite, counts at least 0.
+    """
+    if isinstance(like, Tensor):
+        fits = isinstance(found, Tensor) and (found.shape, found.dtype) == (like.shape, like.dtype)
+    elif isinstance(like, dict):
+        fits = isinstance(found, dict) and found.keys() >= like.keys()
+    elif isinstance(like, list):
+        fits = isinstance(found, list) and len(found) == len(like)
+    elif isinstance(like, int):
+        fits = type(found) is int and 0 <= found < MOST
+    elif isinstance(like, float):
+        fits = type(found) in (int, float) and isfinite(found)
+    else:
+        fits = found is like
+    if not fits:
+        raise ValueError(f"{name} cannot be of this run")
+    if isinstance(like, dict | list):
+        for key in like if isinstance(like, dict) else range(len(like)):
+            check_like(found[key], like[key], f"{name}.{key}")

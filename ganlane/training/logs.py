@@ -6,6 +6,7 @@ import csv
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from time import monotonic
 from typing import Any, Protocol, TextIO
@@ -52,7 +53,7 @@ class Logs:
         actions: A, for the columns of their shares.
         decisions: already made (in a resumed run).
         total: decisions of the whole run, for the progress; None: no progress is shown.
-        further: further logs of the rows of ``metrics.csv`` and of the evaluations.
+        further: get the rows of ``metrics.csv`` and of the evaluations.
     """
 
     def __init__(
@@ -111,20 +112,20 @@ class CsvLog:
     """
 
     def __init__(self, path: str | Path, columns: Sequence[str], decisions: int = 0) -> None:
-        self.path, self.columns = Path(path), list(columns)
+        self.path = Path(path)
         rows = [row for row in read_rows(self.path) if float(row["decisions"]) <= decisions]
+        form: Any = {"fieldnames": columns, "extrasaction": "ignore", "lineterminator": "\n"}
         with atomic_path(self.path) as part, part.open("w", newline="") as file:
-            self._writer(file).writeheader()
-            self._writer(file).writerows(rows)
+            writer = csv.DictWriter(file, **form)
+            writer.writeheader()
+            writer.writerows(rows)
         self._file = self.path.open("a", newline="")
-
-    def _writer(self, file: object) -> csv.DictWriter:
-        return csv.DictWriter(file, self.columns, extrasaction="ignore", lineterminator="\n")  # type: ignore[arg-type]
+        self._writer = csv.DictWriter(self._file, **form)
 
     def write(self, row: Mapping[str, float]) -> None:
         """Append one line."""
         short = {name: format(value, ".6g") if isinstance(value, float) else value for name, value in row.items()}
-        self._writer(self._file).writerow(short)
+        self._writer.writerow(short)
         self._file.flush()
 
     def close(self) -> None:
@@ -165,12 +166,8 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 class Progress:
     """Shows decisions per second, remaining time, mean return and ends of episodes: a bar, or a line per row.
 
-    Figures that a row lacks, because no episode ended in its interval, keep their last value.
-
-    Args:
-        total: decisions of the whole run.
-        done: decisions already made (a resumed run).
-        stream: to write to (default stderr); a terminal gets the bar.
+    Figures that a row lacks, because no episode ended in its interval, keep their last value. Of the ``total``
+    decisions of the run, ``done`` have been made before. A terminal as ``stream`` (default stderr) gets the bar.
     """
 
     def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
@@ -194,21 +191,15 @@ class Progress:
             self._bar.set_postfix_str(", ".join(shown))
             return
         rate = max(row.get("decisions_per_s", 0.0), 1e-9)
-        left = max(self.total - row["decisions"], 0.0) / rate
-        head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {duration(left)} left"
+        minutes, seconds = divmod(round(max(self.total - row["decisions"], 0.0) / rate), 60)
+        left = f"{minutes // 60}:{minutes % 60:02}:{seconds:02} left"
+        head = f"{int(row['decisions']):,} of {self.total:,} decisions, {rate:,.0f}/s, {left}"
         print(", ".join([head, *shown]), file=self.stream, flush=True)
 
     def close(self) -> None:
         """Stop updating the bar and leave it on the screen."""
         if self._bar is not None:
             self._bar.close()
-
-
-def duration(seconds: float) -> str:
-    """``1:02:03`` for 3723 s."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}"
 
 
 def make_logs(options: LoggerConfig, folder: str | Path, about: Mapping[str, Any] | None = None) -> list[Log]:
@@ -224,18 +215,21 @@ def make_logs(options: LoggerConfig, folder: str | Path, about: Mapping[str, Any
     return []
 
 
+def _module(name: str, extra: str) -> Any:
+    """The module that a log needs, from the extra of that name."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise UserError(
+            f"logger={extra}: {extra} is not installed; run `pip install 'ganlane[{extra}]'` or use logger=csv."
+        ) from error
+
+
 class TensorBoardLog:
     """TensorBoard event files in ``folder`` (extra ``tensorboard``)."""
 
     def __init__(self, folder: str | Path) -> None:
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError as error:
-            raise UserError(
-                "logger=tensorboard: tensorboard is not installed; run `pip install 'ganlane[tensorboard]'` or use "
-                "logger=csv."
-            ) from error
-        self._writer = SummaryWriter(str(folder))
+        self._writer = _module("torch.utils.tensorboard", "tensorboard").SummaryWriter(str(folder))
 
     def write(self, row: Mapping[str, float]) -> None:
         """Add every figure as a scalar over the decisions."""
@@ -251,21 +245,16 @@ class TensorBoardLog:
 class WandbLog:
     """A run of Weights & Biases below ``folder/wandb`` (extra ``wandb``), named after ``folder``'s last two parts.
 
-    Offline, unless the environment variable ``WANDB_MODE`` asks for something else (``online``, ``disabled``);
-    ``wandb sync FOLDER/wandb/offline-run-*`` uploads it later. A resumed training is a new run there that starts at
-    the decisions of the checkpoint. ``about`` holds JSON-serialisable settings, shown with the figures.
+    Offline, unless the environment variable ``WANDB_MODE`` asks for something else (``online``, ``disabled``). A
+    resumed training is a new run there that starts at the decisions of the checkpoint. ``about`` holds
+    JSON-serialisable settings, shown with the figures.
 
     Raises:
         UserError: wandb is not installed, or does not start (``WANDB_MODE=online`` without an account, for instance).
     """
 
     def __init__(self, folder: str | Path, project: str = "ganlane", about: Mapping[str, Any] | None = None) -> None:
-        try:
-            import wandb
-        except ImportError as error:
-            raise UserError(
-                "logger=wandb: wandb is not installed; run `pip install 'ganlane[wandb]'` or use logger=csv."
-            ) from error
+        wandb = _module("wandb", "wandb")
         mode = os.environ.get("WANDB_MODE") or "offline"
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
@@ -18,9 +20,8 @@ from ganlane.config.train import TrainConfig
 from ganlane.errors import UserError
 from ganlane.parameters import Count, CountOrZero, NotNegative, Record
 from ganlane.training.checkpoint import Checkpointer, TrainingState
-from ganlane.training.collectors import Collector
+from ganlane.training.collectors import STOPPING, Collector
 from ganlane.training.logs import Log, Logs
-from ganlane.training.signals import StopRequest
 
 #: Evaluates the greedy policy on fixed episodes and returns its figures by name.
 Evaluate = Callable[[GreedyPolicy], Mapping[str, float]]
@@ -49,9 +50,9 @@ class TrainingConfig(Record):
 class TrainingResult:
     """Result of a run.
 
-    ``stopped_by`` is the number of the signal that stopped it early, or None (an entry
-    point raises :class:`~ganlane.config.app.Stopped` with it). ``best`` is the ``best_metric`` of the
-    best evaluation. ``checkpoint`` is the file to resume from.
+    ``stopped_by`` is the number of the signal that stopped it early, or None (an entry point raises
+    :class:`~ganlane.config.app.Stopped` with it). ``best`` is the ``best_metric`` of the best evaluation.
+    ``checkpoint`` is the file to resume from.
     """
 
     decisions: int
@@ -60,6 +61,29 @@ class TrainingResult:
     best: float | None
     stopped_by: int | None
     checkpoint: Path
+
+
+@contextmanager
+def noted_signals() -> Iterator[list[int]]:
+    """Context in which SIGINT and SIGTERM are noted in the list that it gives, instead of ending the process.
+
+    A second Ctrl-C raises KeyboardInterrupt as usual. Outside the main thread, where Python allows no handlers, the
+    context does nothing.
+    """
+    noted: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        if noted and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        noted.append(number)
+
+    here = threading.current_thread() is threading.main_thread()
+    previous = {number: signal.signal(number, note) for number in STOPPING} if here else {}
+    try:
+        yield noted
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def train(
@@ -102,8 +126,8 @@ def train(
         state.collector.open(agent)
         if state.decisions == 0:
             saver.save()  # a run that is killed at any time can be resumed
-        with StopRequest() as stop:
-            while state.decisions < config.total_decisions and stop.signal is None:
+        with noted_signals() as signals:
+            while state.decisions < config.total_decisions and not signals:
                 advance(state)
                 log.advance(state.decisions)
                 if state.passed(config.log_every):
@@ -112,32 +136,32 @@ def train(
                     keep_best(state, evaluate, config.best_metric, log, saver)
                 if saver.due():
                     saver.save()
-            if evaluate is not None and stop.signal is None and state.evaluated_at < state.decisions:
+            if evaluate is not None and not signals and state.evaluated_at < state.decisions:
                 keep_best(state, evaluate, config.best_metric, log, saver)
             saver.save()
-    return TrainingResult(state.decisions, agent.updates, state.wall_s, state.best, stop.signal, saver.path)
+    stopped_by = signals[-1] if signals else None
+    return TrainingResult(state.decisions, agent.updates, state.wall_s, state.best, stopped_by, saver.path)
 
 
 def advance(state: TrainingState) -> TensorDictBase:
-    """Make one decision of every environment, [N], store it, and make the updates that are due.
-
-    With an overlapping collector the updates due from the decisions before are made while it collects.
-    """
-    agent, overlaps = state.agent, state.collector.overlaps
-    step = collect(state, partial(learn, state) if overlaps else None)
-    agent.store(state.window.push(step))
-    if not overlaps:
+    """Make one decision of every environment, [N], store it, and make the updates that are due."""
+    step = collect(state)
+    state.agent.store(state.window.push(step))
+    if not state.collector.overlaps:
         learn(state)
     return step
 
 
-def collect(state: TrainingState, meanwhile: Callable[[], None] | None = None) -> TensorDictBase:
-    """One decision of every environment, batch [N]; ``meanwhile`` is called while the environments step."""
+def collect(state: TrainingState) -> TensorDictBase:
+    """One decision of every environment, batch [N].
+
+    With an overlapping collector the updates due from the decisions before are made meanwhile.
+    """
     agent, collector = state.agent, state.collector
     agent.anneal(state.decisions)
     collector.begin(agent)
-    if meanwhile is not None:
-        meanwhile()
+    if collector.overlaps:
+        learn(state)
     with torch.no_grad():
         step = collector.step(agent)
         state.decisions += state.environments

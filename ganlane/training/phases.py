@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,7 @@ import polars as pl
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ganlane.agents import (
-    GreedyPolicy,
-    NetworkConfig,
-    Rainbow,
-    RainbowConfig,
-    read_agent,
-    save_agent,
-    warm_start,
-)
+from ganlane.agents import GreedyPolicy, NetworkConfig, Rainbow, RainbowConfig, read_agent, save_agent, warm_start
 from ganlane.agents.checkpoint import SHIPPED, SUPPORT
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
@@ -43,11 +35,10 @@ from ganlane.runtime import keep_freed_memory
 from ganlane.sim.random import Stream
 from ganlane.torch_settings import set_threads
 from ganlane.training.checkpoint import DEFAULTS, LAST, flat, load_checkpoint
-from ganlane.training.collectors import Collector, SingleCollector
+from ganlane.training.collectors import Collector, OverlapCollector, SingleCollector
 from ganlane.training.logs import make_logs
 from ganlane.training.loop import Evaluate, TrainingConfig, TrainingResult, train
-from ganlane.training.overlap import OverlapCollector
-from ganlane.training.workers import MakeEnv, ProcessCollector
+from ganlane.training.workers import ClusterCollector, ProcessCollector
 from ganlane.transforms import observation_size
 
 #: File of the trained agent in the folder of its phase; it exists once the phase is finished.
@@ -99,10 +90,7 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
 def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = None) -> TrainingResult:
     """Train the agent of one phase and write its :data:`AGENT_FILE`, unless a signal stopped it early.
 
-    Args:
-        config: of the whole run.
-        phase: the phase to train.
-        resume: checkpoint to continue from.
+    ``config`` is that of the whole run, ``resume`` a checkpoint to continue from.
 
     Raises:
         UserError: the agent to start from, the weights of the traffic or the checkpoint do not fit.
@@ -151,29 +139,15 @@ def make_collector(config: TrainConfig, phase: Phase) -> Collector:
     if isinstance(collector, OverlapCollectorConfig):
         return OverlapCollector(make_worker_env, collector.workers, collector.num_envs)
     if isinstance(collector, RayCollectorConfig):
-        return cluster_collector(make_worker_env, collector)
+        return ClusterCollector(make_worker_env, collector)
     return ProcessCollector(make_worker_env, collector)
-
-
-def cluster_collector(make_worker_env: MakeEnv, config: RayCollectorConfig) -> Collector:
-    """``collector=ray``.
-
-    Raises:
-        UserError: Ray is not installed.
-    """
-    try:
-        from ganlane.training.cluster import ClusterCollector
-    except ModuleNotFoundError as error:
-        raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
-    return ClusterCollector(make_worker_env, config)
 
 
 def training_env(
     config: TrainConfig, phase: Phase, rows: int, first_episode: int = 0, device: str = "cpu"
 ) -> EnvBase:
     """``rows`` environments of the training stream; row i begins with episode ``first_episode + i``."""
-    traffic = make_traffic(phase.traffic, config.env, Stream.TRAIN)
-    parts = (traffic, config.env, config.observation, config.reward)
+    parts = (make_traffic(phase.traffic, config.env, Stream.TRAIN), config.env, config.observation, config.reward)
     return make_env(*parts, rows, config.seed, device, first_episode, config.mask)
 
 
@@ -186,30 +160,24 @@ def worker_env(config: TrainConfig, phase: Phase, rows: int, first_episode: int)
 
 def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
     """A function that evaluates the greedy policy on the selection stream, whose episodes are never trained on."""
-    traffic = make_traffic(phase.traffic, config.env, Stream.SELECT)
-    rows = min(config.selection_episodes, config.evaluation.num_envs)
-    parts = (traffic, config.env, config.observation, config.reward)
+    parts = (make_traffic(phase.traffic, config.env, Stream.SELECT), config.env, config.observation, config.reward)
     make = partial(make_env, *parts, seed=config.seed, device=config.device, mask=config.mask)
-    env, smaller = make(rows), None if config.env.compile else make
+    env = make(min(config.selection_episodes, config.evaluation.num_envs))
+    smaller = None if config.env.compile else make
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
         table = run_episodes(env, policy, range(config.selection_episodes), config.seed, make_smaller=smaller)
-        return selection_figures(table)
+        total = table.select("reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash").sum()
+        reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
+        spread = float(np.std(table["reward"].to_numpy()))
+        return {
+            "mean_reward": reward / table.height,
+            "standard_error": spread / math.sqrt(table.height),
+            "crash_rate": crashes / table.height,
+            "lane_changes_per_km": 1000.0 * changes / max(distance_m, 1.0),
+        }
 
     return evaluate
-
-
-def selection_figures(table: pl.DataFrame) -> dict[str, float]:
-    """Mean reward, its standard error, crash rate and lane changes per km of ``table``, one episode per row."""
-    total = table.select("reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash").sum()
-    reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
-    spread = float(np.std(table["reward"].to_numpy()))
-    return {
-        "mean_reward": reward / table.height,
-        "standard_error": spread / math.sqrt(table.height),
-        "crash_rate": crashes / table.height,
-        "lane_changes_per_km": 1000.0 * changes / max(distance_m, 1.0),
-    }
 
 
 # --- the agent
@@ -229,10 +197,8 @@ class Start:
 def read_start(name: str, key: str = "init.path") -> Start:
     """Read the agent of ``init.path``.
 
-    Args:
-        name: a shipped agent or a ``.safetensors`` file; or a training run's folder or its ``last.pt``, for the agent
-            as the run last saved it, with its moments.
-        key: the configuration key of ``name``, for error messages.
+    ``name`` is a shipped agent or a ``.safetensors`` file; or a training run's folder or its ``last.pt``, for the
+    agent as the run last saved it, with its moments. ``key`` is its configuration key, for error messages.
 
     Raises:
         UserError: the file is missing or cannot be read.
@@ -280,17 +246,18 @@ def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | N
     Raises:
         UserError: the agent to start from does not fit.
     """
-    if phase.init is None:
+    adopts, resumed = config.init.support == "trained", resume is not None
+    if phase.init is None or (resumed and not adopts):
         return config, make_agent(config, phase)
-    if resume is not None:
-        if config.init.support == "trained":
-            config = with_support(config, read_start(str(resume), "resume"))
-        return config, make_agent(config, phase)
-    start = read_start(phase.init)
-    check_observation(start, config)
-    if config.init.support == "trained":
-        config = with_support(config, start)
+    start = read_start(str(resume), "resume") if resumed else read_start(phase.init)
+    if not resumed:
+        check_observation(start, config)
+    if adopts:
+        support = {name: getattr(start.network, name) for name in SUPPORT}
+        config = replace(config, agent=replace(config.agent, **support))
     agent = make_agent(config, phase)
+    if resumed:
+        return config, agent
     # A second phase starts from the best agent of the first, of which Adam's moments are not saved.
     with_moments = config.init.optimizer and phase.init == config.init.path
     if with_moments and not start.moments:
@@ -300,12 +267,6 @@ def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | N
         )
     warm_start(agent, start.name, start.weights, start.network, start.moments if with_moments else None)
     return config, agent
-
-
-def with_support(config: TrainConfig, start: Start) -> TrainConfig:
-    """``config`` with the atoms, v_min and v_max of ``start``."""
-    support = {name: getattr(start.network, name) for name in SUPPORT}
-    return replace(config, agent=replace(config.agent, **support))
 
 
 def check_observation(start: Start, config: TrainConfig) -> None:
@@ -341,8 +302,8 @@ def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: 
 
 def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     """The settings that a resumed run must share with the run that was stopped."""
-    parts = {"env": config.env, "reward": config.reward, "collector": config.collector}
-    defaults = {f"{name}.{key}": value for name, part in parts.items() for key, value in defaults_of(part).items()}
+    parts: dict[str, Any] = {"env": config.env, "reward": config.reward, "collector": config.collector}
+    defaults = flat({name: asdict(type(part)()) for name, part in parts.items()})
     collector = {name: value for name, value in asdict(config.collector).items() if name != "address"}
     if isinstance(config.collector, OverlapCollectorConfig):
         collector["overlaps"] = True  # ``multi`` has the same options but updates at other times
@@ -381,15 +342,3 @@ def describe(config: TrainConfig, phase: Phase) -> dict[str, Any]:
             "traffic": phase.traffic.description(),
         },
     }
-
-
-def defaults_of(config: Any) -> dict[str, Any]:
-    """Default of every field of a dataclass by dotted name, nested dataclasses included."""
-    defaults: dict[str, Any] = {}
-    for each in fields(config):
-        default = each.default if each.default_factory is MISSING else each.default_factory()
-        if is_dataclass(default):
-            defaults |= {f"{each.name}.{name}": value for name, value in defaults_of(default).items()}
-        elif default is not MISSING:
-            defaults[each.name] = list(default) if isinstance(default, tuple) else default
-    return defaults

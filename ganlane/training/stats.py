@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -53,7 +54,7 @@ class EpisodeStats:
 
     @torch.no_grad()
     def step(self, step: TensorDictBase) -> None:
-        """Add one step of the environments, batch [N]."""
+        """Add one step of the environments, batch [N]; the episodes that end are summed up."""
         after = step.get("next")
         reward, done = after.get("reward").squeeze(-1), after.get("done").squeeze(-1)
         self.returns += reward
@@ -65,13 +66,9 @@ class EpisodeStats:
         chosen = step.get(keys.CHOSEN_VALUE, None)
         if chosen is not None:
             self.values += chosen.reshape(-1)
-        self._finish(after, done, chosen is not None)
         self._add("actions", (step.get(keys.ACTION)[:, None] == self.actions).sum(0))
-
-    def _finish(self, after: TensorDictBase, done: Tensor, has_values: bool) -> None:
-        """Add the episodes that ended and reset their sums."""
         self._add("episodes", done.sum())
-        for name in RUNNING if has_values else RUNNING[:-1]:
+        for name in RUNNING if chosen is not None else RUNNING[:-1]:
             self._add(name, (getattr(self, name) * done).sum())
         events, ego = after.get(keys.EVENTS, {}), after.get(keys.EGO, None)
         for name in RATES.keys() & events.keys():
@@ -88,11 +85,10 @@ class EpisodeStats:
         """Add the 0-dim ``metrics`` of one update."""
         self.update_count += 1
         for name, value in metrics.items():
-            self.updates[name] = self.updates[name] + value if name in self.updates else value
+            self.updates[name] = self.updates.get(name, 0.0) + value
 
     def _add(self, name: str, value: Tensor) -> None:
-        value = value.double()
-        self.sums[name] = self.sums[name] + value if name in self.sums else value
+        self.sums[name] = self.sums.get(name, 0.0) + value.double()
 
     def read(self) -> dict[str, float]:
         """Means since the last call, without those over no episode or no update; resets the sums."""
@@ -101,37 +97,26 @@ class EpisodeStats:
         shares = sums.pop("actions", [])
         row |= {f"action_{i}_share": share / max(sum(shares), 1) for i, share in enumerate(shares)}
         self.sums, self.updates, self.update_count = {}, {}, 0
-        return row | _per_episode(sums)
+        episodes = sums.get("episodes", 0.0)
+        row["episodes"] = episodes
+        if episodes == 0.0:
+            return row
+        row |= {"mean_return": sums["returns"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
+        decisions = max(sums["lengths"], 1.0)
+        row["mean_return_to_go"] = sums["to_go"] / decisions
+        if "values" in sums:
+            row["mean_value"] = sums["values"] / decisions
+        row |= {column: sums[name] / episodes for name, column in RATES.items() if name in sums}
+        if sums.get("distance", 0.0) > 0.0:
+            row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]
+        return row
 
     def state_dict(self) -> dict[str, Any]:
         """Sums of the running episodes and of the current interval."""
         names = (*RUNNING, "discount", "weight", "sums", "updates", "update_count")
-        return {name: _copy(getattr(self, name)) for name in names}
+        return {name: deepcopy(getattr(self, name)) for name in names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
         for name, value in state.items():
-            setattr(self, name, _copy(value))
-
-
-def _per_episode(sums: dict[str, float]) -> dict[str, float]:
-    """Means and rates over the finished episodes."""
-    episodes = sums.get("episodes", 0.0)
-    row = {"episodes": episodes}
-    if episodes == 0.0:
-        return row
-    row |= {"mean_return": sums["returns"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
-    decisions = max(sums["lengths"], 1.0)
-    row["mean_return_to_go"] = sums["to_go"] / decisions
-    if "values" in sums:
-        row["mean_value"] = sums["values"] / decisions
-    row |= {column: sums[name] / episodes for name, column in RATES.items() if name in sums}
-    if sums.get("distance", 0.0) > 0.0:
-        row["lane_changes_per_km"] = 1000.0 * sums["lane_changes"] / sums["distance"]
-    return row
-
-
-def _copy(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        return value.clone()
-    return {name: tensor.clone() for name, tensor in value.items()} if isinstance(value, dict) else value
+            setattr(self, name, deepcopy(value))

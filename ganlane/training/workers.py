@@ -1,12 +1,14 @@
-"""``collector=multi``: TorchRL's collectors in worker processes; batches are returned step by step."""
+"""``collector=multi`` and ``collector=ray``: TorchRL's collectors; their batches are returned step by step."""
 
 from __future__ import annotations
 
 import socket
+import sys
+import warnings
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -15,27 +17,27 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import BaseCollector, MultiSyncCollector
-from torchrl.envs import EnvBase
 
 from ganlane import keys
-from ganlane.agents import Rainbow
-from ganlane.agents.network import NetworkConfig, QNetwork, load_parameters
-from ganlane.agents.policy import ExploringPolicy, LegalActions
-from ganlane.config.train import MultiCollectorConfig
+from ganlane.agents import NetworkConfig, QNetwork, Rainbow
+from ganlane.agents.drivers import ExploringPolicy, LegalActions
+from ganlane.agents.network import load_parameters
+from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig
 from ganlane.errors import UserError
-from ganlane.training.collectors import Collector, pack, unpack
-from ganlane.training.signals import shielded_children
-from ganlane.transforms.observation import PERCEIVED, SENSORS
+from ganlane.training.collectors import (
+    EPISODES_PER_WORKER,
+    INNER,
+    Collector,
+    MakeEnv,
+    exit_codes,
+    pack,
+    shielded_children,
+    unpack,
+    why_lost,
+)
 
-#: Makes the environments of a worker from their number and first episode. It is pickled: a module-level function or
-#: a ``functools.partial`` of one.
-MakeEnv = Callable[[int, int], EnvBase]
 #: Per worker, a function that makes its environments or its policy.
 Factories = Sequence[Callable[[], Any]]
-#: Distance between the first episodes of two workers, so that no two ever drive the same episode.
-EPISODES_PER_WORKER = 2**40
-#: State of the simulation, most of a step's bytes, which the training loop does not need.
-INNER = (keys.VEHICLES, keys.TRAFFIC, keys.ROAD, PERCEIVED, SENSORS)
 
 
 class WorkerPolicy(ExploringPolicy):
@@ -69,15 +71,9 @@ class WorkerCollector(Collector):
     The workers make ``config.steps`` steps with the same weights, then wait for the learner. They are started by
     :meth:`open` or the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is row i of worker w, which
     starts with episode ``w * 2**40 + i``.
-
-    Args:
-        make_env: makes the environments of one worker.
-        config: number of workers and environments, and steps between new weights.
     """
 
     exact = False
-    #: NAME in ``collector=NAME``, for messages.
-    name: str
 
     def __init__(self, make_env: MakeEnv, config: MultiCollectorConfig) -> None:
         self.make_env, self.config, self.environments = make_env, config, config.environments
@@ -91,10 +87,6 @@ class WorkerCollector(Collector):
     def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
         """TorchRL's collector of these environments and policies, ``frames`` decisions of all workers per batch."""
 
-    @abstractmethod
-    def failure(self, error: Exception) -> str | None:
-        """The reason, for the user, if ``error`` means that a worker was lost; else None."""
-
     def open(self, agent: Rainbow) -> None:
         """Start the workers, if they are not running; each has its own episodes and exploration."""
         if self.collector is not None:
@@ -103,7 +95,7 @@ class WorkerCollector(Collector):
         environments = [partial(self.make_env, self.config.num_envs, first) for first in self.first_episodes]
         policies = [partial(make_policy, config, legal, noise_seed(seed, first)) for first in self.first_episodes]
         threads = torch.get_num_threads()
-        with self._failures_as_user_errors(), shielded_children():
+        with self.failures_as_user_errors(), shielded_children():
             self.collector = self.start(environments, policies, self.environments * self.config.steps)
         torch.set_num_threads(threads)
         self._batches = iter(self.collector)
@@ -112,7 +104,7 @@ class WorkerCollector(Collector):
         """The next step of the batch; after the last one, collect a new batch with the agent's current weights."""
         if not self._steps:
             self.open(agent)
-            with self._failures_as_user_errors():
+            with self.failures_as_user_errors():
                 self._send_weights(agent)
                 batch = read_by_loop(next(self._batches))
             # [workers * environments, steps]; from Ray [workers, environments, steps].
@@ -130,33 +122,19 @@ class WorkerCollector(Collector):
         weights = {name: value.cpu() for name, value in agent.weights().items()}
         self.collector.map_fn("policy.load", [(weights, agent.policy.epsilon)] * self.config.workers)
 
-    @contextmanager
-    def _failures_as_user_errors(self) -> Iterator[None]:
-        """Turn the loss of a worker into one sentence."""
-        try:
-            yield
-        except Exception as error:
-            reason = self.failure(error)
-            if reason is None:
-                raise
-            raise UserError(
-                f"collector={self.name}: {reason}; go on from the last checkpoint with resume."
-            ) from error
-
     def state_dict(self, exact: bool) -> dict[str, Any]:
         """The episode numbers at the end of the last batch."""
         return pack(self._last)
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
         """Each worker begins after the last episode that it had begun; call before the first :meth:`step` only."""
-        last = unpack(state)
-        self._last = last
-        if keys.EPISODE in last:
-            begun = last.get(keys.EPISODE).reshape(self.config.workers, -1).amax(1)
+        self._last = unpack(state)
+        if keys.EPISODE in self._last:
+            begun = self._last.get(keys.EPISODE).reshape(self.config.workers, -1).amax(1)
             self.first_episodes = [int(episode) + 1 for episode in begun.tolist()]
 
     def close(self) -> None:
-        """Stop the workers; one that does not end by itself is killed."""
+        """Stop the workers."""
         collector, self.collector = self.collector, None
         self._steps.clear()
         self._batches = iter(())
@@ -193,23 +171,66 @@ class ProcessCollector(WorkerCollector):
         return why_lost(processes) if closed or exit_codes(processes) else None
 
 
-def exit_codes(processes: Sequence[Any]) -> dict[int, int]:
-    """Exit codes of workers that failed or were killed, by worker."""
-    codes: dict[int, int] = {}
-    for worker, process in enumerate(processes):
-        with suppress(ValueError):  # closed by TorchRL
-            if process.exitcode:
-                codes[worker] = process.exitcode
-    return codes
+class ClusterCollector(WorkerCollector):
+    """``collector=ray``: TorchRL's ``RayCollector``, one actor per worker, on this machine or a cluster.
 
+    The state of the simulation is not sent. On a cluster, ganlane must be installed on its machines.
 
-def why_lost(processes: Sequence[Any]) -> str:
-    """Why workers were lost, for an error message."""
-    codes = exit_codes(processes)
-    who = ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items()) or "a worker"
-    if any(code > 0 for code in codes.values()):
-        return f"{who} failed; its own message is above"
-    return f"{who} died, killed from outside or for want of memory (fewer collector.workers or num_envs need less)"
+    Raises:
+        UserError: Ray is not installed (extra ``ray``).
+    """
+
+    name = "ray"
+
+    def __init__(self, make_env: MakeEnv, config: RayCollectorConfig) -> None:
+        try:
+            import ray  # noqa: F401
+        except ModuleNotFoundError as error:
+            raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
+        super().__init__(make_env, config)
+        self.address = config.address
+
+    def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
+        """One actor per worker; a local Ray gets one CPU per worker, even on a smaller machine."""
+        from torchrl.collectors.distributed import RayCollector
+
+        connection: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+        if self.address is None:
+            connection |= {"address": "local", "num_cpus": self.config.workers, "include_dashboard": False}
+        else:
+            check_reachable(self.address)
+            connection["address"] = self.address
+        # One dictionary per worker: TorchRL writes the worker's policy into it.
+        own = [{"postproc": read_by_loop, "auto_register_policy_transforms": False} for _ in environments]
+        # TorchRL warns twice that it has no weights to send; :meth:`_send_weights` sends them.
+        warnings.filterwarnings("ignore", message="RayCollector iteration started before weight synchronization")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return RayCollector(
+                list(environments),
+                policy_factory=list(policies),
+                frames_per_batch=frames,
+                total_frames=sys.maxsize,  # its default, -1, is none at all
+                sync=True,
+                collector_kwargs=own,
+                remote_configs={"num_cpus": 1, "num_gpus": 0},
+                ray_init_config=connection,
+                trust_policy=True,
+                weight_sync_schemes={},
+            )
+
+    def failure(self, error: Exception) -> str | None:
+        """No cluster answers, an actor is gone, or Ray did not start."""
+        import ray
+        from ray.exceptions import RayActorError
+
+        if isinstance(error, ConnectionError):
+            return f"no Ray cluster answers at collector.address={self.address}, start one or leave the address out"
+        if isinstance(error, RayActorError):
+            return "a worker died or its machine was lost"
+        if not ray.is_initialized():
+            return f"Ray could not be started ({str(error).partition('.')[0]}), see whether the machine is overloaded"
+        return None
 
 
 def check_reachable(address: str, patience_s: float = 10.0) -> None:

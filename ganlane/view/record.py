@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane import keys
-from ganlane.agents.policy import GreedyPolicy
+from ganlane.agents.drivers import GreedyPolicy
 from ganlane.data.recordings import scene_csv, write_prepared
 from ganlane.data.schema import SCHEMA, TRACK_STRIDE, sort
 from ganlane.errors import UserError

@@ -41,16 +41,6 @@ def test_another_observation_size_is_refused_naming_both(saved):
         start_from(agent(size=9), saved)
 
 
-def test_a_truncated_or_foreign_file_is_refused(saved, tmp_path):
-    whole = saved.read_bytes()
-    saved.write_bytes(whole[: len(whole) // 2])
-    other = tmp_path / "notes.txt"
-    other.write_text("hello")
-    for path, said in ((saved, "agent.safetensors: damaged"), (other, "checkpoint of kind agent")):
-        with pytest.raises(UserError, match=said):
-            load_agent(path)
-
-
 def test_an_unknown_agent_is_refused_with_the_names_there_are():
     with pytest.raises(UserError, match="agents that ship are agent_gan, agent_general, agent_idm"):
         load_agent("agent_xyz")

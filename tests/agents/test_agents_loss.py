@@ -1,12 +1,16 @@
-"""The lean losses equal TorchRL's, and the projection an independent reference."""
+"""The lean losses equal TorchRL's, the projection a reference, and the whole update autograd and Adam."""
+
+from copy import deepcopy
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import DistributionalDQNLoss, DQNLoss
 
-from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, project
-from ganlane.agents.network import NetworkConfig, QNetwork, redraw_noise
+from ganlane.agents import NetworkConfig, QNetwork, Rainbow, RainbowConfig
+from ganlane.agents.loss import LeanDistributionalLoss, LeanDQNLoss, UpdateGraph, project
+from ganlane.agents.network import redraw_noise
+from ganlane.runtime import has_compiler
 
 SIZE = 5
 
@@ -17,20 +21,18 @@ def batch(seed=0, rows=64, scale=3.0):
     def normal(*shape):
         return torch.randn(shape, generator=generator)
 
-    return TensorDict(
-        {
-            "observation": normal(rows, SIZE),
-            "action": torch.randint(0, 3, (rows,), generator=generator),
-            "steps_to_next_obs": torch.randint(1, 4, (rows, 1), generator=generator).float(),
-            "next": {
-                "observation": normal(rows, SIZE),
-                "reward": scale * normal(rows, 1),
-                "terminated": torch.rand(rows, 1, generator=generator) < 0.3,
-                "done": torch.rand(rows, 1, generator=generator) < 0.3,
-            },
-        },
-        batch_size=[rows],
-    )
+    content = {
+        "observation": normal(rows, SIZE),
+        "action": torch.randint(0, 3, (rows,), generator=generator),
+        "steps_to_next_obs": torch.randint(1, 4, (rows, 1), generator=generator).float(),
+    }
+    after = {
+        "observation": normal(rows, SIZE),
+        "reward": scale * normal(rows, 1),
+        "terminated": torch.rand(rows, 1, generator=generator) < 0.3,
+        "done": torch.rand(rows, 1, generator=generator) < 0.3,
+    }
+    return TensorDict({**content, "next": after}, [rows])
 
 
 def network(**options):
@@ -52,20 +54,12 @@ def unlike_target(loss):
 def test_the_distributional_loss_equals_torchrls(noisy, rows):
     """Also when the batch has as many rows as there are atoms, where a wrong shape would broadcast."""
     loss = unlike_target(LeanDistributionalLoss(network(noisy=noisy), gamma=0.97, kl_priority=False))
-    data = batch(rows=rows)
-    theirs, ours = data.clone(), data.clone()
-    expected = DistributionalDQNLoss.forward(loss, theirs)["loss"]
-    actual = loss(ours)["loss"]
+    theirs, ours, parameters = batch(rows=rows), batch(rows=rows), list(loss.network.parameters())
+    expected, actual = DistributionalDQNLoss.forward(loss, theirs)["loss"], loss(ours)["loss"]
     torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(ours["td_error"], theirs["td_error"], atol=1e-6, rtol=1e-6)
-
-
-def test_its_gradients_equal_torchrls():
-    loss = unlike_target(LeanDistributionalLoss(network(), gamma=0.97))
-    parameters = list(loss.network.parameters())
-    expected = torch.autograd.grad(DistributionalDQNLoss.forward(loss, batch())["loss"].mean(), parameters)
-    actual = torch.autograd.grad(loss(batch())["loss"].mean(), parameters)
-    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-5)
+    gradients = [torch.autograd.grad(each.mean(), parameters) for each in (actual, expected)]
+    torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("double", [True, False])
@@ -169,3 +163,79 @@ def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
     ended = data["next", "terminated"][:, 0]
     torch.testing.assert_close(masked[ended], unmasked[ended], atol=1e-6, rtol=1e-6)
     assert bool((masked[~agree & ~ended] != unmasked[~agree & ~ended]).all())
+
+
+# --- the whole update as one function
+
+
+def agent(graph=None, masked=False, **options):
+    usual = {"hidden": (16, 24), "atoms": 7, "batch_size": 32, "warmup": 100, "capacity": 1000, "target_period": 3}
+    config = RainbowConfig(**{**usual, "v_min": -20.0, "v_max": 20.0, **options})
+    made = Rainbow(config, SIZE, seed=0)
+    data = batch(rows=600, scale=30.0)  # some targets lie outside the support
+    if masked:
+        data["next", "action_mask"] = torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) < 0.6
+        data["next", "action_mask"][:, 0] = True
+    made.store(data)
+    if graph is not None:
+        made.graph = UpdateGraph(made.network, made.loss, made.optimizer, config, compile=graph)
+    return made
+
+
+def assert_close(one, other):
+    for (name, value), twin in zip(one.network.named_parameters(), other.network.parameters()):
+        torch.testing.assert_close(value, twin, atol=2e-6, rtol=1e-5, msg=name)
+    for mine, theirs in zip(one.optimizer.state.values(), other.optimizer.state.values()):
+        for name in ("step", "exp_avg", "exp_avg_sq"):
+            torch.testing.assert_close(mine[name], theirs[name], atol=1e-7, rtol=1e-3, msg=name)
+
+
+def run_both(graph, masked=False, updates=8, **options):
+    plain, graphed = agent(masked=masked, **options), agent(graph, masked, **options)
+    for _ in range(updates):
+        expected, found = plain.update(), graphed.update()
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            torch.testing.assert_close(found[name], value.detach(), atol=1e-5, rtol=1e-4, msg=name)
+    assert_close(plain, graphed)
+    assert plain.updates == graphed.updates == updates
+    return plain, graphed
+
+
+@pytest.mark.parametrize(
+    ("masked", "options"),
+    [
+        (False, {}),
+        (True, {"gradient_clip": 0.01}),
+        (True, {"learning_rate_end": 1e-5, "learning_rate_decisions": 100, "hidden": (8,)}),
+        (False, {"hidden": (8, 8, 8), "gamma": 0.9, "adam_eps": 1e-3}),
+    ],
+)
+def test_updates_are_those_of_the_loss_of_autograd_and_of_adam(masked, options):
+    run_both(False, masked, **options)
+
+
+def test_training_can_change_from_one_way_to_the_other_and_be_resumed():
+    plain, graphed = run_both(False)
+    resumed = agent(False)
+    resumed.load_state_dict(deepcopy(plain.state_dict()))
+    for each in (plain, graphed, resumed):
+        each.update()
+    assert_close(plain, graphed)
+    assert_close(plain, resumed)
+    back = agent()
+    back.load_state_dict(deepcopy(graphed.state_dict()))
+    back.update(), plain.update()
+    assert_close(plain, back)
+
+
+@pytest.mark.parametrize("part", ["distributional", "double", "dueling", "noisy", "prioritised"])
+def test_an_agent_without_one_of_the_components_keeps_the_other_way(part):
+    config = RainbowConfig(**{part: False})
+    assert Rainbow(config, SIZE, compile=True).graph is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
+def test_the_compiled_graph_does_the_same():
+    run_both(True, masked=True)

@@ -7,7 +7,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ganlane.agents import Rainbow, RainbowConfig
-from ganlane.agents.network import duel
 from ganlane.errors import UserError
 
 SIZE = 4
@@ -18,9 +17,14 @@ def agent(seed=0, **options):
     return Rainbow(RainbowConfig(**{**SMALL, **options}), SIZE, seed=seed)
 
 
-def trained(updates=5, **options):
+def filled(**options):
     result = agent(**options)
     result.store(transitions(SIZE))
+    return result
+
+
+def trained(updates=5, **options):
+    result = filled(**options)
     for _ in range(updates):
         result.update()
     return result
@@ -30,41 +34,24 @@ def observations(rows=2000):
     return TensorDict({"observation": torch.randn(rows, SIZE, generator=torch.Generator().manual_seed(9))}, [rows])
 
 
-# --- the network
-
-
-def test_dueling_takes_the_mean_advantage_off():
-    rows = torch.tensor([[10.0], [1.0], [2.0], [6.0]])
-    assert duel(rows).flatten().tolist() == [8.0, 9.0, 13.0]
-
-
 # --- exploration
 
 
 def test_the_noise_is_drawn_anew_at_every_step():
     explorer = agent(noisy_sigma=3.0)
-    data = observations()
-    first, second = (explorer.policy(data.clone())["action"] for _ in range(2))
+    first, second = (explorer.policy(observations())["action"] for _ in range(2))
     assert not torch.equal(first, second)
 
 
 @pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN])
-def test_under_deterministic_exploration_the_policy_is_greedy(kind):
-    explorer = agent(noisy_sigma=3.0)
-    data = observations()
-    with set_exploration_type(kind):
-        actions = [explorer.policy(data.clone())["action"] for _ in range(2)]
+def test_under_deterministic_exploration_the_policy_is_greedy_which_has_no_noise_whatever_the_context(kind):
+    explorer, data = agent(noisy_sigma=3.0), observations()
     greedy = explorer.greedy(data.clone())["action"]
-    assert all(torch.equal(action, greedy) for action in actions)
-
-
-def test_the_greedy_policy_has_no_noise_whatever_the_context():
-    explorer = agent(noisy_sigma=3.0)
-    data = observations()
-    expected = explorer.greedy(data.clone())["action"]
-    explorer.policy(data.clone())
+    explorer.policy(data.clone())  # leaves its noise in the network
+    with set_exploration_type(kind):
+        assert all(torch.equal(explorer.policy(data.clone())["action"], greedy) for _ in range(2))
     with set_exploration_type(ExplorationType.RANDOM):
-        assert torch.equal(explorer.greedy(data.clone())["action"], expected)
+        assert torch.equal(explorer.greedy(data.clone())["action"], greedy)
 
 
 def test_the_policy_writes_the_action_and_what_it_thinks_it_worth():
@@ -96,9 +83,7 @@ def test_a_share_epsilon_of_the_actions_is_random_and_legal():
 
 
 def test_the_learning_rate_falls_in_a_straight_line_and_stays():
-    falling = Rainbow(
-        RainbowConfig(**SMALL, learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_decisions=100), SIZE
-    )
+    falling = agent(learning_rate=1e-3, learning_rate_end=1e-4, learning_rate_decisions=100)
     rates = []
     for decisions in (0, 50, 100, 200):
         falling.anneal(decisions)
@@ -109,15 +94,14 @@ def test_the_learning_rate_falls_in_a_straight_line_and_stays():
 @pytest.mark.parametrize("half", [{"learning_rate_end": 1e-4}, {"learning_rate_decisions": 100}])
 def test_half_of_a_falling_learning_rate_is_refused(half):
     with pytest.raises(UserError, match="give both or neither"):
-        Rainbow(RainbowConfig(**SMALL, **half), SIZE)
+        agent(**half)
 
 
 # --- updates
 
 
 def test_the_target_is_copied_exactly_every_period():
-    learner = agent(target_period=3)
-    learner.store(transitions(SIZE))
+    learner = filled(target_period=3)
     copied = []
     for _ in range(9):
         learner.update()
@@ -127,8 +111,7 @@ def test_the_target_is_copied_exactly_every_period():
 
 
 def test_every_update_draws_the_noise_of_both_networks_anew():
-    learner = agent()
-    learner.store(transitions(SIZE))
+    learner = filled()
     modules = (learner.network, learner.loss.target_network)
     before = [module.head.weight_epsilon.clone() for module in modules]
     learner.update()
@@ -138,8 +121,7 @@ def test_every_update_draws_the_noise_of_both_networks_anew():
 
 
 def test_the_objective_is_the_mean_of_weight_times_loss():
-    learner = agent(beta_start=1.0)
-    learner.store(transitions(SIZE))
+    learner = filled(beta_start=1.0)
     learner.replay.update_priority(torch.arange(64), torch.linspace(0.1, 5.0, 64))
     learner.replay.sample()
     seen = {}
@@ -154,12 +136,13 @@ def test_the_objective_is_the_mean_of_weight_times_loss():
     torch.testing.assert_close(objective, (seen["weight"] * seen["terms"]["loss"]).mean().detach())
 
 
-def test_an_update_gives_the_drawn_items_their_new_priority():
-    learner = agent()
-    learner.store(transitions(SIZE))
+def test_an_update_gives_the_drawn_items_their_new_priority_and_metrics_without_dimensions():
+    learner = filled()
     before = learner.replay.sampler.priorities.clone()
-    learner.update()
+    metrics = learner.update()
     assert not torch.equal(before, learner.replay.sampler.priorities)
+    assert {"loss", "mean_q", "clamped_fraction", "priority", "gradient_norm"} == set(metrics)
+    assert all(value.shape == () and not value.requires_grad for value in metrics.values())
 
 
 SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
@@ -167,21 +150,11 @@ SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
 
 @pytest.mark.parametrize("off", [[name] for name in SWITCHES] + [SWITCHES])
 def test_each_component_can_be_switched_off_and_the_rest_learns(off):
-    options = {"learning_rate": 3e-3, "target_period": 1000, "noisy_sigma": 0.1}
-    learner = agent(**{name: False for name in off}, **options)
-    learner.store(transitions(SIZE))
+    learner = filled(**dict.fromkeys(off, False), learning_rate=3e-3, target_period=1000, noisy_sigma=0.1)
     before = learner.loss(transitions(SIZE))["loss"].mean()
     for _ in range(80):
         learner.update()
     assert learner.loss(transitions(SIZE))["loss"].mean() < 0.95 * before
-
-
-def test_metrics_are_tensors_without_dimensions():
-    learner = agent()
-    learner.store(transitions(SIZE))
-    metrics = learner.update()
-    assert {"loss", "mean_q", "clamped_fraction", "priority", "gradient_norm"} == set(metrics)
-    assert all(value.shape == () and not value.requires_grad for value in metrics.values())
 
 
 def test_the_agent_learns_the_values_of_a_known_chain():
@@ -206,16 +179,11 @@ def test_the_agent_learns_the_values_of_a_known_chain():
 # --- randomness and saving
 
 
-def test_the_global_random_state_is_left_alone():
-    before = torch.get_rng_state()
-    learner = trained()
-    learner.policy(observations(5))
-    assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_the_seed_decides_everything_and_the_global_one_nothing():
+def test_the_seed_decides_everything_and_the_global_random_state_is_left_alone():
     torch.manual_seed(1)
-    first = trained()
+    before, first = torch.get_rng_state(), trained()
+    first.policy(observations(5))
+    assert torch.equal(torch.get_rng_state(), before)
     torch.manual_seed(2)
     assert same_weights(first, trained())
     assert not same_weights(first, trained(seed=1))

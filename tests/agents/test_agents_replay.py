@@ -7,7 +7,6 @@ from scipy import stats  # scikit-learn, a dependency, brings it along
 from tensordict import TensorDict
 
 from ganlane.agents import RainbowConfig
-from ganlane.agents.rainbow import annealed
 from ganlane.agents.replay import draw, load_replay_state, make_replay, replay_state
 
 
@@ -124,7 +123,3 @@ def test_drawing_gives_the_batch_of_torchrls_own_way(prioritised):
         ours, theirs = draw(first), second.sample()
         assert ours.keys() == theirs.keys()
         assert all(torch.equal(ours[key], theirs[key]) for key in theirs.keys(True, True))
-
-
-def test_annealing_ends_at_its_end():
-    assert [annealed(0.4, 1.0, done, 10) for done in (0, 5, 10, 20)] == pytest.approx([0.4, 0.7, 1.0, 1.0])

@@ -2,13 +2,11 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
 from training.test_training_loop import ToyRoad, agent, settings, train
 
 from ganlane.errors import UserError
 from ganlane.files import PLACE
 from ganlane.training.checkpoint import LAST, TrainingState, load_checkpoint, save_checkpoint
-from ganlane.training.collectors import pack, unpack
 
 
 def test_a_checkpoint_comes_back_as_it_was(tmp_path):
@@ -23,14 +21,6 @@ def test_names_of_version_0_1_are_read_as_those_of_today(tmp_path):
     save_checkpoint(tmp_path / "last.pt", {"carrier": 1, "meter": 2, "counters": {"owed": 3, "best": None}})
     expected = {"env_state": 1, "stats": 2, "counters": {"pending_decisions": 3, "best": None}}
     assert load_checkpoint(tmp_path / "last.pt") == expected
-
-
-def test_a_tensordict_is_packed_with_its_nested_batch_sizes():
-    inner = TensorDict({"a": torch.zeros(2, 3, 1)}, [2, 3])
-    whole = TensorDict({"inner": inner, "b": torch.ones(2)}, [2])
-    back = unpack(pack(whole))
-    assert back["inner"].batch_size == (2, 3)
-    assert (back == whole).all()
 
 
 def test_one_changed_byte_anywhere_is_refused(tmp_path):

@@ -1,211 +1,246 @@
-"""Steps from workers: in the order of time, from episodes of their own, with weights that follow the learner's."""
+"""Driving while learning: whose weights choose, the same bits after every end, one sentence for a lost worker."""
 
-import importlib.util
+import dataclasses
+import multiprocessing
+import os
+import signal
+import subprocess
 import sys
+import threading
+import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from training.toy import ROAD, SMALL, ToyRoad, agent, road, steps, toy
+from training.test_training_loop import agent, same, settings, train
+from training.toy import ROAD, ToyRoad, check_order, gone, road, steps, toy
+from training.toy import agent as road_agent
 
 from ganlane import keys
-from ganlane.agents import Rainbow, RainbowConfig
-from ganlane.build import make_env, make_traffic
 from ganlane.config.traffic import IdmTrafficConfig
-from ganlane.config.train import MultiCollectorConfig, RayCollectorConfig, TrainConfig
-from ganlane.errors import UserError
-from ganlane.parameters.observation import ObservationConfig
-from ganlane.training import TrainingConfig, train
-from ganlane.training.checkpoint import TrainingState
-from ganlane.training.loop import collect
-from ganlane.training.phases import cluster_collector, identity, make_collector, phases_of
-from ganlane.training.workers import (
-    EPISODES_PER_WORKER,
-    ProcessCollector,
-    WorkerCollector,
-    noise_seed,
-)
-
-ROOT = Path(__file__).resolve().parents[2]
-NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)")
-NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
-QUIET = {"auto_register_policy_transforms": False}
+from ganlane.config.train import CollectorConfig, OverlapCollectorConfig, TrainConfig
+from ganlane.errors import ParameterError, UserError
+from ganlane.training.checkpoint import load_checkpoint
+from ganlane.training.collectors import OverlapCollector, SingleCollector, pack, shielded_children, unpack, work
+from ganlane.training.phases import identity, make_collector, phases_of
 
 
-def pool(workers, num_envs, weights_every):
-    return MultiCollectorConfig(num_envs, workers, weights_every)
+class Thread(threading.Thread):
+    """A worker in this process, which a pipe that is closed ends."""
+
+    exitcode = 0
 
 
-class Here:
-    """TorchRL's collectors of all workers, one after the other in this process, with the interface of the others."""
+class HereCollector(OverlapCollector):
+    """Workers are threads; ``late_s`` is what a worker waits before it starts."""
 
-    def __init__(self, environments, policies, frames):
-        self.workers = [
-            Collector(
-                env, policy_factory=policy, frames_per_batch=frames // len(policies), trust_policy=True, **QUIET
-            )
-            for env, policy in zip(environments, policies)
-        ]
-        self.handed_over = []
+    late_s = 0.0
 
-    def map_fn(self, name, arguments):
-        self.handed_over.append(arguments)
-        for worker, given in zip(self.workers, arguments):
-            worker.cascade_execute(name, *given)
+    def _start_worker(self, make):
+        late_s = self.late_s * (len(self._pipes) + 1)
 
-    def __iter__(self):
-        for batches in zip(*self.workers):
-            yield torch.cat(list(batches), 0)
+        def target():
+            time.sleep(late_s)
+            work(theirs, make)
 
-    def shutdown(self):
-        for worker in self.workers:
-            worker.shutdown()
+        ours, theirs = multiprocessing.Pipe()
+        self._processes.append(Thread(target=target, daemon=True))
+        self._processes[-1].start()
+        self._pipes.append(ours)
 
 
-class HereCollector(WorkerCollector):
-    name = "here"
+class Twin(SingleCollector):
+    """The same in one process: actions are chosen before the updates, and driven after them."""
 
-    def start(self, environments, policies, frames):
-        return Here(environments, policies, frames)
+    overlaps = True
 
-    def failure(self, error):
-        return None
+    def begin(self, agent):
+        self.given = agent.policy(self.env_state)
 
-
-# --- steps, episodes, weights
-
-
-def test_steps_come_in_the_order_of_time_across_batches():
-    source = HereCollector(road, pool(2, 3, 18))
-    seen = steps(source, agent(), 10)
-    assert seen.batch_size == (10, 6)
-    going = ~seen["next", "done"][:-1, :, 0]
-    assert going.any()
-    assert torch.equal(seen["next", keys.OBSERVATION][:-1][going], seen[keys.OBSERVATION][1:][going])
-    assert keys.VEHICLES not in seen
-    assert keys.VEHICLES not in seen["next"]
+    def step(self, agent):
+        step, self.env_state = self.env.step_and_maybe_reset(self.given)
+        return step
 
 
-def test_no_two_workers_drive_the_same_episode():
-    source = HereCollector(road, pool(3, 2, 60))
-    episodes = steps(source, agent(), 40)[keys.EPISODE]
-    assert torch.equal(episodes[0], torch.tensor([w * EPISODES_PER_WORKER + i for w in range(3) for i in range(2)]))
-    driven = [set(episodes[:, row].tolist()) for row in range(6)]
-    assert all(len(own) > 1 for own in driven)
-    assert len(set.union(*driven)) == sum(map(len, driven))
+def run(source, decisions, folder, seed=0, **options):
+    """The agent and the result of a run with ``source``."""
+    learner = agent(seed)
+    with closing(source):
+        return learner, train(source, learner, settings(decisions), folder, **options)
 
 
-def test_workers_explore_each_in_its_own_way():
-    source = HereCollector(toy, pool(2, 64, 1))
-    learner = agent(4, epsilon_start=1.0)
-    first, second = source.step(learner)[keys.ACTION].split(64)
-    assert not torch.equal(first, second)
-    seeds = {noise_seed(0, first) for first in (0, EPISODES_PER_WORKER, 7, EPISODES_PER_WORKER + 7)}
-    assert len(seeds | {noise_seed(1, 0)}) == 5
+def test_a_tensordict_is_packed_with_its_nested_batch_sizes():
+    inner = TensorDict({"a": torch.zeros(2, 3, 1)}, [2, 3])
+    whole = TensorDict({"inner": inner, "b": torch.ones(2)}, [2])
+    back = unpack(pack(whole))
+    assert back["inner"].batch_size == (2, 3)
+    assert (back == whole).all()
 
 
-def test_workers_drive_with_the_weights_of_the_last_handover():
-    source = HereCollector(toy, pool(2, 4, 32))
-    learner = agent(4, noisy=False, epsilon_start=0.0, epsilon=0.0)
-    source.step(learner)
-    with torch.no_grad():
-        learner.network.head.bias[11:22] += torch.linspace(-50.0, 50.0, 11)
-    old = steps(source, learner, 3)[keys.ACTION]
-    new = steps(source, learner, 4)[keys.ACTION]
-    assert not (old == 0).all()
-    assert (new == 0).all()
-    assert len(source.collector.handed_over) == 2
+# --- the same bits
 
 
-@pytest.mark.parametrize(("every", "expected"), [(1, 1), (8, 1), (23, 2), (800, 100)])
-def test_weights_are_handed_over_every_so_many_decisions_in_whole_steps(every, expected):
-    assert pool(2, 4, every).steps == expected
+def test_driving_while_learning_is_choosing_before_the_updates_of_the_step_before(tmp_path):
+    ours, result = run(HereCollector(toy, 1, 8), 240, tmp_path / "here")
+    twin, _ = run(Twin(ToyRoad(8)), 240, tmp_path / "twin")
+    single, before = run(SingleCollector(ToyRoad(8)), 240, tmp_path / "single")
+    assert same(ours, twin)
+    assert not same(ours, single)
+    assert result.updates == before.updates - 1  # those of the last step are still to come
 
 
-def test_the_share_of_random_actions_travels_with_the_weights():
-    source = HereCollector(toy, pool(1, 4, 4))
-    run = TrainingState(source, agent(4, epsilon_start=1.0, epsilon=0.0, epsilon_decisions=8))
-    for _ in range(3):
-        collect(run)
-    assert [given[0][1] for given in source.collector.handed_over] == [1.0, 0.5, 0.0]
+def test_it_does_not_matter_which_worker_is_the_slowest(tmp_path):
+    class Late(HereCollector):
+        late_s = 0.2
+
+    assert same(run(HereCollector(toy, 2, 8), 160, tmp_path)[0], run(Late(toy, 2, 8), 160, tmp_path / "late")[0])
 
 
-# --- the loop on top of them
+@pytest.mark.parametrize("decisions", [24, 160])
+def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, tmp_path, capsys):
+    whole, _ = run(HereCollector(toy, 2, 8), 240, tmp_path / "whole")
+    _, first = run(HereCollector(toy, 2, 8), decisions, tmp_path / "parts")
+    resumed, _ = run(HereCollector(toy, 2, 8), 240, tmp_path / "parts", seed=5, resume=first.checkpoint)
+    assert same(whole, resumed)
+    assert "bit-exact" not in capsys.readouterr().err
 
 
-def test_a_run_with_workers_learns_what_a_run_without_does(tmp_path):
-    learner = agent(4, **{"gamma": 0.8, "v_min": -10.0, "v_max": 10.0, "learning_rate": 3e-3})
-    config = TrainingConfig(6000, log_every=1000, progress=False)
-    source = HereCollector(toy, pool(2, 8, 64))
-    result = train(source, learner, config, tmp_path)
-    assert result.decisions == 6000
-    assert result.updates == pytest.approx((6000 - 32) / 8, abs=8)
-    observation = torch.rand(500, 4)
-    action = learner.greedy(TensorDict({"observation": observation}, [500]))["action"]
-    assert (action == observation[:, :3].argmax(-1)).float().mean() > 0.7
+def test_the_state_of_a_highway_is_taken_over_row_by_row():
+    learner = road_agent()
+    with closing(HereCollector(road, 2, 6)) as first, closing(HereCollector(road, 2, 6)) as second:
+        steps(first, learner, 3)
+        second.load_state_dict(first.state_dict(True), True)
+        noise = learner.generators["collect"].get_state()
+        expected = first.step(learner).clone()
+        learner.generators["collect"].set_state(noise)
+        found = second.step(learner)
+        for key in (keys.OBSERVATION, keys.ACTION, ("next", keys.OBSERVATION), ("next", "done")):
+            assert torch.equal(found[key], expected[key])
+        second.load_state_dict(first.state_dict(False), False)
+        assert second.step(learner)[keys.STEP].eq(0).all()  # the next episodes, from their start
 
 
-def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(tmp_path, capsys):
-    config = TrainingConfig(400, log_every=200, progress=False)
-    source = HereCollector(road, pool(2, 4, 80))
-    first = train(source, agent(), config, tmp_path)
-    begun = source._last[keys.EPISODE].reshape(2, 4)
-    resumed, again = agent(), HereCollector(road, pool(2, 4, 80))
-    result = train(again, resumed, TrainingConfig(480, progress=False), tmp_path, resume=first.checkpoint)
-    assert "the workers begin the next ones; not bit-exact" in capsys.readouterr().err
-    assert again.first_episodes == [int(last) + 1 for last in begun.amax(1)]
-    assert len(resumed.replay) > 400  # the buffer of the first stretch is still there
-    assert (result.decisions, result.updates > first.updates) == (480, True)
-
-
-def test_another_number_of_workers_is_refused_on_resume(tmp_path):
-    first = train(HereCollector(toy, pool(2, 4, 8)), agent(4), TrainingConfig(80, progress=False), tmp_path)
-    for other in (HereCollector(toy, pool(3, 4, 8)), ToyRoad(4)):
-        with pytest.raises(UserError, match=r"shape \[8\], this run has"):
-            train(other, agent(4), TrainingConfig(160, progress=False), tmp_path, resume=first.checkpoint)
+def test_steps_come_in_the_order_of_time_and_no_two_workers_drive_the_same_episode():
+    with closing(HereCollector(road, 2, 6)) as source:
+        seen = steps(source, road_agent(), 30)
+    assert seen["next", "done"].any()
+    check_order(seen, [0, 1, 2, 2**40, 2**40 + 1, 2**40 + 2])
+    assert keys.TRAFFIC not in seen
 
 
 # --- options
 
 
-def test_a_phase_collects_as_the_option_says(monkeypatch):
-    collector = MultiCollectorConfig(num_envs=3, workers=5, weights_every=60)
-    config = TrainConfig(collector=collector, traffic=IdmTrafficConfig(), env=ROAD)
+def test_a_phase_collects_as_the_option_says():
+    config = TrainConfig(collector=OverlapCollectorConfig(6, 3), traffic=IdmTrafficConfig(), env=ROAD)
     (phase,) = phases_of(config, Path("nowhere"))
     source = make_collector(config, phase)
-    assert isinstance(source, ProcessCollector)
-    assert source.config is collector
-    assert collector.environments == source.environments == 15
-    assert source.make_env(2, 70).reset()[keys.EPISODE].tolist() == [70, 71]
-    assert identity(config, phase)["collector"] == {"num_envs": 3, "workers": 5, "weights_every": 60}
+    assert isinstance(source, OverlapCollector)
+    assert (source.environments, source.rows) == (6, 2)
 
 
-def test_a_missing_ray_is_named_with_the_command_that_mends_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "ganlane.training.cluster", raising=False)
-    with pytest.raises(UserError, match=r"pip install 'ganlane\[ray\]'"):
-        cluster_collector(toy, RayCollectorConfig())
+def test_environments_that_cannot_be_shared_out_are_refused():
+    with pytest.raises(ParameterError, match="evenly"):
+        OverlapCollectorConfig(7, 2)
 
 
-# --- device=cuda
+@pytest.mark.parametrize("resumed", [OverlapCollectorConfig(8, 2), CollectorConfig(8)])
+def test_a_run_is_not_resumed_with_the_other_collector(resumed, tmp_path):
+    started = CollectorConfig(8) if isinstance(resumed, OverlapCollectorConfig) else OverlapCollectorConfig(8, 2)
+    config = TrainConfig(collector=started, traffic=IdmTrafficConfig(), env=ROAD)
+    (phase,) = phases_of(config, tmp_path)
+    _, first = run(SingleCollector(ToyRoad(8)), 40, tmp_path, identity=identity(config, phase))
+    other = identity(dataclasses.replace(config, collector=resumed), phase)
+    with pytest.raises(UserError, match=r"collector\.overlaps="):
+        run(SingleCollector(ToyRoad(8)), 80, tmp_path, resume=first.checkpoint, identity=other)
 
 
-@NO_CUDA
-def test_on_a_gpu_nothing_of_a_run_is_elsewhere():
-    traffic = make_traffic(IdmTrafficConfig(), ROAD)
-    env = make_env(traffic, ROAD, ObservationConfig(), num_envs=32, device="cuda")
-    learner = Rainbow(RainbowConfig(**SMALL), 29, device="cuda")
-    run = TrainingState(env, learner)
-    for _ in range(4):
-        step = collect(run)
-        learner.store(run.window.push(step))
-    learner.update()
-    tensors = [
-        *run.collector.env_state.values(True, True),
-        *step.values(True, True),
-        *learner.replay[:].values(True, True),
-    ]
-    tensors += [*learner.network.parameters(), *run.stats.sums.values(), run.stats.returns]
-    assert {tensor.device.type for tensor in tensors} == {"cuda"}
+# --- processes
+
+
+def test_children_of_a_run_are_spared_its_signals():
+    with shielded_children():
+        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            child.send_signal(number)
+        time.sleep(0.5)
+        assert child.poll() is None
+    finally:
+        child.kill()
+        child.wait()
+
+
+def test_a_signal_that_comes_while_children_start_is_not_lost_nor_its_handler():
+    seen = []
+    before = signal.signal(signal.SIGTERM, lambda number, frame: seen.append(number))
+    try:
+        with shielded_children():
+            os.kill(os.getpid(), signal.SIGTERM)
+        with shielded_children():
+            signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))  # as ray.init does
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert seen == [signal.SIGTERM, signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_processes_give_what_threads_give_and_a_lost_one_ends_the_run_in_one_sentence():
+    learner, other = agent(), agent()
+    with closing(OverlapCollector(toy, 1, 4)) as source, closing(HereCollector(toy, 1, 4)) as here:
+        for _ in range(3):
+            ours, theirs = source.step(learner), here.step(other)
+            assert torch.equal(ours["next", "reward"], theirs["next", "reward"])
+        numbers = [process.pid for process in source._processes]
+        os.kill(numbers[0], signal.SIGKILL)
+        with pytest.raises(UserError, match=r"^collector=overlap: worker 0 .*died.* go on from the last") as error:
+            source.step(learner)
+        assert "\n" not in str(error.value)
+    assert not any(Path(f"/proc/{number}").exists() for number in numbers)
+
+
+KILLED = """
+import sys
+import torch
+torch.set_num_threads(1)
+sys.path[:0] = [{tests!r}]
+from training.test_training_collectors import OverlapCollector, SingleCollector, ToyRoad, agent, settings, toy, train
+import ganlane.training.checkpoint as checkpoint
+checkpoint.PATIENCE = 0.0
+if __name__ == "__main__":
+    train({source}, agent(), settings(10**9, checkpoint_every_s=0.0), {folder!r})
+"""
+#: What a killed run collects with, and its like in this process.
+SOURCES = {
+    "SingleCollector(ToyRoad(8))": lambda: SingleCollector(ToyRoad(8)),
+    "OverlapCollector(toy, 2, 8)": lambda: HereCollector(toy, 2, 8),
+}
+SINGLE, OVERLAP = SOURCES
+ATTEMPTS = [(SINGLE, 0, 0.0), (SINGLE, 0, 0.53), (OVERLAP, 160, 0.1), (OVERLAP, 160, 0.7)]
+
+
+@pytest.mark.parametrize(
+    ("source", "decisions", "after_s"),
+    [(SINGLE, 0, 0.11), *(pytest.param(*attempt, marks=pytest.mark.slow) for attempt in ATTEMPTS)],
+)
+def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights_and_leaves_no_process(
+    source, decisions, after_s, tmp_path
+):
+    """Killed so many seconds after its checkpoint of so many ``decisions``."""
+    folder, tests, script = tmp_path / "parts", Path(__file__).resolve().parent.parent, tmp_path / "killed.py"
+    script.write_text(KILLED.format(tests=str(tests), folder=str(folder), source=source))
+    process = subprocess.Popen([sys.executable, str(script)], cwd=tests.parent, start_new_session=True)
+    last = folder / "checkpoints" / "last.pt"
+    while not last.exists() or load_checkpoint(last)["counters"]["decisions"] < decisions:
+        assert process.poll() is None
+        time.sleep(0.01)
+    time.sleep(after_s)
+    process.kill()
+    process.wait()
+    assert gone(process.pid)
+    reached = int(load_checkpoint(last)["counters"]["decisions"])
+    resumed, _ = run(SOURCES[source](), reached + 400, folder, seed=5, resume=last)
+    whole, _ = run(SOURCES[source](), reached + 400, tmp_path / "whole")
+    assert same(whole, resumed)

@@ -1,5 +1,10 @@
 """Phases: what a run starts from and takes over, what it may go on from, and what its agent is told of it."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +21,7 @@ from ganlane.errors import UserError
 from ganlane.files import conf_folder
 from ganlane.parameters.agent import LAST_REVISION, without_removed_overrides
 from ganlane.parameters.observation import MaskParameters
+from ganlane.runtime import has_compiler
 from ganlane.training.checkpoint import LAST, load_checkpoint, save_checkpoint
 from ganlane.training.phases import (
     AGENT_FILE,
@@ -29,6 +35,7 @@ from ganlane.training.phases import (
     run_phase,
 )
 
+ROOT = Path(__file__).resolve().parents[2]
 TINY = [*entry_tiny.TINY, "logger.progress=false"]
 WITHOUT_INIT = [option for option in entry_tiny.TINY if option != "init=none"]
 
@@ -235,12 +242,12 @@ def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_
 
 # --- masks
 
-MOBIL, SAFE = "traffic=idm_mobil", "mask=safe"
+MASKED = ["traffic=idm_mobil", "mask=safe", "mask.safe_deceleration=3"]
 
 
 @pytest.fixture(scope="module")
 def masked(tmp_path_factory):
-    return run(tmp_path_factory.mktemp("masked"), MOBIL, SAFE, "mask.safe_deceleration=3")
+    return run(tmp_path_factory.mktemp("masked"), *MASKED)
 
 
 def test_an_agent_drives_behind_the_mask_that_it_was_trained_with(masked):
@@ -259,20 +266,19 @@ def test_the_mask_of_the_next_state_is_kept_with_every_transition(masked):
 
 
 def test_a_masked_run_stopped_and_resumed_ends_with_the_same_bits(masked, tmp_path):
-    given = [MOBIL, SAFE, "mask.safe_deceleration=3"]
-    half = run(tmp_path / "half", *given, "total_decisions=160")
-    assert same_agent(masked, run(half, *given, resume=half / LAST))
+    half = run(tmp_path / "half", *MASKED, "total_decisions=160")
+    assert same_agent(masked, run(half, *MASKED, resume=half / LAST))
 
 
 @pytest.mark.parametrize("other", ["mask=legal", "mask.safe_deceleration=4"])
 def test_a_run_is_not_resumed_behind_another_mask(masked, other):
     with pytest.raises(UserError, match="mask"):
-        run(masked, MOBIL, SAFE, "mask.safe_deceleration=3", other, resume=masked / LAST)
+        run(masked, *MASKED, other, resume=masked / LAST)
 
 
 def test_runs_without_a_mask_have_the_identity_that_they_always_had(tmp_path):
     """Those of versions that knew no masks can be resumed."""
-    assert "mask" not in load_checkpoint(run(tmp_path, MOBIL, "mask=none") / LAST)["identity"]
+    assert "mask" not in load_checkpoint(run(tmp_path, "traffic=idm_mobil", "mask=none") / LAST)["identity"]
 
 
 @pytest.mark.parametrize(("now", "refused"), [([], False), (["env.truck_share=0.5"], True)])
@@ -317,3 +323,45 @@ def test_a_checkpoint_with_a_removed_option_names_the_revision_that_had_it(train
     save_checkpoint(path, state)
     with pytest.raises(UserError, match=f"fixed_order: it was removed after revision {LAST_REVISION}"):
         read_start(str(path))
+
+
+# --- env.compile=true
+
+#: A phase alone, without the evaluation that a command makes at its end: that would compile as much again.
+SCRIPT = """
+import sys
+from pathlib import Path
+from ganlane.config.command_line import check
+from ganlane.training.phases import phases_of, run_phase
+
+if __name__ == "__main__":
+    folder, resume, *told = sys.argv[1:]
+    config = check("train", told).config
+    run_phase(config, phases_of(config, Path(folder))[0], resume or None)
+"""
+#: Decisions that nobody waits for.
+TOO_LONG = 64_000
+
+
+def begin(folder, total, resume=""):
+    """A compiled training run in ``folder``, under way; what the compiler leaves is shared by the runs beside it."""
+    own = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"), "OMP_NUM_THREADS": "1"}
+    given = [str(folder), str(resume), *TINY, "env.compile=true", f"total_decisions={total}"]
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, *given], env={**os.environ, **own})
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
+def test_a_compiled_run_stopped_and_resumed_in_a_process_of_its_own_ends_with_the_same_bits(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    first, metrics = begin(parts, TOO_LONG), parts / "metrics.csv"
+    while first.poll() is None and not (metrics.is_file() and len(metrics.read_text().splitlines()) > 1):
+        time.sleep(0.1)
+    first.send_signal(signal.SIGTERM)  # in the loop, some steps after the first figures
+    assert first.wait() == 0
+    reached = load_checkpoint(parts / LAST)["counters"]["decisions"]
+    assert 160 <= reached < TOO_LONG
+    assert not (parts / AGENT_FILE).exists()
+    assert begin(parts, reached + 480, resume=parts / LAST).wait() == 0
+    assert begin(whole, reached + 480).wait() == 0
+    assert same_agent(parts, whole)

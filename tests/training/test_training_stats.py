@@ -60,11 +60,10 @@ def test_what_an_environment_or_a_policy_does_not_write_has_no_column():
     assert set(stats.read()) == {"episodes", "action_0_share", "action_1_share", *means}
 
 
-def test_the_return_to_go_is_averaged_over_the_decisions_of_finished_episodes():
+def test_returns_to_go_and_values_are_averaged_over_the_decisions_of_finished_episodes():
     stats = EpisodeStats(2, 2, gamma=0.5)
-    stats.step(step([1.0, 9.0], [False, False], value=[2.0, 0.0]))
-    stats.step(step([2.0, 9.0], [False, False], value=[4.0, 0.0]))
-    stats.step(step([4.0, 9.0], [True, False], value=[6.0, 0.0]))
+    for reward, value in ((1.0, 2.0), (2.0, 4.0), (4.0, 6.0)):
+        stats.step(step([reward, 9.0], [reward == 4.0, False], value=[value, 0.0]))
     row = stats.read()
     # From the three decisions: 1 + 2/2 + 4/4, 2 + 4/2, 4.
     assert row["mean_return_to_go"] == pytest.approx((3.0 + 4.0 + 4.0) / 3.0)

@@ -4,7 +4,6 @@ import os
 import time
 
 import torch
-from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -60,17 +59,12 @@ class ToyRoad(EnvBase):
             # TorchRL hides everything but the mask from an automatic reset: the last step knows the episodes.
             seed, episode = self.last
             episode = torch.where(mask.squeeze(-1), episode + rows, episode)
-        step, none = torch.zeros(rows, dtype=torch.int64), torch.zeros(rows, 1, dtype=torch.bool)
-        names = ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")
-        events = TensorDict({name: none.clone() for name in names}, [rows])
-        ego = TensorDict({"distance": torch.zeros(rows), "lane_changes": step.clone()}, [rows])
-        counters = {"seed": seed, "episode": episode, "step": step}
-        observation = self._observe(seed, episode, step)
-        ends = {name: none.clone() for name in ("done", "terminated", "truncated")}
-        return TensorDict({"observation": observation, "events": events, "ego": ego, **counters, **ends}, [rows])
+        begin = self.observation_spec.zero().update(self.full_done_spec.zero())
+        begin.update({"seed": seed, "episode": episode})
+        return begin.set("observation", self._observe(seed, episode, begin["step"]))
 
     def _step(self, tensordict):
-        rows, observation, action = self.batch_size[0], tensordict["observation"], tensordict["action"]
+        observation, action = tensordict["observation"], tensordict["action"]
         right, wrong = observation[:, :3].argmax(-1), observation[:, :3].argmin(-1)
         step = tensordict["step"] + 1
         crash = action == wrong
@@ -78,26 +72,15 @@ class ToyRoad(EnvBase):
         goal = over & (tensordict["seed"] % 2 == 0)
         timeout = over & ~goal
         reward = (action == right).float() - 5.0 * crash + 2.0 * goal
-        flags = {"goal": goal, "hard_crash": crash, "out_of_road": crash & False, "timeout": timeout}
-        events = TensorDict({n: f[:, None] for n, f in {**flags, "scene_end": crash & False}.items()}, [rows])
-        ego = {
-            "distance": tensordict["ego", "distance"] + 100.0,
-            "lane_changes": tensordict["ego", "lane_changes"] + (action > 0),
-        }
         seed, episode = self.last = tensordict["seed"], tensordict["episode"]
-        content = {
-            "observation": self._observe(seed, episode, step),
-            "reward": reward[:, None],
-            "events": events,
-            "ego": TensorDict(ego, [rows]),
-            "seed": seed,
-            "episode": episode,
-            "step": step,
-            "terminated": (crash | goal)[:, None],
-            "truncated": timeout[:, None],
-            "done": (crash | over)[:, None],
-        }
-        return TensorDict(content, [rows])
+        after = self.observation_spec.zero().update({"seed": seed, "episode": episode, "step": step})
+        flags = {"terminated": crash | goal, "truncated": timeout, "done": crash | over}
+        flags |= {("events", "goal"): goal, ("events", "hard_crash"): crash, ("events", "timeout"): timeout}
+        for name, flag in flags.items():
+            after.set(name, flag[:, None])
+        after.set(("ego", "distance"), tensordict["ego", "distance"] + 100.0)
+        after.set(("ego", "lane_changes"), tensordict["ego", "lane_changes"] + (action > 0))
+        return after.set("reward", reward[:, None]).set("observation", self._observe(seed, episode, step))
 
     def _set_seed(self, seed):
         self.seed_number = seed
@@ -119,6 +102,16 @@ def agent(size=29, seed=0, **options):
 
 def steps(source, learner, count):
     return torch.stack([source.step(learner).clone() for _ in range(count)])
+
+
+def check_order(seen, first):
+    """Steps [T, N] on the road: observations follow on, rows begin with episodes ``first``, and no two share one."""
+    going = ~seen["next", "done"][:-1, :, 0]
+    assert going.any()
+    assert torch.equal(seen["next", "observation"][:-1][going], seen["observation"][1:][going])
+    assert seen["episode"][0].tolist() == first
+    driven = [set(seen["episode"][:, row].tolist()) for row in range(len(first))]
+    assert len(set.union(*driven)) == sum(map(len, driven))
 
 
 def gone(group: int, within_s: float = 20.0) -> bool:

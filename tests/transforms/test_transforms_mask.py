@@ -11,9 +11,8 @@ from torchrl.envs.utils import check_env_specs
 
 import ganlane
 from ganlane import keys
-from ganlane.agents.drivers import RandomDriver
+from ganlane.agents.drivers import ExploringPolicy, GreedyPolicy, MaskedPolicy, RandomDriver
 from ganlane.agents.n_step import NStepWindow
-from ganlane.agents.policy import ExploringPolicy, GreedyPolicy, MaskedPolicy
 from ganlane.build import make_driver
 from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError

@@ -1,11 +1,16 @@
-"""The fast linear layer is the ordinary one."""
+"""The network: the duel, and the fast linear layer, which is the ordinary one."""
 
 import pytest
 import torch
 from torch.nn import functional
 
 from ganlane.agents import network as module
-from ganlane.agents.network import linear
+from ganlane.agents.network import duel, linear
+
+
+def test_dueling_takes_the_mean_advantage_off():
+    rows = torch.tensor([[10.0], [1.0], [2.0], [6.0]])
+    assert duel(rows).flatten().tolist() == [8.0, 9.0, 13.0]
 
 
 @pytest.mark.parametrize(("rows", "inputs", "outputs"), [(1, 1, 1), (7, 29, 13), (256, 64, 51)])

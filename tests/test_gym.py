@@ -18,6 +18,8 @@ from reference.gym_env import ID, KEEP, LEFT, RIGHT, ROOT, make, make_vec, until
 import ganlane
 from ganlane.errors import UserError
 from ganlane.gym import ENV_IDS
+from ganlane.gym.rows import NativeRows, make_rows
+from ganlane.native.library import why_not
 
 
 @pytest.mark.parametrize("name", sorted(ENV_IDS.keys() - {ID}))
@@ -327,3 +329,9 @@ def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffi
     for (observation, *rest), (expected, *known) in zip([env.step(action) for action in (KEEP, RIGHT)], theirs):
         assert np.array_equal(observation, expected)
         assert str(rest) == str(known)
+
+
+@pytest.mark.skipif(why_not() is not None, reason=f"no native kernel here: {why_not()}")
+@pytest.mark.parametrize("count", [3, np.int64(3)])
+def test_numpys_numbers_of_environments_get_the_native_kernel_too(count):
+    assert isinstance(make_rows("idm_mobil", count, None, {}), NativeRows)

@@ -80,8 +80,9 @@ class Rainbow:
         self.greedy = GreedyPolicy(self.network)
         self.updates = 0
         self.graph: UpdateGraph | None = None
-        parts = (config.distributional, config.double, config.dueling, config.noisy, config.prioritised)
-        if compile and all(parts) and self.device.type == "cpu":
+        # The graph is of the whole of Rainbow; with any part left out the update is computed step by step.
+        parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
+        if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
             self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
         self.anneal(0)
 

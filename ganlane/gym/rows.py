@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from numbers import Integral
 from typing import Any, Final
 
 import numpy as np
@@ -128,13 +129,13 @@ def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeR
         config._target_ in _NATIVE_TRAFFICS and not config.blind_share and not config.parameters
         and observation.form in NATIVE_FORMS and observation.sensors is None
         and type(env).scenes is EnvConfig.scenes and env.kernel != "torch"
-        and isinstance(count, int) and 1 <= count <= 65536
+        and isinstance(count, Integral) and 1 <= count <= 65536
         and device == "cpu" and not len(given.get("transforms", ()))
     )  # fmt: skip
     if not implemented:
         return None
     batch = NativeBatch(
-        count,
+        int(count),
         env.lanes,
         env.lane_width_m,
         env.vehicles,

@@ -229,7 +229,7 @@ def test_training_can_change_from_one_way_to_the_other_and_be_resumed():
     assert_close(plain, back)
 
 
-@pytest.mark.parametrize("part", ["distributional", "double", "dueling", "noisy", "prioritised"])
+@pytest.mark.parametrize("part", ["distributional", "double", "dueling", "noisy", "prioritised", "kl_priority"])
 def test_an_agent_without_one_of_the_components_keeps_the_other_way(part):
     config = RainbowConfig(**{part: False})
     assert Rainbow(config, SIZE, compile=True).graph is None

@@ -1,7 +1,6 @@
 """The variants of the generated traffics: each as it is, and with one thing changed at a time.
 
-Two changes are no option of the package: a generator in bfloat16 (layers and states; positions and displacements that
-are driven stay float32), and one that follows plans of several steps.
+One change is no option of the package: a calibrated generator that follows plans of several steps.
 """
 
 from __future__ import annotations
@@ -14,13 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from torch import Tensor, nn
 
 from ganlane.errors import UserError
 from ganlane.generator import Generator, load_generator
 from ganlane.generator.closed_loop import COMMON_SPEED_MPS
-from ganlane.generator.networks import MotionLSTM, Observation, PairPooling, motion_features
+from ganlane.generator.networks import Observation
 from ganlane.sim.idm import TABLE_V
 from ganlane.sim.spawn import TABLE_II, SpawnParameters
 from ganlane.sim.state import Road
@@ -34,44 +32,6 @@ PLANS = (2, 4, 8)
 COMMON_SPAWN = replace(TABLE_II, desired_speed_mps=(COMMON_SPEED_MPS, COMMON_SPEED_MPS))
 PRESETS = {"gan": gan_traffic, "gan_calibrated": gan_calibrated_traffic}
 Change = Callable[[TrafficSequential], None]
-
-
-class Bfloat16Motion(MotionLSTM):
-    """Projections in bfloat16; so are the recurrence and its state."""
-
-    def project(self, displacement: Tensor, difference: Tensor) -> Tensor:
-        """See :meth:`MotionLSTM.project`."""
-        return self.input(torch.relu(self.embed(motion_features(displacement, difference).bfloat16())))
-
-
-class Bfloat16Pooling(PairPooling):
-    """Positions are made relative to the first vehicle before they lose digits (0.25 m at 60 m)."""
-
-    def forward(self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor) -> Tensor:
-        """See :meth:`PairPooling.forward`."""
-        near = (position - position[..., :1, :]).bfloat16()
-        return super().forward(hidden, near, displacement.bfloat16(), valid)
-
-
-class Bfloat16Generator(Generator):
-    """``generator`` with its layers in bfloat16; its output is float32."""
-
-    def __init__(self, generator: Generator) -> None:
-        sizes = generator.sizes
-        super().__init__(sizes)
-        self.encoder = Bfloat16Motion(sizes.embedding, sizes.hidden)
-        self.decoder = Bfloat16Motion(sizes.embedding, sizes.hidden)
-        self.pooling = Bfloat16Pooling(sizes.hidden, sizes.pooling, sizes.pooled, sizes.neighbours)
-        self.load_state_dict(generator.state_dict())
-        self.bfloat16().eval().requires_grad_(False)
-
-    def summarise(self, now: Observation) -> Tensor:
-        """See :meth:`Generator.summarise`."""
-        return super().summarise(now._replace(extra=now.extra.bfloat16()))
-
-    def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
-        """See :meth:`Generator.decode`."""
-        return super().decode(context, noise.bfloat16(), now, steps).float()
 
 
 class PlanningGenerator(Generator):
@@ -97,11 +57,6 @@ class PlanningGenerator(Generator):
 def generator_of(traffic: TrafficSequential) -> GeneratedTraffic:
     """The chain's first part."""
     return cast(GeneratedTraffic, traffic.parts["generator"])
-
-
-def in_bfloat16(traffic: TrafficSequential) -> None:
-    """Run the generator in bfloat16."""
-    generator_of(traffic).generator = Bfloat16Generator(generator_of(traffic).generator)
 
 
 def planning(steps: int, traffic: TrafficSequential) -> None:
@@ -174,7 +129,6 @@ def gan_variants() -> list[Variant]:
         *plans,
         Variant("gan", "without latent noise (z = 0)", {"noise_scale": 0.0}),
         *(Variant("gan", f"without {words}", {}, partial(without, part)) for words, part in parts.items()),
-        Variant("gan", "generator in bfloat16", {}, in_bfloat16),
     ]
 
 
@@ -197,7 +151,6 @@ def calibrated_variants() -> list[Variant]:
         *(Variant("gan_calibrated", name, {}, change, spawn) for name, (change, spawn) in changes.items()),
         Variant("gan_calibrated", "without lane changes", {"changes_per_km": 0.0}),
         *plans,
-        Variant("gan_calibrated", "generator in bfloat16", {}, in_bfloat16),
     ]
 
 

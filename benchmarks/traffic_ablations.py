@@ -9,8 +9,7 @@ recipe fitted with other seeds; a cell then holds the mean, lowest and highest o
 ``--fitted LABEL=FILE`` adds other weights as rows of their own. The numbers of every variant and fit are kept in a
 file in ``--folder``, so a run that was stopped goes on where it was.
 
-Two variants are no option of the package: the generator in bfloat16, and plans of several steps for the calibrated
-traffic (:mod:`benchmarks.ablation_variants`).
+Plans of several steps for the calibrated traffic are no option of the package (:mod:`benchmarks.ablation_variants`).
 """
 
 from __future__ import annotations

@@ -24,10 +24,6 @@ class Daydreamers(TrafficModule):
         super().__init__(road, stream)
         self.every_s, self.lasts_s = every_s, lasts_s
 
-    def fresh_memory(self, vehicles, key):
-        """Everybody starts out attentive."""
-        return {"away": torch.zeros_like(vehicles.target_lane)}
-
     def move(self, vehicles, memory, key, step):
         """Follow the leader by IDM, or hold the speed; straight on in either case."""
         u = uniform(key, step, vehicles.x.shape[1], [Purpose.FAULT], vehicles.x.dtype)[..., 0]

@@ -141,7 +141,7 @@ def calibrated_variants() -> list[Variant]:
         "without own headways": (common_headway, TABLE_II),
         "without traits (headway, desired speed)": (common_headway, COMMON_SPAWN),
         "wishes not kept until a gap comes": (partial(with_changes, {"patience_s": 0.1}), TABLE_II),
-        "without the gap check": (partial(with_changes, {"safe_deceleration": math.inf}), TABLE_II),
+        "without the gap check": (partial(with_changes, {"safe_deceleration": 1e6}), TABLE_II),
         "without giving way to others' changes": (partial(with_changes, {"exclusive_m": 0.0}), TABLE_II),
     }
     plans = [Variant("gan_calibrated", f"plans of {steps} steps", {}, partial(planning, steps)) for steps in PLANS]

@@ -9,8 +9,10 @@
 
 Writes results.json into its run folder, and with ``report`` the tables into that document.
 
-A suite (:class:`~ganlane.bench.measure.Suite`) lists groups of cases. The cases of a group take turns (A B C A B C),
-so that other work on the machine slows all of them alike; each case gives one row of medians and ratios.
+A suite lists groups of cases. The cases of a group take turns (A B C A B C), so that other work on the machine slows
+all of them alike; each case gives one row of medians and ratios.
+
+Modules:
 
 - :mod:`~ganlane.bench.measure`: cases, groups and suites; timing, memory, rows.
 - :mod:`~ganlane.bench.systems`: the simulator, a training, and their peers, ready to run.

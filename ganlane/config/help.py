@@ -47,7 +47,7 @@ def help_text(command: str, everything: bool = True) -> str:
     groups = {mount: option for mount, option in chosen.items() if "@" not in mount}
     listed = [_options(*each) for each in chosen.items()] if everything else map(_names, groups, groups.values())
     parts = [
-        inspect.getdoc(importlib.import_module(f"ganlane.{command}")) or "",
+        _purpose(command),
         "options (GROUP=NAME; * is the default)\n" + "\n".join(listed),
         "keys (KEY=VALUE)\n" + "\n".join(key_lines(SCHEMAS[""][command], {}, 2, {*groups, "traffic_options"})),
     ]
@@ -57,6 +57,12 @@ def help_text(command: str, everything: bool = True) -> str:
             parts.append("\n".join([f"keys of {group}={option}", f"  {group}:", *lines]))
     more = [] if everything else [f"ganlane {command} --help-all explains every option, and lists their keys."]
     return "\n\n".join([*parts, *more, _FLAGS.format(command=command)])
+
+
+def _purpose(command: str) -> str:
+    """The docstring of the command's module, without what it says of the modules below."""
+    text = inspect.getdoc(importlib.import_module(f"ganlane.{command}")) or ""
+    return _plain(text.partition("\n\nModules")[0])
 
 
 def _names(group: str, default: str | None) -> str:

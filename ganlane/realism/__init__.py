@@ -14,7 +14,7 @@ and recorded trajectories go through the same measurement. Each quantity gets th
 with an interval over scenes, on a scale with two ends: one half of the recordings against the other, and random
 driving. Long runs without an ego show what a traffic does over minutes.
 
-The modules, from the bottom up:
+Modules, from the bottom up:
 
 - :mod:`~ganlane.realism.recordings`: recorded scenes as arrays.
 - :mod:`~ganlane.realism.measures`: what is measured of trajectories, the distance of two distributions, and the

@@ -9,8 +9,12 @@ Writes results.json, report.html, crashes.json (for ``ganlane render crashes=FIL
 behind each into its run folder. What was driven stays in ``cells``: a command that was stopped goes on where it was,
 and one with other drivers drives those alone.
 
-:mod:`ganlane.compare` drives, :mod:`~ganlane.reproduce.report` computes and writes,
-:mod:`~ganlane.reproduce.figures` draws, :mod:`~ganlane.reproduce.crashes` lists crashes and drives them again.
+Modules:
+
+- :mod:`ganlane.compare`: drives, cell by cell.
+- :mod:`~ganlane.reproduce.report`: numbers and tables.
+- :mod:`~ganlane.reproduce.figures`: the paper's figures and the picture of the matrix.
+- :mod:`~ganlane.reproduce.crashes`: lists crashes, and drives them again.
 """
 
 from __future__ import annotations

@@ -205,3 +205,11 @@ def test_shares_on_the_command_line_replace_those_of_an_experiment(shares):
 
 def test_an_experiment_on_top_of_another_sets_its_own_shares():
     assert config_of("train", "experiment=general_continued").traffic.shares["gan"] == 4
+
+
+@pytest.mark.parametrize("command", SCHEMAS[""])
+def test_the_help_is_plain_text_about_the_command(command):
+    text = help_text(command)
+    assert ":mod:" not in text
+    assert "``" not in text.partition("options (GROUP=NAME")[0]
+    assert "Modules" not in text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -11,6 +12,9 @@ from pathlib import Path
 
 import entry_tiny
 import pytest
+from reference.refusals import is_one_sentence
+
+from ganlane.evaluate import main
 
 TINY = [*entry_tiny.TINY, "evaluation.agents=[random_legal]"]
 #: Option of hydra/launcher to the package that brings it and what it is told beside.
@@ -70,3 +74,27 @@ def test_a_mistake_in_a_sweep_is_one_sentence(launcher, tmp_path):
     assert "nowhere.safetensors" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "outputs").exists()
+
+
+@pytest.fixture
+def own_logging(monkeypatch):
+    """Hydra's log handlers, which write to this test's captured output, end with the test."""
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+
+
+@pytest.mark.usefixtures("empty_folder", "own_logging")
+def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(capsys):
+    assert main(["-m", "seed=0,1", "agents=[mobil,random_legal]", "traffics=[idm]", "episodes=2"]) == 0
+    (folder,) = Path("outputs/evaluate_sweeps").iterdir()
+    seeds = [json.loads((folder / run / "results.json").read_text())["config"]["seed"] for run in ("0", "1")]
+    assert seeds == [0, 1]
+    table = capsys.readouterr().out.rpartition("results: ")[2]
+    assert table.count("random_legal") == 2
+    assert f"sweep: {folder.absolute()}" in table
+
+
+@pytest.mark.usefixtures("empty_folder", "own_logging")
+def test_a_run_of_a_sweep_that_is_refused_ends_it_with_one_sentence(capsys):
+    assert main(["-m", "seed=0,1", "agents=[missing.safetensors]", "traffics=[idm]", "episodes=2"]) == 2
+    assert is_one_sentence(capsys.readouterr().err, "evaluate")
+    assert not list(Path("outputs").rglob("config.yaml"))

@@ -1,0 +1,228 @@
+"""Recycling: who falls out of the ego's range comes back on its other side, where there is room."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference.worlds import drawing, environment, random_scenes, step, vehicles
+
+from ganlane import keys
+from ganlane.agents.drivers import MobilDriver
+from ganlane.errors import UserError
+from ganlane.parameters.driving import Visibility
+from ganlane.parameters.episode import SpawnParameters
+from ganlane.sim.collisions import pair_overlaps
+from ganlane.sim.idm import TABLE_V, following_acceleration
+from ganlane.sim.neighbours import perceive
+from ganlane.sim.spawn import (
+    RANGE_M,
+    SAFE_DECELERATION,
+    recycle,
+)
+from ganlane.sim.state import Road, Vehicles
+
+# Recycling, by hand
+
+ROAD = Road(lanes=3)
+EGO = {"x": 1000.0, "lane": 1}
+AWAY = {"x": 790.0}
+
+
+@pytest.mark.parametrize(
+    ("others", "after"),
+    [
+        # More than 200 m behind: 400 m ahead, and the reverse.
+        ([AWAY, {"x": 1230.0, "lane": 2}], [1190.0, 830.0]),
+        *([[{"x": x, "lane": 2}], [x]] for x in (800.0, 801.0, 1000.0, 1199.0, 1200.0)),
+        # Padding stays and takes no room.
+        ([{**AWAY, "valid": False}], [790.0]),
+        ([AWAY, {"x": 1190.0, "valid": False}], [1190.0, 1190.0]),
+        # At 20 m/s, within 4 m of another one in its lane, IDM asks for far more than 4 m/s2; beside it for nothing.
+        *([[AWAY, {"x": x}], [790.0, x]] for x in (1182.0, 1190.0, 1198.0)),
+        *([[AWAY, {"x": x, "lane": 1}], [1190.0, x]] for x in (1182.0, 1190.0, 1198.0)),
+        # 60 m behind: a follower at the same speed is fine, one that closes in at 20 m/s is not.
+        ([AWAY, {"x": 1130.0, "speed": 20.0, "desired_speed": 40.0}], [1190.0, 1130.0]),
+        ([AWAY, {"x": 1130.0, "speed": 40.0, "desired_speed": 40.0}], [790.0, 1130.0]),
+        # In the middle of a change from lane 0 to lane 1 there has to be room in both.
+        ([{**AWAY, "y": 0.5, "target_lane": 1}, {"x": 1185.0, "lane": 1}], [790.0, 1185.0]),
+        ([{**AWAY, "y": 0.5, "target_lane": 1}, {"x": 1185.0, "lane": 2}], [1190.0, 1185.0]),
+    ],
+)
+def test_who_is_out_of_range_goes_to_the_other_side_where_there_is_room(others, after):
+    assert recycle(vehicles(EGO, *others), ROAD, TABLE_V).x[0].tolist() == [1000.0, *after]
+
+
+def test_nobody_is_put_beside_one_that_has_hardly_left_the_lane():
+    """Each in its own lane, but at an angle: the corners of two cars of 2.5 m, 2.6 m apart, would touch."""
+    moved = {**AWAY, "y": 7.28, "heading": 0.03, "target_lane": 2, "width": 2.5}
+    leaving = {"x": 1190.0, "y": 4.68, "heading": -0.06, "target_lane": 1, "width": 2.5}
+    for other, x in ((leaving, 790.0), ({**leaving, "y": 4.0}, 1190.0)):
+        assert recycle(vehicles(EGO, moved, other), ROAD, TABLE_V).x[0, 1] == x
+    assert pair_overlaps(vehicles(EGO, {**moved, "x": 1190.0}, leaving)).any()
+
+
+def test_only_the_position_changes():
+    before = vehicles(EGO, {**AWAY, "y": 0.3, "heading": 0.01, "speed": 17.0, "acceleration": 0.2})
+    after = recycle(before, ROAD, TABLE_V)
+    assert [name for name, a, b in zip(before._fields, before, after) if not torch.equal(a, b)] == ["x"]
+
+
+# Recycling, any scene
+
+
+def scenes_around(rows: int, cars: int, lanes: int, seed: int) -> Vehicles:
+    """On 1000 m around the ego, some in the middle of a change, some padding."""
+    scene, is_ego = random_scenes(rows, cars, lanes, seed), torch.arange(cars) == keys.EGO_INDEX
+    between = drawing((rows, cars), seed + 1)
+    x = torch.where(is_ego, 1000.0, between(500, 1500))
+    return scene.with_(x=x, valid=is_ego | (between(0, 1) < 0.9))
+
+
+ANY = {"seed": st.integers(0, 2**31), "lanes": st.integers(1, 5), "cars": st.integers(2, 25)}
+
+
+@settings(max_examples=50)
+@given(**ANY)
+def test_positions_change_by_twice_the_range_the_ego_and_padding_never_move(seed, lanes, cars):
+    before = scenes_around(20, cars, lanes, seed)
+    after = recycle(before, Road(lanes), TABLE_V)
+    moved = after.x - before.x
+    distance = before.x - before.x[:, :1]
+    across = -2.0 * RANGE_M * torch.sign(distance)
+    assert ((moved == 0) | ((moved - across).abs() < 1e-9)).all()
+    assert (moved[:, keys.EGO_INDEX] == 0).all()
+    assert (moved[~before.valid] == 0).all()
+    assert (moved[distance.abs() <= RANGE_M] == 0).all()
+    # And a row comes out the same alone.
+    alone = recycle(Vehicles(*(value[7:8] for value in before)), Road(lanes), TABLE_V)
+    assert torch.equal(alone.x[0], after.x[7])
+
+
+def burdened(before: Vehicles, after: Vehicles, road: Road) -> torch.Tensor:
+    """Who brakes harder than is safe because of one that came, or came and has to, bool [N, M].
+
+    Compared with the scene that those who left have left, and in which they have not come back.
+    """
+    went = after.x != before.x
+    gone = before.with_(valid=before.valid & ~went)
+    was, now = (following_acceleration(perceive(scene, road)) for scene in (gone, after))
+    was = torch.where(went, 0.0, was)
+    return (now < was.clamp_max(-SAFE_DECELERATION) - 1e-9) & before.valid
+
+
+@settings(max_examples=50)
+@given(**ANY)
+def test_one_vehicle_that_returns_burdens_nobody(seed, lanes, cars):
+    around = scenes_around(20, cars, lanes, seed)
+    near = around.x.clamp(1000.0 - RANGE_M, 1000.0 + RANGE_M)
+    before = around.with_(x=torch.where(torch.arange(cars) == 1, around.x, near))
+    after = recycle(before, Road(lanes), TABLE_V)
+    assert not burdened(before, after, Road(lanes)).any()
+    assert not (pair_overlaps(after) & ~pair_overlaps(before)).any()
+
+
+def test_several_that_return_at_once_burden_nobody():
+    road, before = Road(lanes=2), scenes_around(2000, 12, 2, seed=0)
+    after = recycle(before, road, TABLE_V)
+    assert (after.x != before.x).sum() > 1000
+    assert not burdened(before, after, road).any()
+    assert not (pair_overlaps(after) & ~pair_overlaps(before)).any()
+
+
+# Recycling in the environment
+
+
+def in_range_by_km(on: bool, cars: int = 9, goal_m: float = 5000.0, rows: int = 8) -> tuple[list[float], int]:
+    """Mean number of others within 200 m of a MOBIL ego, in each kilometre; and how often one of them was moved.
+
+    No vehicle overlaps another in a physics step, and none is burdened.
+    """
+    spread = SpawnParameters(spread_m=max(200.0, 22.3 * cars))
+    env = environment(num_envs=rows, vehicles=cars, goal_m=goal_m, spawn=spread, recycle=on)
+    driver, td, moved = MobilDriver(env.road), env.reset(), 0
+
+    def spied(before: Vehicles, road: Road, idm: object) -> Vehicles:
+        nonlocal moved
+        after = recycle(before, road, TABLE_V)
+        moved += int((after.x != before.x).sum())
+        assert not burdened(before, after, road).any()
+        return after
+
+    def record(cars: Vehicles, running: torch.Tensor) -> None:
+        assert not pair_overlaps(cars)[running].any()
+
+    if on:
+        env.physics.recycle, env.recorder = spied, record
+    seen: list[list[int]] = [[] for _ in range(round(goal_m / 1000.0) + 1)]
+    running = torch.ones(rows, dtype=torch.bool)
+    while running.any():
+        td = env.step(driver(td))["next"]
+        running &= ~td["done"][:, 0]
+        x = td[keys.VEHICLES, "x"]
+        near = ((x[:, 1:] - x[:, :1]).abs() <= RANGE_M).sum(1)
+        for row in running.nonzero()[:, 0].tolist():
+            seen[int(x[row, 0] // 1000.0)].append(int(near[row]))
+    return [sum(counts) / len(counts) for counts in seen if counts], moved
+
+
+@pytest.mark.slow
+def test_without_recycling_the_ego_loses_its_company_over_5_km():
+    alone, _ = in_range_by_km(on=False)
+    assert alone[0] > 7.0
+    assert alone[-1] < 4.0
+
+
+@pytest.mark.parametrize("goal_m", [3000.0, pytest.param(5000.0, marks=pytest.mark.slow)])
+def test_with_it_the_ego_keeps_its_company_and_nobody_is_burdened(goal_m):
+    company, moved = in_range_by_km(on=True, goal_m=goal_m)
+    assert min(company) > 7.5
+    assert moved > goal_m / 100.0
+
+
+@pytest.mark.slow
+def test_among_30_vehicles_too_nobody_overlaps_or_is_burdened():
+    company, _ = in_range_by_km(on=True, cars=30, rows=16)
+    assert min(company) > 20.0
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_rows_that_ended_are_not_recycled(on):
+    """Row 0 reaches its goal in this decision, row 1 goes on; in both somebody is 250 m behind."""
+    env = environment(num_envs=2, vehicles=2, mobil=False, goal_m=1015.0, recycle=on)
+    td = env.reset()
+    row = vehicles({**EGO, "visibility": int(Visibility.BODY)}, {"x": 750.0})
+    for name, value in row.as_dict().items():
+        td[keys.VEHICLES, name] = value.expand(2, 2).clone()
+    td[keys.VEHICLES, "x"][1] -= 100.0
+    after = step(env, td)
+    assert after[keys.EVENTS, "goal"][:, 0].tolist() == [True, False]
+    distance = (after[keys.VEHICLES, "x"][:, 1] - after[keys.VEHICLES, "x"][:, 0]).tolist()
+    assert distance[0] == pytest.approx(-250.0, abs=2.0)
+    assert distance[1] == pytest.approx(150.0 if on else -250.0, abs=2.0)
+
+
+def driven(share: float, num_envs: int = 32, first_episode: int = 0) -> torch.Tensor:
+    """x [N, M] after 60 decisions at up to 35 m/s, where a ``share`` of the episodes is recycled."""
+    spawn = SpawnParameters(ego_desired_speed_mps=35.0)
+    env = environment(num_envs=num_envs, spawn=spawn, first_episode=first_episode, recycle=True, recycle_share=share)
+    state = env.reset()
+    for _ in range(60):
+        state = step(env, state, 0)
+    return state[keys.VEHICLES, "x"]
+
+
+def test_only_a_share_of_the_episodes_is_recycled_and_the_same_ones_in_any_batch():
+    never, half, all_of_them = map(driven, (0.0, 0.5, 1.0))
+    left = [int(((x[:, :1] - x) > RANGE_M + 40.0).any(1).sum()) for x in (never, half, all_of_them)]
+    assert left[0] > 8
+    assert left[2] < 0.2 * left[0]  # who finds no room waits
+    assert 0.2 < left[1] / left[0] < 0.8
+    assert torch.equal(half[8:12], driven(0.5, num_envs=4, first_episode=8))
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
+def test_a_share_outside_0_to_1_is_refused(share):
+    with pytest.raises(UserError, match="recycle_share"):
+        environment(num_envs=2, recycle=True, recycle_share=share)

@@ -16,15 +16,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 import torch
@@ -32,7 +31,7 @@ import torch
 from benchmarks.ablation_variants import Variant, calibrated_variants, fitted_variant, gan_variants, preset_of
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.evaluation import machine_sentence
-from ganlane.evaluation.table import Table
+from ganlane.evaluation.table import NOTHING, Table, with_interval
 from ganlane.files import write_json
 from ganlane.realism.long_runs import LongRun, LongRunParameters
 from ganlane.runtime import keep_freed_memory
@@ -96,6 +95,7 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
 
 def cells(fits: Sequence[dict[str, Any]]) -> list[str]:
     """A row of the table behind its name, of one fit or several."""
+    quantiles = [each["acceleration_quantiles"].values() for each in fits]
     return [
         f"{sum(each['vehicle_km'] for each in fits):.0f}",
         _over_fits(fits, lambda each: each["lane_changes_per_vehicle_km"], 2),
@@ -103,14 +103,10 @@ def cells(fits: Sequence[dict[str, Any]]) -> list[str]:
         str(sum(each["off_road"] for each in fits)),
         _over_fits(fits, lambda each: each["mean_speed_mps"], 1),
         _over_fits(fits, lambda each: each["spread_mps"], 2),
-        ", ".join(f"{sum(levels) / len(fits):.2f}" for levels in zip(*(_quantiles(each) for each in fits))),
+        ", ".join(f"{sum(levels) / len(fits):.2f}" for levels in zip(*quantiles)),
         _over_fits(fits, lambda each: None if each["guard_share"] is None else 100.0 * each["guard_share"], 1),
         f"{sum(each['physics_steps_per_cpu_s'] for each in fits) / len(fits) / 1000:.1f} k",
     ]
-
-
-def _quantiles(numbers: dict[str, Any]) -> tuple[float, ...]:
-    return tuple(numbers["acceleration_quantiles"].values())
 
 
 def _over_fits(
@@ -119,15 +115,9 @@ def _over_fits(
     """Mean, lowest and highest of several fits; the value of a single one, with its ``interval`` if it has one."""
     values = [found for each in fits if (found := value(each)) is not None]
     if not values:
-        return "-"
-    mean = f"{sum(values) / len(values):.{digits}f}"
-    if len(fits) > 1:
-        low, high = min(values), max(values)
-    elif interval:
-        low, high = fits[0][interval] or (0.0, math.inf)
-    else:
-        return mean
-    return f"{mean} [{low:.{digits}f}, {high:.{digits}f}]"
+        return NOTHING
+    bounds = (min(values), max(values)) if len(fits) > 1 else fits[0].get(interval)
+    return with_interval({"mean": fmean(values), "mean_ci": bounds}, "mean", digits)
 
 
 def table(rows: Sequence[tuple[Variant, Sequence[dict[str, Any]]]]) -> str:
@@ -136,23 +126,24 @@ def table(rows: Sequence[tuple[Variant, Sequence[dict[str, Any]]]]) -> str:
     return Table("", HEADINGS, lines).markdown(heading=False)
 
 
-def settings(options: argparse.Namespace) -> dict[str, Any]:
-    """What a variant's numbers depend on."""
-    return {name: getattr(options, name) for name in ("vehicle_km", "vehicles", "batch", "seconds", "seed")}
+def settings(variant: Variant, options: argparse.Namespace) -> dict[str, Any]:
+    """What a variant's numbers depend on: its own options, with the weights, and those of the run."""
+    run = {name: getattr(options, name) for name in ("vehicle_km", "vehicles", "batch", "seconds", "seed")}
+    return {"options": variant.options, **run}
 
 
-def with_each_fit(variant: Variant, options: argparse.Namespace) -> list[dict[str, Any]]:
-    """The numbers of a variant with the weights that ship, then with those of ``--fits`` for its preset."""
+def with_each_fit(variant: Variant, fits: Mapping[Path, str], options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The numbers of a variant with the weights that ship, then with the ``fits`` (and their presets) of its own."""
     if "path" in variant.options:
         return [driven(variant, options)]
-    others = [file for file in options.fits if preset_of(file) == variant.preset]
-    fits = [variant, *(replace(variant, options={**variant.options, "path": str(file)}) for file in others)]
-    return [driven(each, options) for each in fits]
+    others = [file for file, preset in fits.items() if preset == variant.preset]
+    variants = [variant, *(replace(variant, options={**variant.options, "path": str(file)}) for file in others)]
+    return [driven(each, options) for each in variants]
 
 
 def driven(variant: Variant, options: argparse.Namespace) -> dict[str, Any]:
     """The numbers of a variant, from its file if it was driven with these settings before."""
-    path, wanted = options.folder / f"{variant.slug}.json", settings(options)
+    path, wanted = options.folder / f"{variant.slug}.json", settings(variant, options)
     if path.is_file():
         kept = json.loads(path.read_text(encoding="utf-8"))
         if kept["settings"] == wanted:
@@ -213,7 +204,8 @@ def measure(options: argparse.Namespace) -> str:
     chosen = [*gan_variants(), *calibrated_variants(), *map(fitted_variant, options.fitted)]
     if options.only:
         chosen = [each for each in chosen if any(word in f"{each.preset} {each.name}" for word in options.only)]
-    text = table([(variant, with_each_fit(variant, options)) for variant in chosen])
+    fits = {file: preset_of(file) for file in options.fits}
+    text = table([(variant, with_each_fit(variant, fits, options)) for variant in chosen])
     document.write(section(options, text))
     return text
 

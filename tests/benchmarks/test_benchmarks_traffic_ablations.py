@@ -80,6 +80,17 @@ def test_several_fits_give_mean_lowest_and_highest_and_sums_of_counts(tmp_path, 
     assert (cells[1], cells[4], cells[5]) == ("3", "6", "13.0 [9.0, 18.0]")
 
 
+def test_other_weights_of_the_same_name_are_driven_too(tmp_path, capsys):
+    only = ["--only", "gan_calibrated as it is"]
+    for folder in ("one", "other"):
+        fit = tmp_path / folder / "fit.safetensors"
+        fit.parent.mkdir()
+        fit.write_bytes(Path(shipped_generator("calibrated")).read_bytes())
+        capsys.readouterr()
+        assert run(tmp_path, *only, "--fits", str(fit)) == 0
+        assert "gan_calibrated_as_it_is_fit: " in capsys.readouterr().err  # driven, not found
+
+
 def test_every_variant_has_a_name_and_a_file_of_its_own():
     every = [*gan_variants(), *calibrated_variants()]
     assert len({variant.slug for variant in every}) == len(every)

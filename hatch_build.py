@@ -1,10 +1,12 @@
 """Puts the native kernel into the wheel, so that whoever installs it needs no compiler.
 
-Runs when a wheel is built (``pip install .`` builds one), with the compiler that :mod:`ganlane.native.library` finds:
-g++, clang++ or, where there is none, Clang from the package ``ziglang``, which is then fetched for the build. Without
-any of them the wheel has no kernel, and the tensor code drives. An editable install builds at first use.
+Runs when a wheel is built (``pip install .`` builds one), with the compiler that
+:mod:`ganlane.native.library` finds: g++, clang++ or, where there is none, Clang from the package
+``ziglang``, which is then fetched for the build. Without any of them the wheel has no kernel, and
+the tensor code drives. An editable install builds at first use.
 
-``GANLANE_LIGHT_WHEEL=1`` leaves the further trainings of the shipped agents (``agent_idm@1``) out: 12 MB of 17.
+``GANLANE_LIGHT_WHEEL=1`` leaves the further trainings of the shipped agents (``agent_idm@1``) out:
+12 MB of 17.
 """
 
 from __future__ import annotations

@@ -35,7 +35,10 @@ Change = Callable[[TrafficSequential], None]
 
 
 class PlanningGenerator(Generator):
-    """``generator`` asked for one step at a time, but looking only every ``steps``: what execute_k is to ``gan``."""
+    """``generator`` asked for one step at a time, but looking only every ``steps``.
+
+    What execute_k is to ``gan``.
+    """
 
     def __init__(self, generator: Generator, steps: int) -> None:
         super().__init__(generator.sizes)
@@ -48,7 +51,10 @@ class PlanningGenerator(Generator):
         return now.displacement if self.ahead else super().summarise(now)
 
     def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
-        """The next step of the plan [..., 1, 2]; all rows began together, so all look at the same time."""
+        """The next step of the plan [..., 1, 2].
+
+        All rows began together, so all look at the same time.
+        """
         if not self.ahead:
             self.ahead = list(super().decode(context, noise, now, self.steps).unbind(-2))
         return self.ahead.pop(0)[..., None, :]
@@ -128,7 +134,10 @@ def gan_variants() -> list[Variant]:
         Variant("gan", "without the guard", {"guard": False}),
         *plans,
         Variant("gan", "without latent noise (z = 0)", {"noise_scale": 0.0}),
-        *(Variant("gan", f"without {words}", {}, partial(without, part)) for words, part in parts.items()),
+        *(
+            Variant("gan", f"without {words}", {}, partial(without, part))
+            for words, part in parts.items()
+        ),
     ]
 
 
@@ -142,13 +151,22 @@ def calibrated_variants() -> list[Variant]:
         "without traits (headway, desired speed)": (common_headway, COMMON_SPAWN),
         "wishes not kept until a gap comes": (partial(with_changes, {"patience_s": 0.1}), TABLE_II),
         "without the gap check": (partial(with_changes, {"safe_deceleration": 1e6}), TABLE_II),
-        "without giving way to others' changes": (partial(with_changes, {"exclusive_m": 0.0}), TABLE_II),
+        "without giving way to others' changes": (
+            partial(with_changes, {"exclusive_m": 0.0}),
+            TABLE_II,
+        ),
     }
-    plans = [Variant("gan_calibrated", f"plans of {steps} steps", {}, partial(planning, steps)) for steps in PLANS]
+    plans = [
+        Variant("gan_calibrated", f"plans of {steps} steps", {}, partial(planning, steps))
+        for steps in PLANS
+    ]
     return [
         Variant("gan_calibrated", "as it is", {}),
         Variant("gan_calibrated", "without latent noise (z = 0)", {"noise_scale": 0.0}),
-        *(Variant("gan_calibrated", name, {}, change, spawn) for name, (change, spawn) in changes.items()),
+        *(
+            Variant("gan_calibrated", name, {}, change, spawn)
+            for name, (change, spawn) in changes.items()
+        ),
         Variant("gan_calibrated", "without lane changes", {"changes_per_km": 0.0}),
         *plans,
     ]
@@ -158,7 +176,9 @@ def fitted_variant(label_and_file: str) -> Variant:
     """``LABEL=FILE``: other weights in their own preset's chain."""
     label, _, file = label_and_file.partition("=")
     if not label or not file:
-        raise UserError(f"--fitted {label_and_file}: expected LABEL=FILE, a name and the weights of a generator.")
+        raise UserError(
+            f"--fitted {label_and_file}: expected LABEL=FILE, a name and the weights of a generator."
+        )
     return Variant(preset_of(file), label, {"path": file})
 
 

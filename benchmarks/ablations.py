@@ -1,12 +1,12 @@
 """What each part of the agent is worth: trained again without it, with several seeds, and compared.
 
-    python -m benchmarks.ablations                        # trains what is missing: about four hours on one core
-    python -m benchmarks.ablations --only nothing dqn --seeds 0 1
+    python -m benchmarks.ablations                        # trains what is missing: about four hours
+    on one core python -m benchmarks.ablations --only nothing dqn --seeds 0 1
 
-Everything is trained as ``experiment=ablation`` with the options of :data:`ABLATIONS`, seed after seed, and its last
-policy is compared on the same episodes behind the mask of its training, or behind none. Trainings that are finished
-are not done again, nor are cells that were driven. ``python -m benchmarks.printed --write`` makes the document's
-table.
+Everything is trained as ``experiment=ablation`` with the options of :data:`ABLATIONS`, seed after
+seed, and its last policy is compared on the same episodes behind the mask of its training, or
+behind none. Trainings that are finished are not done again, nor are cells that were driven.
+``python -m benchmarks.printed --write`` makes the document's table.
 """
 
 from __future__ import annotations
@@ -54,7 +54,11 @@ ABLATIONS: Mapping[str, tuple[str, ...]] = {
     "lane_view": ("observation=lane_view",),
     "legal": ("mask=legal",),
     "safe": ("mask=safe",),
-    "mixed": ("traffic=mixed", "traffic.shares={idm:1,idm_mobil:1,idm_random:1}", "collector.num_envs=1023"),
+    "mixed": (
+        "traffic=mixed",
+        "traffic.shares={idm:1,idm_mobil:1,idm_random:1}",
+        "collector.num_envs=1023",
+    ),
     "considerate": ("reward=considerate",),
 }
 #: Mask that its agents are compared behind, where it is another than none.
@@ -69,20 +73,38 @@ def train(folder: Path, name: str, seed: int, options: Sequence[str]) -> None:
     Raises:
         UserError: it ended without an agent.
     """
-    overrides = ["experiment=ablation", *ABLATIONS[name], f"seed={seed}", *options, f"hydra.run.dir={folder}"]
+    overrides = [
+        "experiment=ablation",
+        *ABLATIONS[name],
+        f"seed={seed}",
+        *options,
+        f"hydra.run.dir={folder}",
+    ]
     quiet = ["logger.progress=false", "checkpoint_replay=false"]
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "log.txt").open("w", encoding="utf-8") as log:
-        done = subprocess.run([sys.executable, "-m", "ganlane.train", *quiet, *overrides], stdout=log, stderr=log)
+        done = subprocess.run(
+            [sys.executable, "-m", "ganlane.train", *quiet, *overrides], stdout=log, stderr=log
+        )
     if done.returncode != 0:
-        raise UserError(f"{name}, seed {seed}: the training ended with {done.returncode}; see {folder / 'log.txt'}.")
+        raise UserError(
+            f"{name}, seed {seed}: the training ended with {done.returncode}; see {folder / 'log.txt'}."
+        )
 
 
 def train_all(options: argparse.Namespace) -> dict[str, Path]:
     """Train what is missing; the file of each ablation's agents by name."""
-    folders = {(name, seed): options.runs / f"{name}_{seed}" for seed in options.seeds for name in options.only}
-    missing = {place: folder for place, folder in folders.items() if not (folder / AGENT_FILE).is_file()}
-    for (name, seed), folder in tqdm(missing.items(), unit="training", disable=not sys.stderr.isatty()):
+    folders = {
+        (name, seed): options.runs / f"{name}_{seed}"
+        for seed in options.seeds
+        for name in options.only
+    }
+    missing = {
+        place: folder for place, folder in folders.items() if not (folder / AGENT_FILE).is_file()
+    }
+    for (name, seed), folder in tqdm(
+        missing.items(), unit="training", disable=not sys.stderr.isatty()
+    ):
         train(folder, name, seed, options.train)
     files = {name: options.runs / f"{name}.safetensors" for name in options.only}
     for name, path in files.items():
@@ -90,10 +112,16 @@ def train_all(options: argparse.Namespace) -> dict[str, Path]:
     return files
 
 
-def compared(files: Mapping[str, Path], options: Sequence[str]) -> tuple[dict[str, Any], ReproduceConfig]:
-    """Rows and comparisons with :data:`BASE`, where that is among them, by the names of :data:`ABLATIONS`."""
+def compared(
+    files: Mapping[str, Path], options: Sequence[str]
+) -> tuple[dict[str, Any], ReproduceConfig]:
+    """Rows and comparisons with :data:`BASE`, where that is among them, by the names of
+    :data:`ABLATIONS`.
+    """
     drivers = {name: f"{path}@all+{BEHIND.get(name, 'none')}" for name, path in files.items()}
-    config = check("reproduce", [f"agents=[mobil,{','.join(drivers.values())}]", *OPTIONS, *options]).config
+    config = check(
+        "reproduce", [f"agents=[mobil,{','.join(drivers.values())}]", *OPTIONS, *options]
+    ).config
     assert isinstance(config, ReproduceConfig)
     cells = cells_of(config, available(config)[0])
     drive(cells, config)
@@ -118,14 +146,18 @@ def measure(options: argparse.Namespace) -> str:
     if unknown:
         raise UserError(f"--only {unknown[0]}: no such ablation; there are {', '.join(ABLATIONS)}.")
     record, config = compared(train_all(options), options.options)
-    record = {"command": shlex.join(["python", "-m", "benchmarks.ablations", *options.given]), **record}
+    record = {
+        "command": shlex.join(["python", "-m", "benchmarks.ablations", *options.given]),
+        **record,
+    }
     options.out.mkdir(parents=True, exist_ok=True)
     seeds = {
         "trainings": list(options.seeds),
         "stream": config.stream,
         "seed": config.seed,
         "episodes": {
-            name: config.episodes_on(name) for name in dict.fromkeys(row["traffic"] for row in record["rows"])
+            name: config.episodes_on(name)
+            for name in dict.fromkeys(row["traffic"] for row in record["rows"])
         },
     }
     return f"results: {write_results(options.out, record, asdict(config), seeds)}"
@@ -134,11 +166,19 @@ def measure(options: argparse.Namespace) -> str:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
-    parser.add_argument("options", nargs="*", metavar="KEY=VALUE", help="options of ganlane reproduce")
     parser.add_argument(
-        "--train", nargs="*", default=[], metavar="KEY=VALUE", help="further options of ganlane train"
+        "options", nargs="*", metavar="KEY=VALUE", help="options of ganlane reproduce"
     )
-    parser.add_argument("--only", nargs="+", default=list(ABLATIONS), metavar="NAME", help="some of the ablations")
+    parser.add_argument(
+        "--train",
+        nargs="*",
+        default=[],
+        metavar="KEY=VALUE",
+        help="further options of ganlane train",
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=list(ABLATIONS), metavar="NAME", help="some of the ablations"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--runs", type=Path, default=RUNS, help=f"folder of the trainings ({RUNS})")
     parser.add_argument("--out", type=Path, default=OUT, help=f"folder of results.json ({OUT})")

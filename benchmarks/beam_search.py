@@ -1,10 +1,10 @@
 """A driver who knows what comes: a beam search over lane changes, on the simulator itself.
 
-Per episode up to K states are alive. Each is driven on by one decision with every action that makes a difference
-there; what crashed is dropped, what came to nearly the same is merged, and K of the rest are kept, spread over
-lanes and over progress (:func:`choose`). The search ends with the first state that reaches
-the episode's end, or when all are dead. It is a heuristic: a sequence that it finds is proof
-(:func:`ganlane.evaluation.episodes.replay`), none found is not.
+Per episode up to K states are alive. Each is driven on by one decision with every action that makes
+a difference there; what crashed is dropped, what came to nearly the same is merged, and K of the
+rest are kept, spread over lanes and over progress (:func:`choose`). The search ends with the first
+state that reaches the episode's end, or when all are dead. It is a heuristic: a sequence that it
+finds is proof (:func:`ganlane.evaluation.episodes.replay`), none found is not.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from ganlane.errors import UserError
 from ganlane.evaluation.episodes import base_of, start_rows, step_rows
 from ganlane.keys import EGO_INDEX
 
-#: States that agree in lane and change under way and within these steps are one: x and y in m, speed in m/s.
+#: States that agree in lane and change under way and within these steps are one: x and y in m,
+#: speed in m/s.
 MERGED = {"x": 1.0, "y": 0.5, "speed": 0.5}
 
 
@@ -32,9 +33,11 @@ class Plan:
     """What the search found for one episode.
 
     Attributes:
-        actions: one per decision, to the episode's end; of a state that lived longest where ``found`` is false.
+        actions: one per decision, to the episode's end; of a state that lived longest where
+            ``found`` is false.
         reward: their undiscounted return; 0 where the environment pays none.
-        widest: most states that were alive at once; below the beam, nothing but like states was ever dropped.
+        widest: most states that were alive at once; below the beam, nothing but like states was
+            ever dropped.
     """
 
     episode: int
@@ -46,12 +49,16 @@ class Plan:
 
 @dataclass
 class _Front:
-    """The states alive after some decision: whose they are, what they earned, and how they came about."""
+    """The states alive after some decision.
+
+    Whose they are, what they earned, and how they came about.
+    """
 
     state: TensorDictBase
     owner: Tensor
     total: Tensor
-    #: Per decision so far, of every state then alive: its predecessor's row, and the action taken there.
+    #: Per decision so far, of every state then alive: its predecessor's row, and the action taken
+    #: there.
     trail: list[tuple[Tensor, Tensor]]
 
     def actions(self, row: int) -> tuple[int, ...]:
@@ -64,14 +71,17 @@ class _Front:
 
 
 @torch.no_grad()
-def beam_search(env: EnvBase, episodes: Sequence[int], seed: int, beam: int, by_reward: bool = False) -> list[Plan]:
+def beam_search(
+    env: EnvBase, episodes: Sequence[int], seed: int, beam: int, by_reward: bool = False
+) -> list[Plan]:
     """Search ``episodes`` of ``seed`` side by side; one plan each, in the order given.
 
     Args:
-        env: steps as many rows at a time as it has; its size makes no difference to rule-driven traffic.
+        env: steps as many rows at a time as it has; its size makes no difference to rule-driven
+            traffic.
         beam: K, states kept per episode.
-        by_reward: keep those with the highest return in each lane rather than the most different ones, for an
-            optimistic bound of the reward; needs an environment that pays one.
+        by_reward: keep those with the highest return in each lane rather than the most different
+            ones, for an optimistic bound of the reward; needs an environment that pays one.
 
     Raises:
         UserError: ``beam`` is not positive, or no episode is given.
@@ -119,9 +129,15 @@ class _Search:
         alive = ~done & ~self._concluded(owner)
         self._conclude(after, _last_of_their_kind(owner, alive) & ~self._concluded(owner), False)
         living = alive.nonzero()[:, 0]
-        kept = living[choose(state[living], owner[living], total[living], self.beam, self.by_reward)]
-        self.widest = torch.maximum(self.widest, torch.bincount(owner[kept], minlength=len(self.widest)))
-        return _Front(state[kept], owner[kept], total[kept], [*front.trail, (rows[kept], action[kept])])
+        kept = living[
+            choose(state[living], owner[living], total[living], self.beam, self.by_reward)
+        ]
+        self.widest = torch.maximum(
+            self.widest, torch.bincount(owner[kept], minlength=len(self.widest))
+        )
+        return _Front(
+            state[kept], owner[kept], total[kept], [*front.trail, (rows[kept], action[kept])]
+        )
 
     def _branches(self, state: TensorDictBase) -> Tensor:
         """Which actions to try, bool [rows, 3]: legal ones, and in a change those that are heard."""
@@ -155,7 +171,9 @@ def _last_of_their_kind(owner: Tensor, alive: Tensor) -> Tensor:
     return ~living[owner]
 
 
-def choose(state: TensorDictBase, owner: Tensor, total: Tensor, beam: int, by_reward: bool) -> Tensor:
+def choose(
+    state: TensorDictBase, owner: Tensor, total: Tensor, beam: int, by_reward: bool
+) -> Tensor:
     """At most ``beam`` rows of ``state`` per episode, as their numbers in growing order.
 
     Args:
@@ -163,11 +181,16 @@ def choose(state: TensorDictBase, owner: Tensor, total: Tensor, beam: int, by_re
         owner: which episode each row belongs to, [rows] int64.
         total: what each row has earned, [rows].
         beam: rows kept per episode.
-        by_reward: within a lane keep those that earned most, rather than the foremost and the hindmost.
+        by_reward: within a lane keep those that earned most, rather than the foremost and the
+            hindmost.
     """
     vehicles = state.get(keys.VEHICLES)
     ego = {name: vehicles.get(name)[:, EGO_INDEX] for name in MERGED}
-    cell = (owner, vehicles.get("target_lane")[:, EGO_INDEX], state.get(keys.EGO).get("change_direction"))
+    cell = (
+        owner,
+        vehicles.get("target_lane")[:, EGO_INDEX],
+        state.get(keys.EGO).get("change_direction"),
+    )
     near = [torch.floor(value / MERGED[name]) for name, value in ego.items()]
     gain = total if by_reward else ego["x"]
     distinct = order(*cell, *near, -gain)

@@ -3,10 +3,11 @@
     python -m benchmarks.carry_over outputs/evaluate/RUN [RUN ...] --name general=agent_general \
         --report docs/carry_over.md --table seed_0
 
-Joins the ``episodes.parquet`` of the folders. The first table has every driver's paired lead over MOBIL on the same
-episodes (mean and bootstrap interval, 95 %), the second what went wrong: hard crashes, departures from the road, and
-dangerous closeness to somebody behind per episode. ``--report`` puts both between the marker lines
-``<!-- NAME: begin -->`` and ``<!-- NAME: end -->`` of a document, ``--table`` names them.
+Joins the ``episodes.parquet`` of the folders. The first table has every driver's paired lead over
+MOBIL on the same episodes (mean and bootstrap interval, 95 %), the second what went wrong: hard
+crashes, departures from the road, and dangerous closeness to somebody behind per episode.
+``--report`` puts both between the marker lines ``<!-- NAME: begin -->`` and ``<!-- NAME: end -->``
+of a document, ``--table`` names them.
 """
 
 from __future__ import annotations
@@ -39,9 +40,13 @@ def read(folders: Sequence[Path], names: Mapping[str, str]) -> pl.DataFrame:
     for folder in folders:
         path = folder / "episodes.parquet"
         if not path.is_file():
-            raise UserError(f"{folder}: no episodes.parquet; give the folder of a finished 'ganlane evaluate'.")
+            raise UserError(
+                f"{folder}: no episodes.parquet; give the folder of a finished 'ganlane evaluate'."
+            )
         frame = pl.read_parquet(path)
-        frames.append(frame.with_columns(pl.col("agent").replace({old: new for new, old in names.items()})))
+        frames.append(
+            frame.with_columns(pl.col("agent").replace({old: new for new, old in names.items()}))
+        )
     return pl.concat(frames, how="diagonal").unique(KEY, keep="first", maintain_order=True)
 
 
@@ -73,7 +78,10 @@ def tables(episodes: pl.DataFrame) -> str:
     for agent in agents:
         there = {traffic: _of(episodes, agent, traffic) for traffic in traffics}
         leads.append(
-            [lead_cell(x, _of(episodes, BASELINE, traffic)) if x.height else "" for traffic, x in there.items()]
+            [
+                lead_cell(x, _of(episodes, BASELINE, traffic)) if x.height else ""
+                for traffic, x in there.items()
+            ]
         )
         failures.append([failure_cell(x) if x.height else "" for x in there.values()])
     counts = [str(_of(episodes, BASELINE, traffic).height) for traffic in traffics]
@@ -106,7 +114,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
     parser.add_argument("folders", type=Path, nargs="+", help="of finished 'ganlane evaluate' runs")
-    parser.add_argument("--name", action="append", default=[], help="NEW=OLD: another name for an agent")
+    parser.add_argument(
+        "--name", action="append", default=[], help="NEW=OLD: another name for an agent"
+    )
     parser.add_argument("--report", type=Path, help="document with the marker lines")
     parser.add_argument("--table", default="table", help="name of the markers")
     return parser.parse_args(arguments)
@@ -114,7 +124,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def report(options: argparse.Namespace) -> str:
     """The tables, in the document too where one is named."""
-    section = ReportSection(options.report, *(f"<!-- {options.table}: {which} -->" for which in ("begin", "end")))
+    section = ReportSection(
+        options.report, *(f"<!-- {options.table}: {which} -->" for which in ("begin", "end"))
+    )
     text = tables(read(options.folders, dict(name.split("=", 1) for name in options.name)))
     section.write(text)
     return text

@@ -1,10 +1,11 @@
-"""Does the agent learn? Rainbow on CartPole-v1, until 100 evaluation episodes have a mean return of 475 or more.
+"""Does the agent learn? Rainbow on CartPole-v1, until 100 evaluation episodes have a mean return of
+475 or more.
 
     python -m benchmarks.cartpole --seeds 5
     python -m benchmarks.cartpole --seeds 5 --report docs/agent.md
 
-Trained through TorchRL's GymEnv. Every 5,000 frames the greedy policy drives the same 100 episodes. A benchmark
-rather than a test: the median over 5 seeds should reach 475 within 300,000 frames.
+Trained through TorchRL's GymEnv. Every 5,000 frames the greedy policy drives the same 100 episodes.
+A benchmark rather than a test: the median over 5 seeds should reach 475 within 300,000 frames.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from ganlane.evaluation.table import Table
 from ganlane.training import TrainingConfig, train
 
 BEGIN, END = "<!-- cartpole: begin -->", "<!-- cartpole: end -->"
-#: CartPole ends after 500 steps; with a discount of 0.99 a perfect policy's return is 99.3. Noise alone explores.
+#: CartPole ends after 500 steps; with a discount of 0.99 a perfect policy's return is 99.3. Noise
+#: alone explores.
 CONFIG = RainbowConfig(
     hidden=(128, 128),
     gamma=0.99,
@@ -57,7 +59,8 @@ class Solved(Exception):
 
 @dataclass
 class Outcome:
-    """Result of one seed: the best evaluation, the frames at which it reached the goal, and the time it took.
+    """Result of one seed: the best evaluation, the frames at which it reached the goal, and the
+    time it took.
 
     Also a log: it reads the rows of the evaluations and ends the run at the goal.
     """
@@ -97,7 +100,9 @@ def evaluate(policy: GreedyPolicy) -> dict[str, float]:
     observation, _ = envs.reset(seed=1_000_000)
     running, returns = np.ones(EPISODES, dtype=bool), np.zeros(EPISODES)
     while running.any():
-        chosen = policy(TensorDict({"observation": torch.from_numpy(observation)}, [EPISODES]))["action"]
+        chosen = policy(TensorDict({"observation": torch.from_numpy(observation)}, [EPISODES]))[
+            "action"
+        ]
         observation, reward, terminated, truncated, _ = envs.step(chosen.numpy())
         returns += reward * running
         running &= ~(terminated | truncated)
@@ -120,14 +125,18 @@ def run(seed: int, frames: int) -> Outcome:
 
 def median(outcomes: Sequence[Outcome]) -> str:
     """Of the frames to the goal; a seed that did not reach it counts as never."""
-    frames = statistics.median(float("inf") if o.reached is None else float(o.reached) for o in outcomes)
+    frames = statistics.median(
+        float("inf") if o.reached is None else float(o.reached) for o in outcomes
+    )
     return f"{frames:,.0f}" if frames < float("inf") else "not reached"
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
     """All seeds and their median, as Markdown."""
     lines = [*(outcome.cells() for outcome in outcomes), ["median", median(outcomes), "", ""]]
-    return Table("", ["seed", "frames to 475", "best mean return", "time"], lines, 4).markdown(heading=False)
+    return Table("", ["seed", "frames to 475", "best mean return", "time"], lines, 4).markdown(
+        heading=False
+    )
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -1,17 +1,20 @@
-"""Upper bound on the share of crashes that no driver could have avoided, by beam search on the simulator itself.
+"""Upper bound on the share of crashes that no driver could have avoided, by beam search on the
+simulator itself.
 
-    python -m benchmarks.crash_floor --traffic gan --episodes 300 --beam 8 32 128 --report docs/results.md
+    python -m benchmarks.crash_floor --traffic gan --episodes 300 --beam 8 32 128 --report
+    docs/results.md
 
-An episode counts as avoidable once some sequence of actions brings the ego through it without a hard crash. First
-ordinary drivers drive the first episodes of the report stream, which costs little. Those in which all of them crashed
-are searched with beams of growing size (:mod:`benchmarks.beam_search`), and a sequence that a search found is driven
-again before it counts. What is left is an upper bound of the unavoidable share, and it falls with the beam.
+An episode counts as avoidable once some sequence of actions brings the ego through it without a
+hard crash. First ordinary drivers drive the first episodes of the report stream, which costs
+little. Those in which all of them crashed are searched with beams of growing size
+(:mod:`benchmarks.beam_search`), and a sequence that a search found is driven again before it
+counts. What is left is an upper bound of the unavoidable share, and it falls with the beam.
 
-The bound belongs to a driver who knows what comes and who, like every driver here, decides on lanes alone: the ego's
-speed is IDM's. Who does not know what comes will do worse.
+The bound belongs to a driver who knows what comes and who, like every driver here, decides on lanes
+alone: the ego's speed is IDM's. Who does not know what comes will do worse.
 
-Writes results.json, with the actions of every way that was found, into its folder; with --report also the tables
-between the markers of a document.
+Writes results.json, with the actions of every way that was found, into its folder; with --report
+also the tables between the markers of a document.
 """
 
 from __future__ import annotations
@@ -46,8 +49,8 @@ class Way:
     Attributes:
         stage: ``drivers`` or ``beam K``: what found it; None where nobody came through.
         ride: with the actions; None where nobody has driven this episode yet.
-        widest: most states alive at once in the last search; 0 where there was none. Below the beam, the search
-            dropped nothing but like states.
+        widest: most states alive at once in the last search; 0 where there was none. Below the
+            beam, the search dropped nothing but like states.
     """
 
     episode: int
@@ -62,39 +65,59 @@ def stage_of(beam: int) -> str:
 
 
 def ways_of_drivers(driven: Iterable[Sequence[Rollout]], episodes: Sequence[int]) -> list[Way]:
-    """Which of ``episodes`` ordinary drivers came through, by the ride with the highest return; one way each."""
+    """Which of ``episodes`` ordinary drivers came through, by the ride with the highest return.
+
+    One way each.
+    """
     best: dict[int, Rollout] = {}
-    for ride in sorted((ride for rides in driven for ride in rides), key=lambda ride: (ride.safe, ride.reward)):
+    for ride in sorted(
+        (ride for rides in driven for ride in rides), key=lambda ride: (ride.safe, ride.reward)
+    ):
         best[ride.episode] = ride
     rides = [(number, best.get(number)) for number in episodes]
-    return [Way(number, FIRST_STAGE if ride is not None and ride.safe else None, ride) for number, ride in rides]
+    return [
+        Way(number, FIRST_STAGE if ride is not None and ride.safe else None, ride)
+        for number, ride in rides
+    ]
 
 
 def search_left(env: EnvBase, ways: Sequence[Way], seed: int, beam: int) -> list[Way]:
-    """``ways`` with those of episodes of ``seed`` that had none searched for, and driven again, in ``env``."""
+    """``ways`` with those of episodes of ``seed`` that had none searched for, and driven again, in
+    ``env``.
+    """
     left = [way.episode for way in ways if way.stage is None]
     if not left:
         return list(ways)
     plans = {plan.episode: plan for plan in beam_search(env, left, seed, beam)}
     rides = replay(env, {number: plan.actions for number, plan in plans.items()}, seed)
     stages = {ride.episode: stage_of(beam) if ride.safe else None for ride in rides}
-    found = {r.episode: Way(r.episode, stages[r.episode], r, plans[r.episode].widest) for r in rides}
+    found = {
+        r.episode: Way(r.episode, stages[r.episode], r, plans[r.episode].widest) for r in rides
+    }
     return [found.get(way.episode, way) for way in ways]
 
 
 def floor_rows(ways: Sequence[Way], beams: Sequence[int]) -> list[dict[str, Any]]:
-    """Per stage: ``searched_with, avoidable, not_avoided`` (counts so far), ``share, share_ci`` (exact, 95 %)."""
+    """Per stage.
+
+    ``searched_with, avoidable, not_avoided`` (counts so far), ``share, share_ci`` (exact, 95 %).
+    """
     rows, avoidable = [], 0
     for stage in (FIRST_STAGE, *map(stage_of, beams)):
         avoidable += sum(way.stage == stage for way in ways)
         share = clopper_pearson(len(ways) - avoidable, len(ways))
         left = {"avoidable": avoidable, "not_avoided": len(ways) - avoidable}
-        rows.append({"searched_with": stage, **left, "share": share.value, "share_ci": share.interval})
+        rows.append(
+            {"searched_with": stage, **left, "share": share.value, "share_ci": share.interval}
+        )
     return rows
 
 
 def driver_row(name: str, rides: Sequence[Rollout], ways: Sequence[Way]) -> dict[str, Any]:
-    """A driver's crashes: how many, which of them were avoidable, what they hit and whether the ego kept its lane."""
+    """A driver's crashes.
+
+    How many, which of them were avoidable, what they hit and whether the ego kept its lane.
+    """
     crashes = [ride for ride in rides if ride.end == "hard_crash"]
     avoidable = {way.episode for way in ways if way.stage is not None}
     share = clopper_pearson(len(crashes), len(rides))
@@ -178,7 +201,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--traffic", default="gan")
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--beam", type=int, nargs="+", default=[8, 32, 128], help="growing sizes")
-    parser.add_argument("--drivers", nargs="*", default=list(DRIVERS), help="none: search every episode")
+    parser.add_argument(
+        "--drivers", nargs="*", default=list(DRIVERS), help="none: search every episode"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--vehicles", type=int, default=9, help="the ego included")
     parser.add_argument("--rows", type=int, default=32, help="highways that are stepped at once")
@@ -192,8 +217,13 @@ def markers(traffic: str) -> tuple[str, str]:
     return f"<!-- begin crash floor {traffic} -->", f"<!-- end crash floor {traffic} -->"
 
 
-def publish(options: argparse.Namespace, section: ReportSection, tables: dict[str, Any], ways: Sequence[Way]) -> str:
-    """Print the tables, write them, and with --report put them into the document; where the results are."""
+def publish(
+    options: argparse.Namespace, section: ReportSection, tables: dict[str, Any], ways: Sequence[Way]
+) -> str:
+    """Print the tables, write them, and with --report put them into the document.
+
+    Where the results are.
+    """
     both = floor_table(tables["floor"], options.episodes), driver_table(tables["drivers"])
     text = "\n\n".join(table.markdown(heading=False) for table in both)
     print(text, flush=True)
@@ -205,7 +235,10 @@ def publish(options: argparse.Namespace, section: ReportSection, tables: dict[st
 
 
 def measure(options: argparse.Namespace) -> str:
-    """Drive and search; the results are published after every stage, since the later ones take long."""
+    """Drive and search.
+
+    The results are published after every stage, since the later ones take long.
+    """
     keep_freed_memory()
     section = ReportSection(options.report, *markers(options.traffic))
     begun, line = time.monotonic(), ""

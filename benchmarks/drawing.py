@@ -1,11 +1,13 @@
-"""How fast frames of an episode are drawn: frames/s on one core, MOBIL with 8 others on three lanes.
+"""How fast frames of an episode are drawn: frames/s on one core, MOBIL with 8 others on three
+lanes.
 
     OMP_NUM_THREADS=1 python -m benchmarks.drawing
     OMP_NUM_THREADS=1 python -m benchmarks.drawing --width 1920 --height 480
     python -m benchmarks.drawing --profile
 
-Prints the median and the best of the rounds, by the clock and by CPU time. Drawing runs in one thread: on an idle
-core the two agree; on a busy machine the clock also counts the time that others had.
+Prints the median and the best of the rounds, by the clock and by CPU time. Drawing runs in one
+thread: on an idle core the two agree; on a busy machine the clock also counts the time that others
+had.
 """
 
 from __future__ import annotations
@@ -29,10 +31,14 @@ from ganlane.view import FramePainter, Trajectory, WindowParameters, record_epis
 
 
 def episode(length_s: float, number: int = 2) -> Trajectory:
-    """The first ``length_s`` seconds of an episode of ``ganlane render agent=mobil traffic=idm_mobil``."""
+    """The first ``length_s`` seconds of an episode of
+    ``ganlane render agent=mobil traffic=idm_mobil``.
+    """
     config = EnvConfig()
     env = make_env(make_traffic(IdmMobilTrafficConfig(), config, Stream.REPORT), config)
-    return record_episode(env, make_driver("mobil", config).policy, 0, number, "mobil", "idm_mobil", length_s)
+    return record_episode(
+        env, make_driver("mobil", config).policy, 0, number, "mobil", "idm_mobil", length_s
+    )
 
 
 def rounds(painter: FramePainter, frames: int, count: int) -> tuple[list[float], list[float]]:
@@ -80,7 +86,9 @@ def measure(options: argparse.Namespace) -> str:
     painter.draw(0)
     if options.profile:
         return profile(painter, options.frames)
-    lines = [f"{options.width} x {options.height}, {trajectory.vehicles} vehicles, {options.rounds} rounds"]
+    lines = [
+        f"{options.width} x {options.height}, {trajectory.vehicles} vehicles, {options.rounds} rounds"
+    ]
     for unit, found in zip(("s", "CPU-s"), rounds(painter, options.frames, options.rounds)):
         lines.append(f"{statistics.median(found):.0f} frames/{unit} (best {max(found):.0f})")
     return "\n".join(lines)

@@ -1,10 +1,12 @@
-"""Physics steps per CPU-second of the eager tensor code, of this checkout and of an older revision, in turns.
+"""Physics steps per CPU-second of the eager tensor code, of this checkout and of an older revision,
+in turns.
 
     python -m benchmarks.eager_revisions --revision 82e9c00
     python -m benchmarks.eager_revisions --cases 30,256,3 200,64,6 --turns 5
 
-A case is vehicles, batch and lanes. Bare physics of ``idm_mobil``, without kernel and compiler: no observation, no
-reward, no resets; the ego keeps its lane. Each revision has a process of its own, which computes when it is told to.
+A case is vehicles, batch and lanes. Bare physics of ``idm_mobil``, without kernel and compiler: no
+observation, no reward, no resets; the ego keeps its lane. Each revision has a process of its own,
+which computes when it is told to.
 """
 
 from __future__ import annotations
@@ -92,15 +94,21 @@ def measure(options: argparse.Namespace) -> str:
             times = median(new / before for before, new in turns)
             lines.append([f"{vehicles}, {lanes}", rows, *map(count, rates), f"{times:.2f}"])
     headings = ["vehicles, lanes", "batch", options.revision, "now", "times"]
-    note = f"Physics steps per CPU-second, medians of {options.turns} turns. {machine_sentence([1])}"
-    return Table("Eager tensor code against an older revision", headings, lines, 1, [note]).markdown()
+    note = (
+        f"Physics steps per CPU-second, medians of {options.turns} turns. {machine_sentence([1])}"
+    )
+    return Table(
+        "Eager tensor code against an older revision", headings, lines, 1, [note]
+    ).markdown()
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
     parser.add_argument("--revision", default="82e9c00")
-    parser.add_argument("--cases", nargs="+", default=["9,256,3", "9,4096,3", "30,256,3", "30,1024,3", "200,64,6"])
+    parser.add_argument(
+        "--cases", nargs="+", default=["9,256,3", "9,4096,3", "30,256,3", "30,1024,3", "200,64,6"]
+    )
     parser.add_argument("--turns", type=int, default=3)
     return parser.parse_args(arguments)
 

@@ -1,10 +1,12 @@
-"""The figures of the docs that need no long run: the architecture, and recorded against generated courses.
+"""The figures of the docs that need no long run: the architecture, and recorded against generated
+courses.
 
     python -m benchmarks.figures --folder docs/figures
     python -m benchmarks.figures --folder docs/figures --scene us101-e --lane 1
 
-Writes generator_architecture.png (the paper's Figure 1, with the shapes of the generator that ships) and
-generator_courses.png (its Figure 2: a scene that the generator was not fitted to; needs the recordings).
+Writes generator_architecture.png (the paper's Figure 1, with the shapes of the generator that
+ships) and generator_courses.png (its Figure 2: a scene that the generator was not fitted to; needs
+the recordings).
 """
 
 from __future__ import annotations
@@ -41,7 +43,10 @@ _ACROSS, _STEP_X, _STEP_Y = 4, 2.0, 1.15
 
 @dataclass(frozen=True)
 class Block:
-    """A part of a network: its name, what it does (two lines), the shape of its output, and its number of weights."""
+    """A part of a network.
+
+    Its name, what it does (two lines), the shape of its output, and its number of weights.
+    """
 
     title: str
     does: tuple[str, str]
@@ -55,7 +60,9 @@ def _count(*modules: nn.Module) -> int:
 
 @torch.no_grad()
 def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
-    """The generator's parts in order, run on ``vehicles`` vehicles to see the shapes (batch left out)."""
+    """The generator's parts in order, run on ``vehicles`` vehicles to see the shapes (batch left
+    out).
+    """
     sizes = generator.sizes
     observed = torch.zeros(1, vehicles, sizes.observed, 2)
     seen = generator.observe(observed, observed[:, :, 0], torch.ones(1, vehicles, dtype=torch.bool))
@@ -87,7 +94,9 @@ def generator_blocks(generator: Generator, vehicles: int = 9) -> list[Block]:
 
 
 @torch.no_grad()
-def discriminator_blocks(discriminator: Discriminator, steps: int, vehicles: int = 9) -> list[Block]:
+def discriminator_blocks(
+    discriminator: Discriminator, steps: int, vehicles: int = 9
+) -> list[Block]:
     """The discriminator's parts, run on ``steps`` displacements of ``vehicles`` vehicles."""
     shown = torch.zeros(1, vehicles, steps, 2)
     encoder = discriminator.encoder
@@ -128,7 +137,9 @@ def draw_architecture(networks: Mapping[str, Sequence[Block]]) -> Figure:
             if place + 1 < len(blocks):
                 ends = {"xy": (left + 1.98, top + 0.4), "xytext": (left + 1.68, top + 0.4)}
                 axes.annotate(
-                    "", **ends, arrowprops={"arrowstyle": "-|>", "color": FAINT, "shrinkA": 0, "shrinkB": 0}
+                    "",
+                    **ends,
+                    arrowprops={"arrowstyle": "-|>", "color": FAINT, "shrinkA": 0, "shrinkB": 0},
                 )
     return figure
 
@@ -136,14 +147,22 @@ def draw_architecture(networks: Mapping[str, Sequence[Block]]) -> Figure:
 def _draw_block(axes: Axes, left: float, top: float, block: Block, colour: str) -> None:
     """A box of 1.65 by 0.8 inches with its four lines."""
     style = "round,pad=0,rounding_size=0.07"
-    axes.add_patch(FancyBboxPatch((left, top), 1.65, 0.8, boxstyle=style, fc="white", ec=colour, lw=1.5))
+    axes.add_patch(
+        FancyBboxPatch((left, top), 1.65, 0.8, boxstyle=style, fc="white", ec=colour, lw=1.5)
+    )
     axes.text(left + 0.08, top + 0.14, block.title, va="center", size=8.5)
     for line, text in enumerate(block.does):
         axes.text(left + 0.08, top + 0.3 + 0.15 * line, text, va="center", color=FAINT, size=7)
     axes.text(left + 0.08, top + 0.67, str(list(block.shape)), va="center", color=colour, size=8.5)
     if block.parameters:
         axes.text(
-            left + 1.57, top + 0.67, f"{block.parameters} weights", va="center", ha="right", color=FAINT, size=7
+            left + 1.57,
+            top + 0.67,
+            f"{block.parameters} weights",
+            va="center",
+            ha="right",
+            color=FAINT,
+            size=7,
         )
 
 
@@ -154,18 +173,24 @@ def lane_courses(frame: pl.DataFrame, lane: int) -> list[tuple[np.ndarray, np.nd
         frame: one scene in the schema, sorted by track.
         lane: 0 is the rightmost.
     """
-    tracks = [track for track in frame.partition_by("vehicle", maintain_order=True) if track["lane"][0] == lane]
+    tracks = [
+        track
+        for track in frame.partition_by("vehicle", maintain_order=True)
+        if track["lane"][0] == lane
+    ]
     return [(track["frame"].to_numpy() * FRAME_S, track["x"].to_numpy()) for track in tracks]
 
 
 @rc_context(STYLE)
 def draw_space_time(scene: str, lane: int, courses: Mapping[str, pl.DataFrame]) -> Figure:
-    """Positions over time of one lane's vehicles, the first of ``courses`` in black and the others dashed over it.
+    """Positions over time of one lane's vehicles, the first of ``courses`` in black and the others
+    dashed over it.
 
     Args:
         scene: its name.
         lane: whose vehicles are drawn.
-        courses: name to trajectories (:func:`ganlane.realism.recordings.frame_of`) of the same scene.
+        courses: name to trajectories (:func:`ganlane.realism.recordings.frame_of`) of the same
+            scene.
     """
     first, *others = courses
     colours = {first: INK, **palette(others)}
@@ -186,14 +211,18 @@ def architecture() -> Figure:
     discriminator = Discriminator(sizes.embedding, sizes.hidden)
     return draw_architecture(
         {
-            f"generator of the preset {metadata['preset']}, for 9 vehicles": generator_blocks(generator),
+            f"generator of the preset {metadata['preset']}, for 9 vehicles": generator_blocks(
+                generator
+            ),
             "discriminator": discriminator_blocks(discriminator, sizes.observed + sizes.predicted),
         }
     )
 
 
 def courses(scene: str, lane: int) -> Figure:
-    """The vehicles of one lane as recorded, and as the calibrated traffic drives them from the same start."""
+    """The vehicles of one lane as recorded, and as the calibrated traffic drives them from the same
+    start.
+    """
 
     def make(road: Road) -> TrafficModule:
         return gan_calibrated_traffic(road, Stream.REPORT)
@@ -201,14 +230,18 @@ def courses(scene: str, lane: int) -> Figure:
     frame = read_scenes(default_scenes()).filter(pl.col("scene") == scene)
     (recording,) = recordings_of(frame, scene_lane_widths(frame))
     driven = drive_recordings(make, [recording], StartOptions(desired_above_mps=11.0))
-    return draw_space_time(scene, lane, {"recorded": recorded_frame([recording]), "gan_calibrated": driven})
+    return draw_space_time(
+        scene, lane, {"recorded": recorded_frame([recording]), "gan_calibrated": driven}
+    )
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
     parser.add_argument("--folder", type=Path, default=Path("docs/figures"))
-    parser.add_argument("--scene", default="us101-b", help="a scene that the generator was not fitted to")
+    parser.add_argument(
+        "--scene", default="us101-b", help="a scene that the generator was not fitted to"
+    )
     parser.add_argument("--lane", type=int, default=2, help="0 is the rightmost")
     return parser.parse_args(arguments)
 

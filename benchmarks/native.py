@@ -1,17 +1,19 @@
-"""Physics steps per CPU-second of the native kernel and of the tensor code, one after the other, several times.
+"""Physics steps per CPU-second of the native kernel and of the tensor code, one after the other,
+several times.
 
     python benchmarks/native.py
     python benchmarks/native.py --vehicles 9 30 60 --batches 1 16 256 1024 4096 --repeats 5
     python benchmarks/native.py --environment --vehicles 9
 
-Bare physics of ``idm_mobil`` on 3 lanes: no observation, no reward, no resets; the ego keeps its lane. Printed is the
-median over the repeats. ``--kernel-only`` leaves the tensor code out, ``--variants`` compares instruction sets.
+Bare physics of ``idm_mobil`` on 3 lanes: no observation, no reward, no resets; the ego keeps its
+lane. Printed is the median over the repeats. ``--kernel-only`` leaves the tensor code out,
+``--variants`` compares instruction sets.
 
 ``--pairs`` adds the tensor code without sorting (:mod:`ganlane.sim.neighbours`).
 
-``--environment``: everything, through TorchRL: observation (``lane_view``), reward and automatic resets, in episodes
-of 1 km (about 45 decisions), so that about every 45th row is reset in each decision.
-``--goal-m 5000`` makes them the paper's.
+``--environment``: everything, through TorchRL: observation (``lane_view``), reward and automatic
+resets, in episodes of 1 km (about 45 decisions), so that about every 45th row is reset in each
+decision. ``--goal-m 5000`` makes them the paper's.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ def scene(rows: int, vehicles: int, lanes: int) -> tuple[HighwayEnv, TensorDictB
     """A highway after ten seconds, when lane changes are under way."""
     room = SpawnParameters().min_spacing_m * (vehicles / lanes + 2)
     spawn = SpawnParameters(spread_m=max(200.0, room))
-    env = HighwayEnv(IdmMobilTraffic(Road(lanes)), num_envs=rows, vehicles=vehicles, spawn_parameters=spawn)
+    env = HighwayEnv(
+        IdmMobilTraffic(Road(lanes)), num_envs=rows, vehicles=vehicles, spawn_parameters=spawn
+    )
     td = env.reset()
     for _ in range(10):
         td[keys.ACTION] = torch.zeros(rows, dtype=torch.int64)
@@ -74,8 +78,12 @@ def contenders(
     out = empty_outcome(rows, env.vehicles)
     made: dict[str, Callable] = {}
     for variant in variants:
-        kernel = Kernel(env.road, env.vehicles, env.episode, env.ego, mobil=env.traffic.mobil, variant=variant)
-        made[variant] = lambda kernel=kernel: kernel.decide(td[keys.ACTION], vehicles, steering, ego, step, out=out)
+        kernel = Kernel(
+            env.road, env.vehicles, env.episode, env.ego, mobil=env.traffic.mobil, variant=variant
+        )
+        made[variant] = lambda kernel=kernel: kernel.decide(
+            td[keys.ACTION], vehicles, steering, ego, step, out=out
+        )
     if tensor:
         made["torch"] = lambda: env._step(td)
     if pairs:
@@ -88,20 +96,29 @@ def contenders(
     return made
 
 
-def whole_environments(rows: int, vehicles: int, lanes: int, tensor: bool, goal_m: float) -> dict[str, Callable]:
-    """Name to a decision through TorchRL, automatic resets included, of rows in all parts of their episodes."""
+def whole_environments(
+    rows: int, vehicles: int, lanes: int, tensor: bool, goal_m: float
+) -> dict[str, Callable]:
+    """Name to a decision through TorchRL, automatic resets included, of rows in all parts of their
+    episodes.
+    """
     made: dict[str, Callable] = {}
     room = SpawnParameters().min_spacing_m * (vehicles / lanes + 2)
     for kernel in ("native", "torch") if tensor else ("native",):
-        config = EnvConfig(vehicles=vehicles, lanes=lanes, spread_m=max(200.0, room), goal_m=goal_m, kernel=kernel)
-        env = make_env(IdmMobilTraffic(Road(lanes)), config, ObservationConfig(form="lane_view"), num_envs=rows)
+        config = EnvConfig(
+            vehicles=vehicles, lanes=lanes, spread_m=max(200.0, room), goal_m=goal_m, kernel=kernel
+        )
+        env = make_env(
+            IdmMobilTraffic(Road(lanes)), config, ObservationConfig(form="lane_view"), num_envs=rows
+        )
         state = {"td": env.reset()}
 
         def decide(env: TransformedEnv = env, state: dict[str, TensorDictBase] = state) -> None:
             state["td"][keys.ACTION] = torch.zeros(rows, dtype=torch.int64)
             state["td"] = env.step_and_maybe_reset(state["td"])[1]
 
-        for _ in range(round(goal_m / 20.0) + 10):  # until the rows are in all parts of their episodes
+        # until the rows are in all parts of their episodes
+        for _ in range(round(goal_m / 20.0) + 10):
             decide()
         made[kernel] = decide
     return made
@@ -109,7 +126,9 @@ def whole_environments(rows: int, vehicles: int, lanes: int, tensor: bool, goal_
 
 def main() -> None:
     """Print one line per number of vehicles and batch."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--vehicles", type=int, nargs="+", default=[9, 30, 60])
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 16, 256, 1024, 4096])
     parser.add_argument("--lanes", type=int, default=3)
@@ -122,7 +141,9 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=[best_variant()])
     wanted = parser.parse_args()
     torch.set_num_threads(wanted.threads)
-    print(f"{wanted.lanes} lanes, {wanted.threads} threads, torch {torch.__version__}; million steps per CPU-second")
+    print(
+        f"{wanted.lanes} lanes, {wanted.threads} threads, torch {torch.__version__}; million steps per CPU-second"
+    )
     with torch.inference_mode():
         for vehicles in wanted.vehicles:
             for rows in wanted.batches:
@@ -132,12 +153,16 @@ def main() -> None:
                     )
                 else:
                     env, td = scene(rows, vehicles, wanted.lanes)
-                    decisions = contenders(env, td, wanted.variants, not wanted.kernel_only, wanted.pairs)
+                    decisions = contenders(
+                        env, td, wanted.variants, not wanted.kernel_only, wanted.pairs
+                    )
                 rates: dict[str, list[float]] = {name: [] for name in decisions}
                 for _ in range(wanted.repeats):
                     for name, decide in decisions.items():
                         rates[name].append(steps_per_cpu_second(decide, rows) / 1e6)
-                shown = "  ".join(f"{name} {statistics.median(rate):8.4f}" for name, rate in rates.items())
+                shown = "  ".join(
+                    f"{name} {statistics.median(rate):8.4f}" for name, rate in rates.items()
+                )
                 print(f"{vehicles:4d} vehicles  batch {rows:5d}  {shown}", flush=True)
 
 

@@ -1,20 +1,24 @@
-"""Does everything still give what it gave? Digests of rollouts, trainings, evaluations and cards, before and after.
+"""Does everything still give what it gave? Digests of rollouts, trainings, evaluations and cards,
+before and after.
 
     python benchmarks/nets.py make FOLDER               # before a change
-    python benchmarks/nets.py compare FOLDER            # after it: one table, exit status 1 where something differs
-    python benchmarks/nets.py make FOLDER --episodes 200
+    python benchmarks/nets.py compare FOLDER            # after it: one table, exit status 1 where
+    something differs python benchmarks/nets.py make FOLDER --episodes 200
     python benchmarks/nets.py compare FOLDER --only rollout
 
-``FOLDER`` belongs outside the repository, since digests depend on the machine and the version of torch. Recorded are:
+``FOLDER`` belongs outside the repository, since digests depend on the machine and the version of
+torch. Recorded are:
 
-- ``rollout``: 64 rows, 100 decisions of a fixed sequence of actions in every traffic (``replay`` where recordings are
-  found), and 20 decisions in every scenario, observation, reward and mask;
-- ``training``: the final weights of three tiny runs on one thread (from scratch, resumed, warm-started);
+- ``rollout``: 64 rows, 100 decisions of a fixed sequence of actions in every traffic (``replay``
+  where recordings are found), and 20 decisions in every scenario, observation, reward and mask;
+- ``training``: the final weights of three tiny runs on one thread (from scratch, resumed,
+  warm-started);
 - ``evaluation``: every row of a table with all rule-based drivers and the agents that ship;
 - ``realism``: the numbers of a quick card;
 - ``load``: weights and decisions of the agents that ship.
 
-A digest is a sha256 of the values, bit for bit. Names may change: a group is equal when its digests are the same set.
+A digest is a sha256 of the values, bit for bit. Names may change: a group is equal when its digests
+are the same set.
 """
 
 from __future__ import annotations
@@ -36,8 +40,25 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 ROOT = Path(__file__).resolve().parents[1]
-TRAFFICS = ("idm", "idm_mobil", "idm_random", "idm_faults", "gan", "gan_calibrated", "mixed", "replay")
-AGENTS = ("mobil", "mobil_egoistic", "keep_lane", "random_legal", "random", "agent_idm", "agent_gan")
+TRAFFICS = (
+    "idm",
+    "idm_mobil",
+    "idm_random",
+    "idm_faults",
+    "gan",
+    "gan_calibrated",
+    "mixed",
+    "replay",
+)
+AGENTS = (
+    "mobil",
+    "mobil_egoistic",
+    "keep_lane",
+    "random_legal",
+    "random",
+    "agent_idm",
+    "agent_gan",
+)
 SHIPPED_AGENTS = ("agent_idm", "agent_gan")
 ROWS, DECISIONS, SHORT = 64, 100, 20
 #: Keys of the state that are compared, by group; a nested key takes all of its leaves.
@@ -92,7 +113,10 @@ def leaves_of(state: TensorDictBase, names: tuple[str, ...]) -> dict[str, Tensor
             found[name] = value
         elif value is not None:
             inner = value.items(include_nested=True, leaves_only=True)
-            found |= {".".join([name, *([key] if isinstance(key, str) else key)]): leaf for key, leaf in inner}
+            found |= {
+                ".".join([name, *([key] if isinstance(key, str) else key)]): leaf
+                for key, leaf in inner
+            }
     return found
 
 
@@ -183,7 +207,9 @@ def values_of(value: Any, name: str = "") -> Group:
         inner = list(enumerate(value))
     else:
         return {name.removeprefix("."): repr(value)}
-    return {path: text for key, each in inner for path, text in values_of(each, f"{name}.{key}").items()}
+    return {
+        path: text for key, each in inner for path, text in values_of(each, f"{name}.{key}").items()
+    }
 
 
 def results_in(folder: Path) -> dict[str, Any]:
@@ -192,7 +218,10 @@ def results_in(folder: Path) -> dict[str, Any]:
 
 
 def trainings(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Group]]:
-    """Tiny runs: from scratch with a first phase, the same gone on with, and warm-started from a shipped agent."""
+    """Tiny runs.
+
+    From scratch with a first phase, the same gone on with, and warm-started from a shipped agent.
+    """
     scratch, warm = work / "scratch", work / "warm"
     run_command("train", scratch, *FROM_SCRATCH, *TWO_PHASES)
     yield "from scratch, weights", weights_of(scratch / "agent.safetensors")
@@ -229,9 +258,14 @@ def loaders(arguments: argparse.Namespace, work: Path) -> Iterator[tuple[str, Gr
         agent = ganlane.load_agent(name)
         state = agent.policy.state_dict()
         # The noise of noisy layers is drawn when they are made, and is no weight.
-        yield f"{name}, weights", {key: digest(value) for key, value in state.items() if "epsilon" not in key}
+        yield (
+            f"{name}, weights",
+            {key: digest(value) for key, value in state.items() if "epsilon" not in key},
+        )
         form = agent.observation.name if hasattr(agent.observation, "name") else "lane_view_overlap"
-        env = ganlane.make_env(traffic="idm_mobil", num_envs=ROWS, observation=form, stream="report")
+        env = ganlane.make_env(
+            traffic="idm_mobil", num_envs=ROWS, observation=form, stream="report"
+        )
         actions = env.rollout(SHORT, agent.policy, break_when_any_done=False)["action"]
         yield f"{name}, decisions", {"action": digest(actions)}
 
@@ -265,7 +299,9 @@ def verdict(before: Group | None, after: Group | None) -> str:
     if sorted(before.values()) == sorted(after.values()):
         return "equal"
     names = sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
-    return f"DIFFERS: {', '.join(names[:4])}" + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return f"DIFFERS: {', '.join(names[:4])}" + (
+        f" and {len(names) - 4} more" if len(names) > 4 else ""
+    )
 
 
 def make(arguments: argparse.Namespace, section: str, path: Path) -> list[tuple[str, str]]:
@@ -287,10 +323,14 @@ def compare(arguments: argparse.Namespace, section: str, path: Path) -> list[tup
 
 def main() -> int:
     """Record or compare; 1 where something differs."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("task", choices=("make", "compare"))
     parser.add_argument("folder", type=Path, help="where the digests are, outside the repository")
-    parser.add_argument("--episodes", type=int, default=64, help="of the evaluation; the same in both tasks")
+    parser.add_argument(
+        "--episodes", type=int, default=64, help="of the evaluation; the same in both tasks"
+    )
     parser.add_argument("--only", nargs="+", choices=list(SECTIONS), default=list(SECTIONS))
     arguments = parser.parse_args()
     torch.set_num_threads(1)

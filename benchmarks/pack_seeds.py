@@ -5,9 +5,9 @@
     python -m benchmarks.pack_seeds outputs/paper_1 outputs/paper_2 \
         --out ganlane/checkpoints/seeds_of_agent_gan.safetensors
 
-Each folder is a finished training's and holds agent.safetensors; an agent's file may be given as well, and
-``FILE@all`` for all agents of a packed file that others are to join. The agent with seed 1 is then ``agent_idm@1``,
-or ``FILE@1`` for a file elsewhere.
+Each folder is a finished training's and holds agent.safetensors; an agent's file may be given as
+well, and ``FILE@all`` for all agents of a packed file that others are to join. The agent with seed
+1 is then ``agent_idm@1``, or ``FILE@1`` for a file elsewhere.
 """
 
 from __future__ import annotations
@@ -32,8 +32,19 @@ Agent = tuple[dict[str, Tensor], NetworkConfig, dict[str, Any]]
 AGENT_FILE = "agent.safetensors"
 #: Largest file that is written.
 MOST_BYTES = 5_000_000
-#: What agents of one recipe have in common; of the environment all but what has no effect on the episodes.
-RECIPE = ("observation", "observation_scale", "mask", "sensors", "env", "num_envs", "agent", "reward", "network")
+#: What agents of one recipe have in common; of the environment all but what has no effect on the
+#: episodes.
+RECIPE = (
+    "observation",
+    "observation_scale",
+    "mask",
+    "sensors",
+    "env",
+    "num_envs",
+    "agent",
+    "reward",
+    "network",
+)
 WITHOUT_EFFECT = ("compile", "kernel")
 
 
@@ -41,20 +52,30 @@ def recipe_of(metadata: Mapping[str, Any]) -> dict[str, Any]:
     """What a training was, without its seed and its results."""
     shared = {name: metadata.get(name) for name in RECIPE}
     if isinstance(shared["env"], dict):
-        shared["env"] = {key: value for key, value in shared["env"].items() if key not in WITHOUT_EFFECT}
-    return {**shared, **{name: metadata.get("training", {}).get(name) for name in ("phase", "traffic")}}
+        shared["env"] = {
+            key: value for key, value in shared["env"].items() if key not in WITHOUT_EFFECT
+        }
+    return {
+        **shared,
+        **{name: metadata.get("training", {}).get(name) for name in ("phase", "traffic")},
+    }
 
 
 def of_no_machine(start: str | None) -> str | None:
-    """What a training started from, without the folders of the machine: ``RUN/pretrain/agent.safetensors``."""
+    """What a training started from, without the folders of the machine.
+
+    ``RUN/pretrain/agent.safetensors``.
+    """
     return "/".join(Path(start).parts[-3:]) if start and Path(start).is_absolute() else start
 
 
 def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
-    """The agents by seed; ``folders`` are folders of trainings, agents' files, ``FILE@1`` or ``FILE@all``.
+    """The agents by seed; ``folders`` are folders of trainings, agents' files, ``FILE@1`` or
+    ``FILE@all``.
 
     Raises:
-        UserError: a folder without an agent, an agent without a seed, a seed that comes twice, or two recipes.
+        UserError: a folder without an agent, an agent without a seed, a seed that comes twice, or
+            two recipes.
     """
     found: dict[int, Agent] = {}
     recipes: dict[str, dict[str, Any]] = {}
@@ -62,19 +83,25 @@ def collect(folders: Sequence[str | Path]) -> dict[int, Agent]:
         if Path(path).is_dir():
             path = f"{path}/{AGENT_FILE}"
             if not Path(path).is_file():
-                raise UserError(f"{path}: no such file; give the folder of a finished training, which has one.")
+                raise UserError(
+                    f"{path}: no such file; give the folder of a finished training, which has one."
+                )
         agent = read_agent(path)
         metadata = {**agent[2], "network": asdict(agent[1])}
         seed = metadata.get("training", {}).get("seed")
         if not isinstance(seed, int):
-            raise UserError(f"{path}: its metadata name no seed; give an agent that 'ganlane train' wrote.")
+            raise UserError(
+                f"{path}: its metadata name no seed; give an agent that 'ganlane train' wrote."
+            )
         if seed in found:
             raise UserError(f"{path}: another run has seed {seed}, too; give each seed once.")
         recipes[path] = recipe_of(metadata)
         first, reference = next(iter(recipes.items()))
         differing = [name for name, value in recipes[path].items() if value != reference[name]]
         if differing:
-            raise UserError(f"{path}: another recipe than {first} ({', '.join(differing)}); give runs of one recipe.")
+            raise UserError(
+                f"{path}: another recipe than {first} ({', '.join(differing)}); give runs of one recipe."
+            )
         agent[2]["training"]["init"] = of_no_machine(metadata["training"].get("init"))
         found[seed] = agent
     return dict(sorted(found.items()))
@@ -99,7 +126,9 @@ def pack(options: argparse.Namespace) -> str:
         for name, value in agent[0].items()
     )
     if size > MOST_BYTES:
-        raise UserError(f"--out {options.out}: {size / 1e6:.1f} MB, above {MOST_BYTES / 1e6:.0f}; give fewer runs.")
+        raise UserError(
+            f"--out {options.out}: {size / 1e6:.1f} MB, above {MOST_BYTES / 1e6:.0f}; give fewer runs."
+        )
     save_agents(options.out, agents)
     return f"{options.out}: seeds {', '.join(map(str, agents))}; {options.out.stat().st_size / 1e6:.1f} MB"
 

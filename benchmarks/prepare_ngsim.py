@@ -1,11 +1,13 @@
-"""A made-up NGSIM portal file of full size (11.8 million rows, 1.2 GB) through ``ganlane prepare``: time and memory.
+"""A made-up NGSIM portal file of full size (11.8 million rows, 1.2 GB) through ``ganlane prepare``:
+time and memory.
 
     python benchmarks/prepare_ngsim.py --folder /tmp/ngsim
     python benchmarks/prepare_ngsim.py --folder /tmp/ngsim --rows 1000000
 
-Writes the file, prepares it in a process of its own, prints seconds and peak resident memory, and removes the file.
-Nothing in it was recorded: vehicles enter six lanes and drive 640 m at about 12 m/s, some change lanes. Places,
-periods, number formats and the order (whole tracks, periods mixed) are those of the portal's file.
+Writes the file, prepares it in a process of its own, prints seconds and peak resident memory, and
+removes the file. Nothing in it was recorded: vehicles enter six lanes and drive 640 m at about 12
+m/s, some change lanes. Places, periods, number formats and the order (whole tracks, periods mixed)
+are those of the portal's file.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ ROAD_FT, LANES, LANE_FT, SECONDS, TRACK_ROWS = 2100.0, 6, 12.0, 900.0, 530
 BATCH = 400
 
 
-def tracks(place: str, start_ms: int, vehicles: np.ndarray, random: np.random.Generator) -> pl.DataFrame:
+def tracks(
+    place: str, start_ms: int, vehicles: np.ndarray, random: np.random.Generator
+) -> pl.DataFrame:
     """Rows of some vehicles of one period."""
     n, k = len(vehicles), TRACK_ROWS
     time_s = 0.1 * np.arange(k)
@@ -47,10 +51,14 @@ def tracks(place: str, start_ms: int, vehicles: np.ndarray, random: np.random.Ge
     swing = random.uniform(0.0, 2.0, n)[:, None]
     y = speed[:, None] * time_s + swing / 0.6 * np.sin(0.6 * time_s)
     lane = random.integers(1, LANES + 1, n)
-    target = np.where(random.uniform(size=n) < 0.3, np.clip(lane + random.choice([-1, 1], n), 1, LANES), lane)
+    target = np.where(
+        random.uniform(size=n) < 0.3, np.clip(lane + random.choice([-1, 1], n), 1, LANES), lane
+    )
     done = np.clip((time_s - random.uniform(5.0, 40.0, n)[:, None]) / 4.0, 0.0, 1.0)
     share = 0.5 * (1.0 - np.cos(np.pi * done))
-    x = LANE_FT * (lane[:, None] - 0.5 + (target - lane)[:, None] * share) + random.normal(0.0, 0.3, (n, k))
+    x = LANE_FT * (lane[:, None] - 0.5 + (target - lane)[:, None] * share) + random.normal(
+        0.0, 0.3, (n, k)
+    )
     lanes = np.clip(np.ceil(x / LANE_FT), 1, LANES).astype(int)
     frame = entry[:, None] + np.arange(k)
 
@@ -74,10 +82,21 @@ def tracks(place: str, start_ms: int, vehicles: np.ndarray, random: np.random.Ge
         "v_acc": (-0.6 * swing * np.sin(0.6 * time_s)).ravel().round(2),
         "lane_id": lanes.ravel(),
     }
-    empty = {name: pl.lit(None, pl.String) for name in ("o_zone", "d_zone", "int_id", "section_id", "direction")}
-    last = {"preceding": 12, "following": 14, "space_headway": 61.55, "time_headway": 1.61, "location": place}
+    empty = {
+        name: pl.lit(None, pl.String)
+        for name in ("o_zone", "d_zone", "int_id", "section_id", "direction")
+    }
+    last = {
+        "preceding": 12,
+        "following": 14,
+        "space_headway": 61.55,
+        "time_headway": 1.61,
+        "location": place,
+    }
     return pl.DataFrame(numbers).with_columns(
-        **empty, movement=pl.lit(None, pl.String), **{name: pl.lit(value) for name, value in last.items()}
+        **empty,
+        movement=pl.lit(None, pl.String),
+        **{name: pl.lit(value) for name, value in last.items()},
     )
 
 
@@ -88,11 +107,15 @@ def with_thousands(rows: pl.DataFrame) -> pl.DataFrame:
     both = {}
     for name in ("global_x", "global_y"):
         text = pl.col(name).cast(pl.String)
-        both[name] = pl.concat_str([text.str.slice(0, 1), text.str.slice(1, 3), text.str.slice(4)], separator=",")
+        both[name] = pl.concat_str(
+            [text.str.slice(0, 1), text.str.slice(1, 3), text.str.slice(4)], separator=","
+        )
     return rows.with_columns(global_time=pl.concat_str(grouped, separator=","), **both)
 
 
-def write(path: Path, rows: int, thousands: bool, periods: tuple[tuple[str, int, float], ...]) -> int:
+def write(
+    path: Path, rows: int, thousands: bool, periods: tuple[tuple[str, int, float], ...]
+) -> int:
     """Write the file batch by batch, periods in turn; the rows written."""
     random = np.random.default_rng(0)
     whole = sum(share for *_, share in periods)
@@ -108,16 +131,24 @@ def write(path: Path, rows: int, thousands: bool, periods: tuple[tuple[str, int,
         for number, (place, start, vehicles) in enumerate(batches):
             table = tracks(place, start, vehicles, random)
             written += table.height
-            (with_thousands(table) if thousands else table).write_csv(file, include_header=number == 0)
+            (with_thousands(table) if thousands else table).write_csv(
+                file, include_header=number == 0
+            )
     return written
 
 
 def main() -> None:
     """Make the file, prepare it, tell what it cost, remove it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, required=True, help="an empty or new folder with 5 GB of room")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--folder", type=Path, required=True, help="an empty or new folder with 5 GB of room"
+    )
     parser.add_argument("--rows", type=int, default=11_800_000)
-    parser.add_argument("--one-period", action="store_true", help="all rows in one period (at most 5,000,000)")
+    parser.add_argument(
+        "--one-period", action="store_true", help="all rows in one period (at most 5,000,000)"
+    )
     parser.add_argument("--plain", action="store_true", help="no commas between thousands")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
@@ -125,15 +156,30 @@ def main() -> None:
     run = options.folder / "run"
     try:
         begun = time.perf_counter()
-        rows = write(path, options.rows, not options.plain, PERIODS[:1] if options.one_period else PERIODS)
-        print(f"made {rows:,} rows, {path.stat().st_size / 1e9:.2f} GB in {time.perf_counter() - begun:.0f} s")
+        rows = write(
+            path, options.rows, not options.plain, PERIODS[:1] if options.one_period else PERIODS
+        )
+        print(
+            f"made {rows:,} rows, {path.stat().st_size / 1e9:.2f} GB in {time.perf_counter() - begun:.0f} s"
+        )
         begun = time.perf_counter()
-        command = [sys.executable, "-m", "ganlane.prepare", "data=ngsim", f"data.path={path}", f"hydra.run.dir={run}"]
+        command = [
+            sys.executable,
+            "-m",
+            "ganlane.prepare",
+            "data=ngsim",
+            f"data.path={path}",
+            f"hydra.run.dir={run}",
+        ]
         subprocess.run(command, check=True)
         seconds = time.perf_counter() - begun
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
         counted = json.loads((run / "results.json").read_text())["rows"]
-        print(json.dumps({"rows": counted, "wall_s": round(seconds, 1), "peak_rss_gib": round(peak, 2)}))
+        print(
+            json.dumps(
+                {"rows": counted, "wall_s": round(seconds, 1), "peak_rss_gib": round(peak, 2)}
+            )
+        )
     finally:
         path.unlink(missing_ok=True)
         shutil.rmtree(run, ignore_errors=True)

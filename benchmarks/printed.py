@@ -1,11 +1,12 @@
-"""The tables of README and docs that the matrix gives, and a check of the numbers printed around them.
+"""The tables of README and docs that the matrix gives, and a check of the numbers printed around
+them.
 
-    python -m benchmarks.printed                                   # print what is not as the results say
-    python -m benchmarks.printed outputs/reproduce/RUN/results.json --write
+    python -m benchmarks.printed                                   # print what is not as the
+    results say python -m benchmarks.printed outputs/reproduce/RUN/results.json --write
 
-Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes them again from
-``docs/reproduce/results.json`` and from those of :data:`FURTHER`; it also looks up every figure with an interval,
-such as ``14.0 [3.2, 25.6]``, in the sections of :data:`CHECKED`.
+Tables stand between ``<!-- matrix NAME: begin -->`` and ``<!-- matrix NAME: end -->``. A test makes
+them again from ``docs/reproduce/results.json`` and from those of :data:`FURTHER`; it also looks up
+every figure with an interval, such as ``14.0 [3.2, 25.6]``, in the sections of :data:`CHECKED`.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from ganlane.files import split_at_markers, write_between_markers
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "reproduce" / "results.json"
-#: Folders below it with further results: ``ganlane reproduce`` with the control trainings, agent_general over more
-#: episodes and on traffics that are not the project's own; ``benchmarks.roads`` and ``benchmarks.ablations``.
+#: Folders below it with further results: ``ganlane reproduce`` with the control trainings,
+#: agent_general over more episodes and on traffics that are not the project's own;
+#: ``benchmarks.roads`` and ``benchmarks.ablations``.
 FURTHER = ("controls", "general", "roads", "elsewhere", "ablations")
 #: Driver of the matrix to its name in a document, and the traffics that it was trained on.
 DRIVERS: Mapping[str, tuple[str, frozenset[str]]] = {
@@ -62,7 +64,11 @@ CONTROL_CLAIMS = (
     ("agent_gan+none", "agent_gan_only+none", "Agent_GAN over `gan` alone"),
     ("agent_idm_table3+none", "agent_idm+none", "Agent_IDM with Table III over Agent_IDM"),
     ("agent_gan_table3+none", "agent_gan+none", "Agent_GAN with Table III over Agent_GAN"),
-    ("agent_gan_table3+none", "agent_idm_table3+none", "Agent_GAN over Agent_IDM, both with Table III"),
+    (
+        "agent_gan_table3+none",
+        "agent_idm_table3+none",
+        "Agent_GAN over Agent_IDM, both with Table III",
+    ),
 )
 #: Sections whose figures are looked up: document, and the heading of the section (None: all of it).
 CHECKED = (
@@ -82,7 +88,9 @@ Row = Mapping[str, Any]
 
 
 def _at(results: Results, driver: str, traffic: str) -> Row:
-    return next(row for row in results["rows"] if (row["driver"], row["traffic"]) == (driver, traffic))
+    return next(
+        row for row in results["rows"] if (row["driver"], row["traffic"]) == (driver, traffic)
+    )
 
 
 def _traffics(results: Results) -> list[str]:
@@ -101,7 +109,9 @@ def _lead(row: Row, trained: frozenset[str]) -> str:
 
 
 def _lead_and_failures(row: Row, lead: str = "minus_mobil") -> str:
-    return f"{_with_interval(row[lead], row[f'{lead}_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
+    return (
+        f"{_with_interval(row[lead], row[f'{lead}_ci'])}; {row['hard_crash']}, {row['out_of_road']}"
+    )
 
 
 def _mean_and_failures(row: Row) -> str:
@@ -115,18 +125,25 @@ def _drivers(results: Results, among: Sequence[str]) -> list[str]:
 
 def _by_traffic(results: Results, first: str, lines: Sequence[Sequence[str]]) -> str:
     """Lines of a name and a cell for every traffic."""
-    return Table("", [first, *(f"`{traffic}`" for traffic in _traffics(results))], lines).markdown(heading=False)
+    return Table("", [first, *(f"`{traffic}`" for traffic in _traffics(results))], lines).markdown(
+        heading=False
+    )
 
 
 def leads(results: Results) -> str:
     """Drivers by traffics: paired lead over MOBIL."""
     drivers = _drivers(results, [name for name in DRIVERS if name != "random_legal"])
     lines = [
-        [DRIVERS[driver][0], *(_lead(_at(results, driver, t), DRIVERS[driver][1]) for t in _traffics(results))]
+        [
+            DRIVERS[driver][0],
+            *(_lead(_at(results, driver, t), DRIVERS[driver][1]) for t in _traffics(results)),
+        ]
         for driver in drivers
     ]
     table = _by_traffic(results, "lead over MOBIL", lines)
-    means = ", ".join(f"{_at(results, 'mobil', t)['mean_reward']:.1f} on `{t}`" for t in _traffics(results))
+    means = ", ".join(
+        f"{_at(results, 'mobil', t)['mean_reward']:.1f} on `{t}`" for t in _traffics(results)
+    )
     return f"{table}\n\nMOBIL's own mean reward: {means}."
 
 
@@ -146,11 +163,18 @@ def failures(results: Results) -> str:
 
 
 def _differences(results: Results, pairs: Sequence[tuple[str, str, str]]) -> list[list[str]]:
-    """Lines with the lead of one driver over another by traffics; pairs that are not in the results are left out."""
+    """Lines with the lead of one driver over another by traffics.
+
+    Pairs that are not in the results are left out.
+    """
     found = {(row["driver"], row["over"], row["traffic"]): row for row in results["comparisons"]}
     lines = []
     for first, second, name in pairs:
-        rows = [found[first, second, each] for each in _traffics(results) if (first, second, each) in found]
+        rows = [
+            found[first, second, each]
+            for each in _traffics(results)
+            if (first, second, each) in found
+        ]
         if rows:
             lines.append([name, *(_with_interval(row["lead"], row["lead_ci"]) for row in rows)])
     return lines
@@ -162,12 +186,23 @@ def claims(results: Results) -> str:
 
 
 def controls(results: Results) -> str:
-    """Control trainings by traffics: lead over MOBIL and failures, then their differences from the paper's agents."""
+    """Control trainings by traffics.
+
+    Lead over MOBIL and failures, then their differences from the paper's agents.
+    """
     own, lines = results["controls"], []
     for driver in _drivers(own, list(CONTROLS)):
         name, trained = CONTROLS[driver]
         rows = [_at(own, driver, traffic) for traffic in _traffics(own)]
-        lines.append([name, *(f"{_lead(row, trained)}; {row['hard_crash']}, {row['out_of_road']}" for row in rows)])
+        lines.append(
+            [
+                name,
+                *(
+                    f"{_lead(row, trained)}; {row['hard_crash']}, {row['out_of_road']}"
+                    for row in rows
+                ),
+            ]
+        )
     return _by_traffic(own, "lead; crashes, departures", lines + _differences(own, CONTROL_CLAIMS))
 
 
@@ -191,11 +226,19 @@ def readme(results: Results) -> str:
 
     def cell(driver: str, traffic: str) -> str:
         row, mobil = _at(results, driver, traffic), _at(results, "mobil", traffic)
-        per_1000 = [1000 * each["hard_crash"] / (each["trainings"] * each["episodes"]) for each in (row, mobil)]
+        per_1000 = [
+            1000 * each["hard_crash"] / (each["trainings"] * each["episodes"])
+            for each in (row, mobil)
+        ]
         return f"{_lead(row, DRIVERS[driver][1])}, {per_1000[0]:.0f} ({per_1000[1]:.0f})"
 
-    drivers = _drivers(results, ["agent_general+safe", "agent_idm+none", "agent_gan+none", "mobil_egoistic"])
-    lines = [[DRIVERS[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))] for driver in drivers]
+    drivers = _drivers(
+        results, ["agent_general+safe", "agent_idm+none", "agent_gan+none", "mobil_egoistic"]
+    )
+    lines = [
+        [DRIVERS[driver][0], *(cell(driver, traffic) for traffic in _traffics(results))]
+        for driver in drivers
+    ]
     return _by_traffic(results, "driver", lines)
 
 
@@ -205,10 +248,15 @@ def roads(results: Results) -> str:
     places = list(dict.fromkeys((row["vehicles"], row["lanes"]) for row in rows))
     found = {(row["driver"], row["traffic"], row["vehicles"], row["lanes"]): row for row in rows}
     lines = []
-    for driver, traffic in dict.fromkeys((row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"):
+    for driver, traffic in dict.fromkeys(
+        (row["driver"], row["traffic"]) for row in rows if row["driver"] != "mobil"
+    ):
         cells = [_lead_and_failures(found[(driver, traffic, *place)]) for place in places]
         lines.append([f"{DRIVERS[driver][0]}, `{traffic}`", *cells])
-    headings = ["lead; crashes, departures", *(f"{vehicles} on {lanes}" for vehicles, lanes in places)]
+    headings = [
+        "lead; crashes, departures",
+        *(f"{vehicles} on {lanes}" for vehicles, lanes in places),
+    ]
     return Table("", headings, lines).markdown(heading=False)
 
 
@@ -220,15 +268,28 @@ def elsewhere(results: Results) -> str:
         row = _at(own, driver, traffic)
         return _mean_and_failures(row) if driver == "mobil" else _lead_and_failures(row)
 
-    names = {"mobil": "MOBIL (its mean reward)", **{driver: name for driver, (name, _) in DRIVERS.items()}}
+    names = {
+        "mobil": "MOBIL (its mean reward)",
+        **{driver: name for driver, (name, _) in DRIVERS.items()},
+    }
     there, traffics = {row["driver"] for row in own["rows"]}, _traffics(own)
-    lines = [[names[driver], *(cell(driver, traffic) for traffic in traffics)] for driver in names if driver in there]
-    episodes = ["episodes of each training", *(str(own["seeds"]["episodes"][traffic]) for traffic in traffics)]
+    lines = [
+        [names[driver], *(cell(driver, traffic) for traffic in traffics)]
+        for driver in names
+        if driver in there
+    ]
+    episodes = [
+        "episodes of each training",
+        *(str(own["seeds"]["episodes"][traffic]) for traffic in traffics),
+    ]
     return _by_traffic(own, "lead; crashes, departures", [episodes, *lines])
 
 
 def ablations(results: Results) -> str:
-    """Trainings with one thing changed by traffics: lead over the one without a change, and failures."""
+    """Trainings with one thing changed by traffics.
+
+    Lead over the one without a change, and failures.
+    """
     own = results["ablations"]
     leads = {(row["driver"], row["traffic"]): row for row in own["comparisons"]}
     lines = []
@@ -237,7 +298,9 @@ def ablations(results: Results) -> str:
         for traffic in _traffics(own):
             row = _at(own, name, traffic)
             cells.append(
-                _lead_and_failures({**row, **leads[name, traffic]}, "lead") if changed else _mean_and_failures(row)
+                _lead_and_failures({**row, **leads[name, traffic]}, "lead")
+                if changed
+                else _mean_and_failures(row)
             )
         lines.append([f"`{' '.join(changed)}`" if changed else "nothing (its mean reward)", *cells])
     return _by_traffic(own, "changed: lead; crashes, departures", lines)
@@ -269,7 +332,9 @@ def section(text: str, heading: str) -> str:
         UserError: there is no such heading.
     """
     level = heading.split()[0]
-    found = re.search(rf"^{re.escape(heading)}$(.*?)(?=^{level} |\Z)", text, re.MULTILINE | re.DOTALL)
+    found = re.search(
+        rf"^{re.escape(heading)}$(.*?)(?=^{level} |\Z)", text, re.MULTILINE | re.DOTALL
+    )
     if found is None:
         raise UserError(f"{heading}: no such section; expected it in the document.")
     return found[1]
@@ -289,7 +354,8 @@ def _values(node: Any) -> Iterator[tuple[float, float, float]]:
 
 
 def unsourced(text: str, results: Results) -> list[str]:
-    """Figures with an interval in ``text`` that the results do not have, rounded as they are printed.
+    """Figures with an interval in ``text`` that the results do not have, rounded as they are
+    printed.
 
     A lead may be told the other way round: ``12 [10, 14]`` below as ``-12 [-14, -10]``.
     """
@@ -312,17 +378,24 @@ def differences(results: Results, root: Path = ROOT) -> list[str]:
         before, after = split_at_markers(root / document, *markers(name))
         whole = (root / document).read_text(encoding="utf-8")
         if whole[len(before) : -len(after)].strip() != table(results):
-            found.append(f"{document}: the table {name} differs; run `python -m benchmarks.printed --write`.")
+            found.append(
+                f"{document}: the table {name} differs; run `python -m benchmarks.printed --write`."
+            )
     for document, heading in CHECKED:
         text = section((root / document).read_text(encoding="utf-8"), heading)
-        found += [f"{document}, {heading}: {figure} is not in the results." for figure in unsourced(text, results)]
+        found += [
+            f"{document}, {heading}: {figure} is not in the results."
+            for figure in unsourced(text, results)
+        ]
     return found
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
-    parser.add_argument("results", type=Path, nargs="?", default=RESULTS, help="of ganlane reproduce")
+    parser.add_argument(
+        "results", type=Path, nargs="?", default=RESULTS, help="of ganlane reproduce"
+    )
     parser.add_argument("--write", action="store_true", help="put the tables into the documents")
     return parser.parse_args(arguments)
 
@@ -330,7 +403,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def load(path: Path = RESULTS) -> Results:
     """The results of the matrix, with those of :data:`FURTHER` by name."""
     further = {name: RESULTS.parent / name / RESULTS.name for name in FURTHER}
-    matrix, *others = (json.loads(each.read_text(encoding="utf-8")) for each in (path, *further.values()))
+    matrix, *others = (
+        json.loads(each.read_text(encoding="utf-8")) for each in (path, *further.values())
+    )
     return {**matrix, **dict(zip(further, others))}
 
 

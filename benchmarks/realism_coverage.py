@@ -1,11 +1,12 @@
-"""Do the realism card's intervals hold what they should? Models of which the true distance is known, many times.
+"""Do the realism card's intervals hold what they should? Models of which the true distance is
+known, many times.
 
     python -m benchmarks.realism_coverage --scenes 11 4 --trials 200
 
-Scenes have means of their own and sizes of their own; a recording and two models are drawn from each of them, over
-and over. Printed is how often an interval holds the distance that scenes without end would show (covers), how often
-it holds its own estimate, and how often a difference is called closer or farther. Beside the card's intervals stand
-the percentile bootstrap's.
+Scenes have means of their own and sizes of their own; a recording and two models are drawn from
+each of them, over and over. Printed is how often an interval holds the distance that scenes without
+end would show (covers), how often it holds its own estimate, and how often a difference is called
+closer or farther. Beside the card's intervals stand the percentile bootstrap's.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from benchmarks.script import make_parser
 from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, resample_counts
 from ganlane.realism.measures import distance, distance_difference, jensen_shannon
 
-#: Spread of the scenes' means, and of the logarithm of their sizes; independent samples of a scene of median size.
+#: Spread of the scenes' means, and of the logarithm of their sizes; independent samples of a scene
+#: of median size.
 _BETWEEN, _SIZES, _MEDIAN = 0.7, 0.8, 20.0
 #: A model drives every scene so often.
 _REPEATS = 4
@@ -30,7 +32,10 @@ _MANY = 20_000
 
 @dataclass(frozen=True)
 class Model:
-    """A normal quantity: its mean in a scene lies by ``shift`` off the recorded one, where the spread is 1."""
+    """A normal quantity.
+
+    Its mean in a scene lies by ``shift`` off the recorded one, where the spread is 1.
+    """
 
     shift: float = 0.0
     spread: float = 1.0
@@ -53,7 +58,9 @@ PAIRS: Mapping[str, tuple[Model, Model]] = {
 
 def scenes(number: int, random: np.random.Generator) -> tuple[Array, Array]:
     """Means and sizes of so many scenes."""
-    return random.normal(0.0, _BETWEEN, number), np.maximum(5.0, random.lognormal(np.log(_MEDIAN), _SIZES, number))
+    return random.normal(0.0, _BETWEEN, number), np.maximum(
+        5.0, random.lognormal(np.log(_MEDIAN), _SIZES, number)
+    )
 
 
 def truth(model: Model) -> float:
@@ -71,17 +78,26 @@ def percentile(models: tuple[Array, ...], recorded: Array, resamples: int) -> Es
         every = [jensen_shannon(counts @ model, counts @ recorded) for model in models]
         return np.sum([sign * each for sign, each in zip(signs, every)], axis=0)
 
-    drawn = np.concatenate([value(counts) for counts in resample_counts(len(recorded), resamples, 0)])
+    drawn = np.concatenate(
+        [value(counts) for counts in resample_counts(len(recorded), resamples, 0)]
+    )
     low, high = np.quantile(drawn, TAIL_LEVELS)
     return Estimate(float(value(np.ones(len(recorded)))), float(low), float(high))
 
 
-def trial(pair: tuple[Model, Model], number: int, resamples: int, random: np.random.Generator) -> list[Estimate]:
-    """The intervals of one draw: of a distance and of a difference, the card's and the percentile bootstrap's."""
+def trial(
+    pair: tuple[Model, Model], number: int, resamples: int, random: np.random.Generator
+) -> list[Estimate]:
+    """The intervals of one draw.
+
+    Of a distance and of a difference, the card's and the percentile bootstrap's.
+    """
     means, sizes = scenes(number, random)
 
     def drawn(model: Model, times: int) -> Array:
-        return random.multinomial((times * sizes).astype(int), model.shares(means)).astype(np.float64)
+        return random.multinomial((times * sizes).astype(int), model.shares(means)).astype(
+            np.float64
+        )
 
     recorded, one, other = drawn(RECORDED, 1), drawn(pair[0], _REPEATS), drawn(pair[1], _REPEATS)
     own = distance(one, recorded, resamples=resamples)
@@ -92,7 +108,11 @@ def trial(pair: tuple[Model, Model], number: int, resamples: int, random: np.ran
 
 def holds(estimate: Estimate, value: float) -> bool:
     """Whether the interval holds a value."""
-    return estimate.low is not None and estimate.high is not None and estimate.low <= value <= estimate.high
+    return (
+        estimate.low is not None
+        and estimate.high is not None
+        and estimate.low <= value <= estimate.high
+    )
 
 
 def shares(estimates: list[Estimate], true: float) -> str:
@@ -115,9 +135,13 @@ def main() -> None:
     for number in options.scenes:
         for name, pair in PAIRS.items():
             random, true = np.random.default_rng(0), [truth(model) for model in pair]
-            rows = zip(*(trial(pair, number, options.resamples, random) for _ in range(options.trials)))
+            rows = zip(
+                *(trial(pair, number, options.resamples, random) for _ in range(options.trials))
+            )
             kinds = ("distance", "distance, percentile", "difference", "difference, percentile")
-            for kind, values, value in zip(kinds, rows, (true[0], true[0], true[0] - true[1], true[0] - true[1])):
+            for kind, values, value in zip(
+                kinds, rows, (true[0], true[0], true[0] - true[1], true[0] - true[1])
+            ):
                 print(f"{f'{number}, {name}, {kind}':52} {shares(list(values), value)}", flush=True)
 
 

@@ -1,11 +1,14 @@
-"""The drivers of the matrix on other roads: fewer and more vehicles, fewer and more lanes than in their training.
+"""The drivers of the matrix on other roads: fewer and more vehicles, fewer and more lanes than in
+their training.
 
     python -m benchmarks.roads                                  # ten minutes on one core
-    python -m benchmarks.roads 'traffics=[idm_mobil,gan]' 'fewer={gan:300}' env.compile=true        # 100 minutes
+    python -m benchmarks.roads 'traffics=[idm_mobil,gan]' 'fewer={gan:300}' env.compile=true
+    # 100 minutes
 
-What is given besides ``--out`` are options of ``ganlane reproduce``. Vehicles stand at Table II's density, so that
-more of them fill a longer road (``env=dense``); with other lanes there are nine of them on 200 m, as in the paper.
-Cells that were driven are not driven again. ``python -m benchmarks.printed --write`` makes the table of the document.
+What is given besides ``--out`` are options of ``ganlane reproduce``. Vehicles stand at Table II's
+density, so that more of them fill a longer road (``env=dense``); with other lanes there are nine of
+them on 200 m, as in the paper. Cells that were driven are not driven again.
+``python -m benchmarks.printed --write`` makes the table of the document.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ from ganlane.evaluation import write_results
 from ganlane.reproduce import report
 
 OUT = Path("docs/reproduce/roads")
-#: Vehicles, the ego included, and lanes. The first is the paper's, on which all agents were trained.
+#: Vehicles, the ego included, and lanes. The first is the paper's, on which all agents were
+#: trained.
 ROADS = ((9, 3), (6, 3), (15, 3), (30, 3), (9, 2), (9, 4), (9, 5))
 BEHIND = ("agent_idm@all+safe", "agent_gan@all+safe", "agent_general@all+safe")
 OPTIONS = (
@@ -34,7 +38,16 @@ OPTIONS = (
     *("traffics=[idm_mobil]", "episodes=300", "workers=1"),
 )
 #: What is kept of a row, with the intervals.
-KEPT = ("driver", "traffic", "trainings", "episodes", "mean_reward", "minus_mobil", "hard_crash", "out_of_road")
+KEPT = (
+    "driver",
+    "traffic",
+    "trainings",
+    "episodes",
+    "mean_reward",
+    "minus_mobil",
+    "hard_crash",
+    "out_of_road",
+)
 
 
 def config_of(vehicles: int, lanes: int, options: Sequence[str]) -> ReproduceConfig:
@@ -46,7 +59,9 @@ def config_of(vehicles: int, lanes: int, options: Sequence[str]) -> ReproduceCon
     return config
 
 
-def rows_on(vehicles: int, lanes: int, config: ReproduceConfig) -> tuple[list[dict[str, Any]], list[str]]:
+def rows_on(
+    vehicles: int, lanes: int, config: ReproduceConfig
+) -> tuple[list[dict[str, Any]], list[str]]:
     """The rows of a road, driven where they are missing, and the revisions that drove them."""
     traffics, _ = available(config)
     cells = cells_of(config, traffics)
@@ -55,7 +70,9 @@ def rows_on(vehicles: int, lanes: int, config: ReproduceConfig) -> tuple[list[di
     kept = {*KEPT, *(f"{name}_ci" for name in KEPT)}
     rows = report.rows(report.by_recipe(episodes))
     place = {"vehicles": vehicles, "lanes": lanes}
-    return [place | {name: value for name, value in row.items() if name in kept} for row in rows], revisions
+    return [
+        place | {name: value for name, value in row.items() if name in kept} for row in rows
+    ], revisions
 
 
 def measure(options: argparse.Namespace) -> str:
@@ -84,7 +101,9 @@ def measure(options: argparse.Namespace) -> str:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = make_parser(__doc__)
-    parser.add_argument("options", nargs="*", metavar="KEY=VALUE", help="options of ganlane reproduce")
+    parser.add_argument(
+        "options", nargs="*", metavar="KEY=VALUE", help="options of ganlane reproduce"
+    )
     parser.add_argument("--out", type=Path, default=OUT, help=f"folder of results.json ({OUT})")
     return parser.parse_intermixed_args(arguments)
 

@@ -1,4 +1,7 @@
-"""Shared by the scripts: command line, the part of a document that a script writes, exit status, older revisions."""
+"""Shared by the scripts.
+
+Command line, the part of a document that a script writes, exit status, older revisions.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,9 @@ from ganlane.files import split_at_markers, write_between_markers
 
 def make_parser(description: str | None) -> argparse.ArgumentParser:
     """A command line whose help begins with ``description``, the docstring of the script."""
-    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    return argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
 
 
 def add_report(parser: argparse.ArgumentParser, begin: str, end: str) -> None:
@@ -29,7 +34,8 @@ def add_report(parser: argparse.ArgumentParser, begin: str, end: str) -> None:
 class ReportSection:
     """The part of a document that a script writes, between two markers.
 
-    Made before anything is measured, so that a document without the markers is refused at once, not hours later.
+    Made before anything is measured, so that a document without the markers is refused at once, not
+    hours later.
 
     Args:
         document: as ``--report`` gives it; None: nothing is written anywhere.
@@ -67,8 +73,12 @@ def checkout_of(revision: str) -> Iterator[Path]:
     git = ["git", "-C", str(Path(__file__).resolve().parents[1]), "worktree"]
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "revision"
-        subprocess.run([*git, "add", "--detach", str(folder), revision], check=True, capture_output=True)
+        subprocess.run(
+            [*git, "add", "--detach", str(folder), revision], check=True, capture_output=True
+        )
         try:
             yield folder
         finally:
-            subprocess.run([*git, "remove", "--force", str(folder)], check=True, capture_output=True)
+            subprocess.run(
+                [*git, "remove", "--force", str(folder)], check=True, capture_output=True
+            )

@@ -1,10 +1,12 @@
-"""The runs of a hyperparameter search in one table: their differences, and their scores on the selection stream.
+"""The runs of a hyperparameter search in one table: their differences, and their scores on the
+selection stream.
 
     python -m benchmarks.search outputs/train_sweeps/SWEEP
     python -m benchmarks.search outputs/train_sweeps/* --report docs/search.md --csv docs/search.csv
 
-Reads config.yaml, evaluation.csv and metrics.csv of every run below the folders; runs that are not finished are
-listed with what they have. ``--report`` puts the table between the two marker lines of a document.
+Reads config.yaml, evaluation.csv and metrics.csv of every run below the folders; runs that are not
+finished are listed with what they have. ``--report`` puts the table between the two marker lines of
+a document.
 """
 
 from __future__ import annotations
@@ -36,7 +38,10 @@ SCORE = "mean_reward"
 
 @dataclass(frozen=True)
 class SearchRun:
-    """One run folder: its options by dotted name, rows of its evaluations and of its metrics as they stand there."""
+    """One run folder.
+
+    Its options by dotted name, rows of its evaluations and of its metrics as they stand there.
+    """
 
     name: str
     options: dict[str, Any]
@@ -58,11 +63,17 @@ def read_runs(folders: Iterable[Path]) -> list[SearchRun]:
     runs = []
     for folder in folders:
         found = sorted(
-            (path.parent for path in folder.rglob("config.yaml") if (path.parent / "metrics.csv").is_file()),
+            (
+                path.parent
+                for path in folder.rglob("config.yaml")
+                if (path.parent / "metrics.csv").is_file()
+            ),
             key=_in_order,
         )
         if not found:
-            raise UserError(f"{folder}: no run there with config.yaml and metrics.csv; give the folder of a sweep.")
+            raise UserError(
+                f"{folder}: no run there with config.yaml and metrics.csv; give the folder of a sweep."
+            )
         runs += [read_run(path, folder) for path in found]
     return runs
 
@@ -84,11 +95,18 @@ def _in_order(path: Path) -> tuple[int, str]:
 def differing(runs: Sequence[SearchRun]) -> list[str]:
     """Names of the options that are not the same in all runs, as the configs list them."""
     names = dict.fromkeys(name for run in runs for name in run.options)
-    return [name for name in names if any(run.options.get(name) != runs[0].options.get(name) for run in runs)]
+    return [
+        name
+        for name in names
+        if any(run.options.get(name) != runs[0].options.get(name) for run in runs)
+    ]
 
 
 def table(runs: Sequence[SearchRun]) -> list[dict[str, str]]:
-    """One row per run, the best score first; cells as they are shown, empty where there is nothing to show."""
+    """One row per run, the best score first.
+
+    Cells as they are shown, empty where there is nothing to show.
+    """
     options = differing(runs)
     ordered = sorted(runs, key=lambda run: float(run.best.get(SCORE, "-inf")), reverse=True)
     return [_row(run, options) for run in ordered]
@@ -122,7 +140,10 @@ def _number(row: Mapping[str, str], name: str, form: str = "{:.1f}") -> str:
 
 
 def compact(rows: Sequence[Mapping[str, str]], options: Sequence[str]) -> list[dict[str, str]]:
-    """The same rows with the options in one cell: only those in which a run differs from what most of them have."""
+    """The same rows with the options in one cell.
+
+    Only those in which a run differs from what most of them have.
+    """
     usual = {name: Counter(row[name] for row in rows).most_common(1)[0][0] for name in options}
     short = []
     for row in rows:

@@ -1,11 +1,13 @@
-"""Speed of the generated traffics beside two Social-GANs that were written without this package's optimisations.
+"""Speed of the generated traffics beside two Social-GANs that were written without this package's
+optimisations.
 
     python -m benchmarks.social_gan
     python -m benchmarks.social_gan --batches 512 2048 --threads 1 2 --report docs/performance.md
 
-Both predict and move, and do nothing else; their widths are those of the package's generator (the original's defaults
-are several times as wide), so they differ in method and not in size. Weights are random: they do not change the time.
-All take turns as in ``ganlane bench`` (:mod:`ganlane.bench.measure`).
+Both predict and move, and do nothing else; their widths are those of the package's generator (the
+original's defaults are several times as wide), so they differ in method and not in size. Weights
+are random: they do not change the time. All take turns as in ``ganlane bench``
+(:mod:`ganlane.bench.measure`).
 """
 
 from __future__ import annotations
@@ -37,8 +39,9 @@ _SPACING_M, _STRIDE_M = 25.0, 2.0
 class PaddedGenerator(nn.Module):
     """The architecture (Gupta et al. 2018) for padded scenes: [N, M] vehicles with a mask.
 
-    All 8 observed displacements are encoded anew at every step, every pair goes through the whole first layer of the
-    pooling, and the decoder runs to its end although only its first displacement is driven.
+    All 8 observed displacements are encoded anew at every step, every pair goes through the whole
+    first layer of the pooling, and the decoder runs to its end although only its first displacement
+    is driven.
     """
 
     def __init__(self, sizes: GeneratorSizes) -> None:
@@ -49,20 +52,27 @@ class PaddedGenerator(nn.Module):
         self.embed_pair = nn.Linear(2, s.embedding)
         self.pool = _pooling(s)
         self.context = nn.Sequential(
-            nn.Linear(s.hidden + s.pooled, s.context), nn.ReLU(), nn.Linear(s.context, s.hidden - s.noise)
+            nn.Linear(s.hidden + s.pooled, s.context),
+            nn.ReLU(),
+            nn.Linear(s.context, s.hidden - s.noise),
         )
         self.embed_decoded = nn.Linear(2, s.embedding)
         self.decoder = nn.LSTMCell(s.embedding, s.hidden)
         self.head = nn.Linear(s.hidden, 2)
 
     def forward(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Tensor:
-        """Displacements [N * M, 8, 2] that follow [N, M, 8, 2], at positions [N, M, 2], by a mask [N, M]."""
+        """Displacements [N * M, 8, 2] that follow [N, M, 8, 2], at positions [N, M, 2], by a mask
+        [N, M].
+        """
         n, m = valid.shape
         observed = torch.relu(self.embed(displacements)).flatten(0, 1)
         hidden = self.encoder(observed)[1][0][0].view(n, m, -1)
         context = self.context(torch.cat([hidden, self.pooled(hidden, position, valid)], dim=-1))
         noise = torch.randn(n, m, self.sizes.noise)
-        return self.decode(torch.cat([context, noise], dim=-1).flatten(0, 1), displacements[..., -1, :].flatten(0, 1))
+        return self.decode(
+            torch.cat([context, noise], dim=-1).flatten(0, 1),
+            displacements[..., -1, :].flatten(0, 1),
+        )
 
     def pooled(self, hidden: Tensor, position: Tensor, valid: Tensor) -> Tensor:
         """Maximum over the others [N, M, P]."""
@@ -77,18 +87,22 @@ class PaddedGenerator(nn.Module):
         """All predicted steps."""
         cell, predicted = torch.zeros_like(hidden), []
         for _ in range(self.sizes.predicted):
-            hidden, cell = self.decoder(torch.relu(self.embed_decoded(displacement)), (hidden, cell))
+            hidden, cell = self.decoder(
+                torch.relu(self.embed_decoded(displacement)), (hidden, cell)
+            )
             displacement = displacement + self.head(hidden)
             predicted.append(displacement)
         return torch.stack(predicted, dim=1)
 
 
 class SceneLoopGenerator(nn.Module):
-    """The architecture as the original code has it: time first, pooling in a Python loop over scenes.
+    """The architecture as the original code has it: time first, pooling in a Python loop over
+    scenes.
 
-    The vehicles of all scenes are in one long row. The pooling repeats states and positions for every pair of a
-    scene, and the decoder runs all its 8 steps. By default the original pools after every step of its decoder too
-    (``pool_every_timestep=1``); without ``pool_every_step`` it pools once, before the decoder.
+    The vehicles of all scenes are in one long row. The pooling repeats states and positions for
+    every pair of a scene, and the decoder runs all its 8 steps. By default the original pools after
+    every step of its decoder too (``pool_every_timestep=1``); without ``pool_every_step`` it pools
+    once, before the decoder.
     """
 
     def __init__(self, sizes: GeneratorSizes, pool_every_step: bool = True) -> None:
@@ -100,17 +114,27 @@ class SceneLoopGenerator(nn.Module):
         self.embed_pair = nn.Linear(2, s.embedding)
         self.pool = _pooling(s)
         self.context = nn.Sequential(
-            nn.Linear(s.hidden + s.pooled, s.context), nn.ReLU(), nn.Linear(s.context, s.hidden - s.noise), nn.ReLU()
+            nn.Linear(s.hidden + s.pooled, s.context),
+            nn.ReLU(),
+            nn.Linear(s.context, s.hidden - s.noise),
+            nn.ReLU(),
         )
         self.embed_decoded = nn.Linear(2, s.embedding)
         self.decoder = nn.LSTM(s.embedding, s.hidden)
         self.after_pooling = nn.Sequential(
-            nn.Linear(s.hidden + s.pooled, s.context), nn.ReLU(), nn.Linear(s.context, s.hidden), nn.ReLU()
+            nn.Linear(s.hidden + s.pooled, s.context),
+            nn.ReLU(),
+            nn.Linear(s.context, s.hidden),
+            nn.ReLU(),
         )
         self.head = nn.Linear(s.hidden, 2)
 
-    def forward(self, displacements: Tensor, position: Tensor, ends: list[tuple[int, int]]) -> Tensor:
-        """Displacements [8, V, 2] after the observed [8, V, 2], at positions [V, 2], with each scene's vehicles."""
+    def forward(
+        self, displacements: Tensor, position: Tensor, ends: list[tuple[int, int]]
+    ) -> Tensor:
+        """Displacements [8, V, 2] after the observed [8, V, 2], at positions [V, 2], with each
+        scene's vehicles.
+        """
         hidden = self.encoder(torch.relu(self.embed(displacements)))[1][0][0]
         context = self.context(torch.cat([hidden, self.pooled(hidden, position, ends)], dim=1))
         return self.decode(self.with_noise(context, ends), displacements[-1], position, ends)
@@ -131,11 +155,14 @@ class SceneLoopGenerator(nn.Module):
         """One latent vector for all of a scene [V, H]."""
         noise = torch.randn(len(ends), self.sizes.noise)
         parts = [
-            torch.cat([context[start:end], z.expand(end - start, -1)], dim=1) for (start, end), z in zip(ends, noise)
+            torch.cat([context[start:end], z.expand(end - start, -1)], dim=1)
+            for (start, end), z in zip(ends, noise)
         ]
         return torch.cat(parts, dim=0)
 
-    def decode(self, hidden: Tensor, displacement: Tensor, position: Tensor, ends: list[tuple[int, int]]) -> Tensor:
+    def decode(
+        self, hidden: Tensor, displacement: Tensor, position: Tensor, ends: list[tuple[int, int]]
+    ) -> Tensor:
         """All predicted steps."""
         state, predicted = (hidden[None], torch.zeros_like(hidden)[None]), []
         for _ in range(self.sizes.predicted):
@@ -145,13 +172,19 @@ class SceneLoopGenerator(nn.Module):
             if self.pool_every_step:
                 position = position + displacement
                 pooled = self.pooled(state[0][0], position, ends)
-                state = (self.after_pooling(torch.cat([state[0][0], pooled], dim=1))[None], state[1])
+                state = (
+                    self.after_pooling(torch.cat([state[0][0], pooled], dim=1))[None],
+                    state[1],
+                )
         return torch.stack(predicted)
 
 
 def _pooling(s: GeneratorSizes) -> nn.Sequential:
     return nn.Sequential(
-        nn.Linear(s.embedding + s.hidden, s.pooling), nn.ReLU(), nn.Linear(s.pooling, s.pooled), nn.ReLU()
+        nn.Linear(s.embedding + s.hidden, s.pooling),
+        nn.ReLU(),
+        nn.Linear(s.pooling, s.pooled),
+        nn.ReLU(),
     )
 
 
@@ -161,13 +194,18 @@ class ClosedLoop:
     No road, no ego, no collisions, no guard.
 
     Args:
-        predict: displacements [N, M, 8, 2] and positions [N, M, 2] to the next displacement [N, M, 2].
+        predict: displacements [N, M, 8, 2] and positions [N, M, 2] to the next displacement [N, M,
+            2].
         batch, vehicles: N and M.
         observed: 8, the displacements that are observed.
     """
 
     def __init__(
-        self, predict: Callable[[Tensor, Tensor], Tensor], batch: int, vehicles: int, observed: int = 8
+        self,
+        predict: Callable[[Tensor, Tensor], Tensor],
+        batch: int,
+        vehicles: int,
+        observed: int = 8,
     ) -> None:
         self.predict = predict
         along = torch.arange(vehicles) * _SPACING_M
@@ -181,7 +219,9 @@ class ClosedLoop:
             # Bounded, for the weights are random.
             step = self.predict(self.displacements, self.position).clamp(-_STRIDE_M, _STRIDE_M)
             self.position = self.position + step
-            self.displacements = torch.cat([self.displacements[..., 1:, :], step[..., None, :]], dim=-2)
+            self.displacements = torch.cat(
+                [self.displacements[..., 1:, :], step[..., None, :]], dim=-2
+            )
         return 10 * decisions * self.position.shape[0]
 
 
@@ -254,13 +294,16 @@ class SocialGanSuite(TrafficSuite):
 
 
 def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Of each traffic to each baseline, both at their best: ``ratio`` (wall time) and ``ratio_cpu``.
+    """Of each traffic to each baseline, both at their best: ``ratio`` (wall time) and
+    ``ratio_cpu``.
 
     The two ratios may come from different rows: one thread gives the most for its CPU time.
     """
 
     def ratio(rate: str, traffic: str, baseline: str) -> float:
-        ours = max(row[rate] for row in rows if (row["system"], row["traffic"]) == (TRAFFIC, traffic))
+        ours = max(
+            row[rate] for row in rows if (row["system"], row["traffic"]) == (TRAFFIC, traffic)
+        )
         return ours / max(row[rate] for row in rows if row["system"] == baseline)
 
     return [

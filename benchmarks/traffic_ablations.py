@@ -1,15 +1,19 @@
-"""What does each option of the generated traffics do? The closed loop, driven with one of them changed at a time.
+"""What does each option of the generated traffics do? The closed loop, driven with one of them
+changed at a time.
 
     python -m benchmarks.traffic_ablations
-    python -m benchmarks.traffic_ablations --fits docs/reproduce/generators/*.safetensors --report docs/traffic.md
+    python -m benchmarks.traffic_ablations --fits docs/reproduce/generators/*.safetensors --report
+    docs/traffic.md
 
-Vehicles start as the simulator's episodes do (Table II), without an ego, and drive ``--seconds`` an episode until a
-variant has its vehicle-km. Every variant drives with the weights that ship and with each of ``--fits``, the same
-recipe fitted with other seeds; a cell then holds the mean, lowest and highest of the fits, a count their sum.
-``--fitted LABEL=FILE`` adds other weights as rows of their own. The numbers of every variant and fit are kept in a
-file in ``--folder``, so a run that was stopped goes on where it was.
+Vehicles start as the simulator's episodes do (Table II), without an ego, and drive ``--seconds`` an
+episode until a variant has its vehicle-km. Every variant drives with the weights that ship and with
+each of ``--fits``, the same recipe fitted with other seeds; a cell then holds the mean, lowest and
+highest of the fits, a count their sum. ``--fitted LABEL=FILE`` adds other weights as rows of their
+own. The numbers of every variant and fit are kept in a file in ``--folder``, so a run that was
+stopped goes on where it was.
 
-Plans of several steps for the calibrated traffic are no option of the package (:mod:`benchmarks.ablation_variants`).
+Plans of several steps for the calibrated traffic are no option of the package
+(:mod:`benchmarks.ablation_variants`).
 """
 
 from __future__ import annotations
@@ -28,7 +32,13 @@ from typing import Any
 
 import torch
 
-from benchmarks.ablation_variants import Variant, calibrated_variants, fitted_variant, gan_variants, preset_of
+from benchmarks.ablation_variants import (
+    Variant,
+    calibrated_variants,
+    fitted_variant,
+    gan_variants,
+    preset_of,
+)
 from benchmarks.script import ReportSection, add_report, make_parser, run_script
 from ganlane.evaluation import machine_sentence
 from ganlane.evaluation.table import NOTHING, Table, with_interval
@@ -72,8 +82,8 @@ def drive(variant: Variant, parameters: LongRunParameters, batch: int) -> dict[s
     """Drive ``batch`` episodes at a time until the wanted vehicle-km are covered.
 
     Returns:
-        The numbers of a long run; at the end of the episodes the mean speed and its mean standard deviation within an
-        episode, m/s; physics steps per CPU second.
+        The numbers of a long run; at the end of the episodes the mean speed and its mean standard
+        deviation within an episode, m/s; physics steps per CPU second.
     """
     run = LongRun(Road(), parameters)
     ends: list[tuple[float, float]] = []
@@ -99,20 +109,35 @@ def cells(fits: Sequence[dict[str, Any]]) -> list[str]:
     return [
         f"{sum(each['vehicle_km'] for each in fits):.0f}",
         _over_fits(fits, lambda each: each["lane_changes_per_vehicle_km"], 2),
-        _over_fits(fits, lambda each: each["overlaps_per_1000_vehicle_km"], 1, "overlaps_per_1000_vehicle_km_ci"),
+        _over_fits(
+            fits,
+            lambda each: each["overlaps_per_1000_vehicle_km"],
+            1,
+            "overlaps_per_1000_vehicle_km_ci",
+        ),
         str(sum(each["off_road"] for each in fits)),
         _over_fits(fits, lambda each: each["mean_speed_mps"], 1),
         _over_fits(fits, lambda each: each["spread_mps"], 2),
         ", ".join(f"{sum(levels) / len(fits):.2f}" for levels in zip(*quantiles)),
-        _over_fits(fits, lambda each: None if each["guard_share"] is None else 100.0 * each["guard_share"], 1),
+        _over_fits(
+            fits,
+            lambda each: None if each["guard_share"] is None else 100.0 * each["guard_share"],
+            1,
+        ),
         f"{sum(each['physics_steps_per_cpu_s'] for each in fits) / len(fits) / 1000:.1f} k",
     ]
 
 
 def _over_fits(
-    fits: Sequence[dict[str, Any]], value: Callable[[dict[str, Any]], float | None], digits: int, interval: str = ""
+    fits: Sequence[dict[str, Any]],
+    value: Callable[[dict[str, Any]], float | None],
+    digits: int,
+    interval: str = "",
 ) -> str:
-    """Mean, lowest and highest of several fits; the value of a single one, with its ``interval`` if it has one."""
+    """Mean, lowest and highest of several fits.
+
+    The value of a single one, with its ``interval`` if it has one.
+    """
     values = [found for each in fits if (found := value(each)) is not None]
     if not values:
         return NOTHING
@@ -128,16 +153,26 @@ def table(rows: Sequence[tuple[Variant, Sequence[dict[str, Any]]]]) -> str:
 
 def settings(variant: Variant, options: argparse.Namespace) -> dict[str, Any]:
     """What a variant's numbers depend on: its own options, with the weights, and those of the run."""
-    run = {name: getattr(options, name) for name in ("vehicle_km", "vehicles", "batch", "seconds", "seed")}
+    run = {
+        name: getattr(options, name)
+        for name in ("vehicle_km", "vehicles", "batch", "seconds", "seed")
+    }
     return {"options": variant.options, **run}
 
 
-def with_each_fit(variant: Variant, fits: Mapping[Path, str], options: argparse.Namespace) -> list[dict[str, Any]]:
-    """The numbers of a variant with the weights that ship, then with the ``fits`` (and their presets) of its own."""
+def with_each_fit(
+    variant: Variant, fits: Mapping[Path, str], options: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """The numbers of a variant with the weights that ship, then with the ``fits`` (and their
+    presets) of its own.
+    """
     if "path" in variant.options:
         return [driven(variant, options)]
     others = [file for file, preset in fits.items() if preset == variant.preset]
-    variants = [variant, *(replace(variant, options={**variant.options, "path": str(file)}) for file in others)]
+    variants = [
+        variant,
+        *(replace(variant, options={**variant.options, "path": str(file)}) for file in others),
+    ]
     return [driven(each, options) for each in variants]
 
 
@@ -149,7 +184,9 @@ def driven(variant: Variant, options: argparse.Namespace) -> dict[str, Any]:
         if kept["settings"] == wanted:
             return kept["numbers"]
     begun = time.monotonic()
-    asked = LongRunParameters(options.vehicles, options.vehicle_km, options.seconds, options.seed, variant.spawn)
+    asked = LongRunParameters(
+        options.vehicles, options.vehicle_km, options.seconds, options.seed, variant.spawn
+    )
     numbers = drive(variant, asked, options.batch)
     write_json(path, {"settings": wanted, "numbers": numbers})
     line = f"{variant.slug}: {numbers['vehicle_km']:.0f} vehicle-km"
@@ -187,8 +224,12 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--batch", type=int, default=128, help="episodes side by side")
     parser.add_argument("--seconds", type=float, default=20.0, help="of an episode")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--fits", nargs="*", default=[], type=Path, help="weights fitted with other seeds")
-    parser.add_argument("--fitted", action="append", default=[], metavar="LABEL=FILE", help="further weights")
+    parser.add_argument(
+        "--fits", nargs="*", default=[], type=Path, help="weights fitted with other seeds"
+    )
+    parser.add_argument(
+        "--fitted", action="append", default=[], metavar="LABEL=FILE", help="further weights"
+    )
     parser.add_argument("--only", nargs="*", help="variants whose name holds one of these words")
     parser.add_argument("--folder", type=Path, default=Path("outputs/traffic_ablations"))
     add_report(parser, BEGIN, END)
@@ -203,7 +244,11 @@ def measure(options: argparse.Namespace) -> str:
     document = ReportSection(options.report, BEGIN, END)
     chosen = [*gan_variants(), *calibrated_variants(), *map(fitted_variant, options.fitted)]
     if options.only:
-        chosen = [each for each in chosen if any(word in f"{each.preset} {each.name}" for word in options.only)]
+        chosen = [
+            each
+            for each in chosen
+            if any(word in f"{each.preset} {each.name}" for word in options.only)
+        ]
     fits = {file: preset_of(file) for file in options.fits}
     text = table([(variant, with_each_fit(variant, fits, options)) for variant in chosen])
     document.write(section(options, text))

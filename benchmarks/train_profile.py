@@ -1,10 +1,13 @@
-"""Where the time of a training run goes, and TorchRL's distributional loss beside the package's own.
+"""Where the time of a training run goes, and TorchRL's distributional loss beside the package's
+own.
 
     python -m benchmarks.train_profile
-    python -m benchmarks.train_profile --mode compiled --environments 1024 --report docs/performance.md
+    python -m benchmarks.train_profile --mode compiled --environments 1024 --report
+    docs/performance.md
 
-Shares of the time come from timers round the calls of the training loop. The losses are compared on one network, one
-batch and one optimiser, in turns as in ``ganlane bench`` (:mod:`ganlane.bench.measure`).
+Shares of the time come from timers round the calls of the training loop. The losses are compared on
+one network, one batch and one optimiser, in turns as in ``ganlane bench``
+(:mod:`ganlane.bench.measure`).
 """
 
 from __future__ import annotations
@@ -53,7 +56,10 @@ WHOLE_UPDATE = "whole update, with the lean loss"
 
 
 class Clock:
-    """Wall time by part; a part that runs inside another one is counted for itself alone, so that all add up."""
+    """Wall time by part.
+
+    A part that runs inside another one is counted for itself alone, so that all add up.
+    """
 
     def __init__(self, device: str = "cpu") -> None:
         self.seconds: defaultdict[str, float] = defaultdict(float)
@@ -135,7 +141,9 @@ def timed_calls(run: TrainingState, env: TransformedEnv) -> list[tuple[Any, str,
 def take_shares(
     run: TrainingState, env: TransformedEnv, decisions: int, device: str = "cpu"
 ) -> tuple[dict[str, float], float]:
-    """Shares of the parts in ``decisions`` of every environment, and how many all together made per second."""
+    """Shares of the parts in ``decisions`` of every environment, and how many all together made per
+    second.
+    """
     clock, begun = Clock(device), time.perf_counter()
     with instrumented(timed_calls(run, env), clock):
         advance(run, decisions)
@@ -144,13 +152,24 @@ def take_shares(
 
 
 def share_table(found: dict[str, tuple[dict[str, float], float]], where: str) -> Table:
-    """One column per traffic of ``found`` (shares and decisions/s); parts and, below them, what they consist of."""
+    """One column per traffic of ``found`` (shares and decisions/s).
+
+    Parts and, below them, what they consist of.
+    """
     lines = []
     for part, details in PARTS.items():
         names = details or (part,)
-        lines.append([part, "", *(percent(sum(s.get(n, 0.0) for n in names)) for s, _ in found.values())])
-        lines += [["", n, *(percent(shares.get(n, 0.0), 1) for shares, _ in found.values())] for n in details]
-    rates = "; ".join(f"{traffic}: {count(rate)} decisions/s with the timers" for traffic, (_, rate) in found.items())
+        lines.append(
+            [part, "", *(percent(sum(s.get(n, 0.0) for n in names)) for s, _ in found.values())]
+        )
+        lines += [
+            ["", n, *(percent(shares.get(n, 0.0), 1) for shares, _ in found.values())]
+            for n in details
+        ]
+    rates = "; ".join(
+        f"{traffic}: {count(rate)} decisions/s with the timers"
+        for traffic, (_, rate) in found.items()
+    )
     note = (
         "Wall time with timers round the calls; what one part calls of another is counted with the other. Simulator: "
         f"ego, physics, collisions, first scenes. {where}; {rates}."
@@ -192,13 +211,17 @@ def start_update(training: Training) -> Runner:
 
 
 def random_transitions(agent: Rainbow, rows: int) -> TensorDict:
-    """Transitions as :meth:`ganlane.agents.NStepWindow.push` gives them, with random numbers of a usual size."""
+    """Transitions as :meth:`ganlane.agents.NStepWindow.push` gives them, with random numbers of a
+    usual size.
+    """
     generator = torch.Generator().manual_seed(0)
     config = agent.network.config
     observation, following = torch.randn(2, rows, config.observation_size, generator=generator)
     reward = torch.randn(rows, 1, generator=generator)
     terminated = torch.rand(rows, 1, generator=generator) < 0.01
-    after = TensorDict({"observation": following, "reward": reward, "terminated": terminated}, [rows])
+    after = TensorDict(
+        {"observation": following, "reward": reward, "terminated": terminated}, [rows]
+    )
     content = {
         "observation": observation,
         "action": torch.randint(config.actions, (rows,), generator=generator),
@@ -208,8 +231,12 @@ def random_transitions(agent: Rainbow, rows: int) -> TensorDict:
     return TensorDict(content, [rows])
 
 
-def compare_losses(suite: TrainSuite, training: Training, repetitions: int, seconds: float) -> Table:
-    """Milliseconds per update of both losses and of a whole update, for each of the suite's numbers of threads."""
+def compare_losses(
+    suite: TrainSuite, training: Training, repetitions: int, seconds: float
+) -> Table:
+    """Milliseconds per update of both losses and of a whole update, for each of the suite's numbers
+    of threads.
+    """
     starts: dict[str, Callable[[], Runner]] = {
         THEIRS: partial(start_loss, training, theirs=True),
         OURS: partial(start_loss, training, theirs=False),
@@ -217,15 +244,26 @@ def compare_losses(suite: TrainSuite, training: Training, repetitions: int, seco
     }
     lines = []
     for threads in suite.config.threads:
-        cases = [Case(suite.labels(name, "-", EAGER, threads, 1), start) for name, start in starts.items()]
+        cases = [
+            Case(suite.labels(name, "-", EAGER, threads, 1), start)
+            for name, start in starts.items()
+        ]
         with torch_threads(threads):
             samples = take_turns(cases, [case.start() for case in cases], repetitions, seconds)
         for name, taken in zip(starts, samples):
-            wall, cpu = (median(getattr(s, key) / s.decisions for s in taken) for key in ("wall_s", "cpu_s"))
+            wall, cpu = (
+                median(getattr(s, key) / s.decisions for s in taken) for key in ("wall_s", "cpu_s")
+            )
             figures = [f"{1000 * wall:.2f}", f"{1000 * cpu:.2f}"]
             lines.append([name, str(threads), str(training.agent.batch_size), *figures])
     note = "The first two: loss, backward pass and optimiser step on the same network and the same batch; eager."
-    return Table("Milliseconds per update", ["what", "threads", "batch size", "ms", "CPU-ms"], lines, 1, [note])
+    return Table(
+        "Milliseconds per update",
+        ["what", "threads", "batch size", "ms", "CPU-ms"],
+        lines,
+        1,
+        [note],
+    )
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -234,9 +272,15 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--traffics", nargs="+", default=["idm_mobil", "gan"])
     parser.add_argument("--mode", choices=("eager", "compiled", "native"), default="compiled")
     parser.add_argument("--environments", type=int, default=1024)
-    parser.add_argument("--stored", type=int, default=1_000_000, help="transitions in the buffer from the start")
-    parser.add_argument("--decisions", type=int, default=40, help="of every environment, with timers")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="the shares use the first one")
+    parser.add_argument(
+        "--stored", type=int, default=1_000_000, help="transitions in the buffer from the start"
+    )
+    parser.add_argument(
+        "--decisions", type=int, default=40, help="of every environment, with timers"
+    )
+    parser.add_argument(
+        "--threads", type=int, nargs="+", default=[1, 2], help="the shares use the first one"
+    )
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=0.5, help="of a turn")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")

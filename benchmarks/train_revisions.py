@@ -1,11 +1,14 @@
-"""``ganlane train`` of this checkout and of an older revision, in turns: decisions per second with learning.
+"""``ganlane train`` of this checkout and of an older revision, in turns: decisions per second with
+learning.
 
     python -m benchmarks.train_revisions --revision 82e9c00
-    python -m benchmarks.train_revisions --environments 1024 --cores 0 1 --collectors single single:2 overlap
+    python -m benchmarks.train_revisions --environments 1024 --cores 0 1 --collectors single
+    single:2 overlap
 
-Every case is a real run of the command, logs included and checkpoints not, with the agent of ``agent=rainbow``. All
-are started at once and stopped (SIGSTOP) except for the one whose turn it is, so that a change of the machine's speed
-meets all alike. The older revision runs with one core, in a worktree of git that is removed afterwards. Linux alone.
+Every case is a real run of the command, logs included and checkpoints not, with the agent of
+``agent=rainbow``. All are started at once and stopped (SIGSTOP) except for the one whose turn it
+is, so that a change of the machine's speed meets all alike. The older revision runs with one core,
+in a worktree of git that is removed afterwards. Linux alone.
 """
 
 from __future__ import annotations
@@ -41,7 +44,10 @@ _TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 
 @dataclass
 class Run:
-    """A training that runs in turns; ``rates`` are its decisions per second and per CPU-second by turn."""
+    """A training that runs in turns.
+
+    ``rates`` are its decisions per second and per CPU-second by turn.
+    """
 
     name: str
     traffic: str
@@ -54,14 +60,23 @@ class Run:
 
     def start(self) -> None:
         """The command, in a process group of its own."""
-        own = [f"traffic={self.traffic}", f"threads={self.threads}", f"log_every={ROW}", *self.options]
+        own = [
+            f"traffic={self.traffic}",
+            f"threads={self.threads}",
+            f"log_every={ROW}",
+            *self.options,
+        ]
         command = ["-m", "ganlane.train", *OPTIONS, *own]
         self.folder.mkdir(parents=True)
         with (self.folder / "messages.txt").open("w") as messages:
             self.process = subprocess.Popen(
                 [sys.executable, *command, f"hydra.run.dir={self.folder}"],
                 cwd=self.folder,
-                env={**os.environ, "PYTHONPATH": str(self.source), "OMP_NUM_THREADS": str(self.threads)},
+                env={
+                    **os.environ,
+                    "PYTHONPATH": str(self.source),
+                    "OMP_NUM_THREADS": str(self.threads),
+                },
                 stdout=messages,
                 stderr=messages,
                 preexec_fn=lambda: os.sched_setaffinity(0, self.cores),
@@ -180,12 +195,16 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--revision", default="82e9c00")
     parser.add_argument("--traffics", nargs="+", default=["idm_mobil", "gan"])
     parser.add_argument("--collectors", nargs="+", default=["single"], help="NAME, or NAME:THREADS")
-    parser.add_argument("--cores", type=int, nargs="+", default=[0], help="the first one for what needs only one")
+    parser.add_argument(
+        "--cores", type=int, nargs="+", default=[0], help="the first one for what needs only one"
+    )
     parser.add_argument("--environments", type=int, default=512)
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--rows", type=int, default=10, help=f"of {ROW} decisions, per turn")
     parser.add_argument("--warm", type=int, default=12, help="rows before the first turn")
-    parser.add_argument("--options", nargs="*", default=[], help="of ganlane train, not for the older revision")
+    parser.add_argument(
+        "--options", nargs="*", default=[], help="of ganlane train, not for the older revision"
+    )
     add_report(parser, BEGIN, END)
     return parser.parse_args(arguments)
 

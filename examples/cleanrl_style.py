@@ -1,4 +1,5 @@
-"""DQN in one file, in CleanRL's style, on gymnasium's vector interface: 64 highways stepped as one batch.
+"""DQN in one file, in CleanRL's style, on gymnasium's vector interface: 64 highways stepped as one
+batch.
 
 Run it with ``python examples/cleanrl_style.py``; a few seconds of training by default, more with
 ``python examples/cleanrl_style.py 500000``.
@@ -19,7 +20,10 @@ BATCH, CAPACITY, GAMMA, TARGET_EVERY = 256, 50_000, 0.98, 100
 
 
 def next_observations(observation, ended, info):
-    """Observations after the decision; where an episode ended its last one, not the first of the next episode."""
+    """Observations after the decision.
+
+    Where an episode ended its last one, not the first of the next episode.
+    """
     following = observation.copy()
     if ended.any():
         following[ended] = np.stack(info["final_obs"][ended])
@@ -43,18 +47,30 @@ def main(decisions=16_384, num_envs=64):
     """Collect, store, update."""
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    envs = gymnasium.make_vec("ganlane/Highway-v0", num_envs=num_envs, traffic="idm_mobil", goal_m=1000.0)
+    envs = gymnasium.make_vec(
+        "ganlane/Highway-v0", num_envs=num_envs, traffic="idm_mobil", goal_m=1000.0
+    )
     envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(envs)
     size, actions = envs.single_observation_space.shape[0], envs.single_action_space.n
     network, target = (
-        nn.Sequential(nn.Linear(size, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, actions))
+        nn.Sequential(
+            nn.Linear(size, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, actions)
+        )
         for _ in range(2)
     )
     target.load_state_dict(network.state_dict())
     optimiser = torch.optim.Adam(network.parameters(), lr=5e-4)
-    shapes = {"observation": (size,), "action": (), "reward": (), "following": (size,), "terminated": ()}
+    shapes = {
+        "observation": (size,),
+        "action": (),
+        "reward": (),
+        "following": (size,),
+        "terminated": (),
+    }
     kinds = {"action": torch.int64, "terminated": torch.bool}
-    memory = {name: torch.zeros(CAPACITY, *shape, dtype=kinds.get(name)) for name, shape in shapes.items()}
+    memory = {
+        name: torch.zeros(CAPACITY, *shape, dtype=kinds.get(name)) for name, shape in shapes.items()
+    }
     observation, info = envs.reset(seed=0)
     loss = float("nan")
     for step in range(decisions // num_envs):
@@ -78,7 +94,9 @@ def main(decisions=16_384, num_envs=64):
             target.load_state_dict(network.state_dict())
     returns = list(envs.return_queue)
     print(f"{decisions} decisions, {envs.episode_count} episodes, loss {loss:.3f}")
-    print(f"mean return of the last {len(returns)}: {np.mean(returns) if returns else float('nan'):.1f}")
+    print(
+        f"mean return of the last {len(returns)}: {np.mean(returns) if returns else float('nan'):.1f}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """A policy of your own beside MOBIL and a shipped agent, on the same episodes, in the same table.
 
-A policy is anything that writes ``action``: a network that reads ``observation``, or, as here, a rule that reads the
-raw state. Run it with ``python examples/own_policy.py``. On the command line the same class is
-``python -m ganlane.evaluate 'agents=[mobil,random_legal,own_policy.LargestGap]'`` (with this folder on PYTHONPATH).
+A policy is anything that writes ``action``: a network that reads ``observation``, or, as here, a
+rule that reads the raw state. Run it with ``python examples/own_policy.py``. On the command line
+the same class is ``python -m ganlane.evaluate 'agents=[mobil,random_legal,own_policy.LargestGap]'``
+(with this folder on PYTHONPATH).
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from ganlane.sim.dynamics import ego_scene
 
 
 class LargestGap(Driver):
-    """Changes to a lane whose gap ahead is at least ``better_m`` larger, if no driver there has to brake hard."""
+    """Changes to a lane whose gap ahead is at least ``better_m`` larger, if no driver there has to
+    brake hard.
+    """
 
     def __init__(self, road, stream=Stream.TRAIN, better_m=20.0):
         super().__init__(road, stream)
@@ -43,7 +46,9 @@ def main(episodes=24, goal_m=500.0):
     """Evaluate four drivers on short episodes of the stream that is kept for reports."""
     mine = ganlane.Driver("largest_gap", LargestGap(Road(lanes=3), Stream.REPORT))
     drivers = ["mobil", "agent_idm", "random_legal", mine]
-    print(text_table(ganlane.api.evaluate(drivers, ["idm_mobil"], episodes, goal_m=goal_m).to_dicts()))
+    print(
+        text_table(ganlane.api.evaluate(drivers, ["idm_mobil"], episodes, goal_m=goal_m).to_dicts())
+    )
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """A reward of your own: also penalise dangerous approaches behind the ego.
 
-Section V.C counts dangerous approaches ahead of the ego. Those behind it (after the ego cut in) are reported by the
-environment as ``events.soft_crash_behind``, without a penalty. This transform adds one. Run it with
-``python examples/own_reward.py``.
+Section V.C counts dangerous approaches ahead of the ego. Those behind it (after the ego cut in) are
+reported by the environment as ``events.soft_crash_behind``, without a penalty. This transform adds
+one. Run it with ``python examples/own_reward.py``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ class Courtesy(Transform):
 
 
 def main():
-    """Returns of two drivers under the paper's reward and under the courteous one, on the same episodes."""
+    """Returns of two drivers under the paper's reward and under the courteous one, on the same
+    episodes.
+    """
     road, short = Road(lanes=3), EpisodeParameters(goal_m=300.0)
     for name in ("mobil", "random_legal"):
         driver = DRIVERS[name](road, Stream.REPORT)
@@ -45,7 +47,9 @@ def main():
             env = TransformedEnv(env, Compose(RewardTransform(), *transforms))
             episodes = run_episodes(env, driver, range(24), seed=0)
             behind = episodes["soft_crash_behind"].sum()
-            print(f"{name:>12} {title:>9}: mean return {episodes['reward'].mean():7.1f}, {behind} onsets behind")
+            print(
+                f"{name:>12} {title:>9}: mean return {episodes['reward'].mean():7.1f}, {behind} onsets behind"
+            )
 
 
 if __name__ == "__main__":

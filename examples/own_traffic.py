@@ -1,7 +1,8 @@
 """A traffic model of your own: IDM drivers who now and then look away and hold their speed.
 
 Run it with ``python examples/own_traffic.py``. On the command line the same class is
-``traffic._target_=own_traffic.Daydreamers +traffic.parameters.every_s=20.0`` (with this folder on PYTHONPATH).
+``traffic._target_=own_traffic.Daydreamers +traffic.parameters.every_s=20.0`` (with this folder on
+PYTHONPATH).
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from ganlane.traffic import TrafficModule
 
 
 class Daydreamers(TrafficModule):
-    """Attention lapses come at random, once in ``every_s`` seconds of attention, and last ``lasts_s``."""
+    """Attention lapses come at random, once in ``every_s`` seconds of attention, and last
+    ``lasts_s``.
+    """
 
     memory_fields = {"away": ((), torch.int64)}  # noqa: RUF012
 
@@ -29,7 +32,9 @@ class Daydreamers(TrafficModule):
         u = uniform(key, step, vehicles.x.shape[1], [Purpose.FAULT], vehicles.x.dtype)[..., 0]
         lapses = (memory["away"] == 0) & (u < self.dt / self.every_s)
         away = torch.where(lapses, round(self.lasts_s / self.dt), memory["away"])
-        acceleration = torch.where(away > 0, 0.0, following_acceleration(perceive(vehicles, self.road)))
+        acceleration = torch.where(
+            away > 0, 0.0, following_acceleration(perceive(vehicles, self.road))
+        )
         wheel, v = torch.zeros_like(vehicles.x), vehicles
         pose = advance(v.x, v.y, v.heading, v.speed, acceleration, wheel, self.dt)
         return v.with_(**pose._asdict()), {"away": (away - 1).clamp_min(0)}
@@ -43,7 +48,9 @@ def main():
     state = env.rollout(30, MobilDriver(road), auto_reset=True, break_when_any_done=False)["next"]
     others = state["vehicles"][..., 1:]
     looking_away = (state["traffic", "away"][..., 1:] > 0).double().mean()
-    print(f"mean speed of the others {others['speed'].mean():.1f} m/s, {100 * looking_away:.0f} % look away")
+    print(
+        f"mean speed of the others {others['speed'].mean():.1f} m/s, {100 * looking_away:.0f} % look away"
+    )
     print(f"soft crashes of the ego: {int(state['events', 'soft_crash'].sum())} in 8 x 30 s")
 
 

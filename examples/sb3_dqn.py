@@ -1,7 +1,8 @@
-"""stable-baselines3's DQN on the highway, unchanged, and its policy beside MOBIL on the same episodes.
+"""stable-baselines3's DQN on the highway, unchanged, and its policy beside MOBIL on the same
+episodes.
 
-Run it with ``python examples/sb3_dqn.py`` (needs ``pip install stable-baselines3``); a short training by default,
-more with ``python examples/sb3_dqn.py 200000``.
+Run it with ``python examples/sb3_dqn.py`` (needs ``pip install stable-baselines3``); a short
+training by default, more with ``python examples/sb3_dqn.py 200000``.
 """
 
 from __future__ import annotations
@@ -35,10 +36,14 @@ def main(decisions=2_000, episodes=20, goal_m=1000.0):
     model = DQN("MlpPolicy", env, learning_starts=decisions // 4, gamma=0.98, train_freq=4, seed=0)
     model.learn(decisions)
     finished = [episode["r"] for episode in model.ep_info_buffer]
-    print(f"{model.num_timesteps} decisions, mean return of the last {len(finished)} episodes {mean(finished):.1f}")
+    print(
+        f"{model.num_timesteps} decisions, mean return of the last {len(finished)} episodes {mean(finished):.1f}"
+    )
     policy = TensorDictModule(Greedy(model.q_net), in_keys=["observation"], out_keys=["action"])
     sb3 = ganlane.Driver("sb3_dqn", policy)
-    table = ganlane.api.evaluate([sb3, "mobil", "random_legal"], ["idm_mobil"], episodes, goal_m=goal_m)
+    table = ganlane.api.evaluate(
+        [sb3, "mobil", "random_legal"], ["idm_mobil"], episodes, goal_m=goal_m
+    )
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))
 
 

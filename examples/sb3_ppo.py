@@ -1,8 +1,10 @@
-"""PPO of stable-baselines3 on 256 highways at once, and its policy compared with MOBIL on the same episodes.
+"""PPO of stable-baselines3 on 256 highways at once, and its policy compared with MOBIL on the same
+episodes.
 
-``python examples/sb3_ppo.py`` trains sb3-contrib's MaskablePPO behind the safe action mask for 3 M decisions, two
-minutes on one core. ``python examples/sb3_ppo.py 4500000 none PPO`` trains plain PPO without a mask; ``... safe PPO``
-trains it without one as well and lets it drive behind the mask. Needs ``pip install 'ganlane[sb3]'``.
+``python examples/sb3_ppo.py`` trains sb3-contrib's MaskablePPO behind the safe action mask for 3 M
+decisions, two minutes on one core. ``python examples/sb3_ppo.py 4500000 none PPO`` trains plain PPO
+without a mask; ``... safe PPO`` trains it without one as well and lets it drive behind the mask.
+Needs ``pip install 'ganlane[sb3]'``.
 """
 
 import sys
@@ -16,13 +18,21 @@ import ganlane
 import ganlane.sb3
 
 
-def main(decisions="3000000", mask="safe", algorithm="MaskablePPO", episodes="100", goal_m="5000", num_envs="256"):
+def main(
+    decisions="3000000",
+    mask="safe",
+    algorithm="MaskablePPO",
+    episodes="100",
+    goal_m="5000",
+    num_envs="256",
+):
     """Train, then evaluate."""
     torch.set_num_threads(1)  # small networks: a second thread only costs
     options = {"mask": mask, "goal_m": float(goal_m)}
     env = ganlane.sb3.make_vec_env("idm_mobil", num_envs=int(num_envs), seed=0, **options)
     if algorithm == "PPO":
-        env = VecNormalize(env, norm_obs=False, gamma=0.98, clip_reward=1e9)  # crashes make the rewards' scale large
+        # crashes make the rewards' scale large
+        env = VecNormalize(env, norm_obs=False, gamma=0.98, clip_reward=1e9)
     model = {"PPO": PPO, "MaskablePPO": MaskablePPO}[algorithm](
         "MlpPolicy", env, learning_rate=lambda left: 1e-3 * left, n_steps=64, batch_size=2048, n_epochs=5,
         gamma=0.98, gae_lambda=0.9, ent_coef=0.01, policy_kwargs={"net_arch": [128, 128]}, seed=0,

@@ -1,7 +1,8 @@
-"""TorchRL's own DQN on the highway, behind the action mask: nothing of ganlane's agent, only its environment.
+"""TorchRL's own DQN on the highway, behind the action mask: nothing of ganlane's agent, only its
+environment.
 
-``python examples/torchrl_dqn.py`` trains for 1 M decisions; ``python examples/torchrl_dqn.py 20000 4`` for some
-seconds, and compares on 4 episodes.
+``python examples/torchrl_dqn.py`` trains for 1 M decisions;
+``python examples/torchrl_dqn.py 20000 4`` for some seconds, and compares on 4 episodes.
 """
 
 import sys
@@ -24,15 +25,25 @@ def main(decisions="1000000", episodes="100", goal_m="5000", num_envs="64"):
     env = ganlane.make_env("idm_mobil", int(num_envs), **options)
     spec, masked = env.action_spec_unbatched, {"action_mask_key": "action_mask"}
     network = MLP(env.observation_spec["observation"].shape[-1], 3, num_cells=[128, 128])
-    actor = QValueActor(network, in_keys=["observation"], spec=spec, action_space="categorical", **masked)
-    explore = EGreedyModule(spec, eps_init=1.0, eps_end=0.05, annealing_num_steps=int(decisions) // 2, **masked)
+    actor = QValueActor(
+        network, in_keys=["observation"], spec=spec, action_space="categorical", **masked
+    )
+    explore = EGreedyModule(
+        spec, eps_init=1.0, eps_end=0.05, annealing_num_steps=int(decisions) // 2, **masked
+    )
     loss = DQNLoss(actor, delay_value=True, action_space="categorical", loss_function="smooth_l1")
     loss.make_value_estimator(gamma=0.98)
     target = SoftUpdate(loss, eps=0.99)
     optimiser = torch.optim.Adam(loss.parameters(), lr=5e-4)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(200_000), batch_size=512)
     policy = TensorDictSequential(actor, explore)
-    wanted = ["observation", "action", "action_mask", ("next", "observation"), ("next", "action_mask")]
+    wanted = [
+        "observation",
+        "action",
+        "action_mask",
+        ("next", "observation"),
+        ("next", "action_mask"),
+    ]
     wanted += [("next", "reward"), ("next", "done"), ("next", "terminated")]
     batches = {"frames_per_batch": 8 * int(num_envs), "total_frames": int(decisions)}
     for batch in Collector(env, policy, **batches, auto_register_policy_transforms=False):
@@ -44,7 +55,9 @@ def main(decisions="1000000", episodes="100", goal_m="5000", num_envs="64"):
             optimiser.step()
             optimiser.zero_grad()
             target.step()
-    print(f"loss {losses['loss'].item():.3f}, reward per decision {batch['next', 'reward'].mean():.2f}")
+    print(
+        f"loss {losses['loss'].item():.3f}, reward per decision {batch['next', 'reward'].mean():.2f}"
+    )
     drivers = [ganlane.Driver("torchrl_dqn", actor), "mobil"]
     table = ganlane.api.evaluate(drivers, ["idm_mobil"], int(episodes), **options)
     print(table.select("agent", "episodes", "goal", "hard_crash", "mean_reward"))

@@ -1,7 +1,8 @@
-"""TorchRL's own PPO on the highway, behind the action mask; its policy compared with MOBIL on the same episodes.
+"""TorchRL's own PPO on the highway, behind the action mask; its policy compared with MOBIL on the
+same episodes.
 
-``python examples/torchrl_ppo.py`` trains for 2 M decisions; ``python examples/torchrl_ppo.py 20000 4`` for some
-seconds, and compares on 4 episodes.
+``python examples/torchrl_ppo.py`` trains for 2 M decisions;
+``python examples/torchrl_ppo.py 20000 4`` for some seconds, and compares on 4 episodes.
 """
 
 import sys
@@ -25,7 +26,9 @@ def main(decisions="2000000", episodes="100", goal_m="5000", num_envs="256"):
     options = {"mask": "safe", "goal_m": float(goal_m)}
     env = ganlane.make_env("idm_mobil", int(num_envs), **options)
     size = env.observation_spec["observation"].shape[-1]
-    logits, value = (MLP(size, out, num_cells=[128, 128], activation_class=torch.nn.Tanh) for out in (3, 1))
+    logits, value = (
+        MLP(size, out, num_cells=[128, 128], activation_class=torch.nn.Tanh) for out in (3, 1)
+    )
     actor = ProbabilisticActor(
         TensorDictModule(logits, ["observation"], ["logits"]),
         in_keys={"logits": "logits", "mask": "action_mask"},
@@ -34,11 +37,23 @@ def main(decisions="2000000", episodes="100", goal_m="5000", num_envs="256"):
     )
     critic = ValueOperator(value, in_keys=["observation"])
     advantage = GAE(gamma=0.98, lmbda=0.9, value_network=critic)
-    loss = ClipPPOLoss(actor, critic, entropy_coeff=0.01, critic_coeff=0.5, normalize_advantage=True)
+    loss = ClipPPOLoss(
+        actor, critic, entropy_coeff=0.01, critic_coeff=0.5, normalize_advantage=True
+    )
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
     frames = STEPS * int(num_envs)
-    schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.0, max(1, int(decisions) // frames))
-    wanted = ["observation", "action", "action_mask", "action_log_prob", "advantage", "value_target", "state_value"]
+    schedule = torch.optim.lr_scheduler.LinearLR(
+        optimiser, 1.0, 0.0, max(1, int(decisions) // frames)
+    )
+    wanted = [
+        "observation",
+        "action",
+        "action_mask",
+        "action_log_prob",
+        "advantage",
+        "value_target",
+        "state_value",
+    ]
     batches = {"frames_per_batch": frames, "total_frames": int(decisions)}
     for batch in Collector(env, actor, **batches, auto_register_policy_transforms=False):
         with torch.no_grad():

@@ -10,9 +10,10 @@
     env = ganlane.make_env(traffic="gan", num_envs=256)                          # the same for TorchRL
     table = ganlane.api.evaluate(agents=["mobil", "agent_idm"], traffics=["gan"])  # a data frame
 
-Imports run one way: ``data``, ``sim`` <- ``generator`` <- ``traffic`` <- ``env`` <- ``transforms`` <- ``agents`` <-
-``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``api`` <- ``gym`` <- ``commands``. Below all
-of them are ``keys`` (every TensorDict key), ``errors``, ``files`` and ``runtime``.
+Imports run one way: ``data``, ``sim`` <- ``generator`` <- ``traffic`` <- ``env`` <- ``transforms``
+<- ``agents`` <- ``evaluation`` <- ``view`` <- ``config`` <- ``build`` <- ``training`` <- ``api`` <-
+``gym`` <- ``commands``. Below all of them are ``keys`` (every TensorDict key), ``errors``,
+``files`` and ``runtime``.
 """
 
 from __future__ import annotations
@@ -58,21 +59,26 @@ __all__ = ["__version__", "api", *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name at its first use (PEP 562), so that ``import ganlane`` does not wait seconds for torch."""
+    """Import a public name at its first use (PEP 562), so that ``import ganlane`` does not wait
+    seconds for torch.
+    """
     if name in ("api", *_MODULES):
         check_process()
     if name == "api":
         return importlib.import_module("ganlane.api")
     if name in _MODULES:
         return getattr(importlib.import_module(_MODULES[name]), name)
-    raise AttributeError(f"module 'ganlane' has no attribute {name!r}; the commands' calls are in ganlane.api")
+    raise AttributeError(
+        f"module 'ganlane' has no attribute {name!r}; the commands' calls are in ganlane.api"
+    )
 
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-# A command (``ganlane ...``, or ``python -m ganlane...``, where argv[0] is -m during this import) registers them only
-# after checking its keys: importing gymnasium takes 0.2 s of the 0.7 s in which a mistyped key is reported.
+# A command (``ganlane ...``, or ``python -m ganlane...``, where argv[0] is -m during this import)
+# registers them only after checking its keys: importing gymnasium takes 0.2 s of the 0.7 s in which
+# a mistyped key is reported.
 if not sys.argv or os.path.splitext(os.path.basename(sys.argv[0]))[0] not in ("-m", "ganlane"):
     register_envs()

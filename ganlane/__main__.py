@@ -65,7 +65,10 @@ def dispatch(arguments: Sequence[str] | None = None) -> int:
     if set(COMPLETION_FLAGS) & {command, *rest}:
         return shell_completion([command, *rest])
     if command not in ALL_COMMANDS:
-        print(f"ganlane: {command}: no such command; choose one of {', '.join(ALL_COMMANDS)}.", file=sys.stderr)
+        print(
+            f"ganlane: {command}: no such command; choose one of {', '.join(ALL_COMMANDS)}.",
+            file=sys.stderr,
+        )
         return USER_ERROR
     return importlib.import_module(f"ganlane.{command}").main(rest)
 
@@ -73,10 +76,16 @@ def dispatch(arguments: Sequence[str] | None = None) -> int:
 def shell_completion(arguments: Sequence[str]) -> int:
     """``ganlane [COMMAND] -sc install=SHELL`` and the like; the exit status.
 
-    Hydra completes programs that are a single command: its shell function calls the program, ``ganlane``, without the
-    command, which is therefore read from the line and removed before Hydra completes the rest.
+    Hydra completes programs that are a single command: its shell function calls the program,
+    ``ganlane``, without the command, which is therefore read from the line and removed before Hydra
+    completes the rest.
     """
-    asked = next(filter(None, (re.fullmatch(r"(install|uninstall|query)=(\w+)", each) for each in arguments)), None)
+    asked = next(
+        filter(
+            None, (re.fullmatch(r"(install|uninstall|query)=(\w+)", each) for each in arguments)
+        ),
+        None,
+    )
     if asked is None or asked[2] not in SHELLS:
         print(
             f'ganlane: {" ".join(arguments)}: expected for instance eval "$(ganlane -sc install=bash)"; shells: '

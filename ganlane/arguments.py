@@ -53,23 +53,27 @@ def seed_number(seed: Any) -> int:
 
 
 def checked_arguments(function: F) -> F:
-    """Decorator: check the types of the arguments against the annotations before ``function`` is called.
+    """Decorator: check the types of the arguments against the annotations before ``function`` is
+    called.
 
-    NumPy's numbers count as Python's. A text must not hold a zero byte, which paths and names cannot have. ``Any``,
-    alone or in a union, accepts everything.
+    NumPy's numbers count as Python's. A text must not hold a zero byte, which paths and names
+    cannot have. ``Any``, alone or in a union, accepts everything.
 
     Raises:
         UserError: for the first argument of a wrong type.
     """
     signature = inspect.signature(function)
-    hints = cache(lambda: get_type_hints(function))  # at the first call, when all modules are imported
+    # at the first call, when all modules are imported
+    hints = cache(lambda: get_type_hints(function))
 
     @wraps(function)
     def checked(*arguments: Any, **named: Any) -> Any:
         for name, value in signature.bind(*arguments, **named).arguments.items():
             hint = hints().get(name, Any)
             if not _fits(value, hint):
-                raise UserError(f"{name}={_shown(value)}: expected {_in_words(hint)}; correct this argument.")
+                raise UserError(
+                    f"{name}={_shown(value)}: expected {_in_words(hint)}; correct this argument."
+                )
         return function(*arguments, **named)
 
     return checked  # type: ignore[return-value]
@@ -83,8 +87,14 @@ def _fits(value: Any, hint: Any) -> bool:
     if kind is Mapping or kind is dict:
         return isinstance(value, Mapping) and all(_fits(key, inner[0]) for key in value)
     if kind is Sequence:  # or an array
-        listed = isinstance(value, Collection) and not isinstance(value, str | bytes | Mapping | Set)
-        return listed and getattr(value, "ndim", 1) > 0 and all(_fits(each, inner[0]) for each in value)
+        listed = isinstance(value, Collection) and not isinstance(
+            value, str | bytes | Mapping | Set
+        )
+        return (
+            listed
+            and getattr(value, "ndim", 1) > 0
+            and all(_fits(each, inner[0]) for each in value)
+        )
     if kind is int:
         return _is_whole(value)
     if kind is float:
@@ -93,13 +103,20 @@ def _fits(value: Any, hint: Any) -> bool:
         return type(value).__name__ in ("bool", "bool_")  # NumPy's, by either name
     if kind is str:
         return isinstance(value, str) and "\0" not in value
-    if getattr(kind, "_is_protocol", False):  # such as that of scenes: a user's class need not inherit
+    # such as that of scenes: a user's class need not inherit
+    if getattr(kind, "_is_protocol", False):
         return callable(value)
     return kind is Any or not inspect.isclass(kind) or isinstance(value, kind)
 
 
 _NAMES: Final[Mapping[Any, str]] = {
-    **{int: "a whole number", float: "a number", bool: "True or False", str: "a text", Path: "a path"},
+    **{
+        int: "a whole number",
+        float: "a number",
+        bool: "True or False",
+        str: "a text",
+        Path: "a path",
+    },
     **{Mapping: "a mapping of names", dict: "a dictionary", NoneType: "None"},
 }
 
@@ -122,15 +139,16 @@ def is_import_path(name: str) -> bool:
 def import_target(path: str, key: str, base: type[Made]) -> Callable[..., Made]:
     """The subclass of ``base``, or the function annotated to return one, at import path ``path``.
 
-    Importing a module executes it: ``path`` must come from the user's command line or call, or be of this package
-    (:func:`ganlane.config.runs.refuse_stored_imports`). ``key`` is the configuration's, for error messages.
+    Importing a module executes it: ``path`` must come from the user's command line or call, or be
+    of this package (:func:`ganlane.config.runs.refuse_stored_imports`). ``key`` is the
+    configuration's, for error messages.
 
     Raises:
         UserError: it cannot be imported, or does not make a ``base``.
     """
     module, _, name = path.rpartition(".")
-    # A console script does not search the working folder for modules. It is added last, and only when a module is
-    # named, so that no file there replaces an installed module.
+    # A console script does not search the working folder for modules. It is added last, and only
+    # when a module is named, so that no file there replaces an installed module.
     if "" not in sys.path:
         sys.path.append("")
     try:
@@ -168,8 +186,8 @@ def _makes(target: Any, base: type) -> bool:
 def signature_of(target: Callable[..., Any]) -> inspect.Signature:
     """The arguments of ``target``; for a class those of its ``__init__``.
 
-    For a class with an ``__init__`` Python below 3.11.4 gives those of a base's ``__new__``, which accepts anything
-    for modules of TensorDict.
+    For a class with an ``__init__`` Python below 3.11.4 gives those of a base's ``__new__``, which
+    accepts anything for modules of TensorDict.
     """
     if not inspect.isclass(target):
         return inspect.signature(target)
@@ -181,7 +199,9 @@ def signature_of(target: Callable[..., Any]) -> inspect.Signature:
     return inspect.Signature()
 
 
-def call_with(target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str) -> Any:
+def call_with(
+    target: Callable[..., Any], offered: Mapping[str, Any], own: Mapping[str, Any], key: str
+) -> Any:
     """Call ``target`` with all of ``own`` and those of ``offered`` that its signature names.
 
     Raises:

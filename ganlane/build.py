@@ -25,7 +25,12 @@ from ganlane.config.traffic import TrafficConfig
 from ganlane.env import HighwayEnv
 from ganlane.errors import ParameterError, UserError
 from ganlane.files import CHECKPOINTS
-from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters
+from ganlane.parameters.observation import (
+    MASKS,
+    MaskParameters,
+    ObservationConfig,
+    RewardParameters,
+)
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.random import Stream
 from ganlane.sim.state import Road
@@ -45,7 +50,9 @@ def make_road(env: EnvConfig) -> Road:
 
 
 def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:
-    """What the constructors of traffic models and drivers are given where they have an argument of that name."""
+    """What the constructors of traffic models and drivers are given where they have an argument of
+    that name.
+    """
     return {
         "road": make_road(env),
         "stream": stream,
@@ -56,11 +63,14 @@ def _constructor_arguments(env: EnvConfig, stream: int) -> dict[str, Any]:
     }
 
 
-def make_traffic(traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TRAIN) -> TrafficModule:
+def make_traffic(
+    traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TRAIN
+) -> TrafficModule:
     """The traffic model that ``traffic`` names, on the road of ``env``.
 
     Raises:
-        UserError: the target cannot be imported or called, or gives no :class:`ganlane.traffic.TrafficModule`.
+        UserError: the target cannot be imported or called, or gives no
+            :class:`ganlane.traffic.TrafficModule`.
     """
     key = "traffic._target_"
     target = import_target(traffic._target_, key, TrafficModule)
@@ -69,7 +79,9 @@ def make_traffic(traffic: TrafficConfig, env: EnvConfig, stream: int = Stream.TR
         arguments["parts"] = {name: make_traffic(part, env, stream) for name, part in parts.items()}
     module = call_with(target, _constructor_arguments(env, stream), arguments, key)
     if not isinstance(module, TrafficModule):  # an annotation may be wrong
-        raise UserError(f"{key}={traffic._target_}: returned a {type(module).__name__}, expected a TrafficModule.")
+        raise UserError(
+            f"{key}={traffic._target_}: returned a {type(module).__name__}, expected a TrafficModule."
+        )
     return BlindTraffic(module, traffic.blind_share) if traffic.blind_share else module
 
 
@@ -84,7 +96,8 @@ def make_env(
     first_episode: int = 0,
     mask: MaskParameters | None = None,
 ) -> TransformedEnv:
-    """A batched environment with observation, reward and optionally action mask; its stream is that of the traffic.
+    """A batched environment with observation, reward and optionally action mask; its stream is that
+    of the traffic.
 
     Raises:
         UserError: see :class:`ganlane.env.HighwayEnv`.
@@ -109,7 +122,9 @@ def make_env(
     )
     kernel = base.kernel
     transforms: list[ObservationTransform | ActionMaskTransform] = [
-        ObservationTransform(base.road, env.vehicles, observation.form, observation.scale(), kernel is not None)
+        ObservationTransform(
+            base.road, env.vehicles, observation.form, observation.scale(), kernel is not None
+        )
     ]
     if mask is not None and mask.form != "none":
         abort, vehicles = env.ego.abort_lane_change, None if kernel is None else kernel.vehicles
@@ -121,10 +136,16 @@ def make_env(
             each.compile_graphs()
     sensors = observation.sensors
     try:
-        errors = [] if sensors is None else [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
+        errors = (
+            []
+            if sensors is None
+            else [SensorTransform(sensors, traffic.stream, env.decision_period_s)]
+        )
     except ParameterError as error:
         raise error.below("observation.sensors") from error
-    return TransformedEnv(base, Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward)))
+    return TransformedEnv(
+        base, Compose(*errors, *transforms, RewardTransform(env.decision_period_s, reward))
+    )
 
 
 @dataclass(frozen=True)
@@ -149,14 +170,17 @@ class Driver:
         return chosen, self.policy if chosen.form == "none" else MaskedPolicy(self.policy)
 
 
-def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: str = "cpu") -> Driver:
+def make_driver(
+    name: str, env: EnvConfig, stream: int = Stream.REPORT, device: str = "cpu"
+) -> Driver:
     """A driver by its name.
 
     Args:
-        name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent (``agent_idm@1``: the recipe
-            of ``agent_idm``, trained with seed 1), the path of an agent's file, or the import path of a policy of
-            your own (a class or annotated function; it may have ``road``, ``stream``, ``idm`` and ``mobil``). A
-            suffix ``+safe``, ``+legal`` or ``+none`` sets its mask in place of the one in its training.
+        name: a rule-based one (:data:`ganlane.agents.drivers.DRIVERS`), a shipped agent
+            (``agent_idm@1``: the recipe of ``agent_idm``, trained with seed 1), the path of an
+            agent's file, or the import path of a policy of your own (a class or annotated function;
+            it may have ``road``, ``stream``, ``idm`` and ``mobil``). A suffix ``+safe``, ``+legal``
+            or ``+none`` sets its mask in place of the one in its training.
         env: the environment in which it drives.
         stream: stream of its random numbers, if it draws any.
         device: device of its network.
@@ -167,7 +191,11 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     unmasked, plus, form = name.rpartition("+")
     if plus and form in MASKS:
         driver = make_driver(unmasked, env, stream, device)
-        mask = driver.mask if driver.mask is not None and driver.mask.form == form else MaskParameters(form)
+        mask = (
+            driver.mask
+            if driver.mask is not None and driver.mask.form == form
+            else MaskParameters(form)
+        )
         return replace(driver, name=name, mask=mask)
     if name in DRIVERS:
         policy = call_with(DRIVERS[name], _constructor_arguments(env, stream), {}, "agents")
@@ -175,15 +203,23 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
     if names_agent(name):
         network, metadata = load_agent(name, device=device)
         observation = observation_of(metadata)
-        load_agent(name, observation_size(observation.form, env.vehicles), device)  # checks that the sizes fit
+        # checks that the sizes fit
+        load_agent(name, observation_size(observation.form, env.vehicles), device)
         return Driver(name, network, observation, mask_of(metadata))
-    if is_import_path(name):  # a user's own policy; it reads the raw state or the observation of the command
+    # a user's own policy; it reads the raw state or the observation of the command
+    if is_import_path(name):
         target = import_target(name, "agents", TensorDictModuleBase)
         policy = call_with(target, _constructor_arguments(env, stream), {}, "agents")
-        if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(policy, "out_keys", []):
-            raise UserError(f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys name it.")
+        if not isinstance(policy, TensorDictModuleBase) or keys.ACTION not in getattr(
+            policy, "out_keys", []
+        ):
+            raise UserError(
+                f"agents={name}: expected a TensorDictModule that writes 'action'; its out_keys name it."
+            )
         return Driver(name, policy.to(device))
-    known = ", ".join((*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file())))
+    known = ", ".join(
+        (*DRIVERS, *(name for name in SHIPPED if (CHECKPOINTS / f"{name}.safetensors").is_file()))
+    )
     raise UserError(
         f"agent {name:.100}: unknown; choose one of {known}, or give a checkpoint's path (.safetensors) or the "
         "import path of a policy."
@@ -191,7 +227,10 @@ def make_driver(name: str, env: EnvConfig, stream: int = Stream.REPORT, device: 
 
 
 def make_drivers(names: Sequence[str], env: EnvConfig, device: str = "cpu") -> list[Driver]:
-    """:func:`make_driver` for several names; ``agent_idm@all`` means every shipped training of its recipe."""
+    """:func:`make_driver` for several names.
+
+    ``agent_idm@all`` means every shipped training of its recipe.
+    """
     single_names = dict.fromkeys(single for name in names for single in with_seeds(name))
     return [make_driver(name, env, device=device) for name in single_names]
 
@@ -205,7 +244,9 @@ def mask_of(metadata: dict[str, Any]) -> MaskParameters | None:
     try:
         mask = MaskParameters(**metadata.get("mask", {}))
     except TypeError as error:
-        raise UserError(f"the agent's metadata name no mask that is known here ({error}); train it again.") from error
+        raise UserError(
+            f"the agent's metadata name no mask that is known here ({error}); train it again."
+        ) from error
     return None if mask.form == "none" else mask
 
 

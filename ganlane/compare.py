@@ -1,4 +1,7 @@
-"""Compare drivers: each one on each traffic, on the same episodes; a matrix of them cell by cell, a file for each."""
+"""Compare drivers: each one on each traffic, on the same episodes.
+
+A matrix of them cell by cell, a file for each.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,10 @@ _ORIGIN = "ganlane"
 
 
 def evaluate(config: EvaluateConfig, folder: Path) -> str:
-    """``ganlane evaluate``: run the episodes, print and save the table; the line that names the results."""
+    """``ganlane evaluate``: run the episodes, print and save the table.
+
+    The line that names the results.
+    """
     set_threads(config.threads)
     table = compare(make_drivers(config.agents, config.env, config.device), config)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
@@ -45,32 +51,44 @@ def evaluate(config: EvaluateConfig, folder: Path) -> str:
 def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = False) -> pl.DataFrame:
     """Run the episodes of ``config`` with each driver on each of its traffics.
 
-    Each of ``drivers`` (:func:`ganlane.build.make_driver`) drives with its own observation and mask, or with those of
-    ``config`` if it names none; the sensors are those of ``config`` for all. ``quiet`` shows no progress.
+    Each of ``drivers`` (:func:`ganlane.build.make_driver`) drives with its own observation and
+    mask, or with those of ``config`` if it names none; the sensors are those of ``config`` for all.
+    ``quiet`` shows no progress.
 
     Returns:
-        What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one below the other; and
-        with ``scene``, the recorded scene of an episode, where one of the traffics replays (null for the others).
+        What :func:`ganlane.evaluation.run_episodes` gives, with ``agent`` and ``traffic``, one
+        below the other; and with ``scene``, the recorded scene of an episode, where one of the
+        traffics replays (null for the others).
     """
     env, seed, episodes = config.env, config.seed, config.episodes
     stream = Stream.named(config.stream)
-    modules = {name: make_traffic(traffic, env, stream) for name, traffic in config.chosen_traffics().items()}
+    modules = {
+        name: make_traffic(traffic, env, stream)
+        for name, traffic in config.chosen_traffics().items()
+    }
     pairs = [(name, driver) for name in modules for driver in drivers]
     rows, tables = min(config.num_envs, episodes), []
     current = None
     disabled = quiet or not sys.stderr.isatty()
-    with tqdm(total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=disabled) as bar:
+    with tqdm(
+        total=len(pairs) * episodes, unit="episode", file=sys.stderr, disable=disabled
+    ) as bar:
         for number, (traffic, driver) in enumerate(pairs):
             observation = config.observation.read_by(driver.observation)
             mask, policy = driver.behind(config.mask)
             parts = (modules[traffic], env, observation, config.reward)
             make = partial(make_env, *parts, seed=seed, device=config.device, mask=mask)
             if current != (traffic, observation, mask):
-                # Drivers with the same observation and mask share an environment, so that it is compiled once.
+                # Drivers with the same observation and mask share an environment, so that it is
+                # compiled once.
                 current, batch = (traffic, observation, mask), make(rows)
             smaller = None if env.compile else make
-            on_progress = None if quiet else _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
-            table = evaluation.run_episodes(batch, policy, range(episodes), seed, on_progress, smaller)
+            on_progress = (
+                None if quiet else _reporter(bar, f"{driver.name} on {traffic}", number * episodes)
+            )
+            table = evaluation.run_episodes(
+                batch, policy, range(episodes), seed, on_progress, smaller
+            )
             table = table.with_columns(agent=pl.lit(driver.name), traffic=pl.lit(traffic))
             if isinstance(module := modules[traffic], ReplayTraffic):
                 scenes = module.scenes_of_episodes(seed, table["episode"].to_list())
@@ -80,7 +98,10 @@ def compare(drivers: Sequence[Driver], config: EvaluateConfig, quiet: bool = Fal
 
 
 def _reporter(bar: tqdm, title: str, before: int) -> Callable[[int, int], None]:
-    """Callback that shows the progress of one driver and traffic: on the bar, or as one line without a terminal."""
+    """Callback that shows the progress of one driver and traffic.
+
+    On the bar, or as one line without a terminal.
+    """
     bar.set_description(title)
 
     def report(finished: int, wanted: int) -> None:
@@ -92,11 +113,12 @@ def _reporter(bar: tqdm, title: str, before: int) -> Callable[[int, int], None]:
 
 
 def recorded_crashes(table: pl.DataFrame) -> list[dict[str, Any]]:
-    """Crashes per km of each agent on each traffic that replays recorded scenes; none for other traffics.
+    """Crashes per km of each agent on each traffic that replays recorded scenes; none for other
+    traffics.
 
     Returns:
-        Per pair ``agent, traffic, per_km, per_km_ci`` (bootstrap over whole scenes) and ``scenes``, see
-        :func:`ganlane.evaluation.crashes_by_scene`.
+        Per pair ``agent, traffic, per_km, per_km_ci`` (bootstrap over whole scenes) and ``scenes``,
+        see :func:`ganlane.evaluation.crashes_by_scene`.
     """
     if "scene" not in table.columns:
         return []
@@ -116,13 +138,19 @@ def publish(
     seeds: Mapping[str, Any],
     numbers: Mapping[str, Any] | None = None,
 ) -> str:
-    """Print the tables of what :func:`compare` gave, write its episodes and ``results.json``; the line that names it.
+    """Print the tables of what :func:`compare` gave, write its episodes and ``results.json``; the
+    line that names it.
 
-    The record holds ``rows``, ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table with two drivers or
-    more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`), ``crashes_by_scene`` where a traffic replays
-    recorded scenes (:func:`recorded_crashes`), and further ``numbers``.
+    The record holds ``rows``, ``paired`` (:func:`ganlane.evaluation.paired_rows`; a second table
+    with two drivers or more), ``failures`` (:func:`ganlane.evaluation.failed_episodes`),
+    ``crashes_by_scene`` where a traffic replays recorded scenes (:func:`recorded_crashes`), and
+    further ``numbers``.
     """
-    rows, paired, recorded = evaluation.evaluation_rows(table), evaluation.paired_rows(table), recorded_crashes(table)
+    rows, paired, recorded = (
+        evaluation.evaluation_rows(table),
+        evaluation.paired_rows(table),
+        recorded_crashes(table),
+    )
     tables = [evaluation.text_table(rows), *([evaluation.paired_table(paired)] if paired else [])]
     show(*tables, columns=config.get("columns", "all"))
     evaluation.write_episodes(folder, table)
@@ -162,23 +190,32 @@ def available(config: ReproduceConfig) -> tuple[dict[str, TrafficConfig], dict[s
         except UserError as error:
             missing[name] = str(error)
     if not there:
-        raise UserError(f"traffics: none of them can be driven on here ({next(iter(missing.values()))})")
+        raise UserError(
+            f"traffics: none of them can be driven on here ({next(iter(missing.values()))})"
+        )
     return there, missing
 
 
 def cells_of(config: ReproduceConfig, traffics: dict[str, TrafficConfig]) -> list[Cell]:
-    """Every cell, traffic by traffic; :class:`UserError` for a driver that is not known or does not fit."""
+    """Every cell, traffic by traffic.
+
+    :class:`UserError` for a driver that is not known or does not fit.
+    """
     drivers = make_drivers(config.agents, config.env, config.device)
     cells = []
     for traffic, option in traffics.items():
         for driver in drivers:
             settings = _settings(driver, option, config, config.episodes_on(traffic))
             digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
-            cells.append(Cell(driver.name, traffic, settings, Path(config.cells) / f"{digest[:32]}.parquet"))
+            cells.append(
+                Cell(driver.name, traffic, settings, Path(config.cells) / f"{digest[:32]}.parquet")
+            )
     return cells
 
 
-def _settings(driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, episodes: int) -> dict[str, Any]:
+def _settings(
+    driver: Driver, traffic: TrafficConfig, config: ReproduceConfig, episodes: int
+) -> dict[str, Any]:
     weights = hashlib.sha256()
     for name, value in driver.policy.state_dict().items():
         if not name.endswith("_epsilon"):  # noise for exploring, drawn anew by every process
@@ -209,7 +246,10 @@ def drive(cells: Sequence[Cell], config: ReproduceConfig) -> int:
         for cell in _driven(missing, config):
             bar.update()
             if bar.disable:
-                print(f"{cell.driver} on {cell.traffic}: {cell.settings['episodes']} episodes", file=sys.stderr)
+                print(
+                    f"{cell.driver} on {cell.traffic}: {cell.settings['episodes']} episodes",
+                    file=sys.stderr,
+                )
     return len(missing)
 
 
@@ -241,13 +281,16 @@ def drive_cell(cell: Cell, config: ReproduceConfig) -> None:
     alone = replace(config, traffics=[cell.traffic], episodes=cell.settings["episodes"])
     table = compare([make_driver(cell.driver, config.env, device=config.device)], alone, quiet=True)
     seconds = round(time.monotonic() - begun, 3)
-    origin = json.dumps({"settings": cell.settings, "code": evaluation.code_version(), "seconds": seconds})
+    origin = json.dumps(
+        {"settings": cell.settings, "code": evaluation.code_version(), "seconds": seconds}
+    )
     with atomic_path(cell.path) as part:
         table.write_parquet(part, metadata={_ORIGIN: origin})
 
 
 def read_cells(cells: Sequence[Cell]) -> tuple[pl.DataFrame, list[str], dict[str, float]]:
-    """All episodes, one below the other, the revisions that drove them, and how long each traffic took, s.
+    """All episodes, one below the other, the revisions that drove them, and how long each traffic
+    took, s.
 
     A file that does not say how long it took counts as 0.
 

@@ -2,13 +2,16 @@
 
     ganlane doctor
 
-Prints versions, devices, threads, compiler, configuration, shipped weights (each is loaded), recordings, cache, run
-folders and extras. Nothing is written. What is MISSING is needed; what is absent serves further purposes only.
+Prints versions, devices, threads, compiler, configuration, shipped weights (each is loaded),
+recordings, cache, run folders and extras. Nothing is written. What is MISSING is needed; what is
+absent serves further purposes only.
 
-exit status: 0 all that is needed is there, 1 something needed is missing, 2 a mistake on the command line
+exit status: 0 all that is needed is there, 1 something needed is missing, 2 a mistake on the
+command line
 """
 
-# This must run in a broken installation: other parts are imported inside functions, and a failed import is a finding.
+# This must run in a broken installation: other parts are imported inside functions, and a failed
+# import is a finding.
 
 from __future__ import annotations
 
@@ -59,7 +62,10 @@ EXTRAS: Final = {
     "sb3": ("ganlane.sb3", ("stable-baselines3>=2.4", "sb3-contrib>=2.4")),
     "human": ("render_mode=human", ("pygame-ce>=2.1.3",)),
     "minari": ("ganlane record", ("minari[hdf5]>=0.5.2",)),
-    "notebook": ("examples/quickstart.ipynb", ("ipykernel>=6.29", "nbclient>=0.10", "nbformat>=5.10")),
+    "notebook": (
+        "examples/quickstart.ipynb",
+        ("ipykernel>=6.29", "nbclient>=0.10", "nbformat>=5.10"),
+    ),
     "native": ("env.kernel=native without a compiler", ("ziglang>=0.13",)),
     "sumo": ("traffic=sumo", ("eclipse-sumo>=1.20", "libsumo>=1.20")),
     "wandb": ("logger=wandb", ("wandb>=0.18",)),
@@ -76,10 +82,15 @@ EXTRAS: Final = {
 MODULES: Final = {"hydra-core": "hydra", "pillow": "PIL", "scikit-learn": "sklearn"}
 #: Weights without which the commands' defaults do not run.
 NEEDED_WEIGHTS: Final = ("agent_idm", "generator_paper", "generator_calibrated")
-_REINSTALL: Final = "python -m pip install --force-reinstall --no-deps PATH_OF_THE_CHECKOUT_OR_WHEEL"
+_REINSTALL: Final = (
+    "python -m pip install --force-reinstall --no-deps PATH_OF_THE_CHECKOUT_OR_WHEEL"
+)
 _FIX_FIRST: Final = "fix what is MISSING above, then run ganlane doctor again"
 _CUDA_PAGE: Final = "install torch for CUDA as https://pytorch.org/get-started/locally/ says"
-_INSTALL_COMPILER: Final = {"darwin": "xcode-select --install", "win32": "install the Visual Studio build tools"}
+_INSTALL_COMPILER: Final = {
+    "darwin": "xcode-select --install",
+    "win32": "install the Visual Studio build tools",
+}
 
 
 class State(Enum):
@@ -92,7 +103,10 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check: what was checked, what is there and, if something is missing, the command that fixes it."""
+    """Result of a check.
+
+    What was checked, what is there and, if something is missing, the command that fixes it.
+    """
 
     subject: str
     state: State
@@ -101,7 +115,10 @@ class Finding:
 
 
 def guarded(subject: str, look: Callable[[], Finding], fix: str = _FIX_FIRST) -> Finding:
-    """The result of ``look``; any error is a finding too, since a broken installation can fail in any way."""
+    """The result of ``look``.
+
+    Any error is a finding too, since a broken installation can fail in any way.
+    """
     try:
         return look()
     except Exception as error:
@@ -115,7 +132,11 @@ def examine() -> dict[str, list[Finding]]:
         "software": [python(), *(guarded(text, partial(required, text)) for text in REQUIRED)],
         "machine": machine(),
         "files": [
-            guarded("configuration", lambda: Finding("configuration", State.OK, str(conf_folder())), _REINSTALL),
+            guarded(
+                "configuration",
+                lambda: Finding("configuration", State.OK, str(conf_folder())),
+                _REINSTALL,
+            ),
             *checkpoints(),
             guarded("recordings", recordings),
             guarded("cache", cache),
@@ -127,7 +148,12 @@ def examine() -> dict[str, list[Finding]]:
 
 def missing(sections: Mapping[str, Sequence[Finding]]) -> list[str]:
     """Subjects that are needed and not there."""
-    return [each.subject for findings in sections.values() for each in findings if each.state is State.MISSING]
+    return [
+        each.subject
+        for findings in sections.values()
+        for each in findings
+        if each.state is State.MISSING
+    ]
 
 
 def report(sections: Mapping[str, Sequence[Finding]]) -> str:
@@ -146,7 +172,10 @@ def report(sections: Mapping[str, Sequence[Finding]]) -> str:
 
 
 def installed(text: str) -> tuple[str, str | None, bool]:
-    """A requirement's distribution, its installed version (None: not installed), and whether that satisfies it."""
+    """A requirement's distribution, its installed version (None.
+
+    Not installed), and whether that satisfies it.
+    """
     from packaging.requirements import Requirement  # Hydra's and torch's own
 
     requirement = Requirement(text)
@@ -167,14 +196,18 @@ def python() -> Finding:
     if sys.version_info >= PYTHON:
         return Finding("python", State.OK, version)
     needed = ".".join(map(str, PYTHON))
-    return Finding("python", State.MISSING, version, f"a virtual environment with Python {needed} or newer")
+    return Finding(
+        "python", State.MISSING, version, f"a virtual environment with Python {needed} or newer"
+    )
 
 
 def required(text: str) -> Finding:
     """Whether a requirement is installed in a suitable version and can be imported."""
     name, version, fits = installed(text)
     if version is None or not fits:
-        lacking = "not installed" if version is None else f"{version}, needed {text.removeprefix(name)}"
+        lacking = (
+            "not installed" if version is None else f"{version}, needed {text.removeprefix(name)}"
+        )
         return Finding(name, State.MISSING, lacking, _install(text))
 
     def look() -> Finding:
@@ -191,13 +224,23 @@ def extra(name: str) -> Finding:
     lacking = [text for text, (_, _, fits) in parts.items() if not fits]
     if lacking:
         without = ", ".join(parts[text][0] for text in lacking)
-        return Finding(f"extra {name}", State.ABSENT, f"{purpose}: {without} not installed", _install(*lacking))
-    return Finding(f"extra {name}", State.OK, ", ".join(f"{part} {version}" for part, version, _ in parts.values()))
+        return Finding(
+            f"extra {name}", State.ABSENT, f"{purpose}: {without} not installed", _install(*lacking)
+        )
+    return Finding(
+        f"extra {name}",
+        State.OK,
+        ", ".join(f"{part} {version}" for part, version, _ in parts.values()),
+    )
 
 
 def machine() -> list[Finding]:
     """What the commands can compute on."""
-    return [guarded("processor", _processor), guarded("devices", _devices), guarded("C++ compiler", _compiler)]
+    return [
+        guarded("processor", _processor),
+        guarded("devices", _devices),
+        guarded("C++ compiler", _compiler),
+    ]
 
 
 def _processor() -> Finding:
@@ -205,7 +248,9 @@ def _processor() -> Finding:
     from ganlane.evaluation import machine
 
     here = machine()
-    threads = f"torch by itself takes {here['threads']} threads, the commands one (threads=N for more)"
+    threads = (
+        f"torch by itself takes {here['threads']} threads, the commands one (threads=N for more)"
+    )
     return Finding("processor", State.OK, f"{here['cores']} usable cores, {here['cpu']}; {threads}")
 
 
@@ -218,7 +263,9 @@ def _devices() -> Finding:
         cards = ", ".join(torch.cuda.get_device_name(number) for number in range(count))
         return Finding("devices", State.OK, f"cpu, cuda ({cards}; CUDA {torch.version.cuda})")
     if shutil.which("nvidia-smi"):
-        return Finding("devices", State.ABSENT, "cpu; a graphics card that torch does not see", _CUDA_PAGE)
+        return Finding(
+            "devices", State.ABSENT, "cpu; a graphics card that torch does not see", _CUDA_PAGE
+        )
     return Finding("devices", State.OK, "cpu (no CUDA device)")
 
 
@@ -227,14 +274,22 @@ def _compiler() -> Finding:
     path, names = find_compiler()
     if path is None:
         fix = _INSTALL_COMPILER.get(sys.platform, "apt install g++   (Debian, Ubuntu)")
-        return Finding("C++ compiler", State.ABSENT, f"none (looked for {names}); env.compile=true needs one", fix)
+        return Finding(
+            "C++ compiler",
+            State.ABSENT,
+            f"none (looked for {names}); env.compile=true needs one",
+            fix,
+        )
     return Finding("C++ compiler", State.OK, f"{path} (for env.compile=true)")
 
 
 def checkpoints() -> list[Finding]:
     """The weights that ship, each of them loaded."""
     names = sorted({*NEEDED_WEIGHTS, *(path.stem for path in CHECKPOINTS.glob("*.safetensors"))})
-    return [guarded(name, partial(_weights, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL) for name in names]
+    return [
+        guarded(name, partial(_weights, CHECKPOINTS / f"{name}.safetensors"), _REINSTALL)
+        for name in names
+    ]
 
 
 def _weights(path: Path) -> Finding:
@@ -253,7 +308,10 @@ def _weights(path: Path) -> Finding:
 
 
 def recordings() -> Finding:
-    """The recordings used with ``data.path=null``; needed for fitting and realism, not for training or driving."""
+    """The recordings used with ``data.path=null``.
+
+    Needed for fitting and realism, not for training or driving.
+    """
     from ganlane.data.sources import DATA_VARIABLE, SCENES, default_scenes
 
     try:
@@ -272,7 +330,12 @@ def cache() -> Finding:
     if folder is None:
         return Finding("cache", State.OK, f"off ({CACHE_VARIABLE} is empty)")
     if not _can_write(folder):
-        return Finding("cache", State.ABSENT, f"{folder} cannot be written to", f"export {CACHE_VARIABLE}=FOLDER")
+        return Finding(
+            "cache",
+            State.ABSENT,
+            f"{folder} cannot be written to",
+            f"export {CACHE_VARIABLE}=FOLDER",
+        )
     files = list(folder.glob("*.npz"))
     return Finding("cache", State.OK, f"{folder} ({len(files)} files, {_megabytes(*files)})")
 
@@ -282,7 +345,9 @@ def outputs() -> Finding:
     folder = Path("outputs").resolve()
     if _can_write(folder):
         return Finding("run folders", State.OK, f"below {folder}")
-    return Finding("run folders", State.MISSING, f"{folder} cannot be written to", "cd to a folder of your own")
+    return Finding(
+        "run folders", State.MISSING, f"{folder} cannot be written to", "cd to a folder of your own"
+    )
 
 
 def _can_write(folder: Path) -> bool:

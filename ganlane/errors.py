@@ -1,7 +1,7 @@
 """Errors that a user can correct; the message is one sentence that says what to do.
 
-Errors of the file system become such sentences too: the path, what is wrong, what to do. A refused connection or a
-lost process is an OSError that no user can fix: it keeps its traceback.
+Errors of the file system become such sentences too: the path, what is wrong, what to do. A refused
+connection or a lost process is an OSError that no user can fix: it keeps its traceback.
 """
 
 from __future__ import annotations
@@ -24,8 +24,12 @@ _LATER = "close other programs and run the command again"
 ADVICE = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _ROOM),
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), _RIGHTS),
-    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY), _PATH),
-    **dict.fromkeys((errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.ENXIO, errno.ENODEV), _PATH),
+    **dict.fromkeys(
+        (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY), _PATH
+    ),
+    **dict.fromkeys(
+        (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.ENXIO, errno.ENODEV), _PATH
+    ),
     **dict.fromkeys((errno.EBUSY, errno.ETXTBSY, errno.EMFILE, errno.ENFILE, errno.ENOMEM), _LATER),
     errno.EIO: "the disk does not work as it should; check it",
     errno.ESTALE: "the network drive is gone; mount it again",
@@ -35,16 +39,17 @@ ADVICE = {
 class UserError(Exception):
     """Something the user can correct: a config value, a file, a column, a shape or a checkpoint.
 
-    The message names the value, what was expected and what to do. Entry points print it without a traceback and exit
-    with status 2.
+    The message names the value, what was expected and what to do. Entry points print it without a
+    traceback and exit with status 2.
     """
 
 
 class ParameterError(UserError):
     """A parameter out of its range, or incompatible parameters.
 
-    The record that raises it knows its fields, not their keys. So the sentence has the fields in braces,
-    ``"{timeout_s}=0: expected a number above 0."``, and a caller that knows the key adds it with :meth:`below`.
+    The record that raises it knows its fields, not their keys. So the sentence has the fields in
+    braces, ``"{timeout_s}=0: expected a number above 0."``, and a caller that knows the key adds it
+    with :meth:`below`.
 
     Args:
         text: the sentence.
@@ -70,7 +75,8 @@ def as_typed(value: Any) -> str:
         return f"[{','.join(map(as_typed, value))}]"
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
-    exact = isinstance(value, float) and float(f"{value:g}") == value  # the short form is the same number
+    # the short form is the same number
+    exact = isinstance(value, float) and float(f"{value:g}") == value
     return f"{value:g}" if exact else str(value)
 
 
@@ -88,14 +94,20 @@ def file_sentence(error: OSError) -> str:
 
 @contextmanager
 def numbered_refusals() -> Iterator[None]:
-    """Turn errors of the file system that a library reports as text alone into OSErrors with their number.
+    """Turn errors of the file system that a library reports as text alone into OSErrors with their
+    number.
 
-    polars raises "No space left on device (os error 28)" in errors of several types, without number or file name.
+    polars raises "No space left on device (os error 28)" in errors of several types, without number
+    or file name.
     """
     try:
         yield
     except Exception as error:
         code = re.search(r"\(os error (\d+)\)", str(error))
-        if code is None or getattr(error, "errno", None) is not None or isinstance(error, UserError):
+        if (
+            code is None
+            or getattr(error, "errno", None) is not None
+            or isinstance(error, UserError)
+        ):
             raise
         raise OSError(int(code[1]), os.strerror(int(code[1]))) from error

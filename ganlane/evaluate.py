@@ -1,8 +1,9 @@
 """``ganlane evaluate``: agents x traffics on the same episodes, as one table.
 
-    ganlane evaluate 'agents=[mobil,random_legal,agent_idm]' 'traffics=[idm_mobil,gan]' episodes=1000
-    ganlane evaluate 'agents=[mobil,random_legal,outputs/train/RUN/agent.safetensors]' seed=1
-    ganlane evaluate 'agents=[mobil,random_legal,my.module.MyPolicy]' 'traffics=[my.module.MyTraffic]'
+    ganlane evaluate 'agents=[mobil,random_legal,agent_idm]' 'traffics=[idm_mobil,gan]'
+    episodes=1000 ganlane evaluate 'agents=[mobil,random_legal,outputs/train/RUN/agent.safetensors]'
+    seed=1 ganlane evaluate 'agents=[mobil,random_legal,my.module.MyPolicy]'
+    'traffics=[my.module.MyTraffic]'
 
 Writes results.json and episodes.parquet (one row per episode) into its run folder.
 """

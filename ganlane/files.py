@@ -1,9 +1,11 @@
-"""Files: the package's own folders, atomic writes, checksums, and documents with a part that a command writes.
+"""Files: the package's own folders, atomic writes, checksums, and documents with a part that a
+command writes.
 
-Files that are written and read back hold a checksum of their own, so that damage to any byte is detected.
-:data:`PLACE` occurs once in the content, wherever the format has room for text: metadata, an entry, an archive's
-comment. Its digits are the SHA-256 of the whole content with zeros in their place. This protects against damage, not
-against forgery: anyone can compute a new checksum for a changed file.
+Files that are written and read back hold a checksum of their own, so that damage to any byte is
+detected. :data:`PLACE` occurs once in the content, wherever the format has room for text: metadata,
+an entry, an archive's comment. Its digits are the SHA-256 of the whole content with zeros in their
+place. This protects against damage, not against forgery: anyone can compute a new checksum for a
+changed file.
 """
 
 from __future__ import annotations
@@ -49,18 +51,21 @@ def conf_folder() -> Path:
         # A folder 'conf' of another project may be next to an installed package.
         if (folder / "train.yaml").is_file() and (folder / "traffic" / "gan.yaml").is_file():
             return folder
-    raise UserError(f"{PACKAGE}: the folder conf/ is missing next to and inside it; install ganlane again.")
+    raise UserError(
+        f"{PACKAGE}: the folder conf/ is missing next to and inside it; install ganlane again."
+    )
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of ``path`` (made if need be); on success sync and rename it into place.
+    """Yield a temporary path in the folder of ``path`` (made if need be); on success sync and
+    rename it into place.
 
     A process killed at any instant leaves either the old file or the new one, never a part of one.
 
     Raises:
-        OSError: the file system refuses. It names ``path`` and has an ``errno``, whatever the library that wrote
-            made of it.
+        OSError: the file system refuses. It names ``path`` and has an ``errno``, whatever the
+            library that wrote made of it.
         UserError: the path is a folder or a device.
     """
     path = Path(path)
@@ -98,7 +103,8 @@ def remove_leftovers(folder: Path) -> None:
 def _file_system_error(error: Exception, part: Path) -> OSError | None:
     """The file system's error when ``part`` was written; None where ``error`` has another cause.
 
-    Libraries report a full disk in messages of their own (torch: "unexpected pos 576 vs 534"), so a write is tried.
+    Libraries report a full disk in messages of their own (torch: "unexpected pos 576 vs 534"), so a
+    write is tried.
     """
     if isinstance(error, OSError) and error.errno is not None:
         return error if error.filename in (None, str(part)) else None
@@ -119,22 +125,28 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 
 def split_at_markers(path: Path, begin: str, end: str) -> tuple[str, str]:
-    """The text of the document ``path`` up to the marker ``begin`` and from ``end`` on, both markers included.
+    """The text of the document ``path`` up to the marker ``begin`` and from ``end`` on, both
+    markers included.
 
     Raises:
-        UserError: there is no such file, or it does not hold the two markers once each and in order. The sentence
-            names the commands' key ``report``.
+        UserError: there is no such file, or it does not hold the two markers once each and in
+            order. The sentence names the commands' key ``report``.
     """
     if not path.is_file():
-        raise UserError(f"report={path}: no such file; expected a document with the lines {begin} and {end} in it.")
+        raise UserError(
+            f"report={path}: no such file; expected a document with the lines {begin} and {end} in it."
+        )
     text = path.read_text(encoding="utf-8")
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-        raise UserError(f"report={path}: expected the lines {begin} and {end} in it, once each; add them.")
+        raise UserError(
+            f"report={path}: expected the lines {begin} and {end} in it, once each; add them."
+        )
     return text[: text.index(begin) + len(begin)], text[text.index(end) :]
 
 
 def write_between_markers(path: Path, begin: str, end: str, content: str) -> None:
-    """Replace what is between two markers of a document by ``content`` on lines of its own, atomically.
+    """Replace what is between two markers of a document by ``content`` on lines of its own,
+    atomically.
 
     Raises:
         UserError: see :func:`split_at_markers`.
@@ -144,7 +156,10 @@ def write_between_markers(path: Path, begin: str, end: str, content: str) -> Non
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write ``content`` to ``path`` as indented JSON, atomically; with a checksum if an entry is :data:`PLACE`."""
+    """Write ``content`` to ``path`` as indented JSON, atomically.
+
+    With a checksum if an entry is :data:`PLACE`.
+    """
     text = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
     write_bytes(path, sealed(text) if PLACE.encode() in text else text)
 
@@ -200,4 +215,7 @@ def _digits(content: bytes | mmap, begin: int) -> bytes:
 @cache
 def note_without_checksum(path: str | Path) -> None:
     """Warn once per file that a version without checksums wrote it."""
-    print(f"{path}: of a version that wrote no checksum; damage to it would not be seen.", file=sys.stderr)
+    print(
+        f"{path}: of a version that wrote no checksum; damage to it would not be seen.",
+        file=sys.stderr,
+    )

@@ -2,24 +2,26 @@
 
 N environments, M vehicles, the ego at index 0; floats in the run's dtype, SI units.
 
-=========================================  ==========  ==================================================
-``vehicles.x, y``                          [N, M]      centre of the body, m; x along the road, y to the left
-``vehicles.heading``                       [N, M]      rad, relative to the road, anticlockwise
+=========================================  ==========
+================================================== ``vehicles.x, y``                          [N, M]
+     centre of the body, m; x along the road, y to the left ``vehicles.heading``
+       [N, M]      rad, relative to the road, anticlockwise
 ``vehicles.speed, acceleration``           [N, M]      m/s, m/s2
 ``vehicles.length, width``                 [N, M]      m, fixed for an episode
 ``vehicles.desired_speed``                 [N, M]      m/s, fixed for an episode
-``vehicles.target_lane``                   [N, M] i64  the lane it keeps or is moving to; 0 is the rightmost
-``vehicles.visibility``                    [N, M] i64  0 centre, 1 body, 2 signalled (:mod:`ganlane.sim.state`)
-``vehicles.valid``                         [N, M] b    false is padding: never seen, hit or counted
-``ego.*``                                  [N]         the environment's memory of the ego
-``traffic.*``                              free        the traffic module's memory
-``seed, episode, step``                    [N] i64     they determine every random number; step: 0.1 s each
-``road.lanes``                             [N, 1] i64  only where every row has its own road (replay)
-``road.lane_width_m``                      [N, 1]      the same, m
+``vehicles.target_lane``                   [N, M] i64  the lane it keeps or is moving to; 0 is the
+rightmost ``vehicles.visibility``                    [N, M] i64  0 centre, 1 body, 2 signalled
+(:mod:`ganlane.sim.state`) ``vehicles.valid``                         [N, M] b    false is padding:
+never seen, hit or counted ``ego.*``                                  [N]         the environment's
+memory of the ego ``traffic.*``                              free        the traffic module's memory
+``seed, episode, step``                    [N] i64     they determine every random number; step: 0.1
+s each ``road.lanes``                             [N, 1] i64  only where every row has its own road
+(replay) ``road.lane_width_m``                      [N, 1]      the same, m
 ``events.*``                               [N, 1]      events of the last decision
 ``action``                                 [N] i64     0 keep, 1 left, 2 right
-``action_mask``                            [N, 3] b    which of them are allowed, where there is a mask
-=========================================  ==========  ==================================================
+``action_mask``                            [N, 3] b    which of them are allowed, where there is a
+mask =========================================  ==========
+==================================================
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ REWARD_TERMS: Final = "reward_terms"
 SEED: Final = "seed"
 EPISODE: Final = "episode"
 STEP: Final = "step"
-#: The episodes' keys [N] int64 (:func:`ganlane.sim.random.episode_key`), given to the traffic once per decision.
+#: The episodes' keys [N] int64 (:func:`ganlane.sim.random.episode_key`), given to the traffic once
+#: per decision.
 EPISODE_KEY: Final = "episode_key"
 ACTION: Final = "action"
 #: Value of the chosen action by the policy, if it writes one, [N] or [N, 1]; named as in TorchRL.
@@ -44,12 +47,22 @@ CHOSEN_VALUE: Final = "chosen_action_value"
 OBSERVATION: Final = "observation"
 #: Which actions are allowed, [N, 3] bool, where the environment has a mask; named as in TorchRL.
 ACTION_MASK: Final = "action_mask"
-#: Whether even keeping the lane makes a driver brake harder than is safe, [N, 1] bool (mask ``safe``).
+#: Whether even keeping the lane makes a driver brake harder than is safe, [N, 1] bool (mask
+#: ``safe``).
 NO_SAFE_ACTION: Final = "no_safe_action"
 REWARD: Final = "reward"
 
 #: Float fields of ``vehicles``.
-VEHICLE_FLOATS: Final = ("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed")
+VEHICLE_FLOATS: Final = (
+    "x",
+    "y",
+    "heading",
+    "speed",
+    "acceleration",
+    "length",
+    "width",
+    "desired_speed",
+)
 #: Integer fields of ``vehicles``.
 VEHICLE_INTEGERS: Final = ("target_lane", "visibility")
 #: Boolean fields of ``vehicles``.
@@ -66,8 +79,16 @@ SOFT_CRASH: Final = "soft_crash"
 #: The same behind the ego: reported, and penalised by ``reward=considerate`` alone.
 SOFT_CRASH_BEHIND: Final = "soft_crash_behind"
 
-#: Terms of the paper's reward; one that charges for ``soft_crash_behind`` has a further one of that name.
-REWARD_TERM_NAMES: Final = ("speed", "lane_change", "out_of_road", "hard_crash", "soft_crash", "goal")
+#: Terms of the paper's reward; one that charges for ``soft_crash_behind`` has a further one of that
+#: name.
+REWARD_TERM_NAMES: Final = (
+    "speed",
+    "lane_change",
+    "out_of_road",
+    "hard_crash",
+    "soft_crash",
+    "goal",
+)
 
 KEEP: Final = 0
 LEFT: Final = 1

@@ -1,4 +1,6 @@
-"""Config dataclasses from names, mappings and keyword arguments, with the checks of the command line."""
+"""Config dataclasses from names, mappings and keyword arguments, with the checks of the command
+line.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +14,23 @@ from typing import Any, TypeAlias
 from omegaconf import DictConfig, OmegaConf
 
 from ganlane.config.command_line import VALUE_ERRORS, sentence
-from ganlane.config.schemas import HELP, SCHEMAS, chosen_options, made, node_of, option_of, options_of
+from ganlane.config.schemas import (
+    HELP,
+    SCHEMAS,
+    chosen_options,
+    made,
+    node_of,
+    option_of,
+    options_of,
+)
 from ganlane.config.traffic import TrafficConfig
 from ganlane.errors import UserError
 from ganlane.parameters import did_you_mean
 
 #: An option's name; a mapping of its keys, with its name as ``name``; or its config dataclass.
 Option: TypeAlias = str | Mapping[str, Any] | Any
-#: Options that None and mappings without a name mean outside a command; each command's YAML has its own defaults.
+#: Options that None and mappings without a name mean outside a command; each command's YAML has its
+#: own defaults.
 DEFAULTS = {
     "env": "highway",
     "traffic": "idm_mobil",
@@ -29,20 +40,27 @@ DEFAULTS = {
 }
 
 
-def option(group: str, chosen: Option, overrides: Mapping[str, Any] | None = None, default: str | None = None) -> Any:
+def option(
+    group: str,
+    chosen: Option,
+    overrides: Mapping[str, Any] | None = None,
+    default: str | None = None,
+) -> Any:
     """The config dataclass of ``group`` that ``chosen`` names, with ``overrides`` on top.
 
     Args:
         group: ``env``, ``traffic``, ``observation``, ``reward`` ...
-        chosen: see :data:`Option`; None: ``default``; for ``traffic`` also an import path or a class.
+        chosen: see :data:`Option`; None: ``default``; for ``traffic`` also an import path or a
+            class.
         overrides: values by key, nested ones as mappings.
         default: name of the option where none is given; None: that of :data:`DEFAULTS`.
 
     Raises:
-        UserError: no such option or key, a value of the wrong type or out of range, or torch's default device
-            cannot be used.
+        UserError: no such option or key, a value of the wrong type or out of range, or torch's
+            default device cannot be used.
     """
-    if "torch" in sys.modules:  # otherwise its default device is unchanged, and importing it takes seconds
+    # otherwise its default device is unchanged, and importing it takes seconds
+    if "torch" in sys.modules:
         from ganlane.torch_settings import check_default_device
 
         check_default_device("cuda")  # no other one can be the environment's
@@ -95,10 +113,15 @@ def typed(where: str, config: Any, values: Mapping[str, Any]) -> Any:
 def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
     """Give ``node`` the entries of ``values`` that a mapping of dataclasses in it lacks.
 
-    OmegaConf itself would make entries of frozen dataclasses read-only and then refuse their values.
+    OmegaConf itself would make entries of frozen dataclasses read-only and then refuse their
+    values.
     """
     for name, value in values.items():
-        if not isinstance(value, (Mapping, DictConfig)) or not isinstance(node, DictConfig) or node._is_none():
+        if (
+            not isinstance(value, (Mapping, DictConfig))
+            or not isinstance(node, DictConfig)
+            or node._is_none()
+        ):
             continue
         if name in node:
             _add_entries(node._get_node(name), value)
@@ -107,7 +130,10 @@ def _add_entries(node: Any, values: Mapping[str, Any]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` in types that OmegaConf knows: paths as text, NumPy's and torch's numbers and arrays as Python's."""
+    """``value`` in types that OmegaConf knows.
+
+    Paths as text, NumPy's and torch's numbers and arrays as Python's.
+    """
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -124,16 +150,25 @@ def command_config(command: str, keys: Mapping[str, Any]) -> Any:
 
     Args:
         command: ``train``, ``evaluate`` ...
-        keys: options by group, keys of the root and, where the command has an environment, keys of that.
+        keys: options by group, keys of the root and, where the command has an environment, keys of
+            that.
 
     Raises:
         UserError: see :func:`option`.
     """
     chosen = chosen_options(command).items()
-    kind, defaults = SCHEMAS[""][command], {group: name for group, name in chosen if name and "@" not in group}
-    # Outside train_generator, 'generator' only feeds interpolations of the YAML files, which a call does not read.
+    kind, defaults = (
+        SCHEMAS[""][command],
+        {group: name for group, name in chosen if name and "@" not in group},
+    )
+    # Outside train_generator, 'generator' only feeds interpolations of the YAML files, which a call
+    # does not read.
     own = {known.name for known in fields(kind)} - ({"generator"} - set(defaults))
-    of_env = {name: value for name, value in keys.items() if name not in own} if "env" in defaults else {}
+    of_env = (
+        {name: value for name, value in keys.items() if name not in own}
+        if "env" in defaults
+        else {}
+    )
     values = {name: value for name, value in keys.items() if name not in of_env}
     for group, name in defaults.items():
         values[group] = option(group, values.get(group), of_env if group == "env" else None, name)

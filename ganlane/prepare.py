@@ -1,4 +1,5 @@
-"""``ganlane prepare``: recordings of any kind into one schema, as Parquet, with a report of what they show.
+"""``ganlane prepare``: recordings of any kind into one schema, as Parquet, with a report of what
+they show.
 
     ganlane prepare data=scenes data.path=recordings.csv
     ganlane prepare data=ngsim data.path=trajectories-0750am-0805am.txt out=us101

@@ -1,4 +1,5 @@
-"""``ganlane render``: episodes as a film, an HTML player or a table of trajectories; learning curves of runs.
+"""``ganlane render``: episodes as a film, an HTML player or a table of trajectories; learning
+curves of runs.
 
     ganlane render agent=mobil traffic=idm_mobil episode=3
     ganlane render agent=agent_idm traffic=gan format=mp4 out=film.mp4

@@ -1,6 +1,7 @@
 """Settings of the process: compiler, memory, streams; registration with gymnasium.
 
-Without torch, which the command line does not need at first; its settings are in :mod:`ganlane.torch_settings`.
+Without torch, which the command line does not need at first; its settings are in
+:mod:`ganlane.torch_settings`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from typing import Final, TextIO
 
 from ganlane.errors import USER_ERROR, UserError, file_sentence, is_users_matter
 
-#: Exit status when the reader of the output has closed it: 128 plus the number of SIGPIPE, which Windows lacks.
+#: Exit status when the reader of the output has closed it: 128 plus the number of SIGPIPE, which
+#: Windows lacks.
 READER_LEFT = 141
 COMPILERS = ("c++", "g++", "clang++", "cl")
 #: From glibc's malloc.h.
@@ -24,9 +26,9 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 KEPT_BYTES = 2**28
 _STATUS = Path("/proc/self/status")
 ENV_ID: Final = "ganlane/Highway-v0"
-#: Arguments that differ from the defaults, by id; reference scores are in docs/gymnasium.md. The registered specs
-#: have no ``max_episode_steps``: gymnasium would cut all episodes there, whatever ``timeout_s`` and
-#: ``decision_period_s`` are. The spec of a made environment has its actual limit.
+#: Arguments that differ from the defaults, by id; reference scores are in docs/gymnasium.md. The
+#: registered specs have no ``max_episode_steps``: gymnasium would cut all episodes there, whatever
+#: ``timeout_s`` and ``decision_period_s`` are. The spec of a made environment has its actual limit.
 ENV_IDS: Final[dict[str, dict[str, str]]] = {
     ENV_ID: {},
     "ganlane/HighwayDense-v0": {"env": "dense"},
@@ -39,7 +41,8 @@ def register_envs() -> None:
     """Register the environments with gymnasium, once; do nothing without gymnasium."""
     try:
         import gymnasium
-    except ModuleNotFoundError:  # the rest of the package works; 'ganlane doctor' says what is missing
+    # the rest of the package works; 'ganlane doctor' says what is missing
+    except ModuleNotFoundError:
         return
     for name, arguments in ENV_IDS.items():
         if name not in gymnasium.registry:
@@ -52,10 +55,15 @@ def register_envs() -> None:
 
 
 def find_compiler() -> tuple[str | None, str]:
-    """Path of the C++ compiler that torch would find, and the names looked for: ``CXX``'s, or :data:`COMPILERS`."""
+    """Path of the C++ compiler that torch would find, and the names looked for.
+
+    ``CXX``'s, or :data:`COMPILERS`.
+    """
     named = os.environ.get("CXX")
     names = (named,) if named else COMPILERS
-    return next(filter(None, map(shutil.which, names)), None), f"CXX={named}" if named else ", ".join(names)
+    return next(
+        filter(None, map(shutil.which, names)), None
+    ), f"CXX={named}" if named else ", ".join(names)
 
 
 def has_compiler() -> bool:
@@ -74,20 +82,29 @@ def check_compiler() -> None:
 
 
 def check_process() -> None:
-    """Raise :class:`UserError` if TorchRL cannot be imported (``-OO``) or the working directory is gone."""
+    """Raise :class:`UserError` if TorchRL cannot be imported (``-OO``) or the working directory is
+    gone.
+    """
     if sys.flags.optimize > 1:
-        raise UserError("python -OO removes the docstrings, which TorchRL needs; run it without -OO.")
+        raise UserError(
+            "python -OO removes the docstrings, which TorchRL needs; run it without -OO."
+        )
     try:
         os.getcwd()
     except OSError as error:
-        raise UserError("the working directory is gone; change to one that is there (cd).") from error
+        raise UserError(
+            "the working directory is gone; change to one that is there (cd)."
+        ) from error
 
 
 def open_closed_streams() -> None:
-    """Open streams that the shell has closed (``>&-``), for which Python has None, on ``os.devnull``."""
+    """Open streams that the shell has closed (``>&-``), for which Python has None, on
+    ``os.devnull``.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            # It gets the lowest free number, so that no file opened later gets a number that libraries write to.
+            # It gets the lowest free number, so that no file opened later gets a number that
+            # libraries write to.
             nowhere = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(nowhere, nowhere == number)
             setattr(sys, name, os.fdopen(nowhere, "w" if number else "r", closefd=False))
@@ -108,7 +125,8 @@ def status_of(error: OSError, program: str) -> int:
 
 
 def _discard_broken_streams() -> bool:
-    """Redirect streams that cannot be written to os.devnull; return whether the reader of a pipe has closed it.
+    """Redirect streams that cannot be written to os.devnull; return whether the reader of a pipe
+    has closed it.
 
     Otherwise Python would write again at exit, print an error, and exit with a status of its own.
     """
@@ -136,18 +154,22 @@ def _has_no_reader(stream: TextIO) -> bool:
 
 
 def keep_freed_memory() -> bool:
-    """Let the process keep the memory it frees; return whether that is possible (only on Linux with glibc).
+    """Let the process keep the memory it frees; return whether that is possible (only on Linux with
+    glibc).
 
-    By default glibc returns every large block to the system as soon as it is free, and taking it again costs a page
-    fault per 4 kB, with thousands of environments more than the arithmetic. The peak does not change. The commands
-    set this and the library does not, because it holds for the whole process.
+    By default glibc returns every large block to the system as soon as it is free, and taking it
+    again costs a page fault per 4 kB, with thousands of environments more than the arithmetic. The
+    peak does not change. The commands set this and the library does not, because it holds for the
+    whole process.
     """
     if not sys.platform.startswith("linux"):
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
         return False
-    return bool(mallopt(_M_MMAP_THRESHOLD, KEPT_BYTES)) and bool(mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES))
+    return bool(mallopt(_M_MMAP_THRESHOLD, KEPT_BYTES)) and bool(
+        mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)
+    )
 
 
 def peak_resident_bytes() -> int | None:
@@ -156,7 +178,9 @@ def peak_resident_bytes() -> int | None:
     Linux's ``ru_maxrss`` is not used: a fresh process inherits its parent's.
     """
     if _STATUS.is_file():
-        peaks = [line.split() for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM")]
+        peaks = [
+            line.split() for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM")
+        ]
         return int(peaks[0][1]) * 1024 if peaks else None
     if sys.platform == "darwin":
         import resource

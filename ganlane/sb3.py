@@ -1,4 +1,5 @@
-"""The batched highway for stable-baselines3: one ``VecEnv`` whose environments are stepped together.
+"""The batched highway for stable-baselines3: one ``VecEnv`` whose environments are stepped
+together.
 
 ::
 
@@ -9,8 +10,9 @@
     model = PPO("MlpPolicy", env).learn(200_000)
     print(ganlane.api.evaluate([ganlane.sb3.driver(model), "mobil"], ["gan"], episodes=300))
 
-``SubprocVecEnv`` of single environments costs one process each; this one costs one tensor operation for all of them.
-sb3-contrib's ``MaskablePPO`` finds the action masks by itself (``mask="safe"``). Needs the extra ``sb3``.
+``SubprocVecEnv`` of single environments costs one process each; this one costs one tensor operation
+for all of them. sb3-contrib's ``MaskablePPO`` finds the action masks by itself (``mask="safe"``).
+Needs the extra ``sb3``.
 """
 
 from __future__ import annotations
@@ -46,11 +48,13 @@ _OF_ROWS = ("action_masks", "render")
 class HighwayVecEnv(VecEnv):
     """A batch of highways behind stable-baselines3's interface; made by :func:`make_vec_env`.
 
-    A row that ends begins its next episode in the same step. Its info then holds ``terminal_observation``,
-    ``TimeLimit.truncated``, ``episode`` as SB3's ``Monitor`` gives it (``r`` return, ``l`` decisions, ``t`` seconds
-    driven), and what :mod:`ganlane.gym` reports of the final state (docs/gymnasium.md); other rows have empty infos.
+    A row that ends begins its next episode in the same step. Its info then holds
+    ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` as SB3's ``Monitor`` gives it
+    (``r`` return, ``l`` decisions, ``t`` seconds driven), and what :mod:`ganlane.gym` reports of
+    the final state (docs/gymnasium.md); other rows have empty infos.
 
-    ``seed(s)`` makes the next reset begin episode i of seed s in row i; ``set_options({"episode": k})`` begins k + i.
+    ``seed(s)`` makes the next reset begin episode i of seed s in row i;
+    ``set_options({"episode": k})`` begins k + i.
 
     Args:
         highways: the batch, as ``gymnasium.make_vec("ganlane/Highway-v0")`` makes it.
@@ -61,7 +65,9 @@ class HighwayVecEnv(VecEnv):
         self._actions: Any = None
         self._return = np.zeros(highways.num_envs)
         self._length = np.zeros(highways.num_envs, dtype=np.int64)
-        super().__init__(highways.num_envs, highways.single_observation_space, highways.single_action_space)
+        super().__init__(
+            highways.num_envs, highways.single_observation_space, highways.single_action_space
+        )
 
     def reset(self) -> Floats:
         """First observations [N, D] of the next episodes."""
@@ -83,13 +89,23 @@ class HighwayVecEnv(VecEnv):
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(done):
-            infos[row] = self._final_info(int(row), info, bool(truncated[row] and not terminated[row]))
+            infos[row] = self._final_info(
+                int(row), info, bool(truncated[row] and not terminated[row])
+            )
         self._return[done], self._length[done] = 0.0, 0
         return observation, reward.astype(np.float32), done, infos
 
     def _final_info(self, row: int, info: dict[str, Any], truncated: bool) -> dict[str, Any]:
-        final = {name: values[row] for name, values in info["final_info"].items() if not isinstance(values, dict)}
-        episode = {"r": float(self._return[row]), "l": int(self._length[row]), "t": float(final["time_s"])}
+        final = {
+            name: values[row]
+            for name, values in info["final_info"].items()
+            if not isinstance(values, dict)
+        }
+        episode = {
+            "r": float(self._return[row]),
+            "l": int(self._length[row]),
+            "t": float(final["time_s"]),
+        }
         final |= {"terminal_observation": info["final_obs"][row], "TimeLimit.truncated": truncated}
         return {**final, "episode": episode}
 
@@ -112,16 +128,23 @@ class HighwayVecEnv(VecEnv):
         Raises:
             UserError: always.
         """
-        raise UserError(f"set_attr({attr_name!r}): the highways are one batch; give options to make_vec_env().")
+        raise UserError(
+            f"set_attr({attr_name!r}): the highways are one batch; give options to make_vec_env()."
+        )
 
-    def env_method(self, method_name: str, *args: Any, indices: Indices = None, **kwargs: Any) -> list[Any]:
-        """The result of a method that gives one result per row (``action_masks``, ``render``), rows ``indices``.
+    def env_method(
+        self, method_name: str, *args: Any, indices: Indices = None, **kwargs: Any
+    ) -> list[Any]:
+        """The result of a method that gives one result per row (``action_masks``, ``render``), rows
+        ``indices``.
 
         Raises:
             UserError: no such method.
         """
         if method_name not in _OF_ROWS:
-            raise UserError(f"env_method({method_name!r}): the rows have {' and '.join(_OF_ROWS)}; call one of them.")
+            raise UserError(
+                f"env_method({method_name!r}): the rows have {' and '.join(_OF_ROWS)}; call one of them."
+            )
         results = getattr(self.highways, method_name)(*args, **kwargs)
         return [results[row] for row in self._get_indices(indices)]
 
@@ -147,8 +170,9 @@ def make_vec_env(
         traffic: ``idm``, ``idm_mobil``, ``gan``, ``mixed``, ..., or a traffic module of your own.
         num_envs: N, highways side by side.
         seed: of the episodes; None: drawn at random.
-        options: as in :class:`ganlane.gym.vector.HighwayVectorGym`: ``observation``, ``reward``, ``mask``,
-            ``stream``, ``render_mode``, and single keys of the environment such as ``lanes=4``.
+        options: as in :class:`ganlane.gym.vector.HighwayVectorGym`: ``observation``, ``reward``,
+            ``mask``, ``stream``, ``render_mode``, and single keys of the environment such as
+            ``lanes=4``.
 
     Raises:
         UserError: a wrong value.
@@ -157,10 +181,12 @@ def make_vec_env(
 
 
 class ModelPolicy(TensorDictModuleBase):
-    """The deterministic policy of a stable-baselines3 model: writes ``action`` [N] for ``observation`` [N, D].
+    """The deterministic policy of a stable-baselines3 model: writes ``action`` [N] for
+    ``observation`` [N, D].
 
     Args:
-        model: trained on :func:`make_vec_env`; one with masks (sb3-contrib's) is given ``action_mask`` [N, 3].
+        model: trained on :func:`make_vec_env`; one with masks (sb3-contrib's) is given
+            ``action_mask`` [N, 3].
     """
 
     out_keys = [keys.ACTION]  # noqa: RUF012
@@ -175,19 +201,24 @@ class ModelPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
-        masks = {"action_masks": tensordict.get(keys.ACTION_MASK).cpu().numpy()} if self._masked else {}
+        masks = (
+            {"action_masks": tensordict.get(keys.ACTION_MASK).cpu().numpy()} if self._masked else {}
+        )
         observation = tensordict.get(keys.OBSERVATION).cpu().numpy()
         action, _ = self.model.predict(observation, deterministic=True, **masks)
         return tensordict.set(keys.ACTION, torch.as_tensor(action, device=tensordict.device).long())
 
 
 def driver(model: BaseAlgorithm, name: str | None = None) -> Driver:
-    """A trained stable-baselines3 model as a driver for ``ganlane.api.evaluate`` and ``ganlane.api.render``.
+    """A trained stable-baselines3 model as a driver for ``ganlane.api.evaluate`` and
+    ``ganlane.api.render``.
 
-    It reads the observation of the evaluation, by default the one that :func:`make_vec_env` uses by default.
+    It reads the observation of the evaluation, by default the one that :func:`make_vec_env` uses by
+    default.
 
     Args:
-        model: PPO, DQN, MaskablePPO, ...; behind a mask, give ``mask="safe"`` to the evaluation, too.
+        model: PPO, DQN, MaskablePPO, ...; behind a mask, give ``mask="safe"`` to the evaluation,
+            too.
         name: in tables; None: the algorithm's, in lower case.
     """
     return Driver(name or type(model).__name__.lower(), ModelPolicy(model))

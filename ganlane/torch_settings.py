@@ -15,24 +15,35 @@ from ganlane.runtime import has_compiler
 F = TypeVar("F", bound=Callable)
 #: Graphs that one function may have: one per batch size, road and set of parameters in a process.
 GRAPHS_PER_FUNCTION = 64
-#: First torch whose compiler is known to be right: 2.11 on Python 3.12 returns empty NamedTuples from a graph.
+#: First torch whose compiler is known to be right: 2.11 on Python 3.12 returns empty NamedTuples
+#: from a graph.
 TRIED_FROM = (2, 13)
 
 
 def can_compile() -> bool:
-    """Whether compiling is known to work here: a C++ compiler, and a torch from :data:`TRIED_FROM` on."""
+    """Whether compiling is known to work here.
+
+    A C++ compiler, and a torch from :data:`TRIED_FROM` on.
+    """
     version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
     return has_compiler() and version >= TRIED_FROM
 
 
 def compiled(function: F) -> F:
-    """Compile ``function``, pure and on tensors without branches on their values, to one graph per shape."""
-    torch._dynamo.config.cache_size_limit = max(torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION)
+    """Compile ``function``, pure and on tensors without branches on their values, to one graph per
+    shape.
+    """
+    torch._dynamo.config.cache_size_limit = max(
+        torch._dynamo.config.cache_size_limit, GRAPHS_PER_FUNCTION
+    )
     return torch.compile(function, dynamic=False, fullgraph=True)  # type: ignore[return-value]
 
 
 def outside_autocast(function: F) -> F:
-    """Decorator: ``function`` computes in the types of its arguments, even under the caller's autocast."""
+    """Decorator.
+
+    ``function`` computes in the types of its arguments, even under the caller's autocast.
+    """
 
     @wraps(function)
     def computed(*arguments: Any, **named: Any) -> Any:
@@ -48,7 +59,9 @@ def outside_autocast(function: F) -> F:
 
 
 def check_default_device(device: str) -> None:
-    """Raise :class:`UserError` if torch's default device is neither the CPU nor of the type ``device``."""
+    """Raise :class:`UserError` if torch's default device is neither the CPU nor of the type
+    ``device``.
+    """
     default = torch.get_default_device().type
     if default not in ("cpu", device):
         raise UserError(

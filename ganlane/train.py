@@ -1,4 +1,5 @@
-"""``ganlane train``: train an agent on a traffic, then compare it with other drivers on the same episodes.
+"""``ganlane train``: train an agent on a traffic, then compare it with other drivers on the same
+episodes.
 
     ganlane train traffic=gan init=idm_ckpt
     ganlane train traffic=idm_mobil init=none total_decisions=2000000 seed=1
@@ -7,8 +8,9 @@
     ganlane train -m seed=0,1 traffic=idm,gan
     ganlane train traffic=idm traffic._target_=my.module.MyTraffic
 
-Ctrl-C (or SIGTERM) saves and ends; resume continues from there, and after a kill -9 from the last checkpoint.
-Writes agent.safetensors, metrics.csv, config.yaml, results.json and episodes.parquet into its run folder.
+Ctrl-C (or SIGTERM) saves and ends; resume continues from there, and after a kill -9 from the last
+checkpoint. Writes agent.safetensors, metrics.csv, config.yaml, results.json and episodes.parquet
+into its run folder.
 """
 
 import sys

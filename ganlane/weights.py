@@ -15,7 +15,9 @@ from ganlane.errors import UserError
 from ganlane.files import PLACE, has_checksum, note_without_checksum, sealed, write_bytes
 
 
-def save_weights(path: str | Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
+def save_weights(
+    path: str | Path, kind: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]
+) -> None:
     """Save ``tensors`` and plain ``metadata`` as safetensors, atomically.
 
     Args:
@@ -33,18 +35,24 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
     """Load what :func:`save_weights` wrote: ``(tensors, metadata)``.
 
     Raises:
-        UserError: the file is absent, damaged, not safetensors, not written by ganlane, of another kind, or holds
-            numbers that are not finite.
+        UserError: the file is absent, damaged, not safetensors, not written by ganlane, of another
+            kind, or holds numbers that are not finite.
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"{path}: no such file; a checkpoint of kind {kind} (.safetensors) was expected there.")
+        raise UserError(
+            f"{path}: no such file; a checkpoint of kind {kind} (.safetensors) was expected there."
+        )
     content = path.read_bytes()
     whole = has_checksum(content, path)
     try:
         tensors = load(content)
-        header = _json_object(content[8 : 8 + int.from_bytes(content[:8], "little")]).get("__metadata__") or {}
-    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a number type that torch lacks
+        header = (
+            _json_object(content[8 : 8 + int.from_bytes(content[:8], "little")]).get("__metadata__")
+            or {}
+        )
+    # KeyError: a number type that torch lacks
+    except (SafetensorError, ValueError, KeyError) as error:
         raise UserError(
             f"{path}: not a readable safetensors file ({error}); give a checkpoint of kind {kind} that ganlane wrote."
         ) from error
@@ -56,7 +64,9 @@ def load_weights(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[s
         )
     for name, tensor in tensors.items():
         if not tensor.isfinite().all():
-            raise UserError(f"{path}: {name} holds numbers that are not finite; train or fit it again.")
+            raise UserError(
+                f"{path}: {name} holds numbers that are not finite; train or fit it again."
+            )
     if not whole:
         note_without_checksum(path)
     return tensors, metadata

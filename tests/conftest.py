@@ -18,7 +18,8 @@ os.environ["GANLANE_CACHE"] = ""
 # The batches of tests are small: one thread is fastest, and the suite runs in two processes.
 torch.set_num_threads(1)
 
-# Time limits per example fail on a busy machine, and a suite should find the same faults in every run.
+# Time limits per example fail on a busy machine, and a suite should find the same faults in every
+# run.
 settings.register_profile("ganlane", deadline=None, derandomize=True, database=None)
 settings.load_profile("ganlane")
 

@@ -1,4 +1,7 @@
-"""A user's own traffic model and policy, as a user would write them: nothing of the package is touched."""
+"""A user's own traffic model and policy, as a user would write them.
+
+Nothing of the package is touched.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A training run of seconds, for the tests of whole commands; who else drives in its table, each of them says."""
+"""A training run of seconds, for the tests of whole commands.
+
+Who else drives in its table, each of them says.
+"""
 
 TINY = [
     "env.goal_m=40",

@@ -40,18 +40,34 @@ def test_every_name_at_the_top_is_there():
 
 def test_an_environment_takes_what_the_command_line_takes():
     env = ganlane.make_env(
-        "idm", 3, lanes=4, vehicles=15, recycle=True, idm={"headway_s": 1.2}, observation="table3", seed=4
+        "idm",
+        3,
+        lanes=4,
+        vehicles=15,
+        recycle=True,
+        idm={"headway_s": 1.2},
+        observation="table3",
+        seed=4,
     )
     base = env.base_env
-    assert (base.road.lanes, base.vehicles, base.recycle, base.rules.idm.headway_s) == (4, 15, True, 1.2)
+    assert (base.road.lanes, base.vehicles, base.recycle, base.rules.idm.headway_s) == (
+        4,
+        15,
+        True,
+        1.2,
+    )
     state = env.reset()
     assert state["observation"].shape == (3, 3 + 3 * 14)
     assert state["seed"].tolist() == [4, 4, 4]
 
 
 def test_options_come_as_names_mappings_configs_and_classes():
-    by_mapping = ganlane.make_env({"name": "gan", "noise_scale": 0.0}, reward={"hard_crash": -200.0})
-    by_config = ganlane.make_env(GanTrafficConfig(noise_scale=0.0), env=EnvConfig(lanes=2), lane_width_m=3.5)
+    by_mapping = ganlane.make_env(
+        {"name": "gan", "noise_scale": 0.0}, reward={"hard_crash": -200.0}
+    )
+    by_config = ganlane.make_env(
+        GanTrafficConfig(noise_scale=0.0), env=EnvConfig(lanes=2), lane_width_m=3.5
+    )
     assert by_config.base_env.road == ganlane.Road(2, 3.5)
     assert type(by_mapping.base_env.traffic) is type(by_config.base_env.traffic)
     assert by_mapping.transform[-1].parameters.hard_crash == -200.0
@@ -84,33 +100,52 @@ def test_the_table_has_the_numbers_of_the_command(capsys):
     written = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: "))
     rows = json.loads(written.read_text())["rows"]
     threads = torch.get_num_threads()
-    table = ganlane.api.evaluate(["mobil", "random_legal"], ["idm", "idm_mobil"], 3, seed=2, goal_m=40, folder="mine")
+    table = ganlane.api.evaluate(
+        ["mobil", "random_legal"], ["idm", "idm_mobil"], 3, seed=2, goal_m=40, folder="mine"
+    )
     assert torch.get_num_threads() == threads
     assert json.loads(json.dumps(table.to_dicts())) == rows
     assert json.loads(Path("mine/results.json").read_text())["rows"] == rows
-    assert pl.read_parquet("mine/episodes.parquet").equals(pl.read_parquet(written.parent / "episodes.parquet"))
+    assert pl.read_parquet("mine/episodes.parquet").equals(
+        pl.read_parquet(written.parent / "episodes.parquet")
+    )
 
 
 def test_own_drivers_and_own_names_stand_in_the_table():
     own = DRIVERS["keep_lane"](ganlane.Road(3), 2)
     traffics = {"quiet": {"name": "idm"}, "mine": IdmTraffic}
-    episodes = ganlane.api.evaluate([own, ganlane.load_agent("keep_lane")], traffics, 2, goal_m=30, per_episode=True)
+    episodes = ganlane.api.evaluate(
+        [own, ganlane.load_agent("keep_lane")], traffics, 2, goal_m=30, per_episode=True
+    )
     assert episodes.height == 8
     totals = episodes.group_by("traffic", "agent", maintain_order=True).agg(pl.col("reward").sum())
-    pairs = [(traffic, agent) for traffic in ("quiet", "mine") for agent in (type(own).__name__, "keep_lane")]
+    pairs = [
+        (traffic, agent)
+        for traffic in ("quiet", "mine")
+        for agent in (type(own).__name__, "keep_lane")
+    ]
     assert totals.select("traffic", "agent").rows() == pairs
     assert totals["reward"].n_unique() == 1
 
 
 def test_a_run_is_trained_resumed_and_evaluated():
     small = {"name": "rainbow", "warmup": 64, "capacity": 1000, "hidden": [16], "batch_size": 16}
-    tiny = {"agent": small, "num_envs": 8, "goal_m": 40.0, "evaluation": {"agents": ["mobil"], "episodes": 2}}
-    run = ganlane.api.train("idm", "none", total_decisions=256, folder="run", logger={"progress": False}, **tiny)
+    tiny = {
+        "agent": small,
+        "num_envs": 8,
+        "goal_m": 40.0,
+        "evaluation": {"agents": ["mobil"], "episodes": 2},
+    }
+    run = ganlane.api.train(
+        "idm", "none", total_decisions=256, folder="run", logger={"progress": False}, **tiny
+    )
     assert run.folder == Path("run")
     assert run.agent == Path("run/agent.safetensors")
     assert run.table["agent"].to_list() == ["trained", "mobil"]
     assert run.results["decisions"] >= 256
-    assert {"config.yaml", "results.json", "episodes.parquet"} <= {path.name for path in run.folder.iterdir()}
+    assert {"config.yaml", "results.json", "episodes.parquet"} <= {
+        path.name for path in run.folder.iterdir()
+    }
     table = ganlane.api.evaluate([str(run.agent)], ["idm"], 2, goal_m=40.0)
     assert table["mean_reward"][0] == run.table["mean_reward"][0]
     more = ganlane.api.train("idm", "none", total_decisions=512, folder="run", resume=True, **tiny)
@@ -118,10 +153,14 @@ def test_a_run_is_trained_resumed_and_evaluated():
 
 
 def test_a_film_is_written_to_the_given_path():
-    path = ganlane.api.render("keep_lane", "idm", 2, out="strip.png", goal_m=30.0, film={"width": 640, "height": 200})
+    path = ganlane.api.render(
+        "keep_lane", "idm", 2, out="strip.png", goal_m=30.0, film={"width": 640, "height": 200}
+    )
     assert path == Path("strip.png")
     assert path.read_bytes().startswith(b"\x89PNG")
-    assert ganlane.api.render("keep_lane", "idm", format="png", goal_m=20.0).parent.parent == Path("outputs/render")
+    assert ganlane.api.render("keep_lane", "idm", format="png", goal_m=20.0).parent.parent == Path(
+        "outputs/render"
+    )
 
 
 @pytest.mark.parametrize("command", SCHEMAS[""])
@@ -132,14 +171,23 @@ def test_every_command_has_its_function(command):
 
 
 def test_speed_is_measured_and_no_command_is_made_up_for_a_call():
-    few = {"batches": [2], "modes": ["eager"], "threads": [1], "vehicle_counts": [3], "peers": False, "memory": False}
+    few = {
+        "batches": [2],
+        "modes": ["eager"],
+        "threads": [1],
+        "vehicle_counts": [3],
+        "peers": False,
+        "memory": False,
+    }
     run = ganlane.api.run("bench", suite="sim", quick=True, **few)
     assert run.results["rows"][0]["physics_steps_per_s"] > 0
     assert stored_command(run.folder, "python -m ganlane.bench").startswith("called from Python")
 
 
 def test_recordings_become_a_generator_that_drives():
-    write_scene_csv(synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=8, seconds=7.0)), Path("mine.csv"))
+    write_scene_csv(
+        synthetic_scenes(SyntheticTraffic(scenes=3, vehicles=8, seconds=7.0)), Path("mine.csv")
+    )
     prepared = ganlane.api.run("prepare", data={"path": Path("mine.csv")}, out="mine")
     assert prepared.results["files"]
     short = {"batch": 4, "loop": {"updates": 2, "evaluate_every": 1}}
@@ -151,10 +199,17 @@ def test_recordings_become_a_generator_that_drives():
 
 def test_the_short_blocks_in_the_docs_run(capsys):
     page = (Path(__file__).parents[1] / "docs" / "python_api.md").read_text()
-    code = [block for block in re.findall(r"```python\n(.*?)```", page, re.S) if not LONG.search(block)]
+    code = [
+        block for block in re.findall(r"```python\n(.*?)```", page, re.S) if not LONG.search(block)
+    ]
     assert len(code) == 5
     names, text = {}, "\n".join(code)
-    exec(text.replace("episodes=100", "episodes=2, goal_m=30").replace('"end_s": 5.0', '"end_s": 1.0'), names)
+    exec(
+        text.replace("episodes=100", "episodes=2, goal_m=30").replace(
+            '"end_s": 5.0', '"end_s": 1.0'
+        ),
+        names,
+    )
     assert names["table"].height == 6
     assert names["rollout"].batch_size == (64, 10)
     assert Path("film.gif").is_file()
@@ -170,17 +225,26 @@ def test_the_short_blocks_in_the_docs_run(capsys):
         (lambda: ganlane.make_env(stream=[]), "stream=[]: expected a text"),
         (lambda: ganlane.make_env(transforms=["x"]), "transforms=['x']: expected a list"),
         (lambda: ganlane.make_env(device="tpu"), "device=tpu: expected one of cpu, cuda"),
-        (lambda: ganlane.make_env(reward={"base_speed_mps": 30.0}), "expected more than reward.base_speed_mps"),
+        (
+            lambda: ganlane.make_env(reward={"base_speed_mps": 30.0}),
+            "expected more than reward.base_speed_mps",
+        ),
         (lambda: ganlane.make_env("no.such.Traffic"), "traffic._target_=no.such.Traffic"),
         (lambda: ganlane.load_agent("nobody"), "agent nobody: unknown; choose one of"),
         (lambda: ganlane.load_agent("x" * 10**5), "unknown; choose one of"),
         (lambda: ganlane.load_agent("x" * 10**5 + ".safetensors"), "no such file"),
         (lambda: ganlane.load_agent("gone.safetensors"), "agent gone.safetensors: no such file"),
-        (lambda: ganlane.api.evaluate(["mobil"], ["idm"], 0), "episodes=0: expected a number from 1"),
+        (
+            lambda: ganlane.api.evaluate(["mobil"], ["idm"], 0),
+            "episodes=0: expected a number from 1",
+        ),
         (lambda: ganlane.api.evaluate(["mobil", "mobil"], ["idm"]), "a list of different entries"),
         (lambda: ganlane.api.evaluate(["mobil"], ["idm", {"name": "idm"}]), "one name twice"),
         (lambda: ganlane.api.evaluate([42], ["idm"]), "agents=[42]: expected a list"),
-        (lambda: ganlane.api.evaluate(["mobil"], ["idm"], generator={"path": "x"}), "env.generator: no such key"),
+        (
+            lambda: ganlane.api.evaluate(["mobil"], ["idm"], generator={"path": "x"}),
+            "env.generator: no such key",
+        ),
         (lambda: ganlane.api.train("idm", resume=True), "resume=True: which run"),
         (lambda: ganlane.api.train("idm", resume=True, folder="gone"), "no run that can go on"),
         (lambda: ganlane.api.train("idm", evaluation=3), "evaluation=3: expected a mapping"),
@@ -189,8 +253,14 @@ def test_the_short_blocks_in_the_docs_run(capsys):
         (lambda: ganlane.api.run(5), "command=5: expected a text"),
         (lambda: ganlane.api.render(run=5), "run=5: expected"),
         (lambda: ganlane.api.render("nobody", "idm"), "agent nobody: unknown"),
-        (lambda: ganlane.api.run("realism", traffic="replay"), "traffic=replay: it is the recordings themselves"),
-        (lambda: ganlane.api.run("bench", report="x.md"), "report: tables go into a document with the command only"),
+        (
+            lambda: ganlane.api.run("realism", traffic="replay"),
+            "traffic=replay: it is the recordings themselves",
+        ),
+        (
+            lambda: ganlane.api.run("bench", report="x.md"),
+            "report: tables go into a document with the command only",
+        ),
         (lambda: ganlane.api.run("prepare", lanes=3), "lanes: no such key"),
         (lambda: ganlane.api.run("prepare", data="ngsim"), "data=ngsim: which file is missing"),
         (lambda: ganlane.api.run("train_generator", data={"path": "gone.csv"}), "gone.csv"),

@@ -53,5 +53,7 @@ def test_it_is_called_with_what_it_names_and_no_more():
     assert call_with(Inherits, offered, {"stream": 2}, "agents").given == (3, 2)
     assert call_with(Module, offered, {}, "agents").road == 3
     assert isinstance(call_with(Nothing, offered, {}, "agents"), Nothing)
-    with pytest.raises(UserError, match=r"agents=.*Named: cannot be called with .*; it takes road, stream"):
+    with pytest.raises(
+        UserError, match=r"agents=.*Named: cannot be called with .*; it takes road, stream"
+    ):
         call_with(Named, {"idm": 5}, {}, "agents")

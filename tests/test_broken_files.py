@@ -1,4 +1,6 @@
-"""Files damaged in every way that came to mind are refused in one sentence, and nothing in them is executed."""
+"""Files damaged in every way that came to mind are refused in one sentence, and nothing in them is
+executed.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,10 @@ from ganlane.native.library import cache_folder
 from ganlane.weights import load_weights, save_weights
 
 ROOT = Path(__file__).resolve().parents[1]
-AGENT, GENERATOR = CHECKPOINTS / "agent_idm.safetensors", CHECKPOINTS / "generator_paper.safetensors"
+AGENT, GENERATOR = (
+    CHECKPOINTS / "agent_idm.safetensors",
+    CHECKPOINTS / "generator_paper.safetensors",
+)
 
 pytestmark = pytest.mark.usefixtures("hydra_from_memory")
 
@@ -81,9 +86,15 @@ PLACES = {
     "evaluate agents": (AGENT, ["evaluate", "agents=[broken.safetensors]"]),
     "evaluate agents, another ending": (AGENT, ["evaluate", "agents=[broken.pt]"]),
     "render agent": (AGENT, ["render", "agent=broken.safetensors"]),
-    "train init": (AGENT, ["train", "traffic=idm", "init.path=broken.safetensors", "evaluation.agents=[mobil]"]),
+    "train init": (
+        AGENT,
+        ["train", "traffic=idm", "init.path=broken.safetensors", "evaluation.agents=[mobil]"],
+    ),
     "train generator": (GENERATOR, ["train", "traffic=gan", "generator.path=broken.safetensors"]),
-    "evaluate generator": (GENERATOR, ["evaluate", "traffics=[gan]", "generator.path=broken.safetensors"]),
+    "evaluate generator": (
+        GENERATOR,
+        ["evaluate", "traffics=[gan]", "generator.path=broken.safetensors"],
+    ),
 }
 
 
@@ -92,7 +103,8 @@ COMBINATIONS = [
     (place, damage)
     for place in PLACES
     for damage in DAMAGED[AGENT]
-    if place in ("evaluate agents", "evaluate generator") or damage in ("truncated", "torch pickle", "other kind")
+    if place in ("evaluate agents", "evaluate generator")
+    or damage in ("truncated", "torch pickle", "other kind")
 ]
 
 
@@ -118,14 +130,18 @@ NETWORKS = {
 }
 
 
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in NETWORKS.items() for value in values])
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, value) for name, values in NETWORKS.items() for value in values]
+)
 def test_an_agent_with_an_impossible_network_is_refused(name, value, capsys):
     weights, metadata = load_weights(AGENT, "agent")
     del metadata["kind"]
     metadata["network"][name] = value
     save_weights("broken.safetensors", "agent", weights, metadata)
     short = ("traffics=[idm]", "episodes=1", "env.goal_m=20")
-    assert "broken.safetensors" in refusal(capsys, "evaluate", "agents=[broken.safetensors]", *short)
+    assert "broken.safetensors" in refusal(
+        capsys, "evaluate", "agents=[broken.safetensors]", *short
+    )
 
 
 @pytest.mark.parametrize(
@@ -174,7 +190,9 @@ def test_a_run_whose_command_line_is_damaged_is_not_resumed(overrides, capsys):
 
 def damaged_recordings() -> dict[str, bytes]:
     """Scene CSVs with one fault each, or no CSV at all, by the fault."""
-    text = written(lambda path: write_scene_csv(synthetic_scenes(SyntheticTraffic()), path)).decode()
+    text = written(
+        lambda path: write_scene_csv(synthetic_scenes(SyntheticTraffic()), path)
+    ).decode()
     header, _, rows = text.partition("\n")
     first, _, rest = rows.partition("\n")
 
@@ -231,7 +249,9 @@ def test_damaged_recordings_are_refused(reader, fault, here, capsys):
 
 
 @pytest.mark.parametrize("option", ["ngsim", "highd"])
-@pytest.mark.parametrize("fault", ["empty", "noise", "only a header", "a cut line", "utf-16", "parquet magic"])
+@pytest.mark.parametrize(
+    "fault", ["empty", "noise", "only a header", "a cut line", "utf-16", "parquet magic"]
+)
 def test_recordings_in_another_form_are_refused(option, fault, here, capsys):
     (here / "01_tracks.csv").write_bytes(FAULTS[fault])
     assert "01_" in refusal(capsys, "prepare", f"data={option}", "data.path=01_tracks.csv")
@@ -260,7 +280,9 @@ SCENE_FILES = {
     "cut.json": b'[{"x_m": 0, "lane": 1}, {"x_m"',
     "number.json": b"3",
     "text.json": b'["here", "there"]',
-    "lanes.json": json.dumps({"lanes": -1, "vehicles": [{"x_m": 0, "lane": 0}, {"x_m": 40, "lane": 0}]}).encode(),
+    "lanes.json": json.dumps(
+        {"lanes": -1, "vehicles": [{"x_m": 0, "lane": 0}, {"x_m": 40, "lane": 0}]}
+    ).encode(),
     "many.json": json.dumps({"lanes": "many", "vehicles": [{"x_m": 0, "lane": 0}]}).encode(),
     "nothing.json": b'{"vehicles": null}',
     "deep.json": b"[" * 100_000,
@@ -280,7 +302,14 @@ SCENE_FILES = {
 @pytest.mark.parametrize("name", SCENE_FILES)
 def test_a_broken_scene_is_refused(name, here, capsys):
     (here / name).write_bytes(SCENE_FILES[name])
-    told = refusal(capsys, "evaluate", "env=scene", f"env.scene.path={name}", "agents=[mobil]", "traffics=[idm]")
+    told = refusal(
+        capsys,
+        "evaluate",
+        "env=scene",
+        f"env.scene.path={name}",
+        "agents=[mobil]",
+        "traffics=[idm]",
+    )
     assert name in told
     assert len(told) < 1000
 
@@ -289,20 +318,33 @@ def test_a_broken_scene_is_refused(name, here, capsys):
 
 #: In a process of its own, once for a value and once for either kind of file;
 #: a number out of range is in `test_entry_commands`.
-WHOLE = ("prepare data=ngsim", "evaluate agents=[broken.safetensors] traffics=[idm]", "train resume=run")
+WHOLE = (
+    "prepare data=ngsim",
+    "evaluate agents=[broken.safetensors] traffics=[idm]",
+    "train resume=run",
+)
 
 
-@pytest.mark.parametrize("line", [WHOLE[0], *(pytest.param(line, marks=pytest.mark.slow) for line in WHOLE[1:])])
+@pytest.mark.parametrize(
+    "line", [WHOLE[0], *(pytest.param(line, marks=pytest.mark.slow) for line in WHOLE[1:])]
+)
 def test_a_whole_command_ends_with_status_2(line, here):
     if "broken.safetensors" in line:
         Path("broken.safetensors").write_bytes(DAMAGED[AGENT]["pickle"])
     if "resume=run" in line:
         run_folder(IDM, DAMAGED[AGENT]["torch pickle"])
     before = everything_below(here)
-    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(here)}
+    environment = {
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+        "PATH": "/usr/bin:/bin",
+        "HOME": str(here),
+    }
     environment["GANLANE_CACHE"] = str(cache_folder().parent)  # where the kernel is built already
     start = [sys.executable, "-m", "ganlane", *line.split()]
-    done = subprocess.run(start, cwd=here, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        start, cwd=here, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 2, done.stderr
     assert is_one_sentence(done.stderr, line.split()[0]), done.stderr
     assert done.stdout == ""

@@ -1,7 +1,8 @@
-"""A value of a wrong type or out of its range is refused in one sentence, for every key of every command and option.
+"""A value of a wrong type or out of its range is refused in one sentence, for every key of every
+command and option.
 
-The values are made from the dataclasses: every key gets a value of a wrong type, and every key that has a range one
-outside of it, once.
+The values are made from the dataclasses: every key gets a value of a wrong type, and every key that
+has a range one outside of it, once.
 """
 
 from __future__ import annotations
@@ -39,7 +40,10 @@ def here(tmp_path, monkeypatch):
 
 @dataclasses.dataclass(frozen=True)
 class Key:
-    """A key of a command as its dataclass declares it; ``chosen`` are the options that it belongs to."""
+    """A key of a command as its dataclass declares it.
+
+    ``chosen`` are the options that it belongs to.
+    """
 
     command: str
     name: str
@@ -51,7 +55,9 @@ class Key:
         return " ".join((self.command, *self.chosen, self.name))
 
 
-def keys_of(config: Any, command: str, chosen: tuple[str, ...] = (), prefix: str = "") -> Iterator[Key]:
+def keys_of(
+    config: Any, command: str, chosen: tuple[str, ...] = (), prefix: str = ""
+) -> Iterator[Key]:
     """All keys below a dataclass, with their declared types."""
     kinds = get_type_hints(type(config))
     for field in dataclasses.fields(config):
@@ -75,7 +81,9 @@ def keys_of_options() -> Iterator[Key]:
         "data=ngsim": ("data.path=x",),
         "data=highd": ("data.path=x",),
     }
-    for group, option in [(group, option) for group, options in SCHEMAS.items() if group for option in options]:
+    for group, option in [
+        (group, option) for group, options in SCHEMAS.items() if group for option in options
+    ]:
         command, name = homes.get(group, "train"), f"{group}={option}"
         # The forms of the observation share one schema, which is not an option.
         if group == "observation" or not (conf_folder() / group / f"{option}.yaml").is_file():
@@ -88,7 +96,10 @@ def keys_of_options() -> Iterator[Key]:
 
 
 def option_of(command: str, group: str, option: str, chosen: tuple[str, ...]) -> Any:
-    """What an option's dataclass holds; composing takes hundreds of times as long, so only where it has to be."""
+    """What an option's dataclass holds.
+
+    Composing takes hundreds of times as long, so only where it has to be.
+    """
     try:
         return SCHEMAS[group][option]()
     except UserError:
@@ -118,7 +129,15 @@ def plain_kind(kind: Any) -> Any:
 
 
 #: What no key of a kind takes.
-WRONG_TYPE = {int: "many", float: "many", bool: "perhaps", str: ["a"], list: {"a": 1}, tuple: {"a": 1}, dict: 3}
+WRONG_TYPE = {
+    int: "many",
+    float: "many",
+    bool: "perhaps",
+    str: ["a"],
+    list: {"a": 1},
+    tuple: {"a": 1},
+    dict: 3,
+}
 #: What a key of a kind with a range could refuse, the likeliest first.
 ABSURD: dict[Any, tuple[Any, ...]] = {
     int: (-(10**9), 10**15, 0),
@@ -129,7 +148,10 @@ ABSURD: dict[Any, tuple[Any, ...]] = {
 
 
 def with_value(config: Any, names: list[str], value: Any) -> Any:
-    """A copy of a dataclass in which a key, however deep, has another value; its ranges are checked."""
+    """A copy of a dataclass in which a key, however deep, has another value.
+
+    Its ranges are checked.
+    """
     first, *deeper = names
     if isinstance(config, dict):
         return {**config, first: with_value(config[first], deeper, value)}
@@ -155,7 +177,11 @@ def is_list_of_kind(kind: Any, value: Any) -> bool:
     """Whether a list holds what it is declared to hold; anything else passes."""
     kinds = [part for part in (kind, *get_args(kind)) if get_origin(part) is list]
     wanted = get_args(kinds[0])[0] if kinds else str
-    return wanted is str or not isinstance(value, list) or all(isinstance(each, (int, float)) for each in value)
+    return (
+        wanted is str
+        or not isinstance(value, list)
+        or all(isinstance(each, (int, float)) for each in value)
+    )
 
 
 def as_typed(value: Any) -> str:
@@ -169,7 +195,9 @@ def as_typed(value: Any) -> str:
 EVERY_KEY = {key.name: key for key in KEYS + OPTION_KEYS}
 
 
-@pytest.mark.parametrize("key", [key for key in EVERY_KEY.values() if plain_kind(key.kind) in WRONG_TYPE], ids=str)
+@pytest.mark.parametrize(
+    "key", [key for key in EVERY_KEY.values() if plain_kind(key.kind) in WRONG_TYPE], ids=str
+)
 def test_a_key_refuses_a_wrong_type(key):
     field = key.name.rsplit(".", 1)[-1]
     with pytest.raises(OmegaConfBaseException) as caught:
@@ -182,10 +210,17 @@ def test_a_key_refuses_a_wrong_type(key):
 
 def absurd_value(key: Key) -> Any:
     """A value of the right type that the key refuses; None if it takes them all."""
-    return next((value for value in ABSURD.get(plain_kind(key.kind), ()) if refused_in_memory(key, value)), None)
+    return next(
+        (value for value in ABSURD.get(plain_kind(key.kind), ()) if refused_in_memory(key, value)),
+        None,
+    )
 
 
-OUT_OF_RANGE = {name: (key, value) for name, key in EVERY_KEY.items() if (value := absurd_value(key)) is not None}
+OUT_OF_RANGE = {
+    name: (key, value)
+    for name, key in EVERY_KEY.items()
+    if (value := absurd_value(key)) is not None
+}
 
 
 @pytest.mark.parametrize("name", sorted(OUT_OF_RANGE))

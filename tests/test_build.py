@@ -13,18 +13,29 @@ from ganlane.agents.drivers import DRIVERS, MobilDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
 from ganlane.config.recordings import RealismConfig
-from ganlane.config.traffic import HighwayEnvTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, SumoTrafficConfig
+from ganlane.config.traffic import (
+    HighwayEnvTrafficConfig,
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+    SumoTrafficConfig,
+)
 from ganlane.errors import UserError
 from ganlane.parameters.driving import IdmParameters, MobilParameters
 from ganlane.parameters.observation import FORMS, ObservationConfig
 from ganlane.sim.random import Stream
 
-ROAD = EnvConfig(lanes=2, idm=IdmParameters(headway_s=1.2), mobil=MobilParameters(politeness_side=0.0))
+ROAD = EnvConfig(
+    lanes=2, idm=IdmParameters(headway_s=1.2), mobil=MobilParameters(politeness_side=0.0)
+)
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_built_environments_keep_their_specs(form):
-    check_env_specs(make_env(make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(form=form), num_envs=2))
+    check_env_specs(
+        make_env(
+            make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(form=form), num_envs=2
+        )
+    )
 
 
 def test_a_reset_runs_the_episodes_that_were_asked_for():
@@ -57,7 +68,9 @@ def test_every_driver_drives(name):
 
 
 def test_an_unknown_driver_is_refused_with_the_known_ones():
-    with pytest.raises(UserError, match=r"agent nobody: unknown; choose one of random, .*agent_idm"):
+    with pytest.raises(
+        UserError, match=r"agent nobody: unknown; choose one of random, .*agent_idm"
+    ):
         make_driver("nobody", ROAD)
 
 
@@ -65,7 +78,9 @@ def test_an_unknown_driver_is_refused_with_the_known_ones():
     ("module", "config", "extra"),
     [("libsumo", SumoTrafficConfig(), "sumo"), ("highway_env", HighwayEnvTrafficConfig(), "bench")],
 )
-def test_where_the_package_is_missing_a_sentence_names_the_extra(monkeypatch, module, config, extra):
+def test_where_the_package_is_missing_a_sentence_names_the_extra(
+    monkeypatch, module, config, extra
+):
     monkeypatch.setattr("ganlane.traffic.base.find_spec", lambda name: None)
     monkeypatch.delitem(sys.modules, module, raising=False)
     with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'"):

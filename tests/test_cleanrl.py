@@ -1,7 +1,8 @@
 """CleanRL's ``ppo.py`` on the highway.
 
-The script is in CleanRL's repository, not in its package. Here is its form since it uses gymnasium (commit b5fb801,
-for gymnasium 0.29): how it makes environments, acts, reads ends and infos, and updates; shortened, in our words.
+The script is in CleanRL's repository, not in its package. Here is its form since it uses gymnasium
+(commit b5fb801, for gymnasium 0.29): how it makes environments, acts, reads ends and infos, and
+updates; shortened, in our words.
 """
 
 from __future__ import annotations
@@ -33,9 +34,15 @@ def as_a_batch():
 
 
 def ended_returns(infos):
-    """Returns in the form of gymnasium 0.29, which the script reads (``final_info``), or of 1.x (arrays)."""
+    """Returns in the form of gymnasium 0.29, which the script reads (``final_info``), or of 1.x
+    (arrays).
+    """
     if "final_info" in infos:
-        return [float(info["episode"]["r"]) for info in infos["final_info"] if info and "episode" in info]
+        return [
+            float(info["episode"]["r"])
+            for info in infos["final_info"]
+            if info and "episode" in info
+        ]
     return infos["episode"]["r"][infos["_episode"]].tolist() if "episode" in infos else []
 
 
@@ -48,7 +55,10 @@ def layers(size, out, scale):
 
 
 def train(envs, iterations):
-    """Update an agent so many times; the losses, the returns of the episodes, and how far the weights moved."""
+    """Update an agent so many times.
+
+    The losses, the returns of the episodes, and how far the weights moved.
+    """
     assert isinstance(envs.single_action_space, gym.spaces.Discrete)
     shape = envs.single_observation_space.shape
     size, choices = int(np.prod(shape)), int(envs.single_action_space.n)
@@ -65,10 +75,19 @@ def train(envs, iterations):
             with torch.no_grad():
                 chosen = Categorical(logits=actor(next_obs))
                 action = chosen.sample()
-                before = next_obs, next_done, action, chosen.log_prob(action), critic(next_obs).flatten()
+                before = (
+                    next_obs,
+                    next_done,
+                    action,
+                    chosen.log_prob(action),
+                    critic(next_obs).flatten(),
+                )
             next_obs, reward, terminations, truncations, infos = envs.step(action.cpu().numpy())
             steps.append((*before, torch.tensor(reward).view(-1).float()))
-            next_obs, next_done = torch.Tensor(next_obs), torch.Tensor(np.logical_or(terminations, truncations))
+            next_obs, next_done = (
+                torch.Tensor(next_obs),
+                torch.Tensor(np.logical_or(terminations, truncations)),
+            )
             returns += ended_returns(infos)
         obs, dones, actions, logprobs, values, rewards = map(torch.stack, zip(*steps))
         advantages, last = torch.zeros_like(rewards), 0.0
@@ -78,7 +97,11 @@ def train(envs, iterations):
             for step in reversed(range(STEPS)):
                 delta = rewards[step] + GAMMA * following[step] * going_on[step] - values[step]
                 advantages[step] = last = delta + GAMMA * LAMBDA * going_on[step] * last
-        flat, advantage, target = obs.reshape(-1, *shape), advantages.reshape(-1), (advantages + values).reshape(-1)
+        flat, advantage, target = (
+            obs.reshape(-1, *shape),
+            advantages.reshape(-1),
+            (advantages + values).reshape(-1),
+        )
         for rows in torch.randperm(STEPS * ROWS).chunk(4):
             now = Categorical(logits=actor(flat[rows]))
             ratio = (now.log_prob(actions.reshape(-1)[rows]) - logprobs.reshape(-1)[rows]).exp()
@@ -92,7 +115,11 @@ def train(envs, iterations):
             optimiser.step()
             losses.append(loss.item())
     envs.close()
-    return losses, returns, max(float((now.detach() - then).abs().max()) for now, then in zip(weights, first))
+    return (
+        losses,
+        returns,
+        max(float((now.detach() - then).abs().max()) for now, then in zip(weights, first)),
+    )
 
 
 @pytest.mark.parametrize("make_envs", [one_by_one, as_a_batch])

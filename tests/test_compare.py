@@ -32,7 +32,12 @@ def table(recordings):
     env = EnvConfig(goal_m=60.0)
     traffics = {"idm": IdmTrafficConfig(), "replay": ReplayTrafficConfig(path=str(recordings))}
     drivers = [make_driver(name, env) for name in ("keep_lane", "random_legal")]
-    options = {"traffics": list(traffics), "traffic_options": traffics, "episodes": EPISODES, "num_envs": 4}
+    options = {
+        "traffics": list(traffics),
+        "traffic_options": traffics,
+        "episodes": EPISODES,
+        "num_envs": 4,
+    }
     return compare(drivers, EvaluateConfig(env=env, seed=5, **options))
 
 
@@ -40,7 +45,9 @@ def test_every_replayed_episode_has_the_scene_that_it_ran_in(table, recordings):
     scenes = ReplayTraffic(Stream.REPORT, recordings).scenes_of_episodes(5, range(EPISODES))
     assert len(set(scenes)) == 3
     for agent in ("keep_lane", "random_legal"):
-        episodes = table.filter(pl.col("traffic") == "replay", pl.col("agent") == agent).sort("episode")
+        episodes = table.filter(pl.col("traffic") == "replay", pl.col("agent") == agent).sort(
+            "episode"
+        )
         assert episodes["scene"].to_list() == scenes
     assert table.filter(pl.col("traffic") == "idm")["scene"].is_null().all()
 
@@ -49,7 +56,9 @@ def test_the_record_holds_rows_paired_leads_and_crashes_by_scene(table, tmp_path
     publish(table, tmp_path, {}, {})
     record = json.loads((tmp_path / "results.json").read_text())
     assert len(record["rows"]) == 4
-    assert [(row["agent"], row["over"], row["traffic"], row["episodes"]) for row in record["paired"]] == [
+    assert [
+        (row["agent"], row["over"], row["traffic"], row["episodes"]) for row in record["paired"]
+    ] == [
         ("keep_lane", "random_legal", "idm", EPISODES),
         ("keep_lane", "random_legal", "replay", EPISODES),
     ]
@@ -68,7 +77,9 @@ def test_the_record_holds_rows_paired_leads_and_crashes_by_scene(table, tmp_path
         assert row["per_km"] == pytest.approx(expected.per_km.value)
         assert row["per_km_ci"] == pytest.approx(expected.per_km.interval)
         assert sum(scene["episodes"] for scene in row["scenes"]) == EPISODES
-        assert sum(scene["distance_km"] for scene in row["scenes"]) == pytest.approx(own["distance_m"].sum() / 1000)
+        assert sum(scene["distance_km"] for scene in row["scenes"]) == pytest.approx(
+            own["distance_m"].sum() / 1000
+        )
 
 
 def test_other_traffics_have_no_scenes(table, tmp_path):

@@ -12,8 +12,26 @@ from reference.refusals import last_path, refusal
 
 from ganlane.bench import main
 
-TINY = ["quick=true", "batches=[1,3]", "seconds=0.001", "vehicle_counts=[4,6]", "scaling_batch=2", "linear_from=1"]
-LABELS = {"suite", "system", "traffic", "mode", "dtype", "device", "threads", "vehicles", "lanes", "batch"}
+TINY = [
+    "quick=true",
+    "batches=[1,3]",
+    "seconds=0.001",
+    "vehicle_counts=[4,6]",
+    "scaling_batch=2",
+    "linear_from=1",
+]
+LABELS = {
+    "suite",
+    "system",
+    "traffic",
+    "mode",
+    "dtype",
+    "device",
+    "threads",
+    "vehicles",
+    "lanes",
+    "batch",
+}
 RATES = {"physics_steps_per_s", "decisions_per_s", "vehicle_steps_per_s", "peak_memory_mb"}
 TIMES = {"wall_s", "cpu_s", "repetitions", "spread", "ratio", "ratio_cpu"}
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -71,7 +89,11 @@ def test_training_is_measured_and_reported(tmp_path, capsys):
 @pytest.mark.parametrize("suite", ["sim", "traffic", "train"])
 def test_the_document_of_the_project_can_be_written(suite):
     text = (Path(__file__).parents[1] / "docs/performance.md").read_text()
-    assert text.count(f"<!-- begin bench {suite} -->") == text.count(f"<!-- end bench {suite} -->") == 1
+    assert (
+        text.count(f"<!-- begin bench {suite} -->")
+        == text.count(f"<!-- end bench {suite} -->")
+        == 1
+    )
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")

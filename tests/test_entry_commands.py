@@ -1,4 +1,7 @@
-"""The console script: dispatch, help, mistakes that the commands find, commands in a process of their own."""
+"""The console script.
+
+Dispatch, help, mistakes that the commands find, commands in a process of their own.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,16 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def command(*arguments, cwd):
     """A command as a user starts it, from a folder that is not the checkout."""
-    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin", "HOME": str(cwd)}
+    environment = {
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+        "PATH": "/usr/bin:/bin",
+        "HOME": str(cwd),
+    }
     line = [sys.executable, *arguments]
-    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment)
+    return subprocess.run(
+        line, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment
+    )
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -37,7 +47,17 @@ def test_help_fits_on_a_page_and_the_rest_is_behind_a_flag(name, capsys):
 
 def test_help_of_train_explains_every_traffic_and_start():
     text = help_text("train")
-    for group in ("traffic", "init", "experiment", "agent", "observation", "reward", "collector", "logger", "env"):
+    for group in (
+        "traffic",
+        "init",
+        "experiment",
+        "agent",
+        "observation",
+        "reward",
+        "collector",
+        "logger",
+        "env",
+    ):
         for path in (conf_folder() / group).glob("*.yaml"):
             assert path.stem in text, f"{group}={path.stem}"
 
@@ -74,9 +94,7 @@ def test_hydras_views_of_the_config_work_in_a_fresh_process(flags, tmp_path):
 
 
 def test_help_does_not_wait_for_torch(tmp_path):
-    program = (
-        "import sys; from ganlane.__main__ import main; main(['train', '--help']); print('torch' in sys.modules)"
-    )
+    program = "import sys; from ganlane.__main__ import main; main(['train', '--help']); print('torch' in sys.modules)"
     assert command("-c", program, cwd=tmp_path).stdout.splitlines()[-1] == "False"
 
 
@@ -92,7 +110,8 @@ def test_a_mistake_ends_the_process_with_status_2(tmp_path):
     done = command("-m", "ganlane", "train", "env.lanes=0", cwd=tmp_path)
     assert done.returncode == 2
     assert (
-        done.stderr == "ganlane train: env.lanes=0: expected a number from 1 to 20; give for instance env.lanes=3.\n"
+        done.stderr
+        == "ganlane train: env.lanes=0: expected a number from 1 to 20; give for instance env.lanes=3.\n"
     )
     assert list(tmp_path.iterdir()) == []
 
@@ -154,4 +173,6 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(line, empty_folder, capsys
     (empty_folder / "unmarked.md").write_text("nothing")
     command, *arguments = line.split()
     tiny = [*entry_tiny.TINY, "evaluation.agents=[random_legal]"] if command == "train" else []
-    assert MISTAKES[line] in refusal(capsys, command, *tiny, *arguments, printed=command == "render")
+    assert MISTAKES[line] in refusal(
+        capsys, command, *tiny, *arguments, printed=command == "render"
+    )

@@ -31,9 +31,20 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 def test_a_whole_installation_is_found_whole(tmp_path, capsys):
     assert main(["doctor"]) == 0
     shown = capsys.readouterr().out
-    for part in ("python", "torch", "devices", "C++ compiler", "agent_idm", "recordings", "cache", "extra video"):
+    for part in (
+        "python",
+        "torch",
+        "devices",
+        "C++ compiler",
+        "agent_idm",
+        "recordings",
+        "cache",
+        "extra video",
+    ):
         assert f" {part} " in shown
-    assert shown.endswith("All that is needed is there; what is absent serves further purposes only.\n")
+    assert shown.endswith(
+        "All that is needed is there; what is absent serves further purposes only.\n"
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -43,14 +54,19 @@ def test_what_is_needed_and_missing_makes_the_status_1(tmp_path, monkeypatch, ca
     shown = capsys.readouterr().out
     assert "MISSING agent_idm" in shown
     assert "fix: python -m pip install" in shown
-    assert shown.splitlines()[-1].startswith("Missing: agent_idm, generator_calibrated, generator_paper;")
+    assert shown.splitlines()[-1].startswith(
+        "Missing: agent_idm, generator_calibrated, generator_paper;"
+    )
 
 
 def test_help_is_printed_and_keys_are_refused(capsys):
     assert main(["doctor", "--help"]) == 0
     assert "exit status" in capsys.readouterr().out
     assert main(["doctor", "seed=1"]) == 2
-    assert capsys.readouterr().err == "ganlane doctor: seed=1: it takes no keys; run ganlane doctor alone.\n"
+    assert (
+        capsys.readouterr().err
+        == "ganlane doctor: seed=1: it takes no keys; run ganlane doctor alone.\n"
+    )
 
 
 def test_it_asks_for_what_the_package_asks_for():
@@ -63,7 +79,14 @@ def test_it_asks_for_what_the_package_asks_for():
 
 @pytest.mark.parametrize(
     ("version", "allowed"),
-    [("2.11", True), ("2.11.0", True), ("2.13.0+cpu", True), ("2.10.9", False), ("2.14.0", False), ("10.0", False)],
+    [
+        ("2.11", True),
+        ("2.11.0", True),
+        ("2.13.0+cpu", True),
+        ("2.10.9", False),
+        ("2.14.0", False),
+        ("10.0", False),
+    ],
 )
 def test_versions_are_compared_as_numbers(version, allowed, monkeypatch):
     monkeypatch.setattr("ganlane.doctor.metadata.version", lambda name: version)
@@ -72,7 +95,9 @@ def test_versions_are_compared_as_numbers(version, allowed, monkeypatch):
 
 def test_a_package_that_is_not_there_comes_with_its_command():
     fix = 'python -m pip install "no-such-package>=1.0"'
-    assert doctor.required("no-such-package>=1.0") == Finding("no-such-package", State.MISSING, "not installed", fix)
+    assert doctor.required("no-such-package>=1.0") == Finding(
+        "no-such-package", State.MISSING, "not installed", fix
+    )
     assert doctor.required("numpy>=999").state is State.MISSING
 
 
@@ -80,7 +105,9 @@ def test_a_package_that_cannot_be_imported_is_missing(monkeypatch):
     broken = Mock(side_effect=OSError("lib.so:\n undefined symbol"))
     monkeypatch.setattr("ganlane.doctor.importlib.import_module", broken)
     fix = 'python -m pip install "numpy>=1.26" --force-reinstall'
-    assert doctor.required("numpy>=1.26") == Finding("numpy", State.MISSING, "lib.so: undefined symbol", fix)
+    assert doctor.required("numpy>=1.26") == Finding(
+        "numpy", State.MISSING, "lib.so: undefined symbol", fix
+    )
 
 
 def test_an_extra_names_only_what_it_lacks(monkeypatch):
@@ -92,9 +119,13 @@ def test_an_extra_names_only_what_it_lacks(monkeypatch):
 
 def test_a_damaged_checkpoint_is_missing(tmp_path, monkeypatch):
     for file in CHECKPOINTS.glob("*.safetensors"):
-        (tmp_path / file.name).write_bytes(file.read_bytes()[: -100 if "paper" in file.name else None])
+        (tmp_path / file.name).write_bytes(
+            file.read_bytes()[: -100 if "paper" in file.name else None]
+        )
     monkeypatch.setattr("ganlane.doctor.CHECKPOINTS", tmp_path)
-    assert {found.subject for found in doctor.checkpoints() if found.state is State.MISSING} == {"generator_paper"}
+    assert {found.subject for found in doctor.checkpoints() if found.state is State.MISSING} == {
+        "generator_paper"
+    }
 
 
 def test_recordings_are_found_or_asked_for(tmp_path, monkeypatch):
@@ -126,7 +157,12 @@ def test_a_machine_without_compiler_is_told_what_to_install(monkeypatch):
 
 
 def test_the_report_shows_every_finding_and_its_command():
-    sections = {"software": [Finding("torch", State.OK, "2.13"), Finding("numpy", State.MISSING, "gone", "do this")]}
+    sections = {
+        "software": [
+            Finding("torch", State.OK, "2.13"),
+            Finding("numpy", State.MISSING, "gone", "do this"),
+        ]
+    }
     assert doctor.missing(sections) == ["numpy"]
     assert doctor.report(sections).splitlines() == [
         "software",

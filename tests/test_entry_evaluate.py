@@ -24,7 +24,9 @@ def run(capsys, *arguments):
 def test_table_and_files_hold_every_agent_on_every_traffic(capsys):
     path, results = run(capsys, "agents=[mobil,random_legal]", "traffics=[idm,idm_mobil]")
     pairs = [(row["agent"], row["traffic"]) for row in results["rows"]]
-    assert pairs == [(agent, traffic) for traffic in ("idm", "idm_mobil") for agent in ("mobil", "random_legal")]
+    assert pairs == [
+        (agent, traffic) for traffic in ("idm", "idm_mobil") for agent in ("mobil", "random_legal")
+    ]
     assert all(row["episodes"] == 4 for row in results["rows"])
     assert results["rows"][0]["normalized_percent"] == pytest.approx(100.0)
     assert {"config", "code", "machine", "seeds"} <= results.keys()
@@ -36,7 +38,9 @@ def test_table_and_files_hold_every_agent_on_every_traffic(capsys):
 def test_the_same_command_gives_the_same_numbers_whatever_the_batch(capsys):
     rewards = []
     for num_envs in (4, 3):
-        _, results = run(capsys, "agents=[random_legal]", "traffics=[idm_mobil]", f"num_envs={num_envs}")
+        _, results = run(
+            capsys, "agents=[random_legal]", "traffics=[idm_mobil]", f"num_envs={num_envs}"
+        )
         rewards.append(results["rows"][0]["mean_reward"])
     assert rewards[0] == rewards[1]
 
@@ -50,7 +54,10 @@ def test_a_users_traffic_and_policy_stand_in_the_table(capsys):
 
 
 def test_a_users_traffic_takes_parameters_of_its_own(capsys):
-    target = ["traffic_options.idm._target_=entry_own_parts.Cruise", "+traffic_options.idm.parameters.share=0.5"]
+    target = [
+        "traffic_options.idm._target_=entry_own_parts.Cruise",
+        "+traffic_options.idm.parameters.share=0.5",
+    ]
     run(capsys, "agents=[keep_lane]", "traffics=[idm]", *target)
     wrong = [target[0], "+traffic_options.idm.parameters.pace=0.5"]
     assert main(["agents=[keep_lane]", "traffics=[idm]", *wrong]) == 2

@@ -1,4 +1,7 @@
-"""``ganlane prepare`` from end to end, on recordings made up, in process; and on to a generator that drives."""
+"""``ganlane prepare`` from end to end, on recordings made up, in process.
+
+And on to a generator that drives.
+"""
 
 from __future__ import annotations
 
@@ -46,17 +49,32 @@ def test_a_scene_csv_becomes_parquet_and_figures(here, capsys):
     assert found["rows"] == {"read": 1920, "kept": 1920, "dropped": {}, "written": 1920}
     assert found["files"] == ["synthetic-0.parquet", "synthetic-1.parquet"]
     changes = found["lane_changes"]
-    assert changes["per_vehicle_km_low"] <= changes["per_vehicle_km"] <= changes["per_vehicle_km_high"]
-    assert changes["duration"]["complete"]["count"] + changes["duration"]["censored"] == changes["count"]
+    assert (
+        changes["per_vehicle_km_low"] <= changes["per_vehicle_km"] <= changes["per_vehicle_km_high"]
+    )
+    assert (
+        changes["duration"]["complete"]["count"] + changes["duration"]["censored"]
+        == changes["count"]
+    )
     assert found["acceleration_raw"]["count"] > found["acceleration_smoothed"]["count"] > 0
-    assert {"speed", "headway", "time_headway", "gap", "wall_s", "peak_memory_mb", "code"} <= found.keys()
+    assert {
+        "speed",
+        "headway",
+        "time_headway",
+        "gap",
+        "wall_s",
+        "peak_memory_mb",
+        "code",
+    } <= found.keys()
     assert read_scenes("mine").equals(read_scenes("mine.csv"))
 
 
 def test_ngsim_portal_with_two_periods(here, capsys):
     parts = traffic().partition_by("scene")
     rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(parts))
-    (here / "portal.csv").write_text(portal_csv(rows) + portal_csv(rows.head(3), "peachtree").partition("\n")[2])
+    (here / "portal.csv").write_text(
+        portal_csv(rows) + portal_csv(rows.head(3), "peachtree").partition("\n")[2]
+    )
     assert main(["data=ngsim", "data.path=portal.csv", "scene_s=3"]) == 0
     found = results(capsys.readouterr().out)
     assert found["rows"]["dropped"] == {"location peachtree": 3}
@@ -78,7 +96,12 @@ def test_highd_folder(here, capsys):
 def test_from_a_users_csv_to_traffic_in_three_commands(here, capsys):
     made(here / "mine.csv", scenes=3)
     assert main(["data.path=mine.csv", "out=mine"]) == 0
-    few = ["generator.loop.updates=2", "generator.loop.evaluate_every=1", "generator.batch=4", "hydra.run.dir=fit"]
+    few = [
+        "generator.loop.updates=2",
+        "generator.loop.evaluate_every=1",
+        "generator.batch=4",
+        "hydra.run.dir=fit",
+    ]
     assert train_generator(["data.path=mine", *few]) == 0
     tiny = ["agents=[keep_lane]", "episodes=1", "env.goal_m=20"]
     weights = "generator.path=fit/generator_paper.safetensors"
@@ -101,7 +124,12 @@ def test_damage_found_late_leaves_nothing_behind(here, capsys):
 def test_download_then_prepare(here, capsys):
     content = portal_csv(ngsim_rows(traffic().filter(pl.col("scene") == "synthetic-0"))).encode()
     with Server(content=content, breaks=[20_000]) as server:
-        fetched = ["data=ngsim", "data.path=ngsim.csv", "data.download=true", f"data.url={server.url}"]
+        fetched = [
+            "data=ngsim",
+            "data.path=ngsim.csv",
+            "data.download=true",
+            f"data.url={server.url}",
+        ]
         assert main([*fetched, f"data.sha256={SHA256}", "data.path=other.csv"]) == 2
         assert "its SHA-256 is" in capsys.readouterr().err
         assert list(here.iterdir()) == []

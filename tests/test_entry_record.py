@@ -36,16 +36,28 @@ def test_a_dataset_is_listed_loaded_split_and_driven_again_by_minari(capsys):
     assert [part.total_episodes for part in minari.split_dataset(dataset, [4, 2], seed=0)] == [4, 2]
     env = dataset.recover_environment()
     assert env.spec.max_episode_steps == dataset.env_spec.max_episode_steps == 1000
-    assert (dataset.observation_space, dataset.action_space) == (env.observation_space, env.action_space)
-    for number, (episode, about) in enumerate(zip(dataset, dataset.storage.get_episode_metadata(range(6)))):
-        assert (int(about["seed"]), int(about["options"]["episode"]), episode.id) == (3, number, number)
+    assert (dataset.observation_space, dataset.action_space) == (
+        env.observation_space,
+        env.action_space,
+    )
+    for number, (episode, about) in enumerate(
+        zip(dataset, dataset.storage.get_episode_metadata(range(6)))
+    ):
+        assert (int(about["seed"]), int(about["options"]["episode"]), episode.id) == (
+            3,
+            number,
+            number,
+        )
         observation, info = env.reset(seed=3, options={"episode": number})
         for step, action in enumerate(episode.actions):
             np.testing.assert_allclose(observation, episode.observations[step], atol=1e-5)
             np.testing.assert_array_equal(info["action_mask"], episode.infos["action_mask"][step])
             observation, reward, terminated, truncated, info = env.step(action)
             assert reward == pytest.approx(episode.rewards[step], abs=1e-4)
-            assert (terminated, truncated) == (episode.terminations[step], episode.truncations[step])
+            assert (terminated, truncated) == (
+                episode.terminations[step],
+                episode.truncations[step],
+            )
         assert terminated or truncated
         assert len(episode.observations) == len(episode.infos["time_s"]) == len(episode.actions) + 1
         terms = sum(term[-1] for term in episode.infos["reward_terms"].values())
@@ -54,7 +66,12 @@ def test_a_dataset_is_listed_loaded_split_and_driven_again_by_minari(capsys):
 
 def test_the_call_from_python_names_the_dataset_and_says_how_the_episodes_ended(here):
     done = ganlane.api.run(
-        "record", agent="keep_lane", episodes=3, goal_m=30.0, dataset="mine/first-v2", out="datasets"
+        "record",
+        agent="keep_lane",
+        episodes=3,
+        goal_m=30.0,
+        dataset="mine/first-v2",
+        out="datasets",
     )
     assert done.results["dataset"] == "mine/first-v2"
     assert done.results["episodes"] == sum(done.results["ends"].values()) == 3

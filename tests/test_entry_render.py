@@ -56,7 +56,13 @@ def test_simulated_traffic_is_replayed_like_recorded_traffic(ending, capsys):
     path = last_path(capsys.readouterr().out)
     assert path.name == f"keep_lane_idm_mobil_0_0_1.{ending}"
     assert read_scenes(path)["scene"].n_unique() == 2
-    replay = ["traffic=replay", f"traffic.path={path}", "film.end_s=5", "format=parquet", "out=again.parquet"]
+    replay = [
+        "traffic=replay",
+        f"traffic.path={path}",
+        "film.end_s=5",
+        "format=parquet",
+        "out=again.parquet",
+    ]
     assert main([*replay, "agent=keep_lane"]) == 0
     assert "on replay" in capsys.readouterr().out
     assert read_scenes("again.parquet")["vehicle"].n_unique() > 1
@@ -76,7 +82,9 @@ def test_only_a_part_of_the_episode_is_kept(tmp_path):
 def test_curves_of_runs_come_in_the_format_that_is_asked_for(asked, file, begins, capsys, tmp_path):
     for name in ("first", "it's"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "metrics.csv").write_text("decisions,mean_return,crash_rate\n1,2,0.5\n10,3,0.2\n")
+        (tmp_path / name / "metrics.csv").write_text(
+            "decisions,mean_return,crash_rate\n1,2,0.5\n10,3,0.2\n"
+        )
     assert main(["run=first,it's", *asked.split()]) == 0
     assert capsys.readouterr().out == f"curves: {file}\n"
     assert (tmp_path / file).read_bytes().startswith(begins)

@@ -41,7 +41,8 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
     assert main([*SHORT, *SMALL, "fewer={gan: 2, idm: 2}", f"runs=[{runs}]", "from=shipped"]) == 0
     out, folder = capsys.readouterr().out, Path("out")
     assert "Table VI: crashes" in out
-    assert len(cells_driven) == len(set(cells_driven)) == 2 * (3 + 5)  # agent_idm has five trainings
+    # agent_idm has five trainings
+    assert len(cells_driven) == len(set(cells_driven)) == 2 * (3 + 5)
 
     page = (folder / "report.html").read_text()
     for said in ("19", "-22.33", "114.82", "2 on idm, 2 on gan", "agent_idm", "<svg"):
@@ -54,7 +55,8 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
     for name in ("table_vi", "table_vii", "comparisons"):
         assert len((folder / f"{name}.csv").read_text().splitlines()) > 2
 
-    assert json.loads((folder / "crashes.json").read_text())["crashes"] == []  # nobody but random_legal had time to
+    # nobody but random_legal had time to
+    assert json.loads((folder / "crashes.json").read_text())["crashes"] == []
 
     results = json.loads((folder / "results.json").read_text())
     assert results["command"].startswith("ganlane reproduce episodes=3")
@@ -64,7 +66,16 @@ def test_one_command_leaves_numbers_tables_and_figures_in_one_folder(cells_drive
         ("agent_gan+none", "gan", 2),
     }
     assert all(seconds > 0.0 for seconds in results["seconds"].values())
-    assert {"comparisons", "failures", "left_out", "seconds", "cells", "machine", "code", "config"} <= results.keys()
+    assert {
+        "comparisons",
+        "failures",
+        "left_out",
+        "seconds",
+        "cells",
+        "machine",
+        "code",
+        "config",
+    } <= results.keys()
 
 
 def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_driven, capsys):
@@ -76,7 +87,9 @@ def test_what_was_driven_is_not_driven_again_and_gives_the_same_numbers(cells_dr
     assert json.loads(Path("out/results.json").read_text())["rows"] == first
     assert main([*SHORT, "agents=[random_legal,mobil,agent_idm,keep_lane]", "traffics=[idm]"]) == 0
     assert main([*SHORT, agents, "traffics=[idm]", "seed=1"]) == 0
-    assert cells_driven[3:] == [(name, "idm") for name in ("keep_lane", "random_legal", "mobil", "agent_idm")]
+    assert cells_driven[3:] == [
+        (name, "idm") for name in ("keep_lane", "random_legal", "mobil", "agent_idm")
+    ]
 
 
 def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys):
@@ -84,7 +97,9 @@ def test_traffic_that_is_not_at_hand_is_left_out_and_said_so(monkeypatch, capsys
     assert main([*SHORT, "agents=[random_legal,mobil]", "traffics=[idm,replay]"]) == 0
     said = capsys.readouterr().err
     assert all(f"left out, {what}:" in said for what in ("replay", "figure 2", "figure 3"))
-    assert {"replay", "figure 2", "figure 3"} == json.loads(Path("out/results.json").read_text())["left_out"].keys()
+    assert {"replay", "figure 2", "figure 3"} == json.loads(Path("out/results.json").read_text())[
+        "left_out"
+    ].keys()
 
 
 def test_a_damaged_cell_is_named(capsys):
@@ -108,5 +123,11 @@ def test_a_training_from_scratch_that_fails_is_named_after_the_hours_were(monkey
     assert "2 trainings, one after the other: about 2.2 hours on one core." in error
     assert "the same command goes on with it" in error
     assert asked[0][1:] == [
-        *("-m", "ganlane.train", "experiment=paper", "seed=4", "hydra.run.dir=outputs/scratch/seed_4")
+        *(
+            "-m",
+            "ganlane.train",
+            "experiment=paper",
+            "seed=4",
+            "hydra.run.dir=outputs/scratch/seed_4",
+        )
     ]

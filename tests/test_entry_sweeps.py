@@ -31,7 +31,9 @@ def sweep(folder, *arguments):
     command = [sys.executable, "-m", "ganlane.train", "-m", "seed=0,1", *TINY, *arguments]
     root = str(Path(__file__).parent.parent)
     environment = {**os.environ, "PYTHONPATH": root, "OMP_NUM_THREADS": "1"}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=500)
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=500
+    )
 
 
 def skip_without(launcher):
@@ -52,10 +54,21 @@ def test_the_runs_of_a_sweep_share_no_file(launcher, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     (folder,) = (tmp_path / "outputs" / "train_sweeps").iterdir()
     runs = [folder / "0", folder / "1"]
-    assert sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".") == runs
-    files = [sorted(str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()) for run in runs]
+    assert (
+        sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".") == runs
+    )
+    files = [
+        sorted(str(path.relative_to(run)) for path in run.rglob("*") if path.is_file())
+        for run in runs
+    ]
     assert files[0] == files[1]
-    expected = {"agent.safetensors", "checkpoints/last.pt", "config.yaml", "metrics.csv", "results.json"}
+    expected = {
+        "agent.safetensors",
+        "checkpoints/last.pt",
+        "config.yaml",
+        "metrics.csv",
+        "results.json",
+    }
     assert expected <= set(files[0])
     results = [json.loads((run / "results.json").read_text()) for run in runs]
     assert [result["config"]["seed"] for result in results] == [0, 1]
@@ -68,7 +81,12 @@ def test_the_runs_of_a_sweep_share_no_file(launcher, tmp_path):
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
 def test_a_mistake_in_a_sweep_is_one_sentence(launcher, tmp_path):
     skip_without(launcher)
-    given = [f"hydra/launcher={launcher}", *LAUNCHERS[launcher][1], "init=idm_ckpt", "init.path=nowhere.safetensors"]
+    given = [
+        f"hydra/launcher={launcher}",
+        *LAUNCHERS[launcher][1],
+        "init=idm_ckpt",
+        "init.path=nowhere.safetensors",
+    ]
     done = sweep(tmp_path, *given)
     assert done.returncode == 2
     assert "nowhere.safetensors" in done.stderr.splitlines()[-1]
@@ -84,9 +102,14 @@ def own_logging(monkeypatch):
 
 @pytest.mark.usefixtures("empty_folder", "own_logging")
 def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(capsys):
-    assert main(["-m", "seed=0,1", "agents=[mobil,random_legal]", "traffics=[idm]", "episodes=2"]) == 0
+    assert (
+        main(["-m", "seed=0,1", "agents=[mobil,random_legal]", "traffics=[idm]", "episodes=2"]) == 0
+    )
     (folder,) = Path("outputs/evaluate_sweeps").iterdir()
-    seeds = [json.loads((folder / run / "results.json").read_text())["config"]["seed"] for run in ("0", "1")]
+    seeds = [
+        json.loads((folder / run / "results.json").read_text())["config"]["seed"]
+        for run in ("0", "1")
+    ]
     assert seeds == [0, 1]
     table = capsys.readouterr().out.rpartition("results: ")[2]
     assert table.count("random_legal") == 2
@@ -95,6 +118,9 @@ def test_a_sweep_of_evaluate_has_a_folder_for_each_run_and_ends_with_one_table(c
 
 @pytest.mark.usefixtures("empty_folder", "own_logging")
 def test_a_run_of_a_sweep_that_is_refused_ends_it_with_one_sentence(capsys):
-    assert main(["-m", "seed=0,1", "agents=[missing.safetensors]", "traffics=[idm]", "episodes=2"]) == 2
+    assert (
+        main(["-m", "seed=0,1", "agents=[missing.safetensors]", "traffics=[idm]", "episodes=2"])
+        == 2
+    )
     assert is_one_sentence(capsys.readouterr().err, "evaluate")
     assert not list(Path("outputs").rglob("config.yaml"))

@@ -86,7 +86,9 @@ def test_a_run_in_two_parts_ends_like_one_in_a_piece(finished, capsys, tmp_path)
 def test_a_signal_saves_and_the_run_can_be_resumed(number, capsys, tmp_path):
     def stop_when_training():
         # A moment after the first figures stand in the file, the run is in its loop.
-        while not any(len(path.read_text().splitlines()) > 1 for path in tmp_path.rglob("metrics.csv")):
+        while not any(
+            len(path.read_text().splitlines()) > 1 for path in tmp_path.rglob("metrics.csv")
+        ):
             time.sleep(0.01)
         os.kill(os.getpid(), number)
 
@@ -127,7 +129,9 @@ def test_a_sweep_gives_every_run_a_folder(capsys, tmp_path):
     assert [path.parent.name for path in results] == ["0", "1", "2", "3"]
     configs = [json.loads(path.read_text())["config"] for path in results]
     assert {(c["seed"], c["traffic"]["_target_"]) for c in configs} == {
-        (seed, f"ganlane.traffic.{name}") for seed in (0, 1) for name in ("IdmTraffic", "IdmMobilTraffic")
+        (seed, f"ganlane.traffic.{name}")
+        for seed in (0, 1)
+        for name in ("IdmTraffic", "IdmMobilTraffic")
     }
 
 
@@ -137,10 +141,17 @@ def test_a_users_own_traffic_trains(capsys):
 
 
 @pytest.mark.parametrize(
-    ("traffic", "init"), [("idm", "idm_ckpt"), ("idm_mobil", "none"), ("gan", "idm_ckpt"), ("gan_calibrated", "none")]
+    ("traffic", "init"),
+    [("idm", "idm_ckpt"), ("idm_mobil", "none"), ("gan", "idm_ckpt"), ("gan_calibrated", "none")],
 )
 def test_every_traffic_and_every_start_runs(traffic, init, capsys):
-    budget = ["total_decisions=64", "collector.num_envs=16", "env.goal_m=40", "agent.warmup=256", "log_every=64"]
+    budget = [
+        "total_decisions=64",
+        "collector.num_envs=16",
+        "env.goal_m=40",
+        "agent.warmup=256",
+        "log_every=64",
+    ]
     final = ["evaluation.agents=[keep_lane]", "evaluation.episodes=1", "agent.capacity=1000"]
     assert main([f"traffic={traffic}", f"init={init}", *budget, *final]) == 0
     results = last_path(capsys.readouterr().out)
@@ -157,7 +168,9 @@ def test_a_trained_agent_survives_an_error_after_training(tmp_path, capsys, monk
     assert any(tmp_path.rglob("last.pt"))
 
 
-def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(finished, capsys, tmp_path):
+def test_a_resume_with_other_settings_is_refused_and_leaves_the_run_as_it_was(
+    finished, capsys, tmp_path
+):
     folder = shutil.copytree(finished, tmp_path / "run")
     asked = (folder / "overrides.yaml").read_text()
     for change in ("env.vehicles=5", "seed=5", "reward.goal=1000", "collector.num_envs=8"):

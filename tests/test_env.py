@@ -55,7 +55,9 @@ def test_a_seed_gives_the_same_episodes_again_and_another_one_others():
 
 
 def test_training_and_reported_episodes_are_different_ones():
-    scenes = [environment(num_envs=4, stream=stream).reset()[keys.VEHICLES, "speed"] for stream in Stream]
+    scenes = [
+        environment(num_envs=4, stream=stream).reset()[keys.VEHICLES, "speed"] for stream in Stream
+    ]
     assert not torch.equal(scenes[0], scenes[1])
     assert not torch.equal(scenes[1], scenes[2])
 
@@ -73,7 +75,9 @@ def test_after_a_reset_nothing_has_happened_yet():
     assert not td["done"].any()
 
 
-@pytest.mark.parametrize(("period", "substeps"), [(0.1, 1), (0.3, 3), (0.7, 7), (1.0, 10), (2.0, 20)])
+@pytest.mark.parametrize(
+    ("period", "substeps"), [(0.1, 1), (0.3, 3), (0.7, 7), (1.0, 10), (2.0, 20)]
+)
 def test_a_decision_is_a_whole_number_of_physics_steps(period, substeps):
     for wrong in (period + 0.05, period - 2.0):
         with pytest.raises(UserError, match="decision_period_s"):
@@ -110,7 +114,12 @@ def test_an_automatic_reset_goes_on_with_episode_i_plus_n():
     assert ends(stepped["next"], 1) == ["out_of_road"]
     assert going_on[keys.EPISODE].tolist() == [0, 4, 2]
     assert going_on[keys.STEP].tolist() == [10, 0, 10]
-    assert same_bits(going_on[[0, 2]].exclude("action", "reward"), stepped["next"][[0, 2]].exclude("reward")) == []
+    assert (
+        same_bits(
+            going_on[[0, 2]].exclude("action", "reward"), stepped["next"][[0, 2]].exclude("reward")
+        )
+        == []
+    )
 
 
 def test_under_a_transform_and_in_a_collector_every_episode_is_driven_once():
@@ -201,7 +210,9 @@ def test_with_abort_the_opposite_command_turns_back_and_the_same_one_does_nothin
 
 def test_the_mean_acceleration_is_the_change_of_speed_over_the_time_driven():
     env = environment(vehicles=2, mobil=False, lanes=1)
-    td = placed(env, vehicles({"x": 0.0, "lane": 0, "speed": 20.0}, {"x": 40.0, "lane": 0, "speed": 5.0}))
+    td = placed(
+        env, vehicles({"x": 0.0, "lane": 0, "speed": 20.0}, {"x": 40.0, "lane": 0, "speed": 5.0})
+    )
     after = step(env, td)
     change = after[keys.VEHICLES, "speed"][0, 0] - 20.0
     assert change < -2.0
@@ -220,11 +231,23 @@ TO_GOAL = {"x": 999.0, "lane": 1, "speed": 20.0}
         # At 25 m/s, 2.5 m a step: 997.6, then 1000.1.
         ({"x": 995.1, "lane": 1, "speed": 25.0}, [FAR], KEEP, ["goal"], 2),
         # Within one step a hard crash comes before the goal: half a metre behind a standing car.
-        (TO_GOAL, [{"x": x, "lane": 1, "speed": 0.0} for x in (1004.0, 1009.0)], KEEP, ["hard_crash"], 1),
+        (
+            TO_GOAL,
+            [{"x": x, "lane": 1, "speed": 0.0} for x in (1004.0, 1009.0)],
+            KEEP,
+            ["hard_crash"],
+            1,
+        ),
         # The goal reached a step before a crash counts.
         (TO_GOAL, [{"x": x, "lane": 1, "speed": 0.0} for x in (1006.5, 1011.5)], KEEP, ["goal"], 1),
         # A crash with a vehicle that is not valid is none.
-        ({**TO_GOAL, "x": 0.0}, [{"x": 10.0, "lane": 1, "speed": 0.0, "valid": False}], KEEP, [], 10),
+        (
+            {**TO_GOAL, "x": 0.0},
+            [{"x": 10.0, "lane": 1, "speed": 0.0, "valid": False}],
+            KEEP,
+            [],
+            10,
+        ),
         ({"x": 0.0, "lane": 0}, [FAR], RIGHT, ["out_of_road"], 0),
         ({"x": 0.0, "lane": 2}, [FAR], LEFT, ["out_of_road"], 0),
     ],
@@ -278,7 +301,9 @@ def test_a_row_that_has_ended_stays_as_it_was_while_the_others_drive_on():
 
 
 def standing(gap: float, behind: bool = False) -> list[dict]:
-    """The ego at rest with its neighbour ``gap`` m ahead or behind, and a third that keeps them from driving off."""
+    """The ego at rest with its neighbour ``gap`` m ahead or behind, and a third that keeps them
+    from driving off.
+    """
     ego = {"x": 0.0, "lane": 1, "speed": 0.0}
     near, third = (-4.5 - gap, 4.5 + 2.0) if behind else (4.5 + gap, 9.0 + gap + 0.5)
     return [ego, {**ego, "x": near}, {**ego, "x": third}]
@@ -296,7 +321,11 @@ def test_a_soft_crash_counts_once_until_it_is_over(behind):
         assert flags(td) == (False, False, False)  # it is no end
         for name, count in counts.items():
             count.append(td[keys.EVENTS, name].item())
-    here, there = (keys.SOFT_CRASH_BEHIND, keys.SOFT_CRASH) if behind else (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
+    here, there = (
+        (keys.SOFT_CRASH_BEHIND, keys.SOFT_CRASH)
+        if behind
+        else (keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
+    )
     assert counts == {here: [1, 0, 0, 1, 0], there: [0, 0, 0, 0, 0]}
 
 

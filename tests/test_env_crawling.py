@@ -15,13 +15,16 @@ from ganlane.transforms import RewardParameters, RewardTransform
 from ganlane.transforms.reward import speed_reward
 
 MEANT_MPS = 25.0
-#: Rows of one batch, all of which keep their lane: normal; wanting 1 m/s; wanting 0.1 m/s; behind a column at 1 m/s.
+#: Rows of one batch, all of which keep their lane: normal; wanting 1 m/s; wanting 0.1 m/s; behind a
+#: column at 1 m/s.
 NORMAL, CRAWLING, PARKING, STUCK = slice(0, 4), slice(4, 6), slice(6, 8), slice(8, 11)
 ROWS = 11
 
 
 def slowed(env: HighwayEnv):
-    """The start of the episodes, with the slow ones slowed and a car of the column in the lane of the stuck."""
+    """The start of the episodes, with the slow ones slowed and a car of the column in the lane of
+    the stuck.
+    """
     td = env.reset()
     cars = td[keys.VEHICLES]
     cars["desired_speed"][CRAWLING, 0], cars["desired_speed"][PARKING, 0] = 1.0, 0.1
@@ -71,9 +74,11 @@ def test_who_crawls_stands_or_waits_behind_a_stalled_column_earns_far_less_than_
     assert (seconds[4:] == timeout_s).all()
     for rows, speed in ((CRAWLING, 1.0), (PARKING, 0.1), (STUCK, 1.0)):
         expected = timeout_s * (speed - 15.0) / 10.0
-        # It starts at 10 to 15 m/s, and the first seconds cost less; -10 for a soft crash behind the column.
+        # It starts at 10 to 15 m/s, and the first seconds cost less; -10 for a soft crash behind
+        # the column.
         assert ((paid[rows] - expected).abs() < 30.0).all()
-    # Known weakness: below 15 m/s every second costs, so leaving the road at once is cheaper than living on.
+    # Known weakness: below 15 m/s every second costs, so leaving the road at once is cheaper than
+    # living on.
     assert (paid[4:] < RewardParameters().out_of_road).all()
     assert (paid[NORMAL] > normal).all()
     assert (paid[4:] < slow).all()

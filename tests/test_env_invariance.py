@@ -1,4 +1,6 @@
-"""An episode is the same bit for bit in any batch, in any slot and when it is replayed by its number."""
+"""An episode is the same bit for bit in any batch, in any slot and when it is replayed by its
+number.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +71,9 @@ def test_the_episodes_compared_end_in_several_ways(mobil):
         (7, 11, [5, 40, 3, 21, 63, 0, 13], 7),
     ],
 )
-def test_an_episode_is_the_same_in_any_batch_and_slot(mobil, in_64, batch, decisions, episodes, at_least):
+def test_an_episode_is_the_same_in_any_batch_and_slot(
+    mobil, in_64, batch, decisions, episodes, at_least
+):
     assert_same_tracks(tracks(make(batch, mobil), decisions, action, episodes), in_64, at_least)
 
 

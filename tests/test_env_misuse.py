@@ -1,4 +1,7 @@
-"""Wrong arguments, actions, seeds and states end in one sentence; autocast and float types change no episode."""
+"""Wrong arguments, actions, seeds and states end in one sentence.
+
+Autocast and float types change no episode.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ from ganlane.native.library import why_not
 from ganlane.options import option
 from ganlane.traffic import IdmTraffic
 
-KERNELS = ["torch", pytest.param("native", marks=pytest.mark.skipif(bool(why_not()), reason="no C++ compiler"))]
+KERNELS = [
+    "torch",
+    pytest.param("native", marks=pytest.mark.skipif(bool(why_not()), reason="no C++ compiler")),
+]
 
 
 def made(**options):
@@ -71,7 +77,9 @@ def test_an_action_outside_0_to_2_is_refused(action, kernel):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("action", [torch.ones(2), torch.ones(2, 1).long(), torch.ones(2).bool()], ids=str)
+@pytest.mark.parametrize(
+    "action", [torch.ones(2), torch.ones(2, 1).long(), torch.ones(2).bool()], ids=str
+)
 def test_an_action_of_another_form_is_refused(action, kernel):
     env = made(num_envs=2, kernel=kernel)
     with pytest.raises(UserError, match=r"^action of shape"):
@@ -83,7 +91,8 @@ def test_actions_of_a_shorter_integer_type_are_taken(kernel):
     env = made(num_envs=2, kernel=kernel)
     start = env.reset()
     long, short = (
-        env.step(start.clone().set(keys.ACTION, torch.tensor([1, 2]).to(t))) for t in (torch.int64, torch.int8)
+        env.step(start.clone().set(keys.ACTION, torch.tensor([1, 2]).to(t)))
+        for t in (torch.int64, torch.int8)
     )
     assert torch.equal(long["next", keys.VEHICLES, "x"], short["next", keys.VEHICLES, "x"])
 
@@ -96,14 +105,18 @@ def test_what_is_found_on_another_device_is_told_in_a_later_step():
         check._look_later(torch.tensor([1]))
 
 
-@pytest.mark.parametrize("state", [{}, {keys.ACTION: torch.ones(1, dtype=torch.int64)}], ids=["nothing", "action"])
+@pytest.mark.parametrize(
+    "state", [{}, {keys.ACTION: torch.ones(1, dtype=torch.int64)}], ids=["nothing", "action"]
+)
 def test_a_step_before_a_reset_is_refused(state):
     for env in (made(), ganlane.make_env("idm").base_env):
         with pytest.raises(UserError, match="call reset"):
             env.step(TensorDict(state, [1]))
 
 
-@pytest.mark.parametrize("counters", [{keys.EPISODE: torch.zeros(2)}, {keys.EPISODE: torch.zeros(2).long()}])
+@pytest.mark.parametrize(
+    "counters", [{keys.EPISODE: torch.zeros(2)}, {keys.EPISODE: torch.zeros(2).long()}]
+)
 def test_a_reset_to_episodes_that_are_none_is_refused(counters):
     with pytest.raises(UserError, match="reset"):
         made(num_envs=2).reset(TensorDict(counters, [2]))
@@ -137,7 +150,14 @@ def paths(env, actions):
 
 
 @pytest.mark.parametrize(
-    "traffic", ["idm_mobil", "gan", "gan_calibrated", "mixed", {"name": "gan", "execute_k": 3, "blind_share": 0.5}]
+    "traffic",
+    [
+        "idm_mobil",
+        "gan",
+        "gan_calibrated",
+        "mixed",
+        {"name": "gan", "execute_k": 3, "blind_share": 0.5},
+    ],
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_autocast_changes_no_traffic(traffic, dtype):
@@ -151,7 +171,10 @@ def test_autocast_changes_no_traffic(traffic, dtype):
 
 
 def test_generated_traffic_in_float64_is_that_of_float32_up_to_rounding_even_side_by_side():
-    model, actions = make_traffic(option("traffic", "gan_calibrated"), EnvConfig()), torch.zeros(3, 2).long()
+    model, actions = (
+        make_traffic(option("traffic", "gan_calibrated"), EnvConfig()),
+        torch.zeros(3, 2).long(),
+    )
     before = paths(HighwayEnv(model, 2), actions)
     double = paths(HighwayEnv(model, 2, dtype=torch.float64), actions)
     assert torch.allclose(before.double(), double, atol=1e-3)

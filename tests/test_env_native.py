@@ -49,7 +49,15 @@ def test_its_keys_specs_and_first_states_are_those_of_the_tensor_code():
 @pytest.mark.parametrize("mobil", [True, False])
 def test_episodes_with_automatic_resets_agree_with_the_tensor_code(mobil, share):
     """From every state of the tensor code's run the kernel reaches the same, up to rounding."""
-    settings = dict(num_envs=16, mobil=mobil, goal_m=140.0, timeout_s=9.5, seed=3, recycle=True, recycle_share=share)
+    settings = dict(
+        num_envs=16,
+        mobil=mobil,
+        goal_m=140.0,
+        timeout_s=9.5,
+        seed=3,
+        recycle=True,
+        recycle_share=share,
+    )
     ours, theirs = native(**settings), native(**settings, kernel="torch")
     td, ended = theirs.reset(), 0
     for decision in range(30):
@@ -89,7 +97,9 @@ def test_two_threads_are_the_kernels_alone_and_change_no_bit():
 def test_episodes_that_are_no_whole_numbers_in_a_row_are_refused(wrong):
     env = native(2)
     state = env.reset().set("_reset", torch.tensor([[True], [False]]))
-    with pytest.raises(UserError, match=r"next_episode is \[.*; give next_episode as int64 of shape \[2\]"):
+    with pytest.raises(
+        UserError, match=r"next_episode is \[.*; give next_episode as int64 of shape \[2\]"
+    ):
         env.reset(state, next_episode=wrong)
 
 
@@ -104,7 +114,10 @@ class Cruise(TrafficModule):
         ({"traffic": Cruise(Road())}, "drives the traffics idm and idm_mobil alone, not Cruise"),
         ({"dtype": torch.float64}, "in float32"),
         ({"ring_m": 500.0}, "has no ring"),
-        ({"traffic": IdmMobilTraffic(Road(), idm=IdmParameters(headway_s=1.0))}, "one set of parameters"),
+        (
+            {"traffic": IdmMobilTraffic(Road(), idm=IdmParameters(headway_s=1.0))},
+            "one set of parameters",
+        ),
         ({"kernel": "fast"}, "expected one of torch, native, auto"),
     ],
 )
@@ -135,13 +148,18 @@ def test_a_recorder_of_physics_steps_is_refused():
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
 def test_an_environment_can_be_copied_and_sent_to_another_process(copied):
     env = make_env(
-        IdmMobilTraffic(Road()), EnvConfig(kernel="native"), ObservationConfig(form="lane_view"), num_envs=4
+        IdmMobilTraffic(Road()),
+        EnvConfig(kernel="native"),
+        ObservationConfig(form="lane_view"),
+        num_envs=4,
     )
     td = env.rand_action(env.reset())
     assert (copied(env).step(td.clone())["next"] == env.step(td)["next"]).all()
 
 
-SENSORS = pytest.mark.parametrize("sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)])
+SENSORS = pytest.mark.parametrize(
+    "sensors", [None, SensorParameters(position_noise_m=2.0, dropout=0.2)]
+)
 
 
 def driven(env, decisions):
@@ -156,9 +174,16 @@ def driven(env, decisions):
 @pytest.mark.parametrize("form", sorted(NATIVE_FORMS))
 @SENSORS
 def test_the_lane_view_is_that_of_the_tensor_code(form, sensors):
-    """Up to the rounding of the exponential function; with lorries, and with what the sensors deliver."""
-    config = EnvConfig(kernel="native", vehicles=20, spread_m=300.0, min_spacing_m=25.0, truck_share=0.3)
-    env = make_env(IdmMobilTraffic(Road()), config, ObservationConfig(form=form, sensors=sensors), num_envs=64)
+    """Up to the rounding of the exponential function.
+
+    With lorries, and with what the sensors deliver.
+    """
+    config = EnvConfig(
+        kernel="native", vehicles=20, spread_m=300.0, min_spacing_m=25.0, truck_share=0.3
+    )
+    env = make_env(
+        IdmMobilTraffic(Road()), config, ObservationConfig(form=form, sensors=sensors), num_envs=64
+    )
     plain = ObservationTransform(Road(), 20, form)
     for td in driven(env, 40):
         assert torch.allclose(td["observation"], plain(td.clone())["observation"], atol=1e-6)
@@ -178,9 +203,13 @@ def test_rows_that_are_reset_alone_start_as_all_do():
 @pytest.mark.parametrize("abort", [False, True])
 @SENSORS
 def test_the_safe_actions_are_those_of_the_tensor_code(abort, sensors):
-    config = EnvConfig(kernel="native", vehicles=20, spread_m=150.0, ego=EgoParameters(abort_lane_change=abort))
+    config = EnvConfig(
+        kernel="native", vehicles=20, spread_m=150.0, ego=EgoParameters(abort_lane_change=abort)
+    )
     form = ObservationConfig(form="lane_view", sensors=sensors)
-    env = make_env(IdmMobilTraffic(Road()), config, form, num_envs=128, mask=MaskParameters(form="safe"))
+    env = make_env(
+        IdmMobilTraffic(Road()), config, form, num_envs=128, mask=MaskParameters(form="safe")
+    )
     plain = ActionMaskTransform(Road(), "safe", abort=abort)
     refused, hopeless = 0, 0
     for td in driven(env, 40):

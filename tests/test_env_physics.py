@@ -28,7 +28,10 @@ class Ageing(IdmTraffic):
     memory_fields = {"age": ((), torch.int64), **IdmTraffic.memory_fields}  # noqa: RUF012
 
     def fresh_memory(self, vehicles, key):
-        return {"age": torch.zeros_like(vehicles.target_lane), **super().fresh_memory(vehicles, key)}
+        return {
+            "age": torch.zeros_like(vehicles.target_lane),
+            **super().fresh_memory(vehicles, key),
+        }
 
     def move(self, vehicles, memory, key, step):
         moved, kept = super().move(vehicles, {"steering": memory["steering"]}, key, step)
@@ -43,7 +46,10 @@ class Forgetful(Overlay):
 
 
 def ages(traffic: TrafficModule, *name: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """After a decision in which rows end at all of its moments: ages, physics steps and who ended, [N]."""
+    """After a decision in which rows end at all of its moments.
+
+    Ages, physics steps and who ended, [N].
+    """
     env = environment(num_envs=64, traffic=traffic, goal_m=100.0, visibility=Visibility.CENTRE)
     td = env.reset()
     to_go = torch.linspace(0.5, 30.0, 64, dtype=torch.float64)
@@ -84,7 +90,9 @@ def test_a_decision_without_steps_leaves_everything_as_it_is():
         dict(td[keys.EGO].items()),
         td[keys.STEP],
     )
-    _, memory = run_decision(env.traffic, env.physics, env.rules, td, start, torch.arange(3), substeps=0)
+    _, memory = run_decision(
+        env.traffic, env.physics, env.rules, td, start, torch.arange(3), substeps=0
+    )
     assert same_bits(memory, td[keys.TRAFFIC]) == []
 
 
@@ -105,7 +113,9 @@ def test_a_row_that_never_ran_and_one_that_ended_may_differ_in_empty_parts():
 def test_without_a_compiler_on_the_path_one_sentence_says_so(monkeypatch):
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(UserError, match=r"^compile=true needs a C\+\+ compiler, and there is none \(looked"):
+    with pytest.raises(
+        UserError, match=r"^compile=true needs a C\+\+ compiler, and there is none \(looked"
+    ):
         runtime.check_compiler()
     with pytest.raises(UserError, match="apt install"):
         environment(vehicles=3).compile()
@@ -129,7 +139,9 @@ def test_arguments_of_torchrls_version_are_refused():
 def test_env_compile_reaches_the_environment_and_the_observation(asked, monkeypatch):
     seen = []
     monkeypatch.setattr(HighwayEnv, "compile", lambda env: seen.append("environment"))
-    monkeypatch.setattr(build.ObservationTransform, "compile_graphs", lambda transform: seen.append("observation"))
+    monkeypatch.setattr(
+        build.ObservationTransform, "compile_graphs", lambda transform: seen.append("observation")
+    )
     config = EnvConfig(vehicles=3, compile=asked)
     build.make_env(build.make_traffic(IdmTrafficConfig(), config), config)
     assert seen == (["environment", "observation"] if asked else [])

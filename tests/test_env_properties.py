@@ -56,7 +56,9 @@ def test_nobody_goes_faster_than_its_speed_or_backwards_and_sizes_never_change(e
     check_motion(env, plan)
 
 
-def check_motion(env: HighwayEnv, plan: list[list[int]], tolerance_m: float = 1e-9, slides: bool = False) -> None:
+def check_motion(
+    env: HighwayEnv, plan: list[list[int]], tolerance_m: float = 1e-9, slides: bool = False
+) -> None:
     """With ``slides`` the speed of the others is theirs along the road alone."""
     frames: list[Vehicles] = []
     env.recorder = lambda vehicles, running: frames.append(vehicles)
@@ -69,13 +71,16 @@ def check_motion(env: HighwayEnv, plan: list[list[int]], tolerance_m: float = 1e
             if slides:
                 moved[:, 1:] = (after.x - last.x)[:, 1:].abs()
             assert (after.speed >= 0.0).all()
-            assert (moved <= torch.maximum(last.speed, after.speed) * keys.PHYSICS_STEP_S + tolerance_m).all()
+            assert (
+                moved <= torch.maximum(last.speed, after.speed) * keys.PHYSICS_STEP_S + tolerance_m
+            ).all()
             assert ((after.target_lane >= 0) & (after.target_lane < env.road.lanes)).all()
             assert ((after.target_lane - last.target_lane).abs() <= 1).all()
             assert all(torch.equal(getattr(after, name), getattr(start, name)) for name in FIXED)
             last = after
         frames.clear()
-        # After a decision nothing changes but the positions of recycled vehicles: from beyond 200 m, by 400 m.
+        # After a decision nothing changes but the positions of recycled vehicles: from beyond 200
+        # m, by 400 m.
         now = Vehicles.of(td[keys.VEHICLES])
         distance = last.x - last.x[:, :1]
         recycled = last.x - 400.0 * torch.sign(distance)
@@ -120,12 +125,20 @@ def check_observations(env: HighwayEnv, plan: list[list[int]], form: str) -> Non
 
 
 def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lowest and highest value of every entry of an observation (Table III and what was added to it)."""
+    """Lowest and highest value of every entry of an observation (Table III and what was added to
+    it).
+    """
     others = vehicles - 1
-    # A gap, a nearness, a relative speed and a place in the lane; bodies overlap by 4.5 m at the most.
-    gap, drift, overlap = [(0.0, 1.0), (0.0, 1.0), (-1.0, 1.0)], (-1.0, 1.0), [(-4.5 / 200.0, 1.0), (0.0, 5.5)]
+    # A gap, a nearness, a relative speed and a place in the lane; bodies overlap by 4.5 m at the
+    # most.
+    gap, drift, overlap = (
+        [(0.0, 1.0), (0.0, 1.0), (-1.0, 1.0)],
+        (-1.0, 1.0),
+        [(-4.5 / 200.0, 1.0), (0.0, 5.5)],
+    )
     ranges = {
-        # Speed over desired speed (at least 25 m/s; nobody drives twice that), a lane to the left, to the right.
+        # Speed over desired speed (at least 25 m/s; nobody drives twice that), a lane to the left,
+        # to the right.
         observation.OWN: [(0.0, 2.0), (0.0, 1.0), (0.0, 1.0)],
         observation.LIST: [(-1.0, 1.0)] * 3 * others,
         observation.VIEW: gap * 6,
@@ -138,15 +151,27 @@ def bounds(form: str, vehicles: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @settings(max_examples=60)
-@given(data=st.data(), form=st.sampled_from(list(OBSERVATIONS)), lanes=st.integers(1, 6), others=st.integers(1, 19))
+@given(
+    data=st.data(),
+    form=st.sampled_from(list(OBSERVATIONS)),
+    lanes=st.integers(1, 6),
+    others=st.integers(1, 19),
+)
 def test_a_vehicle_that_is_not_valid_is_in_no_observation(data, form, lanes, others):
     """Whatever stands in its fields, not a bit of the observation depends on it."""
-    valid = torch.tensor([[True, *data.draw(st.lists(st.booleans(), min_size=others, max_size=others))]])
+    valid = torch.tensor(
+        [[True, *data.draw(st.lists(st.booleans(), min_size=others, max_size=others))]]
+    )
     seeds = st.integers(0, 2**31)
-    scene, ghosts = (any_vehicles(1 + others, lanes, data.draw(seeds)).with_(valid=valid) for _ in range(2))
+    scene, ghosts = (
+        any_vehicles(1 + others, lanes, data.draw(seeds)).with_(valid=valid) for _ in range(2)
+    )
     haunted = scene.where(valid, ghosts)
     road, own = Road(lanes), torch.zeros(1, dtype=torch.float64)
-    seen = [ObservationTransform(road, 1 + others, form).observe(s, own, own.long(), road) for s in (scene, haunted)]
+    seen = [
+        ObservationTransform(road, 1 + others, form).observe(s, own, own.long(), road)
+        for s in (scene, haunted)
+    ]
     assert torch.equal(*seen)
     # And those that are valid are seen: all of them, from the nearest on, in the list of Table III.
     if observation.LIST in OBSERVATIONS[form]:
@@ -178,7 +203,9 @@ def test_a_vehicle_that_is_not_valid_changes_nobodys_driving_and_no_event(env, p
     valid = torch.tensor([True, *mask]).expand(2, -1)
     start, ends = env.reset(), []
     seed = data.draw(st.integers(0, 2**31))
-    ghosts = torch.cat([any_vehicles(env.vehicles, env.road.lanes, seed + row).x for row in range(2)])
+    ghosts = torch.cat(
+        [any_vehicles(env.vehicles, env.road.lanes, seed + row).x for row in range(2)]
+    )
     for x in (start[keys.VEHICLES, "x"], ghosts):
         td = start.clone()
         td[keys.VEHICLES, "valid"] = valid.clone()
@@ -199,9 +226,11 @@ def test_a_vehicle_that_is_not_valid_changes_nobodys_driving_and_no_event(env, p
 @pytest.mark.parametrize("form", list(OBSERVATIONS))
 @pytest.mark.parametrize("traffic", [gan_traffic, gan_calibrated_traffic])
 def test_all_of_it_holds_in_generated_traffic(traffic, form):
-    """In float32, on two random roads for each form; displacements to the rounding of positions of some 100 m.
+    """In float32, on two random roads for each form; displacements to the rounding of positions of
+    some 100 m.
 
-    The paper's literal lane changers slide: equation 11's lateral speed comes on top of their speed along the road.
+    The paper's literal lane changers slide: equation 11's lateral speed comes on top of their speed
+    along the road.
     """
     rng = random.Random(form)
     lanes = rng.randint(2, 6)

@@ -1,4 +1,7 @@
-"""The environment on recorded scenes: its roads, its ends, and vehicles that leave within a decision."""
+"""The environment on recorded scenes.
+
+Its roads, its ends, and vehicles that leave within a decision.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,10 @@ from ganlane.transforms import ObservationTransform, RewardTransform
 
 @pytest.fixture(scope="module")
 def recordings() -> Recordings:
-    """Scenes of 2, 3 and 4 lanes, each a second shorter than the last; every third driver leaves at 4.5 s."""
+    """Scenes of 2, 3 and 4 lanes, each a second shorter than the last.
+
+    Every third driver leaves at 4.5 s.
+    """
     parts = []
     for k in range(3):
         made = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k, seconds=9.0 - k), seed=k)
@@ -32,7 +38,9 @@ def recordings() -> Recordings:
 
 def make(recordings: Recordings, rows: int, period_s: float = 1.0, **others) -> HighwayEnv:
     traffic = ReplayTraffic(recordings=recordings)
-    return HighwayEnv(traffic, rows, episode=EpisodeParameters(decision_period_s=period_s), **others)
+    return HighwayEnv(
+        traffic, rows, episode=EpisodeParameters(decision_period_s=period_s), **others
+    )
 
 
 def test_the_specs_hold(recordings):
@@ -65,7 +73,9 @@ def test_an_episode_is_truncated_at_the_step_where_its_scene_ends(recordings):
 
 def test_vehicles_leave_in_the_middle_of_a_decision_and_are_then_far_ahead_to_the_agent(recordings):
     env = make(recordings, 64)
-    seen = TransformedEnv(env, Compose(ObservationTransform(env.road, 9, "table3"), RewardTransform()))
+    seen = TransformedEnv(
+        env, Compose(ObservationTransform(env.road, 9, "table3"), RewardTransform())
+    )
     valid: list[torch.Tensor] = []
     env.recorder = lambda vehicles, running: valid.append(vehicles.valid[:, 1:].clone())
     td = seen.reset()
@@ -98,7 +108,9 @@ def test_every_row_has_the_lanes_of_its_scene(recordings):
         vehicles, changing = after[keys.VEHICLES], after[keys.EGO, "change_direction"] == 1
         # The change aims at the next lane's centre on this road.
         expected = 1.0 - (vehicles["target_lane"][:, 0] * width - vehicles["y"][:, 0]).abs() / width
-        torch.testing.assert_close(after[keys.EGO, "change_progress"][changing], expected[changing].clamp(0, 1))
+        torch.testing.assert_close(
+            after[keys.EGO, "change_progress"][changing], expected[changing].clamp(0, 1)
+        )
         td = after.exclude("reward")
         for _ in range(3):
             td = step(env, td).exclude("reward")

@@ -1,4 +1,7 @@
-"""Rule-driven traffic has no crashes of its own making: alone, or with an ego that keeps its lane or signals."""
+"""Rule-driven traffic has no crashes of its own making.
+
+Alone, or with an ego that keeps its lane or signals.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,10 @@ ROWS = 16
 
 
 class Log:
-    """What a recorder saw: vehicle-km, steps with overlaps; nobody leaves the road or drives backwards."""
+    """What a recorder saw: vehicle-km, steps with overlaps.
+
+    Nobody leaves the road or drives backwards.
+    """
 
     def __init__(self) -> None:
         self.vehicle_km, self.overlaps = 0.0, 0
@@ -31,7 +37,9 @@ class Log:
             driven = vehicles.speed * (vehicles.valid & running[:, None])
             self.vehicle_km += driven.sum().item() * keys.PHYSICS_STEP_S / 1000.0
             self.overlaps += pair_overlaps(vehicles)[running].sum().item() // 2
-            assert ((vehicles.y >= env.road.right_edge_m()) & (vehicles.y <= env.road.left_edge_m())).all()
+            assert (
+                (vehicles.y >= env.road.right_edge_m()) & (vehicles.y <= env.road.left_edge_m())
+            ).all()
             assert (vehicles.speed >= 0.0).all()
 
         env.recorder = record
@@ -61,7 +69,10 @@ def crawling(p: SpawnParameters, rng: random.Random) -> SpawnParameters:
 
 
 def drive(rng: random.Random, log: Log, most_vehicles: int, duration_s: float) -> None:
-    """One random road with random traffic, ``ROWS`` episodes of it; in a third of them it is alone, with no ego."""
+    """One random road with random traffic, ``ROWS`` episodes of it.
+
+    In a third of them it is alone, with no ego.
+    """
     lanes, vehicles = rng.randint(1, 6), rng.randint(2, most_vehicles)
     spawn = dense(rng, vehicles, lanes) if rng.random() < 0.5 else sparse(vehicles, lanes)
     spawn = crawling(spawn, rng) if rng.random() < 0.4 else spawn
@@ -89,7 +100,9 @@ def drive(rng: random.Random, log: Log, most_vehicles: int, duration_s: float) -
         assert not td[keys.EVENTS, "out_of_road"].any()
 
 
-def drive_for(vehicle_km: float, roads: int, most_vehicles: int, duration_s: float, seed: int) -> None:
+def drive_for(
+    vehicle_km: float, roads: int, most_vehicles: int, duration_s: float, seed: int
+) -> None:
     """Until so many vehicle-km have been driven, on so many roads at least."""
     rng, log = random.Random(seed), Log()
     while log.vehicle_km < vehicle_km or roads > 0:
@@ -112,7 +125,10 @@ def test_the_recorder_would_see_an_overlap():
     env, log = environment(vehicles=2, mobil=False), Log()
     log.watch(env)
     td = placed(
-        env, vehicles({"x": 0.0, "visibility": Visibility.BODY}, {"x": 0.0, "lane": 1, "desired_speed": 18.0})
+        env,
+        vehicles(
+            {"x": 0.0, "visibility": Visibility.BODY}, {"x": 0.0, "lane": 1, "desired_speed": 18.0}
+        ),
     )
     for action in (keys.LEFT, keys.KEEP, keys.KEEP):
         td = step(env, td, action)

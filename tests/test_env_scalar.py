@@ -7,7 +7,16 @@ import random
 import pytest
 import torch
 from reference import scalar
-from reference.worlds import DOUBLE, disturbed, environment, packed, placed, rules_of, scalar_state, step
+from reference.worlds import (
+    DOUBLE,
+    disturbed,
+    environment,
+    packed,
+    placed,
+    rules_of,
+    scalar_state,
+    step,
+)
 
 from ganlane import keys
 from ganlane.env import HighwayEnv
@@ -38,10 +47,14 @@ def random_environment(rng: random.Random, rows: int) -> HighwayEnv:
 
 
 def disturb(env: HighwayEnv, td, generator: torch.Generator):
-    """A state in which the wheels are turned and some, the ego included, are in the middle of a change."""
+    """A state in which the wheels are turned and some, the ego included, are in the middle of a
+    change.
+    """
     start = Vehicles.of(td[keys.VEHICLES])
     td = placed(env, disturbed(start, env.road.lanes, generator))
-    td[keys.TRAFFIC, "steering"] = 0.02 * torch.randn(start.x.shape, dtype=DOUBLE, generator=generator)
+    td[keys.TRAFFIC, "steering"] = 0.02 * torch.randn(
+        start.x.shape, dtype=DOUBLE, generator=generator
+    )
     td[keys.EGO, "change_direction"] = (td[keys.VEHICLES, "target_lane"] - start.target_lane)[:, 0]
     return td
 
@@ -73,7 +86,9 @@ def compare(env: HighwayEnv, td, duration_s: float, rng: random.Random, choose=a
             break
 
 
-def assert_same(td, row: int, state: scalar.State, outcome: scalar.Outcome, tolerance: float = 1e-6) -> None:
+def assert_same(
+    td, row: int, state: scalar.State, outcome: scalar.Outcome, tolerance: float = 1e-6
+) -> None:
     for name in MOTION:
         expected = torch.tensor([getattr(car, name) for car in state.cars], dtype=DOUBLE)
         error = (td[keys.VEHICLES, name][row] - expected).abs().max().item()
@@ -81,8 +96,12 @@ def assert_same(td, row: int, state: scalar.State, outcome: scalar.Outcome, tole
     assert td[keys.VEHICLES, "target_lane"][row].tolist() == [car.target_lane for car in state.cars]
     assert td[keys.STEP][row] == state.step
     assert [name for name in keys.END_EVENTS if td[keys.EVENTS, name][row]] == outcome.reasons
-    assert td["terminated"][row].item() == any(name in keys.TERMINAL_EVENTS for name in outcome.reasons)
-    assert td["truncated"][row].item() == any(name in keys.TRUNCATING_EVENTS for name in outcome.reasons)
+    assert td["terminated"][row].item() == any(
+        name in keys.TERMINAL_EVENTS for name in outcome.reasons
+    )
+    assert td["truncated"][row].item() == any(
+        name in keys.TRUNCATING_EVENTS for name in outcome.reasons
+    )
     assert td["done"][row].item() == bool(outcome.reasons)
     assert td[keys.EVENTS, keys.SOFT_CRASH][row] == outcome.soft_crash
     assert td[keys.EVENTS, keys.SOFT_CRASH_BEHIND][row] == outcome.soft_crash_behind
@@ -124,8 +143,12 @@ def test_on_a_ring_they_agree_too():
 
 def compare_whole_episodes(episodes: int, goal_m: float) -> None:
     for block, mobil in enumerate((True, False)):
-        env = environment(num_envs=episodes // 2, mobil=mobil, goal_m=goal_m, first_episode=1000 * block)
-        compare(env, env.reset(), duration_s=1000.0, rng=random.Random(block), choose=stay_on_the_road)
+        env = environment(
+            num_envs=episodes // 2, mobil=mobil, goal_m=goal_m, first_episode=1000 * block
+        )
+        compare(
+            env, env.reset(), duration_s=1000.0, rng=random.Random(block), choose=stay_on_the_road
+        )
 
 
 def test_a_few_short_episodes_agree_to_their_end():

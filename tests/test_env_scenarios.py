@@ -1,4 +1,7 @@
-"""What drivers do in the scenarios that ship: cut-in, stalled car, blocked lane, stop-and-go, dense traffic."""
+"""What drivers do in the scenarios that ship.
+
+Cut-in, stalled car, blocked lane, stop-and-go, dense traffic.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,10 @@ SCENARIOS = {
 
 @dataclass
 class Drive:
-    """What happened in ``ROWS`` episodes: every physics step, overlaps, hardest braking, who ran out of time."""
+    """What happened in ``ROWS`` episodes.
+
+    Every physics step, overlaps, hardest braking, who ran out of time.
+    """
 
     frames: list[Vehicles] = field(default_factory=list)
     overlaps: int = 0
@@ -79,7 +85,10 @@ def drive(config: EnvConfig, driver: str, traffic: str, seconds: int) -> Drive:
 @TRAFFIC
 @pytest.mark.parametrize("driver", ["mobil", "keep_lane"])
 def test_in_the_cut_in_the_ego_brakes_hard_but_nobody_crashes(driver, traffic):
-    """IDM wants 1.6 s to the other: it starts with 20 m, 3 m/s too fast, and brakes with 5 to 9 m/s2."""
+    """IDM wants 1.6 s to the other.
+
+    It starts with 20 m, 3 m/s too fast, and brakes with 5 to 9 m/s2.
+    """
     seen = drive(SCENARIOS["cut_in"], driver, traffic, 25)
     assert seen.overlaps == 0
     assert -10.0 < seen.hardest < -4.0
@@ -116,7 +125,10 @@ def test_the_keep_lane_ego_stops_two_metres_behind_the_stalled_car(traffic):
 
 
 def test_the_stalled_car_stays_in_its_lane_and_all_but_stands():
-    """A vehicle that desires next to nothing creeps 3.5 cm/s: IDM's first step from a stand is 0.07 m/s."""
+    """A vehicle that desires next to nothing creeps 3.5 cm/s.
+
+    IDM's first step from a stand is 0.07 m/s.
+    """
     seen = drive(SCENARIOS["stalled_car"], "keep_lane", "idm_mobil", 90)
     assert len(seen.frames) == 900
     assert seen.overlaps == 0
@@ -136,7 +148,9 @@ def test_who_keeps_its_lane_behind_a_stalled_car_runs_out_of_time():
 
 @pytest.mark.parametrize("traffic", [pytest.param("idm", marks=pytest.mark.slow), "idm_mobil"])
 def test_polite_mobil_strands_at_the_closed_lane_and_egoistic_mobil_finds_a_gap(traffic):
-    """With politeness 1 a gap of 55 m costs the follower more than the ego gains, until it stands and cannot go."""
+    """With politeness 1 a gap of 55 m costs the follower more than the ego gains, until it stands
+    and cannot go.
+    """
     polite = drive(SCENARIOS["blocked_lane"], "mobil", traffic, 60)
     assert ((polite.frames[-1].x[:, 0] < 250.0) & (polite.frames[-1].speed[:, 0] < 0.5)).all()
     egoistic = drive(SCENARIOS["blocked_lane"], "mobil_egoistic", traffic, 60)
@@ -217,7 +231,11 @@ def test_any_callable_with_a_check_makes_the_scene():
 @pytest.mark.parametrize(
     ("scenes", "vehicles", "sentence"),
     [
-        (FixedScene((SceneVehicle(0.0, 0), SceneVehicle(50.0, 1)), Road(2)), 9, "vehicles=9: the scene has 2"),
+        (
+            FixedScene((SceneVehicle(0.0, 0), SceneVehicle(50.0, 1)), Road(2)),
+            9,
+            "vehicles=9: the scene has 2",
+        ),
         (RandomScenes(Road(3)), None, "give both the same road"),
         (
             FixedScene((SceneVehicle(0.0, 0, 30.0), SceneVehicle(10.0, 0, 0.0)), Road(2)),
@@ -226,7 +244,9 @@ def test_any_callable_with_a_check_makes_the_scene():
         ),
     ],
 )
-def test_a_scene_that_does_not_fit_or_is_hopeless_is_refused_when_the_environment_is_made(scenes, vehicles, sentence):
+def test_a_scene_that_does_not_fit_or_is_hopeless_is_refused_when_the_environment_is_made(
+    scenes, vehicles, sentence
+):
     with pytest.raises(UserError, match=sentence):
         HighwayEnv(IdmTraffic(Road(2)), vehicles=vehicles, scenes=scenes)
 
@@ -252,10 +272,17 @@ def test_a_file_gives_vehicles_lanes_and_the_egos_desired_speed(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("x_m,lane,speed_mps,desired_speed_mps\n5,1,20,30\n60,2,20,22\n")
     config = check("evaluate", ["env=scene", f"env.scene.path={path}"]).config.env
-    assert (config.vehicles, config.lanes, config.lane_width_m, config.ego_desired_speed_mps) == (2, 3, 4.0, 30.0)
+    assert (config.vehicles, config.lanes, config.lane_width_m, config.ego_desired_speed_mps) == (
+        2,
+        3,
+        4.0,
+        30.0,
+    )
     td = make_env(make_traffic(TRAFFICS["idm"], config), config, num_envs=2).reset()
     assert td[keys.VEHICLES, "x"].tolist() == [[0.0, 55.0]] * 2
     wider = check("evaluate", ["env=scene", f"env.scene.path={path}", "env.lanes=4"]).config.env
     assert wider.lanes == 4
-    slower = check("evaluate", ["env=scene", f"env.scene.path={path}", "env.ego_desired_speed_mps=20"]).config.env
+    slower = check(
+        "evaluate", ["env=scene", f"env.scene.path={path}", "env.ego_desired_speed_mps=20"]
+    ).config.env
     assert slower.scenes().rows[0].desired_speed_mps == 20.0

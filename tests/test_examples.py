@@ -56,13 +56,17 @@ def test_an_example_runs_as_a_user_would_run_it():
     paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     env = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}
     command = [sys.executable, str(ROOT / "examples" / "own_traffic.py")]
-    finished = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
+    finished = subprocess.run(
+        command, env=env, capture_output=True, text=True, timeout=120, check=False
+    )
     assert finished.returncode == 0, finished.stderr
     assert re.search(EXAMPLES["own_traffic.py"], finished.stdout)
 
 
 def test_the_traffic_model_in_the_docs_is_the_one_that_runs():
-    shown = re.search(r"```python\n(class Daydreamers.*?)```", (ROOT / "docs" / "traffic.md").read_text(), re.S)
+    shown = re.search(
+        r"```python\n(class Daydreamers.*?)```", (ROOT / "docs" / "traffic.md").read_text(), re.S
+    )
     assert shown.group(1).strip() in (ROOT / "examples" / "own_traffic.py").read_text()
 
 

@@ -1,4 +1,7 @@
-"""Writes are atomic, also on a full disk; documents are rewritten between markers; damage to any byte is refused."""
+"""Writes are atomic, also on a full disk; documents are rewritten between markers.
+
+Damage to any byte is refused.
+"""
 
 from __future__ import annotations
 
@@ -47,15 +50,21 @@ def test_what_stands_between_the_markers_is_rewritten_and_the_rest_is_kept(tmp_p
     document.write_text(f"# Title\n{BEGIN}{END} tail é\n", encoding="utf-8")
     for content in ("one", "two\nlines"):
         write_between_markers(document, BEGIN, END, content)
-        assert document.read_text(encoding="utf-8") == f"# Title\n{BEGIN}\n{content}\n{END} tail é\n"
+        assert (
+            document.read_text(encoding="utf-8") == f"# Title\n{BEGIN}\n{content}\n{END} tail é\n"
+        )
     assert split_at_markers(document, BEGIN, END) == (f"# Title\n{BEGIN}", f"{END} tail é\n")
 
 
-@pytest.mark.parametrize("text", ["", BEGIN, END, f"{END}{BEGIN}", f"{BEGIN}{END}{END}", f"{BEGIN}{BEGIN}{END}"])
+@pytest.mark.parametrize(
+    "text", ["", BEGIN, END, f"{END}{BEGIN}", f"{BEGIN}{END}{END}", f"{BEGIN}{BEGIN}{END}"]
+)
 def test_a_document_without_both_markers_once_and_in_order_is_refused_and_kept(tmp_path, text):
     document = tmp_path / "page.md"
     document.write_text(text)
-    with pytest.raises(UserError, match=r"page\.md: expected the lines <!-- begin --> and <!-- end -->"):
+    with pytest.raises(
+        UserError, match=r"page\.md: expected the lines <!-- begin --> and <!-- end -->"
+    ):
         write_between_markers(document, BEGIN, END, "new")
     assert document.read_text() == text
 
@@ -90,7 +99,9 @@ def small_disk():
 
 
 @pytest.mark.parametrize("writer", WRITERS)
-def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(writer, tmp_path, small_disk):
+def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(
+    writer, tmp_path, small_disk
+):
     path = tmp_path / "kept"
     write_bytes(path, b"old")
     with pytest.raises(OSError, match="File too large") as caught, atomic_path(path) as part:
@@ -102,7 +113,10 @@ def test_a_full_disk_is_told_of_in_the_systems_words_and_leaves_the_old_file(wri
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EIO])
 def test_a_refusal_without_a_name_gets_that_of_the_file(number, tmp_path):
-    with pytest.raises(OSError, match=os.strerror(number)) as caught, atomic_path(tmp_path / "a") as part:  # noqa: PT012
+    with (
+        pytest.raises(OSError, match=os.strerror(number)) as caught,
+        atomic_path(tmp_path / "a") as part,
+    ):  # noqa: PT012
         part.write_bytes(b"half")
         raise OSError(number, os.strerror(number))
     assert (caught.value.errno, caught.value.filename) == (number, str(tmp_path / "a"))
@@ -110,7 +124,10 @@ def test_a_refusal_without_a_name_gets_that_of_the_file(number, tmp_path):
 
 
 def test_an_error_about_something_else_is_passed_on_as_it_is(tmp_path):
-    for error, fail in ((ZeroDivisionError, lambda: 1 / 0), (FileNotFoundError, (tmp_path / "other").read_bytes)):
+    for error, fail in (
+        (ZeroDivisionError, lambda: 1 / 0),
+        (FileNotFoundError, (tmp_path / "other").read_bytes),
+    ):
         with pytest.raises(error) as caught, atomic_path(tmp_path / "a"):
             fail()
         assert getattr(caught.value, "filename", None) != str(tmp_path / "a")
@@ -135,7 +152,9 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
         assert (tmp_path / "pipe").is_fifo()
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the administrator may write anywhere")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the administrator may write anywhere"
+)
 def test_a_folder_without_the_right_to_write_is_refused(tmp_path):
     tmp_path.chmod(0o555)
     try:
@@ -183,7 +202,10 @@ FILES: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "shipped_agent.safetensors": (copied(CHECKPOINTS / "agent_idm.safetensors"), read_agent),
     "generator.safetensors": (copied(CHECKPOINTS / "generator_paper.safetensors"), load_generator),
     "reference.json": (lambda path: Reference.load(SHIPPED_REFERENCE).save(path), Reference.load),
-    "fit.pt": (lambda path: FitLoop(SmallFit(), path).run(), lambda path: FitLoop(SmallFit(), path)),
+    "fit.pt": (
+        lambda path: FitLoop(SmallFit(), path).run(),
+        lambda path: FitLoop(SmallFit(), path),
+    ),
     "scenes.parquet": (lambda path: write_prepared(synthetic_frame(), path), read_scenes),
 }
 
@@ -201,7 +223,11 @@ def test_any_flipped_byte_is_refused_in_one_sentence(name, tmp_path, capsys):
     whole = path.read_bytes()
     assert has_checksum(whole, path)
     # Both ends, where formats keep their headers, and places all over.
-    places = {*range(0, 200, 9), *range(len(whole) - 120, len(whole), 7), *range(0, len(whole), len(whole) // 40)}
+    places = {
+        *range(0, 200, 9),
+        *range(len(whole) - 120, len(whole), 7),
+        *range(0, len(whole), len(whole) // 40),
+    }
     for place in sorted(place for place in places if place < len(whole)):
         path.write_bytes(flipped(whole, place, place % 8))
         with pytest.raises(UserError, match=f"{path.name}: damaged") as caught:
@@ -274,8 +300,12 @@ def test_tables_of_other_programs_need_none(tmp_path, capsys):
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_weights_that_are_not_finite_are_refused(kind, value, tmp_path):
     path = tmp_path / "w.safetensors"
-    save_weights(path, kind, {"fine": torch.ones(3), "layer.weight": torch.tensor([0.0, value])}, {})
-    with pytest.raises(UserError, match=r"w\.safetensors: layer\.weight holds numbers that are not finite"):
+    save_weights(
+        path, kind, {"fine": torch.ones(3), "layer.weight": torch.tensor([0.0, value])}, {}
+    )
+    with pytest.raises(
+        UserError, match=r"w\.safetensors: layer\.weight holds numbers that are not finite"
+    ):
         load_weights(path, kind)
 
 

@@ -37,14 +37,22 @@ def decisions_until_cut_off(env):
     return info["decisions"]
 
 
-@pytest.mark.parametrize(("timeout_s", "period_s", "decisions"), [(7.0, 1.0, 7), (7.0, 0.5, 14), (7.2, 2.0, 4)])
-def test_the_spec_says_when_an_episode_is_cut_off_and_nothing_else_cuts_it(timeout_s, period_s, decisions):
+@pytest.mark.parametrize(
+    ("timeout_s", "period_s", "decisions"), [(7.0, 1.0, 7), (7.0, 0.5, 14), (7.2, 2.0, 4)]
+)
+def test_the_spec_says_when_an_episode_is_cut_off_and_nothing_else_cuts_it(
+    timeout_s, period_s, decisions
+):
     options = {"goal_m": 5000.0, "timeout_s": timeout_s, "decision_period_s": period_s}
     env = make(**options)
     assert env.spec.max_episode_steps == decisions_until_cut_off(env) == decisions
     assert decisions_until_cut_off(gymnasium.make(env.spec)) == decisions
     envs = make_vec(2, **options)
-    assert envs.spec.max_episode_steps == gymnasium.make_vec(envs.spec).spec.max_episode_steps == decisions
+    assert (
+        envs.spec.max_episode_steps
+        == gymnasium.make_vec(envs.spec).spec.max_episode_steps
+        == decisions
+    )
     assert gymnasium.make(ID).spec.max_episode_steps == 1000
 
 
@@ -61,7 +69,12 @@ def test_a_shorter_time_limit_is_gymnasiums_own_and_refused_for_a_batch():
         {"traffic": "idm_mobil"},
         {"traffic": "gan"},
         {"traffic": "idm", "lanes": 4, "vehicles": 15, "recycle": True, "observation": "table3"},
-        {"traffic": "idm", "env": "cut_in", "observation": "table3_lane_view", "render_mode": "rgb_array"},
+        {
+            "traffic": "idm",
+            "env": "cut_in",
+            "observation": "table3_lane_view",
+            "render_mode": "rgb_array",
+        },
     ],
 )
 @pytest.mark.filterwarnings("error")
@@ -71,7 +84,8 @@ def test_gymnasiums_own_check_finds_nothing_to_say(options):
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    ("traffic", "mode"), [("gan", AutoresetMode.SAME_STEP), *(("idm", mode) for mode in AutoresetMode)]
+    ("traffic", "mode"),
+    [("gan", AutoresetMode.SAME_STEP), *(("idm", mode) for mode in AutoresetMode)],
 )
 def test_neither_making_nor_running_a_batch_warns(traffic, mode):
     """gymnasium has no checker for batches: this is what its one for single environments looks at."""
@@ -109,7 +123,10 @@ def test_episodes_follow_from_seed_and_number():
     second, info = env.reset()
     assert (info["seed"], info["episode_number"]) == (5, 1)
     assert not np.array_equal(first, second)
-    for observation, info in (env.reset(options={"episode": 1}), make(seed=5).reset(options={"episode": 1})):
+    for observation, info in (
+        env.reset(options={"episode": 1}),
+        make(seed=5).reset(options={"episode": 1}),
+    ):
         assert (info["seed"], info["episode_number"]) == (5, 1)
         np.testing.assert_array_equal(observation, second)
 
@@ -124,7 +141,9 @@ def test_a_row_of_a_batch_drives_as_one_alone_does():
     alone = [make(traffic="idm_mobil") for _ in range(3)]
     together, _ = envs.reset(seed=2, options={"episode": 3})
     for row, env in enumerate(alone):
-        np.testing.assert_array_equal(together[row], env.reset(seed=2, options={"episode": 3 + row})[0])
+        np.testing.assert_array_equal(
+            together[row], env.reset(seed=2, options={"episode": 3 + row})[0]
+        )
     running = np.ones(3, bool)
     for step in actions:
         together, reward, terminated, truncated, info = envs.step(step)
@@ -152,9 +171,17 @@ def test_the_facade_gives_what_the_torchrl_environment_gives():
 
 
 def test_the_goal_terminates_and_a_time_out_truncates():
-    for options, is_goal in (({"goal_m": 30.0}, True), ({"goal_m": 5000.0, "timeout_s": 3.0}, False)):
+    for options, is_goal in (
+        ({"goal_m": 30.0}, True),
+        ({"goal_m": 5000.0, "timeout_s": 3.0}, False),
+    ):
         *_, terminated, truncated, info = until_the_end(begun(make(**options)))
-        assert (terminated, truncated, info["goal"], info["timeout"]) == (is_goal, not is_goal, is_goal, not is_goal)
+        assert (terminated, truncated, info["goal"], info["timeout"]) == (
+            is_goal,
+            not is_goal,
+            is_goal,
+            not is_goal,
+        )
     assert info["time_s"] == pytest.approx(3.0)
 
 
@@ -196,7 +223,9 @@ def test_episodes_are_the_same_in_every_autoreset_mode(kernel):
         other = returns_by_episode(mode, kernel)
         shared = same.keys() & other.keys()
         assert len(shared) >= 9
-        assert {number: other[number] for number in shared} == pytest.approx({n: same[n] for n in shared}, abs=1e-3)
+        assert {number: other[number] for number in shared} == pytest.approx(
+            {n: same[n] for n in shared}, abs=1e-3
+        )
 
 
 def test_a_row_that_is_over_is_not_stepped_where_resets_are_left_to_the_user():
@@ -216,7 +245,8 @@ def test_a_row_that_ends_is_reset_in_the_same_step_and_tells_how_it_ended():
     np.testing.assert_array_equal(terminated | truncated, [False, True, False])
     np.testing.assert_array_equal(info["_final_obs"], [False, True, False])
     assert info["final_obs"][0] is None
-    np.testing.assert_array_equal(info["final_obs"][1], first[1])  # off the road at once: nothing moved
+    # off the road at once: nothing moved
+    np.testing.assert_array_equal(info["final_obs"][1], first[1])
     assert info["final_info"]["out_of_road"][1]
     assert info["final_info"]["episode_number"][1] == 1
     np.testing.assert_array_equal(info["episode_number"], [0, 4, 2])
@@ -268,11 +298,26 @@ def begun(env):
         (lambda: make().reset(seed=np.array([1, 2])), "seed=array"),
         (lambda: make().reset(options={"episodes": 3}), "episodes unknown; a reset takes episode"),
         (lambda: make().reset(options={"episode": -3}), "expected a whole number from 0"),
-        (lambda: make().reset(options={"episode": [1, 2]}), "episode=.1, 2.: expected a whole number"),
-        (lambda: make_vec(2).reset(options={"episode": [[1, 2], [3]]}), "expected whole numbers from 0"),
-        (lambda: make_vec(2).reset(seed=[1, 2, 3]), "expected one seed and one episode, or 2 of each"),
-        (lambda: make_vec(2).reset(options={"reset_mask": [[True, True], [True]]}), "expected a boolean array"),
-        (lambda: make_vec(2).reset(options={"reset_mask": np.array([1, 0])}), r"a boolean array of shape \(2,\)"),
+        (
+            lambda: make().reset(options={"episode": [1, 2]}),
+            "episode=.1, 2.: expected a whole number",
+        ),
+        (
+            lambda: make_vec(2).reset(options={"episode": [[1, 2], [3]]}),
+            "expected whole numbers from 0",
+        ),
+        (
+            lambda: make_vec(2).reset(seed=[1, 2, 3]),
+            "expected one seed and one episode, or 2 of each",
+        ),
+        (
+            lambda: make_vec(2).reset(options={"reset_mask": [[True, True], [True]]}),
+            "expected a boolean array",
+        ),
+        (
+            lambda: make_vec(2).reset(options={"reset_mask": np.array([1, 0])}),
+            r"a boolean array of shape \(2,\)",
+        ),
         (lambda: begun(make()).step(3), r"0 \(keep\), 1 \(left\) or 2 \(right\)"),
         (lambda: begun(make_vec(2)).step(np.zeros(3, int)), "expected 2 whole number"),
         *(
@@ -298,7 +343,9 @@ def test_the_safe_mask_is_in_the_info_and_behind_maskable_ppos_method():
         assert mask[0]
         np.testing.assert_array_equal(mask, info["action_mask"].astype(bool))
         forbidden += int((~mask).sum())
-        _, _, terminated, truncated, info = env.step(int(env.action_space.sample(info["action_mask"])))
+        _, _, terminated, truncated, info = env.step(
+            int(env.action_space.sample(info["action_mask"]))
+        )
         assert not (terminated and info["out_of_road"])
         if terminated or truncated:
             break
@@ -326,7 +373,9 @@ def test_a_copy_goes_on_as_the_environment_does_and_leaves_it_alone(twin, traffi
     env.step(LEFT)
     other = twin(env)
     theirs = [other.step(action) for action in (KEEP, RIGHT)]
-    for (observation, *rest), (expected, *known) in zip([env.step(action) for action in (KEEP, RIGHT)], theirs):
+    for (observation, *rest), (expected, *known) in zip(
+        [env.step(action) for action in (KEEP, RIGHT)], theirs
+    ):
         assert np.array_equal(observation, expected)
         assert str(rest) == str(known)
 

@@ -55,8 +55,12 @@ def test_a_list_of_frames_has_ten_for_every_second_of_driving():
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_videos_are_recorded_decision_by_decision_or_ten_times_a_second(tmp_path, smooth):
-    moviepy = pytest.importorskip("moviepy", reason="moviepy, which gymnasium's RecordVideo needs, is not installed")
-    video = gymnasium.wrappers.RecordVideo(make(render_mode="rgb_array", goal_m=30.0), str(tmp_path / "films"))
+    moviepy = pytest.importorskip(
+        "moviepy", reason="moviepy, which gymnasium's RecordVideo needs, is not installed"
+    )
+    video = gymnasium.wrappers.RecordVideo(
+        make(render_mode="rgb_array", goal_m=30.0), str(tmp_path / "films")
+    )
     if smooth:
         video.unwrapped.set_record_video_wrapper(video)
     video.reset(seed=0)

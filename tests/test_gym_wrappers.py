@@ -80,14 +80,20 @@ def test_the_code_in_the_docs_runs(tmp_path, monkeypatch):
 def test_the_docs_list_every_info():
     page = (ROOT / "docs" / "gymnasium.md").read_text()
     table = re.search(r"\| key \| what \|\n(.*?)\n\n", page, re.S).group(1)
-    listed = {name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+    listed = {
+        name for row in table.splitlines()[1:] for name in re.findall(r"`(\w+)`", row.split("|")[1])
+    }
     _, info = make().reset(seed=0)
     assert listed == set(info)
-    assert set(re.search(r"`speed, (.*?)` \|", table).group(1).split(", ")) | {"speed"} == set(info["reward_terms"])
+    assert set(re.search(r"`speed, (.*?)` \|", table).group(1).split(", ")) | {"speed"} == set(
+        info["reward_terms"]
+    )
 
 
 def test_the_check_of_stable_baselines3_finds_nothing():
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="the extra sb3 is not installed")
+    checker = pytest.importorskip(
+        "stable_baselines3.common.env_checker", reason="the extra sb3 is not installed"
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checker.check_env(make().unwrapped)
@@ -96,7 +102,9 @@ def test_the_check_of_stable_baselines3_finds_nothing():
 def test_stable_baselines3s_dqn_learns_on_it_unchanged():
     baselines = pytest.importorskip("stable_baselines3", reason="the extra sb3 is not installed")
     env = gymnasium.make(ID, traffic="idm", goal_m=200.0)
-    model = baselines.DQN("MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]})
+    model = baselines.DQN(
+        "MlpPolicy", env, learning_starts=50, seed=0, policy_kwargs={"net_arch": [16]}
+    )
     before = [weight.clone() for weight in model.q_net.parameters()]
     model.learn(200)
     assert model.num_timesteps == 200

@@ -10,7 +10,8 @@ import pytest
 import ganlane
 
 PACKAGE = Path(ganlane.__file__).parent
-#: From the bottom up; what stands in one line may import each other's neighbours to the left only within itself.
+#: From the bottom up; what stands in one line may import each other's neighbours to the left only
+#: within itself.
 ORDER = [
     {"_version", "arguments", "keys", "errors", "files", "weights", "runtime", "torch_settings"},
     {"parameters"},
@@ -57,7 +58,11 @@ def imported(path: Path) -> set[str]:
             elif node.module and node.module.startswith("ganlane."):
                 found.add(node.module.split(".")[1])
         elif isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("ganlane.")}
+            found |= {
+                alias.name.split(".")[1]
+                for alias in node.names
+                if alias.name.startswith("ganlane.")
+            }
     return found - {"__version__"}
 
 
@@ -75,7 +80,17 @@ def test_imports_point_down(path):
 
 
 BELOW_CONFIG = [
-    *("parameters", "sim", "data", "generator", "traffic", "env", "transforms", "agents", "evaluation"),
+    *(
+        "parameters",
+        "sim",
+        "data",
+        "generator",
+        "traffic",
+        "env",
+        "transforms",
+        "agents",
+        "evaluation",
+    ),
 ]
 
 

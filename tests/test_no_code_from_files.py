@@ -1,4 +1,7 @@
-"""Files and folders are data: nothing that stands in them is executed; each way here would leave a marker."""
+"""Files and folders are data: nothing that stands in them is executed.
+
+Each way here would leave a marker.
+"""
 
 from __future__ import annotations
 
@@ -63,20 +66,38 @@ def here(tmp_path, monkeypatch):
 STORED = {
     "a class of a module beside it": ["traffic=idm", "traffic._target_=evil.Traffic"],
     "a function of it": ["traffic=idm", "traffic._target_=evil.make"],
-    "a shell": ["traffic=idm", "traffic._target_=os.system", "+traffic.parameters.command='touch executed'"],
-    "a process": ["traffic._target_=subprocess.getoutput", "+traffic.parameters.cmd='touch executed'"],
+    "a shell": [
+        "traffic=idm",
+        "traffic._target_=os.system",
+        "+traffic.parameters.command='touch executed'",
+    ],
+    "a process": [
+        "traffic._target_=subprocess.getoutput",
+        "+traffic.parameters.cmd='touch executed'",
+    ],
     "a script": ["traffic._target_=runpy.run_path", "+traffic.parameters.path_name=evil.py"],
     "an import": ["traffic._target_=importlib.import_module", "+traffic.parameters.name=evil"],
     "exec": ["traffic._target_=builtins.exec", "+traffic.parameters.source='import evil'"],
-    "a file": ["traffic._target_=builtins.open", "+traffic.parameters.file=executed", "+traffic.parameters.mode=w"],
+    "a file": [
+        "traffic._target_=builtins.open",
+        "+traffic.parameters.file=executed",
+        "+traffic.parameters.mode=w",
+    ],
     "the first phase's": ["traffic@pretrain.traffic=idm", "pretrain.traffic._target_=evil.Traffic"],
-    "the evaluation's": ["traffic@evaluation.traffic=idm", "evaluation.traffic._target_=evil.Traffic"],
+    "the evaluation's": [
+        "traffic@evaluation.traffic=idm",
+        "evaluation.traffic._target_=evil.Traffic",
+    ],
     "a share": ["traffic=mixed", "traffic.shares={evil.Traffic: 1, idm: 1}"],
     "a share's option": ["traffic=mixed", "traffic.options.gan._target_=evil.Traffic"],
     "a policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,evil.Policy]"],
     "a masked policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,evil.Policy+safe]"],
     "a shell as policy": ["traffic=idm", "evaluation.agents=[mobil,random_legal,os.system]"],
-    "a reference to a name": ["init.path=evil.Traffic", "traffic=idm", "traffic._target_=${init.path}"],
+    "a reference to a name": [
+        "init.path=evil.Traffic",
+        "traffic=idm",
+        "traffic._target_=${init.path}",
+    ],
     "an option elsewhere": ["traffic=../../evil"],
     "an absolute option": ["experiment=/tmp/evil"],
     "an option of the phase's elsewhere": ["traffic@pretrain.traffic=../../evil"],
@@ -152,7 +173,12 @@ def test_an_agents_description_is_not_instantiated(key):
     weights, metadata = load_weights(CHECKPOINTS / "agent_idm.safetensors", "agent")
     del metadata["kind"]
     called = {"_target_": "evil.make", "_partial_": False}
-    save_weights("agent.safetensors", "agent", weights, {**metadata, key: {**metadata.get(key, {}), **called}})
+    save_weights(
+        "agent.safetensors",
+        "agent",
+        weights,
+        {**metadata, key: {**metadata.get(key, {}), **called}},
+    )
     with pytest.raises(UserError):
         make_driver("agent.safetensors", EnvConfig())
     save_weights("agent.safetensors", "agent", weights, {**metadata, "_target_": "evil.make"})
@@ -163,7 +189,9 @@ def test_a_generators_description_is_not_instantiated():
     weights, metadata = load_weights(CHECKPOINTS / "generator_paper.safetensors", "generator")
     del metadata["kind"]
     for key in ("sizes", "preset"):
-        save_weights("g.safetensors", "generator", weights, {**metadata, key: {"_target_": "evil.make"}})
+        save_weights(
+            "g.safetensors", "generator", weights, {**metadata, key: {"_target_": "evil.make"}}
+        )
         with pytest.raises(UserError):
             load_generator("g.safetensors")
 
@@ -198,7 +226,11 @@ def test_hydra_imports_nothing_and_reads_no_other_configuration(arguments, here,
     "override",
     [
         *("hydra.run.dir=out", "hydra.sweep.dir=out", "hydra.job.num=3", "hydra/launcher=joblib"),
-        *("hydra.launcher.n_jobs=2", "hydra.sweeper.max_batch_size=4", "+hydra.launcher.ray.init.num_cpus=2"),
+        *(
+            "hydra.launcher.n_jobs=2",
+            "hydra.sweeper.max_batch_size=4",
+            "+hydra.launcher.ray.init.num_cpus=2",
+        ),
     ],
 )
 def test_what_sweeps_need_of_hydra_can_be_given(override):
@@ -232,32 +264,51 @@ def annotated_with_text(road) -> "a traffic":  # noqa: F722
 
 
 @pytest.mark.parametrize(
-    "name", ["NoTraffic", "traffic_without_annotation", "something_else", "annotated_with_text", "MARKER", "json"]
+    "name",
+    [
+        "NoTraffic",
+        "traffic_without_annotation",
+        "something_else",
+        "annotated_with_text",
+        "MARKER",
+        "json",
+    ],
 )
 def test_what_is_named_is_called_only_if_it_makes_a_traffic(name, capsys):
-    with pytest.raises(UserError, match=r"expected a subclass of ganlane\.traffic\.TrafficModule or a function"):
+    with pytest.raises(
+        UserError, match=r"expected a subclass of ganlane\.traffic\.TrafficModule or a function"
+    ):
         import_target(f"{__name__}.{name}", "traffic._target_", TrafficModule)
-    assert "_target_" in refusal(capsys, "train", "traffic=idm", f"traffic._target_={__name__}.{name}")
+    assert "_target_" in refusal(
+        capsys, "train", "traffic=idm", f"traffic._target_={__name__}.{name}"
+    )
 
 
 def test_a_class_or_an_annotated_function_is_taken():
     for name in ("ganlane.traffic.IdmTraffic", "ganlane.traffic.presets.gan_traffic"):
         import_target(name, "traffic._target_", TrafficModule)
-    assert import_target(f"{__name__}.traffic_by_annotation", "", TrafficModule) is traffic_by_annotation
+    assert (
+        import_target(f"{__name__}.traffic_by_annotation", "", TrafficModule)
+        is traffic_by_annotation
+    )
 
 
 def test_a_resumed_run_takes_what_this_command_line_repeats():
     own = IdmTrafficConfig(_target_="evil.Traffic")
     agents = ["mobil", "random_legal", "evil.Policy+safe"]
     config = TrainConfig(resume="run", traffic=own, evaluation=FinalEvaluationConfig(agents=agents))
-    told = ["traffic._target_=evil.Traffic", "evaluation.agents=[mobil,random_legal,evil.Policy+safe]"]
+    told = [
+        "traffic._target_=evil.Traffic",
+        "evaluation.agents=[mobil,random_legal,evil.Policy+safe]",
+    ]
     refuse_stored_imports(config, told)
     for half, missing in ((told[:1], told[1]), (told[1:], told[0])):
         with pytest.raises(UserError) as caught:
             refuse_stored_imports(config, half)
         assert f"add {missing} to the command line" in str(caught.value)
     with pytest.raises(UserError, match=r"the run's files name evil\.Traffic"):
-        refuse_stored_imports(config, ["resume=evil.Traffic", "init.path=evil.Policy"])  # names of files name no code
+        # names of files name no code
+        refuse_stored_imports(config, ["resume=evil.Traffic", "init.path=evil.Policy"])
 
 
 def test_a_command_does_not_look_for_modules_where_it_is_started(monkeypatch):

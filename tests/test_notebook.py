@@ -1,4 +1,6 @@
-"""The notebook in examples/ runs from its first cell to its last, and the outputs that it is kept with are whole."""
+"""The notebook in examples/ runs from its first cell to its last, and the outputs that it is kept
+with are whole.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +19,27 @@ NOTEBOOK = ROOT / "examples" / "quickstart.ipynb"
 
 def shown(notebook):
     """What its code cells show, by MIME type."""
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    outputs = [
+        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+    ]
     assert not [output for output in outputs if output.output_type == "error"]
     data = [output.data for output in outputs if "data" in output]
-    return {kind: [each[kind] for each in data if kind in each] for kind in ("text/plain", "text/html", "image/png")}
+    return {
+        kind: [each[kind] for each in data if kind in each]
+        for kind in ("text/plain", "text/html", "image/png")
+    }
 
 
 def test_the_notebook_leads_to_tables_and_a_picture(tmp_path, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])))
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    )
     kept = nbformat.read(NOTEBOOK, as_version=4)
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     resources = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3", resources=resources).execute()
+    nbclient.NotebookClient(
+        notebook, timeout=120, kernel_name="python3", resources=resources
+    ).execute()
     for found in (shown(notebook), shown(kept)):
         assert found["text/plain"][0].startswith("'after 1 s: 4")
         assert ["hurried" in table for table in found["text/html"]] == [False, True]

@@ -1,4 +1,7 @@
-"""Runs and agents of version 0.1 load, drive and go on; ``fixtures/run_0_1`` was written by that version."""
+"""Runs and agents of version 0.1 load, drive and go on.
+
+``fixtures/run_0_1`` was written by that version.
+"""
 
 from __future__ import annotations
 

@@ -48,10 +48,17 @@ def test_a_conf_folder_of_another_project_is_not_ours(tmp_path, monkeypatch):
 
 
 def files_of_wheel(folder, monkeypatch):
-    """Names in a wheel and its bytes; built with one variant of the kernel, since the others take seconds."""
+    """Names in a wheel and its bytes.
+
+    Built with one variant of the kernel, since the others take seconds.
+    """
     monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
-    wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling is not installed; CI builds the wheel")
-    (artifact,) = map(Path, wheel.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"]))
+    wheel = pytest.importorskip(
+        "hatchling.builders.wheel", reason="hatchling is not installed; CI builds the wheel"
+    )
+    (artifact,) = map(
+        Path, wheel.WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
+    )
     assert artifact.name.startswith(f"ganlane-{ganlane.__version__}-")
     with zipfile.ZipFile(artifact) as packed:
         return set(packed.namelist()), artifact.stat().st_size
@@ -68,12 +75,21 @@ def test_a_light_wheel_leaves_the_further_trainings_out_and_is_below_5_mb(tmp_pa
 
 def test_the_wheel_holds_configuration_weights_and_kernel(tmp_path, monkeypatch):
     names, _ = files_of_wheel(tmp_path, monkeypatch)
-    assert {f"ganlane/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")} <= names
+    assert {
+        f"ganlane/conf/{path.relative_to(ROOT / 'conf')}"
+        for path in (ROOT / "conf").rglob("*.yaml")
+    } <= names
     for kind in ("safetensors", "json"):
-        shipped = {f"ganlane/checkpoints/{path.name}" for path in (PACKAGE / "checkpoints").glob(f"*.{kind}")}
+        shipped = {
+            f"ganlane/checkpoints/{path.name}"
+            for path in (PACKAGE / "checkpoints").glob(f"*.{kind}")
+        }
         assert shipped
         assert shipped <= names
-    page = {f"ganlane/view/player_page/{path.name}" for path in (PACKAGE / "view" / "player_page").iterdir()}
+    page = {
+        f"ganlane/view/player_page/{path.name}"
+        for path in (PACKAGE / "view" / "player_page").iterdir()
+    }
     assert "ganlane/view/player_page/page.html" in page <= names
     assert "ganlane/py.typed" in names
     kernels = [name for name in names if name.startswith("ganlane/native/prebuilt/kernel-default-")]

@@ -1,4 +1,7 @@
-"""Memory, streams and statuses of a process: a reader who leaves, a full disk, streams that the shell has closed."""
+"""Memory, streams and statuses of a process.
+
+A reader who leaves, a full disk, streams that the shell has closed.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,9 @@ def run(*command, **options):
     return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="glibc's allocator is on Linux alone")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="glibc's allocator is on Linux alone"
+)
 def test_a_process_that_keeps_its_memory_is_not_given_new_pages_at_every_step():
     import resource
 
@@ -74,7 +79,8 @@ def test_without_docstrings_help_still_lists_the_keys():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [((), "working directory is gone"), (("-OO",), "removes the docstrings")]
+    ("options", "message"),
+    [((), "working directory is gone"), (("-OO",), "removes the docstrings")],
 )
 def test_the_doctor_reports_in_one_sentence_that_nothing_can_run(options, message, tmp_path):
     folder = tmp_path / "removed"

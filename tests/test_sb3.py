@@ -1,4 +1,7 @@
-"""stable-baselines3: the batch is a VecEnv; algorithms train on it unchanged, and their policies are evaluated."""
+"""stable-baselines3: the batch is a VecEnv.
+
+Algorithms train on it unchanged, and their policies are evaluated.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,9 @@ def test_observations_and_rewards_are_those_of_the_gymnasium_batch():
 
 def test_the_info_of_a_row_that_ends_holds_its_statistics_and_its_last_observation():
     steps = drive(made(), 40)
-    ends = [(step, row) for step, (_, _, done, _) in enumerate(steps) for row in np.flatnonzero(done)]
+    ends = [
+        (step, row) for step, (_, _, done, _) in enumerate(steps) for row in np.flatnonzero(done)
+    ]
     assert ends
     began = dict.fromkeys(range(ROWS), 0)
     for step, row in ends:
@@ -67,7 +72,9 @@ def test_the_info_of_a_row_that_ends_holds_its_statistics_and_its_last_observati
         assert info["goal"]
         assert not info["TimeLimit.truncated"]
         began[row] = step + 1
-    running = [info for _, _, done, infos in steps for row, info in enumerate(infos) if not done[row]]
+    running = [
+        info for _, _, done, infos in steps for row, info in enumerate(infos) if not done[row]
+    ]
     assert all(info == {} for info in running)
 
 
@@ -130,7 +137,9 @@ def test_the_algorithm_trains_unchanged_and_its_policy_can_be_evaluated(algorith
         warnings.simplefilter("error")
         model = algorithm("MlpPolicy", env, seed=0, device="cpu", **QUICK[algorithm]).learn(128)
         if algorithm is not sb3_contrib.MaskablePPO:
-            returns, lengths = evaluate_policy(model, made(), n_eval_episodes=4, return_episode_rewards=True)
+            returns, lengths = evaluate_policy(
+                model, made(), n_eval_episodes=4, return_episode_rewards=True
+            )
             assert len(returns) == len(lengths) == 4
     assert model.ep_info_buffer
     driver = ganlane.sb3.driver(model)

@@ -2,12 +2,15 @@
 
     python -m benchmarks.peers.compare
 
-Prints the tables of docs/peers.md, writes them there, and writes docs/figures/peers.json and docs/figures/peers.png.
-What separates a peer's trace from ganlane's is taken apart into three pieces:
+Prints the tables of docs/peers.md, writes them there, and writes docs/figures/peers.json and
+docs/figures/peers.png. What separates a peer's trace from ganlane's is taken apart into three
+pieces:
 
 - ``law``: our own driver under the peer's reading of IDM, less ganlane;
-- ``scheme``: the peer, less our own driver under the peer's reading. :mod:`benchmarks.peers.tolerance` bounds it;
-- ``rest``: the peer, less our own driver under the peer's reading and the peer's scheme. Only rounding may remain.
+- ``scheme``: the peer, less our own driver under the peer's reading.
+  :mod:`benchmarks.peers.tolerance` bounds it;
+- ``rest``: the peer, less our own driver under the peer's reading and the peer's scheme. Only
+  rounding may remain.
 """
 
 from __future__ import annotations
@@ -58,7 +61,9 @@ class Apart(NamedTuple):
 
 
 def take_apart(scene: Scene, peer: Peer, ganlane: Trace, driven: Trace) -> Apart:
-    """Law, scheme and rest of the difference between ``driven`` (the peer's trace) and ``ganlane``'s."""
+    """Law, scheme and rest of the difference between ``driven`` (the peer's trace) and
+    ``ganlane``'s.
+    """
     read = integrate(scene, Scheme.BALLISTIC, peer.law)
     return Apart(
         direct=between(driven, ganlane),
@@ -70,7 +75,10 @@ def take_apart(scene: Scene, peer: Peer, ganlane: Trace, driven: Trace) -> Apart
 
 
 def settled(speed_mps: float, drive: Callable[[Scene], Trace], law: Law) -> dict[str, float]:
-    """The last gaps of a platoon: their mean, how far one is from the formula of its law, and how far it may be."""
+    """The last gaps of a platoon.
+
+    Their mean, how far one is from the formula of its law, and how far it may be.
+    """
     trace = drive(settling(speed_mps))
     expected = equilibrium_gap(speed_mps, law)
     return {
@@ -92,7 +100,12 @@ def collect() -> tuple[dict[str, Any], dict[str, dict[str, Trace]]]:
             apart = take_apart(scene, peer, mine, traces[scene.name][peer.name])._asdict()
             pieces = {name: piece._asdict() for name, piece in apart.items()}
             rows.append({"scene": scene.name, "peer": peer.name, **pieces})
-    figures = {"versions": versions(), "traces": rows, "settled": _settled(), "stops": _stops(traces)}
+    figures = {
+        "versions": versions(),
+        "traces": rows,
+        "settled": _settled(),
+        "stops": _stops(traces),
+    }
     # At steps of a millisecond the final gap is the model's own.
     final_gap_m = float(integrate(OBSTACLE, Scheme.BALLISTIC, dt=0.001).gap[-1, 0])
     return {**figures, "steps": _steps(), "final_gap_at_1_ms_m": final_gap_m}, traces
@@ -109,22 +122,36 @@ def _settled() -> list[dict[str, Any]]:
 
 def _stops(traces: dict[str, dict[str, Trace]]) -> list[dict[str, Any]]:
     return [
-        {"simulator": name, "final_gap_m": float(trace.gap[-1, 0]), "lowest_mps": float(trace.speed[:, 1].min())}
+        {
+            "simulator": name,
+            "final_gap_m": float(trace.gap[-1, 0]),
+            "lowest_mps": float(trace.speed[:, 1].min()),
+        }
         for name, trace in traces[OBSTACLE.name].items()
     ]
 
 
 def _steps() -> list[dict[str, Any]]:
-    """What the step itself does in the scene 'slow and go'; every simulator against ganlane at 0.1 s."""
+    """What the step itself does in the scene 'slow and go'.
+
+    Every simulator against ganlane at 0.1 s.
+    """
     mine = drive_ours(SLOW_AND_GO)
     others = {
-        "its own equations at 0.01 s": (every(integrate(SLOW_AND_GO, Scheme.BALLISTIC, dt=0.01), 10), 1),
-        "HighwayEnv at its default 1/15 s": (every(drive_highway_env(SLOW_AND_GO, dt=1 / 15), 3), 2),
+        "its own equations at 0.01 s": (
+            every(integrate(SLOW_AND_GO, Scheme.BALLISTIC, dt=0.01), 10),
+            1,
+        ),
+        "HighwayEnv at its default 1/15 s": (
+            every(drive_highway_env(SLOW_AND_GO, dt=1 / 15), 3),
+            2,
+        ),
         "SUMO at its default 1 s, Euler": (drive_sumo(SLOW_AND_GO, ballistic=False, dt=1.0), 10),
         "SUMO at 1 s, ballistic": (drive_sumo(SLOW_AND_GO, dt=1.0), 10),
     }
     return [
-        {"other": name, **between(other, every(mine, stride))._asdict()} for name, (other, stride) in others.items()
+        {"other": name, **between(other, every(mine, stride))._asdict()}
+        for name, (other, stride) in others.items()
     ]
 
 
@@ -136,14 +163,20 @@ def every(trace: Trace, stride: int) -> Trace:
 def main(argv: list[str] | None = None) -> int:
     """Print the tables, write JSON and plot; 2 after a user's mistake."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="folder of peers.json and peers.png")
-    parser.add_argument("--page", type=Path, default=Path("docs/peers.md"), help="page whose tables are replaced")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs/figures"), help="folder of peers.json and peers.png"
+    )
+    parser.add_argument(
+        "--page", type=Path, default=Path("docs/peers.md"), help="page whose tables are replaced"
+    )
     arguments = parser.parse_args(argv)
     out = arguments.out
     try:
         require_peers()
         if not arguments.page.is_file():
-            raise UserError(f"{arguments.page}: no such page; run from the repository root or give --page.")
+            raise UserError(
+                f"{arguments.page}: no such page; run from the repository root or give --page."
+            )
         figures, traces = collect()
     except UserError as error:
         print(error, file=sys.stderr)

@@ -28,12 +28,16 @@ def page(figures: Figures) -> str:
 
 
 def fill(text: str, figures: Figures) -> str:
-    """``text`` with a new table between every ``<!-- NAME -->`` of :data:`PARTS` and the next ``<!-- end -->``."""
+    """``text`` with a new table between every ``<!-- NAME -->`` of :data:`PARTS` and the next
+    ``<!-- end -->``.
+    """
 
     def replaced(found: re.Match[str]) -> str:
         return f"<!-- {found[1]} -->\n\n{PARTS[found[1]](figures)}\n\n<!-- end -->"
 
-    return re.sub(rf"<!-- ({'|'.join(PARTS)}) -->\n.*?<!-- end -->", replaced, text, flags=re.DOTALL)
+    return re.sub(
+        rf"<!-- ({'|'.join(PARTS)}) -->\n.*?<!-- end -->", replaced, text, flags=re.DOTALL
+    )
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -50,19 +54,39 @@ def number(value: float) -> str:
 
 def traces_table(figures: Figures) -> str:
     """Largest differences of speed and distance per scene and peer."""
-    head = ["scene", "peer", "quantity", "peer - ganlane", "law", "scheme", "allowed for the scheme", "rest"]
+    head = [
+        "scene",
+        "peer",
+        "quantity",
+        "peer - ganlane",
+        "law",
+        "scheme",
+        "allowed for the scheme",
+        "rest",
+    ]
     rows = []
     for row in figures["traces"]:
-        distance = ("position_m", "position, m") if row["scene"] == "free road" else ("gap_m", "gap, m")
+        distance = (
+            ("position_m", "position, m") if row["scene"] == "free road" else ("gap_m", "gap, m")
+        )
         for key, name in (("speed_mps", "speed, m/s"), distance):
-            pieces = [number(row[piece][key]) for piece in ("direct", "law", "scheme", "allowed", "rest")]
+            pieces = [
+                number(row[piece][key]) for piece in ("direct", "law", "scheme", "allowed", "rest")
+            ]
             rows.append([row["scene"], row["peer"], name, *pieces])
     return table(head, rows)
 
 
 def settled_table(figures: Figures) -> str:
     """Equilibrium gaps per speed and simulator."""
-    head = ["speed, m/s", "simulator", "mean gap, m", "formula of its law, m", "largest distance, m", "allowed, m"]
+    head = [
+        "speed, m/s",
+        "simulator",
+        "mean gap, m",
+        "formula of its law, m",
+        "largest distance, m",
+        "allowed, m",
+    ]
     rows = [
         [
             f"{row['speed_mps']:g}",
@@ -79,13 +103,19 @@ def settled_table(figures: Figures) -> str:
 
 def stops_table(figures: Figures) -> str:
     """Where the cars come to rest behind the obstacle."""
-    rows = [[row["simulator"], f"{row['final_gap_m']:.4f}", f"{row['lowest_mps']:.4f}"] for row in figures["stops"]]
+    rows = [
+        [row["simulator"], f"{row['final_gap_m']:.4f}", f"{row['lowest_mps']:.4f}"]
+        for row in figures["stops"]
+    ]
     return table(["simulator", "final gap, m", "lowest speed, m/s"], rows)
 
 
 def steps_table(figures: Figures) -> str:
     """What other steps do."""
-    rows = [[row["other"], *(number(row[key]) for key in ("speed_mps", "gap_m"))] for row in figures["steps"]]
+    rows = [
+        [row["other"], *(number(row[key]) for key in ("speed_mps", "gap_m"))]
+        for row in figures["steps"]
+    ]
     return table(["ganlane at 0.1 s against", "speed, m/s", "gap, m"], rows)
 
 
@@ -109,7 +139,10 @@ SCHEMES = {"HighwayEnv": Scheme.EXPLICIT_EULER, "SUMO, Euler": Scheme.SEMI_IMPLI
 
 @rc_context(STYLE)
 def draw(traces: dict[str, dict[str, Trace]], figures: dict[str, Any], path: Path) -> None:
-    """Four panels: speeds, what the schemes account for, equilibrium gaps, and the stop; written to ``path``."""
+    """Four panels: speeds, what the schemes account for, equilibrium gaps, and the stop.
+
+    Written to ``path``.
+    """
     figure = Figure(figsize=(10, 7))
     (speeds, apart), (gaps, stop) = figure.subplots(2, 2)
     _speeds(speeds, traces[SLOW_AND_GO.name])
@@ -131,7 +164,9 @@ def _label(axes: Axes, title: str, x: str, y: str) -> None:
 def _speeds(axes: Axes, traces: dict[str, Trace]) -> None:
     mine = traces["ganlane"]
     for rank in (0, 1, 4, 8):
-        axes.plot(_times(mine), mine.speed[:, rank], color=str(0.07 * rank), label=f"ganlane, car {rank}")
+        axes.plot(
+            _times(mine), mine.speed[:, rank], color=str(0.07 * rank), label=f"ganlane, car {rank}"
+        )
     for start, (name, (marker, colour)) in enumerate(MARKERS.items()):
         every = slice(20 * start, None, 60)
         for rank in (1, 4, 8):
@@ -146,8 +181,16 @@ def _apart(axes: Axes, traces: dict[str, Trace]) -> None:
     for name, scheme in SCHEMES.items():
         colour = MARKERS[name][1]
         expected = difference(mine, SLOW_AND_GO, scheme).speed[:, 8]
-        axes.plot(_times(mine), traces[name].speed[:, 8] - mine.speed[:, 8], color=colour, label=name)
-        axes.plot(_times(mine), expected, "--", color=INK, label=None if name == "HighwayEnv" else "derived")
+        axes.plot(
+            _times(mine), traces[name].speed[:, 8] - mine.speed[:, 8], color=colour, label=name
+        )
+        axes.plot(
+            _times(mine),
+            expected,
+            "--",
+            color=INK,
+            label=None if name == "HighwayEnv" else "derived",
+        )
     left = traces["SUMO, ballistic"].speed[:, 8] - mine.speed[:, 8]
     axes.plot(_times(mine), left, color=MARKERS["SUMO, ballistic"][1], label="SUMO, ballistic")
     _label(axes, "slow and go, car 8: speed less ganlane's", "time, s", "difference, m/s")
@@ -163,7 +206,10 @@ def _gaps(axes: Axes, rows: list[dict[str, Any]]) -> None:
 
 
 def _stop(axes: Axes, traces: dict[str, Trace]) -> None:
-    for name, colour in {"ganlane": INK, **{name: colour for name, (_, colour) in MARKERS.items()}}.items():
+    for name, colour in {
+        "ganlane": INK,
+        **{name: colour for name, (_, colour) in MARKERS.items()},
+    }.items():
         style = "--" if name == "SUMO, ballistic" else "-"
         axes.plot(_times(traces[name]), traces[name].gap[:, 0], style, color=colour, label=name)
     axes.axhline(TABLE_V.min_gap_m, color="grey", lw=0.8)

@@ -1,6 +1,8 @@
-"""What is driven (one lane, Table V's drivers, a leader with a prescribed speed), and plain equations that drive it.
+"""What is driven (one lane, Table V's drivers, a leader with a prescribed speed), and plain
+equations that drive it.
 
-The three integration schemes agree on the new speed, ``v' = v + a dt``, and differ in the distance of a step:
+The three integration schemes agree on the new speed, ``v' = v + a dt``, and differ in the distance
+of a step:
 
 ========================  =====================  ==========================================
 ``BALLISTIC``             ``(v + v') / 2 * dt``  ganlane; SUMO with ``--step-method.ballistic``
@@ -43,8 +45,8 @@ class Scene:
         seconds: how long it is driven.
         speeds_mps: speed of each vehicle at the start.
         gaps_m: net gap (bumper to bumper) ahead of each vehicle but the foremost.
-        leader: the foremost vehicle's speed as (time in s, speed in m/s), straight lines between them;
-            empty where it drives freely, as everybody else does.
+        leader: the foremost vehicle's speed as (time in s, speed in m/s), straight lines between
+            them; empty where it drives freely, as everybody else does.
     """
 
     name: str
@@ -84,7 +86,9 @@ class Trace:
 UNEVEN_M = (30.0, 60.0, 25.0, 50.0, 35.0, 70.0, 28.0, 45.0)
 
 
-def platoon(name: str, seconds: float, speed_mps: float, leader: tuple[tuple[float, float], ...]) -> Scene:
+def platoon(
+    name: str, seconds: float, speed_mps: float, leader: tuple[tuple[float, float], ...]
+) -> Scene:
     """Eight cars at one speed and at uneven gaps behind a leader."""
     return Scene(name, seconds, (speed_mps,) * 9, UNEVEN_M, leader)
 
@@ -92,7 +96,9 @@ def platoon(name: str, seconds: float, speed_mps: float, leader: tuple[tuple[flo
 FREE_ROAD = Scene("free road", 120.0, (10.0,))
 CONSTANT = platoon("constant leader", 120.0, 15.0, ((0.0, 15.0),))
 #: Brakes at 2 m/s2 and speeds up at 0.5 m/s2.
-SLOW_AND_GO = platoon("slow and go", 150.0, 20.0, ((0, 20.0), (40, 20.0), (45, 10.0), (80, 10.0), (100, 20.0)))
+SLOW_AND_GO = platoon(
+    "slow and go", 150.0, 20.0, ((0, 20.0), (40, 20.0), (45, 10.0), (80, 10.0), (100, 20.0))
+)
 #: The same change of speed within one physics step.
 STEP = platoon("step", 150.0, 20.0, ((0, 20.0), (40, 20.0), (40.1, 10.0), (80, 10.0), (80.1, 20.0)))
 OBSTACLE = Scene("standing obstacle", 90.0, (0.0, 20.0), (300.0,), ((0.0, 0.0),))
@@ -120,8 +126,8 @@ class Law:
     """A reading of IDM.
 
     Args:
-        offset_m: added to the gap and to the minimum gap alike. 0 takes gaps from bumper to bumper; the length of
-            a vehicle takes them from centre to centre, as HighwayEnv does.
+        offset_m: added to the gap and to the minimum gap alike. 0 takes gaps from bumper to bumper;
+            the length of a vehicle takes them from centre to centre, as HighwayEnv does.
         floored: the dynamic part of the desired gap is never negative (ganlane, SUMO).
         reverses: the speed may fall below 0 (HighwayEnv).
         free_gap_m: the gap that stands for nobody ahead.
@@ -148,7 +154,9 @@ def acceleration(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) 
     wanted = p.min_gap_m + law.offset_m + (np.maximum(dynamic, 0.0) if law.floored else dynamic)
     free = 1.0 - (np.maximum(speed, 0.0) / DESIRED_SPEED_MPS) ** 4
     interaction = (wanted / (gap + law.offset_m)) ** 2
-    return np.clip(p.max_acceleration * (free - interaction), p.min_acceleration, p.max_acceleration)
+    return np.clip(
+        p.max_acceleration * (free - interaction), p.min_acceleration, p.max_acceleration
+    )
 
 
 def equilibrium_gap(speed_mps: float, law: Law = LAW) -> float:
@@ -159,7 +167,10 @@ def equilibrium_gap(speed_mps: float, law: Law = LAW) -> float:
 
 
 def ahead(trace: Trace, law: Law = LAW) -> tuple[Array, Array]:
-    """Net gap ahead of each vehicle and the speed of whoever is there, [T, M]; the first one sees nobody."""
+    """Net gap ahead of each vehicle and the speed of whoever is there, [T, M].
+
+    The first one sees nobody.
+    """
     first = np.full_like(trace.speed[:, :1], law.free_gap_m)
     return np.hstack((first, trace.gap)), np.hstack((trace.speed[:, :1], trace.speed[:, :-1]))
 

@@ -4,18 +4,21 @@
 
 **HighwayEnv** (1.10 to 1.12): its own IDM vehicles on its own road.
 
-- ``COMFORT_ACC_MAX``, ``COMFORT_ACC_MIN`` (negative), ``TIME_WANTED``, ``DELTA`` and ``DISTANCE_WANTED`` are Table V.
-  ``DISTANCE_WANTED`` is from centre to centre and so includes a length.
+- ``COMFORT_ACC_MAX``, ``COMFORT_ACC_MIN`` (negative), ``TIME_WANTED``, ``DELTA`` and
+  ``DISTANCE_WANTED`` are Table V. ``DISTANCE_WANTED`` is from centre to centre and so includes a
+  length.
 - ``ACC_MAX`` (6 m/s2) bounds the acceleration both ways; here Table V's 20 m/s2.
-- ``target_speed`` is the desired speed, but the lane's ``speed_limit`` (20 or 30 m/s by default) cuts it.
+- ``target_speed`` is the desired speed, but the lane's ``speed_limit`` (20 or 30 m/s by default)
+  cuts it.
 - Lane changes are off; the step is 0.1 s rather than the environments' 1/15 s.
 
 **SUMO** (1.20 to 1.28): ``carFollowModel`` IDM through libsumo.
 
-- ``accel``, ``decel`` (the comfortable one), ``tau``, ``minGap`` and ``delta`` are Table V; ``emergencyDecel`` is its
-  hardest braking. ``maxSpeed`` is the desired speed, as long as the lane allows it and ``speedFactor`` is 1.
-- ``stepping`` (0.25 s by default) is the step within a step; at the step itself (0.1 s) IDM is evaluated once a
-  step, as elsewhere.
+- ``accel``, ``decel`` (the comfortable one), ``tau``, ``minGap`` and ``delta`` are Table V;
+  ``emergencyDecel`` is its hardest braking. ``maxSpeed`` is the desired speed, as long as the lane
+  allows it and ``speedFactor`` is 1.
+- ``stepping`` (0.25 s by default) is the step within a step; at the step itself (0.1 s) IDM is
+  evaluated once a step, as elsewhere.
 - ``sigma`` and ``speedDev`` are 0; vehicles enter without checks (``insertionChecks="none"``).
 - The prescribed leader is driven by ``setSpeed`` with all checks off (speed mode 0).
 """
@@ -66,15 +69,21 @@ def vehicles_of(scene: Scene, dtype: torch.dtype = torch.float64) -> Vehicles:
 
 
 def led(before: Vehicles, moved: Vehicles, leader_mps: float, dt: float) -> Vehicles:
-    """``moved`` with the foremost at its prescribed speed, at constant acceleration within the step."""
+    """``moved`` with the foremost at its prescribed speed, at constant acceleration within the
+    step.
+    """
     speed, x = moved.speed.clone(), moved.x.clone()
     speed[:, 0] = leader_mps
     x[:, 0] = before.x[:, 0] + 0.5 * dt * (before.speed[:, 0] + leader_mps)
     return moved.with_(speed=speed, x=x)
 
 
-def drive_ours(scene: Scene, dt: float = PHYSICS_STEP_S, dtype: torch.dtype = torch.float64) -> Trace:
-    """Drive ``scene`` with :class:`~ganlane.traffic.idm_mobil.IdmTraffic` as it stands, at steps of ``dt`` s."""
+def drive_ours(
+    scene: Scene, dt: float = PHYSICS_STEP_S, dtype: torch.dtype = torch.float64
+) -> Trace:
+    """Drive ``scene`` with :class:`~ganlane.traffic.idm_mobil.IdmTraffic` as it stands, at steps of
+    ``dt`` s.
+    """
     traffic = IdmTraffic(Road(lanes=1))
     traffic.dt = dt
     vehicles = vehicles_of(scene, dtype)
@@ -83,7 +92,9 @@ def drive_ours(scene: Scene, dt: float = PHYSICS_STEP_S, dtype: torch.dtype = to
     speeds, positions = [vehicles.speed], [vehicles.x]
     for step in range(scene.steps(dt)):
         moved, memory = traffic.move(vehicles, memory, key, key + step)
-        vehicles = led(vehicles, moved, scene.leader_speeds(dt)[step + 1], dt) if scene.leader else moved
+        vehicles = (
+            led(vehicles, moved, scene.leader_speeds(dt)[step + 1], dt) if scene.leader else moved
+        )
         speeds.append(vehicles.speed)
         positions.append(vehicles.x)
     return Trace(_stack(speeds), _stack(positions))
@@ -98,7 +109,8 @@ class Distances(Enum):
 
     #: As it comes: from centre to centre, with one vehicle's length in the minimum gap.
     CENTRES = LENGTH_M
-    #: Points instead of bodies, as far apart as the bumpers are: HighwayEnv's equations see the net gap.
+    #: Points instead of bodies, as far apart as the bumpers are: HighwayEnv's equations see the net
+    #: gap.
     BUMPERS = 0.0
 
 
@@ -123,7 +135,9 @@ def highway_env_road(scene: Scene, distances: Distances, idm: IdmParameters) -> 
     from highway_env.road.road import Road, RoadNetwork
     from highway_env.vehicle.kinematics import Vehicle
 
-    network = RoadNetwork.straight_road_network(lanes=1, length=ROAD_M, speed_limit=2.0 * DESIRED_SPEED_MPS)
+    network = RoadNetwork.straight_road_network(
+        lanes=1, length=ROAD_M, speed_limit=2.0 * DESIRED_SPEED_MPS
+    )
     road = Road(network, np_random=np.random.RandomState(0))
     driver = driver_class(distances, idm)
     squeezed = scene.positions_m() + squeeze(scene, distances)
@@ -132,7 +146,12 @@ def highway_env_road(scene: Scene, distances: Distances, idm: IdmParameters) -> 
             vehicle = Vehicle(road, [x, 0.0], speed=speed)
         else:
             vehicle = driver(
-                road, [x, 0.0], speed=speed, target_speed=DESIRED_SPEED_MPS, enable_lane_change=False, timer=1.0
+                road,
+                [x, 0.0],
+                speed=speed,
+                target_speed=DESIRED_SPEED_MPS,
+                enable_lane_change=False,
+                timer=1.0,
             )
         # Its crash physics would push the points apart that stand for bodies.
         vehicle.check_collisions = distances is Distances.CENTRES
@@ -141,22 +160,32 @@ def highway_env_road(scene: Scene, distances: Distances, idm: IdmParameters) -> 
 
 
 def squeeze(scene: Scene, distances: Distances) -> np.ndarray:
-    """How far forward each vehicle is drawn so that centres are as far apart as bumpers should be, m, [M]."""
+    """How far forward each vehicle is drawn so that centres are as far apart as bumpers should be,
+    m, [M].
+    """
     rank = np.arange(len(scene.speeds_mps))
     return rank * (LENGTH_M - distances.value)
 
 
 def drive_highway_env(
-    scene: Scene, distances: Distances = Distances.BUMPERS, dt: float = PHYSICS_STEP_S, idm: IdmParameters = TABLE_V
+    scene: Scene,
+    distances: Distances = Distances.BUMPERS,
+    dt: float = PHYSICS_STEP_S,
+    idm: IdmParameters = TABLE_V,
 ) -> Trace:
-    """Drive ``scene`` with HighwayEnv at steps of ``dt`` seconds; positions in the trace are the bodies' centres."""
+    """Drive ``scene`` with HighwayEnv at steps of ``dt`` seconds.
+
+    Positions in the trace are the bodies' centres.
+    """
     road = highway_env_road(scene, distances, idm)
     leader = scene.leader_speeds(dt) if scene.leader else None
     speeds, positions = [_speeds(road)], [_positions(road)]
     for step in range(scene.steps(dt)):
         road.act()
         if leader is not None:
-            road.vehicles[0].act({"steering": 0.0, "acceleration": (leader[step + 1] - leader[step]) / dt})
+            road.vehicles[0].act(
+                {"steering": 0.0, "acceleration": (leader[step + 1] - leader[step]) / dt}
+            )
         road.step(dt)
         speeds.append(_speeds(road))
         positions.append(_positions(road))
@@ -196,7 +225,10 @@ def vehicle_type(name: str, max_speed_mps: float, dt: float, p: IdmParameters) -
 
 
 def demand(scene: Scene, dt: float, idm: IdmParameters) -> str:
-    """The route file: everybody on the road from the first step, front bumpers half a length ahead of the centres."""
+    """The route file.
+
+    Everybody on the road from the first step, front bumpers half a length ahead of the centres.
+    """
     limits = {"leader": 2 * DESIRED_SPEED_MPS, "driver": DESIRED_SPEED_MPS}
     lines = [vehicle_type(name, limit, dt, idm) for name, limit in limits.items()]
     lines.append('<route id="all" edges="road"/>')
@@ -212,8 +244,21 @@ def demand(scene: Scene, dt: float, idm: IdmParameters) -> str:
 def command(folder: Path, ballistic: bool, dt: float) -> list[str]:
     """SUMO's command line for the files in ``folder``."""
     return [
-        *("sumo", "--net-file", str(folder / "net.xml"), "--route-files", str(folder / "routes.xml")),
-        *("--step-length", str(dt), "--step-method.ballistic", str(ballistic).lower(), "--default.speeddev", "0"),
+        *(
+            "sumo",
+            "--net-file",
+            str(folder / "net.xml"),
+            "--route-files",
+            str(folder / "routes.xml"),
+        ),
+        *(
+            "--step-length",
+            str(dt),
+            "--step-method.ballistic",
+            str(ballistic).lower(),
+            "--default.speeddev",
+            "0",
+        ),
         *("--collision.action", "none", "--time-to-teleport", "-1", "--xml-validation", "never"),
         *("--no-step-log", "true", "--duration-log.disable", "true", "--no-warnings", "true"),
     ]
@@ -222,7 +267,8 @@ def command(folder: Path, ballistic: bool, dt: float) -> list[str]:
 def drive_sumo(
     scene: Scene, ballistic: bool = True, dt: float = PHYSICS_STEP_S, idm: IdmParameters = TABLE_V
 ) -> Trace:
-    """Drive ``scene`` with SUMO at steps of ``dt`` seconds; positions in the trace are the bodies' centres.
+    """Drive ``scene`` with SUMO at steps of ``dt`` seconds; positions in the trace are the bodies'
+    centres.
 
     Raises:
         UserError: a vehicle is missing, so the trace would not be that of the scene.
@@ -241,12 +287,17 @@ def drive_sumo(
 
 
 def _run_sumo(libsumo: Any, scene: Scene, dt: float) -> Trace:
-    """Step the loaded simulation and record it. SUMO inserts at the end of its first step: that is the start."""
+    """Step the loaded simulation and record it. SUMO inserts at the end of its first step.
+
+    That is the start.
+    """
     leader = scene.leader_speeds(dt) if scene.leader else None
     libsumo.simulationStep()
     names = [str(rank) for rank in range(len(scene.speeds_mps))]
     if sorted(libsumo.vehicle.getIDList()) != names:
-        raise UserError(f"SUMO put {libsumo.vehicle.getIDList()} on the road; expected the vehicles {names}.")
+        raise UserError(
+            f"SUMO put {libsumo.vehicle.getIDList()} on the road; expected the vehicles {names}."
+        )
     if leader is not None:
         libsumo.vehicle.setSpeedMode("0", 0)
     speeds, positions = [], []
@@ -283,7 +334,13 @@ PEERS = (
         Law(LENGTH_M, floored=False, reverses=True, free_gap_m=math.inf),
     ),
     Peer("SUMO, ballistic", "libsumo", drive_sumo, Scheme.BALLISTIC, _SUMO),
-    Peer("SUMO, Euler", "libsumo", partial(drive_sumo, ballistic=False), Scheme.SEMI_IMPLICIT_EULER, _SUMO),
+    Peer(
+        "SUMO, Euler",
+        "libsumo",
+        partial(drive_sumo, ballistic=False),
+        Scheme.SEMI_IMPLICIT_EULER,
+        _SUMO,
+    ),
 )
 PACKAGES = ("highway-env", "eclipse-sumo", "libsumo", "torch", "numpy")
 
@@ -296,7 +353,9 @@ def require_peers() -> None:
     """
     missing = sorted({peer.module for peer in PEERS if find_spec(peer.module) is None})
     if missing:
-        raise UserError(f"{', '.join(missing)}: not installed; pip install 'ganlane[bench]' brings the peers.")
+        raise UserError(
+            f"{', '.join(missing)}: not installed; pip install 'ganlane[bench]' brings the peers."
+        )
 
 
 def versions() -> dict[str, str]:

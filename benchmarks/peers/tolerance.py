@@ -1,12 +1,15 @@
-"""By how much another way of integrating may change a trace, from the accelerations recorded in ours.
+"""By how much another way of integrating may change a trace, from the accelerations recorded in
+ours.
 
-All schemes give the same new speed; they differ in the distance of a step by ``(weight - 1/2) (v' - v) dt``. Summed
-over the steps this telescopes: at equal speeds a vehicle is ``(weight - 1/2) dt (v(t) - v(0))`` ahead of ours. The
-gaps are then other ones, IDM answers them, and the answers run down the platoon. To first order in ``dt`` the
-difference ``(e_s, e_v)`` of gap and speed follows from IDM's partial derivatives along our own trace:
+All schemes give the same new speed; they differ in the distance of a step by
+``(weight - 1/2) (v' - v) dt``. Summed over the steps this telescopes: at equal speeds a vehicle is
+``(weight - 1/2) dt (v(t) - v(0))`` ahead of ours. The gaps are then other ones, IDM answers them,
+and the answers run down the platoon. To first order in ``dt`` the difference ``(e_s, e_v)`` of gap
+and speed follows from IDM's partial derivatives along our own trace:
 
     e_v' = e_v + dt (a_s e_s + a_v e_v + a_l e_leader)
-    e_s' = e_s + dt/2 (e_leader + e_leader' - e_v - e_v') + (weight - 1/2) dt (change of v_leader - change of v)
+    e_s' = e_s + dt/2 (e_leader + e_leader' - e_v - e_v') + (weight - 1/2) dt (change of v_leader -
+    change of v)
 
 No simulator but ours takes part in this, and the other scheme is never run.
 """
@@ -32,15 +35,19 @@ from benchmarks.peers.scene import (
 from ganlane.keys import PHYSICS_STEP_S
 from ganlane.sim.idm import TABLE_V
 
-#: Room for the terms of second order: products of two differences, each of them small beside gap and speed.
+#: Room for the terms of second order: products of two differences, each of them small beside gap
+#: and speed.
 MARGIN = 1.1
-#: What double precision may leave after minutes at positions of kilometres, m/s and m. SUMO's "nobody ahead" is a
-#: leader 1000 km away, worth ``v0/4 (v0 T / 10^6 m)^2`` = 1e-8 m/s, and is in it too.
+#: What double precision may leave after minutes at positions of kilometres, m/s and m. SUMO's
+#: "nobody ahead" is a leader 1000 km away, worth ``v0/4 (v0 T / 10^6 m)^2`` = 1e-8 m/s, and is in
+#: it too.
 ROUNDING_MPS, ROUNDING_M = 2e-8, 2e-6
 
 
 class Slopes(NamedTuple):
-    """IDM's partial derivatives with respect to gap (1/s2), own speed and the leader's speed (1/s), [T, M]."""
+    """IDM's partial derivatives with respect to gap (1/s2), own speed and the leader's speed (1/s),
+    [T, M].
+    """
 
     gap: Array
     speed: Array
@@ -48,7 +55,10 @@ class Slopes(NamedTuple):
 
 
 def slopes(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) -> Slopes:
-    """Derivatives of :func:`~benchmarks.peers.scene.acceleration`; 0 where it is cut to Table V's bounds."""
+    """Derivatives of :func:`~benchmarks.peers.scene.acceleration`.
+
+    0 where it is cut to Table V's bounds.
+    """
     p = TABLE_V
     dynamic = speed * p.headway_s + speed * (speed - leader_speed) / BRAKE
     answers = (dynamic > 0.0) | (not law.floored)
@@ -59,11 +69,17 @@ def slopes(speed: Array, gap: Array, leader_speed: Array, law: Law = LAW) -> Slo
     pull = 2.0 * p.max_acceleration * ratio / (gap + law.offset_m)
     free = 4.0 * p.max_acceleration * np.maximum(speed, 0.0) ** 3 / DESIRED_SPEED_MPS**4
     uncut = acceleration(speed, gap, leader_speed, law) > p.min_acceleration
-    return Slopes(uncut * pull * ratio, uncut * -(free + pull * by_speed), uncut * -pull * by_leader)
+    return Slopes(
+        uncut * pull * ratio, uncut * -(free + pull * by_speed), uncut * -pull * by_leader
+    )
 
 
-def difference(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S) -> Trace:
-    """First-order difference of speed and position between ``scheme`` and the ballistic ``trace``, [steps + 1, M]."""
+def difference(
+    trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S
+) -> Trace:
+    """First-order difference of speed and position between ``scheme`` and the ballistic ``trace``,
+    [steps + 1, M].
+    """
     by = slopes(trace.speed, *ahead(trace, law), law)
     shift = (scheme.value - 0.5) * dt * np.diff(trace.speed, axis=0)
     speed, position = np.zeros_like(trace.speed), np.zeros_like(trace.speed)
@@ -81,7 +97,10 @@ def difference(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: f
 
 
 class Largest(NamedTuple):
-    """The largest absolute difference at any moment of any vehicle: speed (m/s), gap and position (m)."""
+    """The largest absolute difference at any moment of any vehicle.
+
+    Speed (m/s), gap and position (m).
+    """
 
     speed_mps: float
     gap_m: float
@@ -94,12 +113,19 @@ ROUNDING = Largest(ROUNDING_MPS, ROUNDING_M, ROUNDING_M)
 def between(one: Trace, other: Trace) -> Largest:
     """How far two traces of one scene are apart."""
     return Largest(
-        largest(one.speed - other.speed), largest(one.gap - other.gap), largest(one.position - other.position)
+        largest(one.speed - other.speed),
+        largest(one.gap - other.gap),
+        largest(one.position - other.position),
     )
 
 
-def tolerance(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S) -> Largest:
-    """How far ``scheme`` may be from the ballistic ``trace``: :func:`difference`, margin and rounding."""
+def tolerance(
+    trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: float = PHYSICS_STEP_S
+) -> Largest:
+    """How far ``scheme`` may be from the ballistic ``trace``.
+
+    :func:`difference`, margin and rounding.
+    """
     expected = difference(trace, scene, scheme, law, dt)
     gap = expected.position[:, :-1] - expected.position[:, 1:]
     sizes = (largest(expected.speed), largest(gap), largest(expected.position))
@@ -107,9 +133,11 @@ def tolerance(trace: Trace, scene: Scene, scheme: Scheme, law: Law = LAW, dt: fl
 
 
 def free_road_speed_mps(free_gap_m: float) -> float:
-    """How much below its desired speed a driver settles whose empty road is a gap of ``free_gap_m``, m/s.
+    """How much below its desired speed a driver settles whose empty road is a gap of
+    ``free_gap_m``, m/s.
 
-    To first order ``v0/4 (s*/d)^2``: the slope of the free term, ``4 a / v0``, against the interaction that is left.
+    To first order ``v0/4 (s*/d)^2``: the slope of the free term, ``4 a / v0``, against the
+    interaction that is left.
     """
     wanted = TABLE_V.min_gap_m + DESIRED_SPEED_MPS * TABLE_V.headway_s
     return 0.25 * DESIRED_SPEED_MPS * (wanted / free_gap_m) ** 2
@@ -121,14 +149,17 @@ def largest(values: Array) -> float:
 
 
 def unsettled_gap_m(trace: Trace, law: Law = LAW) -> float:
-    """How far the last gaps may still be from the equilibrium gap, from the motion that is left at the end, m.
+    """How far the last gaps may still be from the equilibrium gap, from the motion that is left at
+    the end, m.
 
-    A gap ``e`` away from equilibrium asks for ``a_s e``; what else moves a driver then is its own and its leader's
-    speed, at their slopes.
+    A gap ``e`` away from equilibrium asks for ``a_s e``; what else moves a driver then is its own
+    and its leader's speed, at their slopes.
     """
     end = Trace(trace.speed[-2:], trace.position[-2:])
     left = np.diff(end.speed, axis=0)[0, 1:] / PHYSICS_STEP_S
     by = slopes(end.speed, *ahead(end, law), law)
     away = np.abs(end.speed[-1] - end.speed[-1, 0])
-    asked = np.abs(left) + np.abs(by.speed[-1, 1:]) * away[1:] + np.abs(by.leader[-1, 1:]) * away[:-1]
+    asked = (
+        np.abs(left) + np.abs(by.speed[-1, 1:]) * away[1:] + np.abs(by.leader[-1, 1:]) * away[:-1]
+    )
     return MARGIN * largest(asked / by.gap[-1, 1:]) + ROUNDING_M

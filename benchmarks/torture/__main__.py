@@ -1,16 +1,18 @@
 """Tries to break the package, and counts what held.
 
-    python -m benchmarks.torture --minutes 60 --report docs/reliability.md     all parts but versions
-    python -m benchmarks.torture kill --runs 45 --minutes 15
+    python -m benchmarks.torture --minutes 60 --report docs/reliability.md     all parts but
+    versions python -m benchmarks.torture kill --runs 45 --minutes 15
     python -m benchmarks.torture damage --inputs 10000
-    python -m benchmarks.torture damage --input 'scene CSV:17'                 one damaged file again
-    python -m benchmarks.torture soak --configurations 500 --minutes 40 --compiled 3
-    python -m benchmarks.torture versions                                      in virtual environments, half an hour
+    python -m benchmarks.torture damage --input 'scene CSV:17'                 one damaged file
+    again python -m benchmarks.torture soak --configurations 500 --minutes 40 --compiled 3
+    python -m benchmarks.torture versions                                      in virtual
+    environments, half an hour
 
-Parts: kill (kill -9, SIGTERM, SIGINT, then resumed to the same bits), disk (full disks, lost workers), damage
-(damaged files), code (ways to have code executed), misuse (of the API), soak (random configurations), memory (of a
-long run), cost (of the checks, in training), versions (of the dependencies). Without a part's name all but the last
-run. Exits with 1 after a failure. Needs Linux.
+Parts: kill (kill -9, SIGTERM, SIGINT, then resumed to the same bits), disk (full disks, lost
+workers), damage (damaged files), code (ways to have code executed), misuse (of the API), soak
+(random configurations), memory (of a long run), cost (of the checks, in training), versions (of the
+dependencies). Without a part's name all but the last run. Exits with 1 after a failure. Needs
+Linux.
 """
 
 from __future__ import annotations
@@ -36,7 +38,16 @@ from ganlane.files import write_json
 
 MARKERS = "<!-- begin torture -->", "<!-- end torture -->"
 #: Parts, and their shares of the minutes.
-SHARES = {"kill": 4, "disk": 2, "damage": 4, "code": 0.5, "misuse": 2, "soak": 8, "memory": 1, "cost": 1}
+SHARES = {
+    "kill": 4,
+    "disk": 2,
+    "damage": 4,
+    "code": 0.5,
+    "misuse": 2,
+    "soak": 8,
+    "memory": 1,
+    "cost": 1,
+}
 HEAD = "| part | tried | failed | minutes |\n|---|---|---|---|"
 
 
@@ -68,18 +79,30 @@ def run(part: str, options: argparse.Namespace, minutes: float, scratch: Path) -
 def main() -> int:
     """Entry point; the exit status."""
     parser = make_parser(__doc__)
-    parser.add_argument("parts", nargs="*", choices=[[], *SHARES, "versions"], default=list(SHARES), metavar="PART")
+    parser.add_argument(
+        "parts", nargs="*", choices=[[], *SHARES, "versions"], default=list(SHARES), metavar="PART"
+    )
     parser.add_argument("--minutes", type=float, default=10.0, help="of all parts together, about")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=int, default=45, help="that kill disturbs")
-    parser.add_argument("--only-kill", action="store_true", help="kill -9 alone: no SIGTERM, no SIGINT")
-    parser.add_argument("--disks", type=int, default=24, help="runs on full disks and with lost workers")
+    parser.add_argument(
+        "--only-kill", action="store_true", help="kill -9 alone: no SIGTERM, no SIGINT"
+    )
+    parser.add_argument(
+        "--disks", type=int, default=24, help="runs on full disks and with lost workers"
+    )
     parser.add_argument("--inputs", type=int, default=10_000, help="damaged files")
     parser.add_argument("--configurations", type=int, default=500, help="that soak drives")
-    parser.add_argument("--compiled", type=int, default=0, help="of them compiled, a minute each before they drive")
+    parser.add_argument(
+        "--compiled", type=int, default=0, help="of them compiled, a minute each before they drive"
+    )
     parser.add_argument("--input", help="one damaged file, KIND:NUMBER, as a failure names it")
-    parser.add_argument("--configuration", type=int, help="one configuration of soak, as a failure names it")
-    parser.add_argument("--pin", nargs="*", default=[], help="for versions: torch==2.13.0 in all environments")
+    parser.add_argument(
+        "--configuration", type=int, help="one configuration of soak, as a failure names it"
+    )
+    parser.add_argument(
+        "--pin", nargs="*", default=[], help="for versions: torch==2.13.0 in all environments"
+    )
     parser.add_argument("--json", type=Path, help="all counts and failures as JSON")
     add_report(parser, *MARKERS)
     options = parser.parse_args()
@@ -115,7 +138,9 @@ def _all(options: argparse.Namespace, report: ReportSection, scratch: Path, here
         tally, table = run(part, options, options.minutes * SHARES.get(part, 0.0) / whole, folder)
         done.append(tally)
         tables += [table] if table else []
-    content = "\n".join([HEAD, *(tally.row() for tally in done), *(f"\n{table}" for table in tables)])
+    content = "\n".join(
+        [HEAD, *(tally.row() for tally in done), *(f"\n{table}" for table in tables)]
+    )
     print(content)
     os.chdir(here)
     if options.json is not None:

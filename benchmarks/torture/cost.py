@@ -50,11 +50,16 @@ def without_checks() -> Iterator[None]:
 
 
 def cost(tally: Tally, minutes: float, seed: int, scratch: Path) -> None:
-    """The share of the time of a training that the checks take, for each of :data:`RUNS`; a third of it each."""
+    """The share of the time of a training that the checks take, for each of :data:`RUNS`.
+
+    A third of it each.
+    """
     torch.set_num_threads(1)
     for number, (name, options) in enumerate(RUNS.items()):
         folder = scratch / str(number)
-        config = check("train", [*options, "init=none", f"seed={seed}", f"hydra.run.dir={folder}"]).config
+        config = check(
+            "train", [*options, "init=none", f"seed={seed}", f"hydra.run.dir={folder}"]
+        ).config
         (phase,) = phases_of(config, folder)
         config, agent = make_initial_agent(config, phase, None)
         state = TrainingState(make_collector(config, phase), agent, identity(config, phase))
@@ -72,7 +77,10 @@ def cost(tally: Tally, minutes: float, seed: int, scratch: Path) -> None:
 def _shares(
     state: TrainingState, minutes: float, rng: random.Random, folder: Path, every_s: float
 ) -> tuple[float, float]:
-    """What the checks take in steps and in checkpoints, as shares of the time; medians of pairs in random order."""
+    """What the checks take in steps and in checkpoints, as shares of the time.
+
+    Medians of pairs in random order.
+    """
     saver = Checkpointer(state, folder, every_s, True, {})
     steps, saves, until = [], [], time.monotonic() + 60.0 * minutes
     while time.monotonic() < until or len(saves) < CHECKPOINTS:

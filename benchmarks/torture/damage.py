@@ -1,7 +1,8 @@
 """Reads thousands of damaged files: each must be refused in one sentence, or read for what it says.
 
-A traceback is anything but a ``UserError`` (or the file system's ``OSError``, of which a command makes a sentence).
-A file that carries a checksum must not be read with another content in silence: refused, or told of.
+A traceback is anything but a ``UserError`` (or the file system's ``OSError``, of which a command
+makes a sentence). A file that carries a checksum must not be read with another content in silence:
+refused, or told of.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def damage(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -
     names = [name for name, reader in READERS.items() for _ in range(reader.share)]
     trial = Trial(good, scratch / "damaged")
     for first in range(0, count, BATCH):
-        items = [(rng.choice(names), seed * 10**7 + first + i) for i in range(min(BATCH, count - first))]
+        items = [
+            (rng.choice(names), seed * 10**7 + first + i) for i in range(min(BATCH, count - first))
+        ]
         for (name, number), result in forked(trial, items, AT_MOST_S, MEMORY_GIB):
             tally.what["damaged files"] += 1
             if result.startswith(("LOST", "TRACEBACK", "ACCEPTED")):
@@ -53,7 +56,10 @@ def damage(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -
 
 
 def good_files(scratch: Path) -> Path:
-    """The folder with a good file of each kind, made in a child: polars has threads, which no fork survives."""
+    """The folder with a good file of each kind, made in a child.
+
+    Polars has threads, which no fork survives.
+    """
     folder = scratch / "good"
     for _, result in forked(make_files, [folder], 600.0, MEMORY_GIB):
         if result is not None:
@@ -83,12 +89,20 @@ class Trial:
         path.write_bytes(broken)
         said = io.StringIO()
         try:
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), warnings.catch_warnings():
+            with (
+                contextlib.redirect_stdout(said),
+                contextlib.redirect_stderr(said),
+                warnings.catch_warnings(),
+            ):
                 warnings.simplefilter("ignore")
                 content = reader.read(path)
         except (UserError, *CONFIG_ERRORS) as error:
             text = str(error)
-            return "TRACEBACK the code of a bomb ran" if "EXECUTED" in said.getvalue() else f"REFUSED {text[:200]}"
+            return (
+                "TRACEBACK the code of a bomb ran"
+                if "EXECUTED" in said.getvalue()
+                else f"REFUSED {text[:200]}"
+            )
         except OSError as error:
             if error.errno is not None:
                 return f"REFUSED {error}"[:200]
@@ -99,7 +113,11 @@ class Trial:
             return "TRACEBACK the code of a bomb ran"
         if not reader.sealed or same(content, self.contents[name]):
             return "READ"
-        return f"TOLD {said.getvalue()}"[:200] if said.getvalue() else f"ACCEPTED after {way.__name__}, in silence"
+        return (
+            f"TOLD {said.getvalue()}"[:200]
+            if said.getvalue()
+            else f"ACCEPTED after {way.__name__}, in silence"
+        )
 
     def _copy(self, file: str) -> Path:
         """The file among its neighbours, in a folder of its own."""
@@ -125,7 +143,11 @@ def traceback_of(error: BaseException) -> str:
 def same(one: Any, other: Any) -> bool:
     """Whether two contents are the same bit for bit."""
     if isinstance(one, dict):
-        return isinstance(other, dict) and one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+        return (
+            isinstance(other, dict)
+            and one.keys() == other.keys()
+            and all(same(one[k], other[k]) for k in one)
+        )
     if isinstance(one, list | tuple):
         return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
     if isinstance(one, torch.Tensor | np.ndarray):

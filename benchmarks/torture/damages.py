@@ -19,7 +19,21 @@ Damage = Callable[[random.Random, bytes], bytes]
 
 #: What stands in a file by mistake or malice instead of a number.
 NUMBERS = (
-    *("nan", "inf", "-inf", "1e308", "-1e308", "1e999", "-1", "0", "-0.0", "1e-320", "9" * 400, "9" * 6000, "0x10"),
+    *(
+        "nan",
+        "inf",
+        "-inf",
+        "1e308",
+        "-1e308",
+        "1e999",
+        "-1",
+        "0",
+        "-0.0",
+        "1e-320",
+        "9" * 400,
+        "9" * 6000,
+        "0x10",
+    ),
     *(
         "1,5",
         "1_000",
@@ -39,12 +53,48 @@ NUMBERS = (
 )
 #: The same for names and texts.
 NAMES = (
-    *("../../../etc/passwd", "/dev/zero", "__class__", "__reduce__", "a" * 10**6, "", "\x00", "'; DROP TABLE x", "é"),
-    *("os.system", "!!python/object/apply:os.system", "${oc.env:HOME}", "%s%n", "\ud7ff", "x=1", "a.b.c", "C:\\nul"),
+    *(
+        "../../../etc/passwd",
+        "/dev/zero",
+        "__class__",
+        "__reduce__",
+        "a" * 10**6,
+        "",
+        "\x00",
+        "'; DROP TABLE x",
+        "é",
+    ),
+    *(
+        "os.system",
+        "!!python/object/apply:os.system",
+        "${oc.env:HOME}",
+        "%s%n",
+        "\ud7ff",
+        "x=1",
+        "a.b.c",
+        "C:\\nul",
+    ),
 )
 #: Values for JSON, YAML and checkpoints.
 VALUES: tuple[Any, ...] = (
-    *(None, True, -1, 0, 2**31, 2**63, 10**400, 1e308, float("nan"), float("inf"), "", "many", [], {}, [[]], -0.5),
+    *(
+        None,
+        True,
+        -1,
+        0,
+        2**31,
+        2**63,
+        10**400,
+        1e308,
+        float("nan"),
+        float("inf"),
+        "",
+        "many",
+        [],
+        {},
+        [[]],
+        -0.5,
+    ),
     *([None] * 3, {"a": {"b": []}}, "../x", ["x"] * 1000, "\x00", 10**12),
 )
 
@@ -74,7 +124,9 @@ def block(rng: random.Random, whole: bytes) -> bytes:
     start = rng.randrange(len(whole))
     size = rng.choice((1, 16, 512, 4096))
     part = whole[start : start + size]
-    new = rng.choice((bytes(len(part)), rng.randbytes(len(part)), b"", part * 2, part + rng.randbytes(size)))
+    new = rng.choice(
+        (bytes(len(part)), rng.randbytes(len(part)), b"", part * 2, part + rng.randbytes(size))
+    )
     return whole[:start] + new + whole[start + len(part) :]
 
 
@@ -97,7 +149,13 @@ def foreign(rng: random.Random, whole: bytes) -> bytes:
             b"{}",
             b"[]",
         ),
-        *(b"null", b"[" * 100_000, b'{"a":' * 5000, b"\xff\xfe" + "x,y\n1,2\n".encode("utf-16-le"), b"\x1f\x8b\x08"),
+        *(
+            b"null",
+            b"[" * 100_000,
+            b'{"a":' * 5000,
+            b"\xff\xfe" + "x,y\n1,2\n".encode("utf-16-le"),
+            b"\x1f\x8b\x08",
+        ),
         *(
             b"\x7fELF" + rng.randbytes(99),
             b"PAR1" + rng.randbytes(64) + b"PAR1",
@@ -105,8 +163,18 @@ def foreign(rng: random.Random, whole: bytes) -> bytes:
             b"\xef\xbb\xbf",
             b"\n" * 999,
         ),
-        *((2**62).to_bytes(8, "little") + b"{}", b"\x93NUMPY" + rng.randbytes(64), b"a" * 10**6, b"," * 10**5),
-        *(b"- !!python/object/apply:os.system [echo]\n", b"&a [*a]\n", b"<html></html>", pickle.dumps(Bomb())),
+        *(
+            (2**62).to_bytes(8, "little") + b"{}",
+            b"\x93NUMPY" + rng.randbytes(64),
+            b"a" * 10**6,
+            b"," * 10**5,
+        ),
+        *(
+            b"- !!python/object/apply:os.system [echo]\n",
+            b"&a [*a]\n",
+            b"<html></html>",
+            pickle.dumps(Bomb()),
+        ),
         *(archive.getvalue(), made.getvalue(), objects.getvalue()),
     )
     return rng.choice(choices)
@@ -161,7 +229,9 @@ def in_safetensors(rng: random.Random, whole: bytes) -> bytes:
     size = int.from_bytes(whole[:8], "little")
     header = json.loads(whole[8 : 8 + size])
     if rng.random() < 0.7:
-        header["__metadata__"]["ganlane"] = json.dumps(_mutated(rng, json.loads(header["__metadata__"]["ganlane"])))
+        header["__metadata__"]["ganlane"] = json.dumps(
+            _mutated(rng, json.loads(header["__metadata__"]["ganlane"]))
+        )
     else:
         header = _mutated(rng, header)
     text = json.dumps(header).encode()
@@ -182,7 +252,9 @@ def in_arrays(rng: random.Random, whole: bytes) -> bytes:
         arrays = dict(kept)
     chosen = rng.choice(list(arrays))
     value = arrays.pop(chosen)
-    new = rng.choice((value[:0], value[:-1], value.astype(np.float64) * np.nan, value.astype(str), -value - 7))
+    new = rng.choice(
+        (value[:0], value[:-1], value.astype(np.float64) * np.nan, value.astype(str), -value - 7)
+    )
     made = io.BytesIO()
     np.savez_compressed(made, **{rng.choice((chosen, "x", "a/b")): new}, **arrays)
     return made.getvalue()
@@ -195,7 +267,10 @@ def in_parquet(rng: random.Random, whole: bytes) -> bytes:
     column = pl.col(chosen)
     new = (
         column.cast(pl.String),
-        *(pl.lit(value).alias(chosen) for value in (None, float("nan"), float("inf"), 1e308, -(2**62), 0, "x")),
+        *(
+            pl.lit(value).alias(chosen)
+            for value in (None, float("nan"), float("inf"), 1e308, -(2**62), 0, "x")
+        ),
         column.cast(pl.Float64, strict=False) * -1e6,
         column.shuffle(seed=rng.randrange(99)),
     )
@@ -205,7 +280,9 @@ def in_parquet(rng: random.Random, whole: bytes) -> bytes:
     elif sort == 1:
         frame = frame.rename({chosen: rng.choice(NAMES)[:1000]})
     elif sort == 2:
-        frame = rng.choice((frame.head(0), frame.head(1), pl.concat([frame, frame]), frame.reverse()))
+        frame = rng.choice(
+            (frame.head(0), frame.head(1), pl.concat([frame, frame]), frame.reverse())
+        )
     else:
         frame = frame.with_columns(rng.choice(new))
     made = io.BytesIO()
@@ -228,7 +305,9 @@ def _mutated(rng: random.Random, content: Any) -> Any:
         return [*content[:chosen], _mutated(rng, content[chosen]), *content[chosen + 1 :]]
     if isinstance(content, torch.Tensor) and rng.random() < 0.7:
         flat = content.reshape(-1)
-        return rng.choice((flat[:0], flat[:-1], content.double() * float("nan"), content.long(), content[None]))
+        return rng.choice(
+            (flat[:0], flat[:-1], content.double() * float("nan"), content.long(), content[None])
+        )
     return rng.choice(VALUES)
 
 

@@ -1,4 +1,6 @@
-"""Fills the disk under tiny training runs, or kills one of their collecting workers, and resumes them to the end."""
+"""Fills the disk under tiny training runs, or kills one of their collecting workers, and resumes
+them to the end.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +39,24 @@ def disk(tally: Tally, count: int, seed: int, minutes: float, scratch: Path) -> 
                 return
             sort = number % 3
             if sort == 0 and small is not None:
-                _full(tally, rng, runs.command(scheme, seed, small / f"run-{number}"), whole, wall_s, small)
+                _full(
+                    tally,
+                    rng,
+                    runs.command(scheme, seed, small / f"run-{number}"),
+                    whole,
+                    wall_s,
+                    small,
+                )
             elif sort < 2:
                 _refused(tally, rng, runs.command(scheme, seed, scratch / f"run-{number}"), whole)
             else:
                 folder = scratch / f"run-{number}"
-                arguments = [*runs.TINY, *runs.WORKERS, f"seed={seed + number}", f"hydra.run.dir={folder}"]
+                arguments = [
+                    *runs.TINY,
+                    *runs.WORKERS,
+                    f"seed={seed + number}",
+                    f"hydra.run.dir={folder}",
+                ]
                 _lost_worker(tally, rng, arguments)
 
 
@@ -51,7 +65,10 @@ def small_disk() -> Iterator[Path | None]:
     """A tmpfs of :data:`DISK` bytes; None where mounting is not allowed."""
     folder = tempfile.mkdtemp(prefix="torture-disk-")
     line = ["mount", "-t", "tmpfs", "-o", f"size={DISK}", "tmpfs", folder]
-    mounted = shutil.which("mount") is not None and subprocess.run(line, capture_output=True).returncode == 0
+    mounted = (
+        shutil.which("mount") is not None
+        and subprocess.run(line, capture_output=True).returncode == 0
+    )
     try:
         yield Path(folder) if mounted else None
     finally:
@@ -60,7 +77,9 @@ def small_disk() -> Iterator[Path | None]:
         os.rmdir(folder)
 
 
-def _full(tally: Tally, rng: random.Random, arguments: list[str], whole: Path, wall_s: float, small: Path) -> None:
+def _full(
+    tally: Tally, rng: random.Random, arguments: list[str], whole: Path, wall_s: float, small: Path
+) -> None:
     """The disk is full from a random instant on; there is room again when the run is resumed."""
     log, filler = whole.with_name("log"), small / "filler"
     after_s = rng.uniform(0.0, wall_s)
@@ -88,7 +107,14 @@ def _refused(tally: Tally, rng: random.Random, arguments: list[str], whole: Path
     """From a certain write on every one is refused with ENOSPC."""
     log, first = whole.with_name("log"), rng.randrange(1, 25)
     attempt = runs.finish(runs.start(arguments, log, refuses_from(first)), log)
-    _resumed(tally, "runs whose writes are refused", f"ENOSPC from write {first} on", arguments, attempt, whole)
+    _resumed(
+        tally,
+        "runs whose writes are refused",
+        f"ENOSPC from write {first} on",
+        arguments,
+        attempt,
+        whole,
+    )
 
 
 def refuses_from(first: int) -> Callable[[], None]:
@@ -114,7 +140,11 @@ def _lost_worker(tally: Tally, rng: random.Random, arguments: list[str]) -> None
     child = runs.start(arguments, log)
     metrics, end = folder / "metrics.csv", time.monotonic() + runs.AT_MOST_S
     running = os.WEXITED | os.WNOHANG | os.WNOWAIT  # look, without collecting the status
-    while time.monotonic() < end and _lines(metrics) < 3 and os.waitid(os.P_PID, child, running) is None:
+    while (
+        time.monotonic() < end
+        and _lines(metrics) < 3
+        and os.waitid(os.P_PID, child, running) is None
+    ):
         time.sleep(0.01)
     found = _workers(child)
     if not found:
@@ -133,11 +163,20 @@ def _lines(path: Path) -> int:
 def _workers(parent: int) -> list[int]:
     """The collecting processes below a run."""
     children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    return [int(each) for each in children if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
+    return [
+        int(each)
+        for each in children
+        if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()
+    ]
 
 
 def _resumed(
-    tally: Tally, kind: str, how: str, arguments: list[str], attempt: runs.Attempt, whole: Path | None
+    tally: Tally,
+    kind: str,
+    how: str,
+    arguments: list[str],
+    attempt: runs.Attempt,
+    whole: Path | None,
 ) -> None:
     """Check how the run ended, resume it, and compare it with the undisturbed one if there is one."""
     folder = runs.folder_of(arguments)
@@ -148,7 +187,9 @@ def _resumed(
     tally.what[kind] += 1
     complaints = [line for line in attempt.said.splitlines() if line.startswith("ganlane train: ")]
     if attempt.status != 2 or attempt.traceback or len(complaints) != 1:
-        tally.fail(f"{where}: not one sentence and status 2, but {attempt.status}: {attempt.said[-600:]}")
+        tally.fail(
+            f"{where}: not one sentence and status 2, but {attempt.status}: {attempt.said[-600:]}"
+        )
     resumed, _ = runs.to_the_end(runs.again(arguments, folder), folder.with_suffix(".log"))
     if resumed.status != 0 or not runs.finished(folder):
         tally.fail(f"{where}: cannot be resumed: {resumed.said[-300:]}")

@@ -14,17 +14,31 @@ from benchmarks.torture import runs
 from benchmarks.torture.tally import Tally
 
 #: Ways to end an attempt, and how often each is chosen.
-WAYS = {"kill": 4, "first second": 2, "in a write": 4, "final evaluation": 2, "SIGTERM": 4, "SIGINT": 4}
+WAYS = {
+    "kill": 4,
+    "first second": 2,
+    "in a write": 4,
+    "final evaluation": 2,
+    "SIGTERM": 4,
+    "SIGINT": 4,
+}
 SIGNALS = {"SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
 
 
-def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path, signals: bool = True) -> None:
-    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more; not only by kill -9."""
+def kill(
+    tally: Tally, count: int, seed: int, minutes: float, scratch: Path, signals: bool = True
+) -> None:
+    """Disturb ``count`` runs, or as many as the minutes allow, each three times or more.
+
+    Not only by kill -9.
+    """
     rng, end = random.Random(seed), time.monotonic() + 60.0 * minutes
     runs.warm_up()
     wholes: dict[tuple[str, int], tuple[Path, float]] = {}
     schemes = list(runs.SCHEMES)
-    ways = [way for way, often in WAYS.items() for _ in range(often) if signals or way not in SIGNALS]
+    ways = [
+        way for way, often in WAYS.items() for _ in range(often) if signals or way not in SIGNALS
+    ]
     for number in range(count):
         if time.monotonic() > end:
             return
@@ -37,11 +51,18 @@ def kill(tally: Tally, count: int, seed: int, minutes: float, scratch: Path, sig
                 continue
             wholes[scheme, own] = whole, wall_s
         whole, wall_s = wholes[scheme, own]
-        _disturbed(tally, rng, runs.command(scheme, own, scratch / f"run-{number}"), whole, wall_s, ways)
+        _disturbed(
+            tally, rng, runs.command(scheme, own, scratch / f"run-{number}"), whole, wall_s, ways
+        )
 
 
 def _disturbed(
-    tally: Tally, rng: random.Random, arguments: list[str], whole: Path, wall_s: float, ways: list[str]
+    tally: Tally,
+    rng: random.Random,
+    arguments: list[str],
+    whole: Path,
+    wall_s: float,
+    ways: list[str],
 ) -> None:
     """One run: disturbed three to five times, then left alone."""
     folder = runs.folder_of(arguments)
@@ -60,7 +81,9 @@ def _disturbed(
             tally.what["kill -9"] += 1
             tally.what[f"of them {way}" if way != "kill" else "of them anytime"] += 1
         else:
-            tally.fail(f"{' '.join(arguments)}: {history}: status {attempt.status}: {attempt.said[-300:]}")
+            tally.fail(
+                f"{' '.join(arguments)}: {history}: status {attempt.status}: {attempt.said[-300:]}"
+            )
             return
         if attempt.traceback:
             tally.fail(f"{' '.join(arguments)}: {history}: a traceback: {attempt.said[-300:]}")
@@ -85,7 +108,10 @@ def _attempt(
         prepare, how = runs.dies_in_write(write, share), f"kill -9 in write {write} at {share:.0%}"
     elif way == "final evaluation":
         delay = rng.uniform(0.0, 0.3)
-        prepare, how = runs.dies_in_evaluation(delay), f"kill -9 {delay:.2f} s into the final evaluation"
+        prepare, how = (
+            runs.dies_in_evaluation(delay),
+            f"kill -9 {delay:.2f} s into the final evaluation",
+        )
     elif way is not None:
         number = SIGNALS.get(way, signal.SIGKILL)
         # A resumed run is shorter than a whole one.

@@ -1,6 +1,7 @@
 """Calls the API with what it does not take: each call must work, or end in one sentence.
 
-And the ways to have code executed by a file or folder, which are tests: ``tests/test_no_code_from_files.py``.
+And the ways to have code executed by a file or folder, which are tests:
+``tests/test_no_code_from_files.py``.
 """
 
 from __future__ import annotations
@@ -56,21 +57,122 @@ class Foreign:
 
 #: Given to every argument.
 VALUES: tuple[Any, ...] = (
-    *(None, True, -1, 0, 3, 2**63, 10**30, -0.5, 1.5, float("nan"), float("inf"), 1e300, "", "x", "\x00"),
-    *("a" * 10**5, "os.system", [], ["x"], [1, None], (), {}, {"name": 3}, {"x": 1}, {1: 2}, b"x", {3}, Foreign()),
-    *(Foreign, print, np.float32(1.5), np.array([1, 2]), torch.tensor(1.5), torch.float16, 1j, range(3)),
+    *(
+        None,
+        True,
+        -1,
+        0,
+        3,
+        2**63,
+        10**30,
+        -0.5,
+        1.5,
+        float("nan"),
+        float("inf"),
+        1e300,
+        "",
+        "x",
+        "\x00",
+    ),
+    *(
+        "a" * 10**5,
+        "os.system",
+        [],
+        ["x"],
+        [1, None],
+        (),
+        {},
+        {"name": 3},
+        {"x": 1},
+        {1: 2},
+        b"x",
+        {3},
+        Foreign(),
+    ),
+    *(
+        Foreign,
+        print,
+        np.float32(1.5),
+        np.array([1, 2]),
+        torch.tensor(1.5),
+        torch.float16,
+        1j,
+        range(3),
+    ),
 )
 #: What an action could be by mistake, for three rows.
 ACTIONS: tuple[Any, ...] = (
-    *(None, -1, 3, 2**40, 1.5, float("nan"), "left", [], [0, 1], [0, 1, 2, 0], [0, 1, 3], [-1, 0, 0], [0.5, 0, 0]),
-    *([None] * 3, ["x"] * 3, [[0], [1], [2]], np.array([0, 1, 9]), np.array([0.0, 1.0, np.nan]), True, Foreign()),
+    *(
+        None,
+        -1,
+        3,
+        2**40,
+        1.5,
+        float("nan"),
+        "left",
+        [],
+        [0, 1],
+        [0, 1, 2, 0],
+        [0, 1, 3],
+        [-1, 0, 0],
+        [0.5, 0, 0],
+    ),
+    *(
+        [None] * 3,
+        ["x"] * 3,
+        [[0], [1], [2]],
+        np.array([0, 1, 9]),
+        np.array([0.0, 1.0, np.nan]),
+        True,
+        Foreign(),
+    ),
 )
 #: The plain arguments; the others are dataclasses and modules of ours.
-OF_ENVIRONMENT = ("num_envs", "vehicles", "stream", "seed", "first_episode", "device", "dtype", "recycle")
+OF_ENVIRONMENT = (
+    "num_envs",
+    "vehicles",
+    "stream",
+    "seed",
+    "first_episode",
+    "device",
+    "dtype",
+    "recycle",
+)
 OF_ENVIRONMENT += ("recycle_share", "kernel")
-OF_TRAIN = ("traffic", "init", "total_decisions", "seed", "num_envs", "evaluation", "pretrain", "folder", "resume")
-OF_TRAIN += ("env", "agent", "mask", "observation", "reward", "logger", "log_every", "evaluate_every", "device")
-OF_EVALUATE = ("agents", "traffics", "episodes", "seed", "env", "reward", "observation", "mask", "num_envs", "stream")
+OF_TRAIN = (
+    "traffic",
+    "init",
+    "total_decisions",
+    "seed",
+    "num_envs",
+    "evaluation",
+    "pretrain",
+    "folder",
+    "resume",
+)
+OF_TRAIN += (
+    "env",
+    "agent",
+    "mask",
+    "observation",
+    "reward",
+    "logger",
+    "log_every",
+    "evaluate_every",
+    "device",
+)
+OF_EVALUATE = (
+    "agents",
+    "traffics",
+    "episodes",
+    "seed",
+    "env",
+    "reward",
+    "observation",
+    "mask",
+    "num_envs",
+    "stream",
+)
 OF_EVALUATE += ("device", "lanes", "goal_m")
 
 
@@ -82,7 +184,9 @@ def misuse(tally: Tally, seed: int, minutes: float) -> None:
     random.Random(seed).shuffle(names)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name, result in forked(lambda name: _outcome(calls[name]), names, AT_MOST_S, memory_gib=16.0):
+        for name, result in forked(
+            lambda name: _outcome(calls[name]), names, AT_MOST_S, memory_gib=16.0
+        ):
             tally.what["calls"] += 1
             tally.what[result.split(maxsplit=1)[0].lower().rstrip(":")] += 1
             if not result.startswith(("REFUSED", "WORKED")):
@@ -101,7 +205,11 @@ def _outcome(call: Callable[[], Any]) -> str:
         text = str(error)
         return f"TALKS in lines: {text[:300]!r}" if "\n" in text else f"REFUSED {text[:100]}"
     except OSError as error:  # the file system's own refusal, which the API passes on
-        return f"REFUSED {error}"[:100] if error.errno is not None else f"TRACEBACK {traceback_of(error)}"
+        return (
+            f"REFUSED {error}"[:100]
+            if error.errno is not None
+            else f"TRACEBACK {traceback_of(error)}"
+        )
     except BaseException as error:
         # gymnasium and TensorDict look at some arguments before any of our code is asked.
         return f"{'TRACEBACK' if _through_ours(error) else 'REFUSED'} {traceback_of(error)}"
@@ -111,7 +219,10 @@ def _outcome(call: Callable[[], Any]) -> str:
 def _through_ours(error: BaseException | None) -> bool:
     """Whether code of the package was at work when the error, or one that it came from, was raised."""
     while error is not None:
-        if any(f"{PACKAGE}{os.sep}" in frame.filename for frame in traceback.extract_tb(error.__traceback__)):
+        if any(
+            f"{PACKAGE}{os.sep}" in frame.filename
+            for frame in traceback.extract_tb(error.__traceback__)
+        ):
             return True
         error = error.__cause__ or error.__context__
     return False
@@ -128,7 +239,13 @@ def _calls() -> Iterator[tuple[str, Callable[[], Any]]]:
         return ganlane.make_env(**given).rollout(2)
 
     def train(**given: Any) -> Any:
-        quick = {"total_decisions": 16, "num_envs": 4, "evaluation": {"episodes": 1}, "traffic": "idm", **given}
+        quick = {
+            "total_decisions": 16,
+            "num_envs": 4,
+            "evaluation": {"episodes": 1},
+            "traffic": "idm",
+            **given,
+        }
         # The checks, and what a command does around it: the training itself takes seconds.
         stopped = Mock(side_effect=UserError("stopped"))
         with patch.object(ganlane.commands.train, "train", stopped):
@@ -148,7 +265,9 @@ def _calls() -> Iterator[tuple[str, Callable[[], Any]]]:
         envs.reset(seed=0)
         return envs.step(envs.action_space.sample())
 
-    of_make_env = [name for name in inspect.signature(ganlane.make_env).parameters if name != "overrides"]
+    of_make_env = [
+        name for name in inspect.signature(ganlane.make_env).parameters if name != "overrides"
+    ]
     of_gym = [name for name in of_make_env if name not in ("num_envs", "device", "transforms")]
     yield from _each("HighwayEnv", environment, OF_ENVIRONMENT)
     yield from _each("make_env", made, [*of_make_env, "lanes", "vehicles", "idm", "recycle_share"])
@@ -192,18 +311,26 @@ def _of_steps() -> Iterator[tuple[str, Callable[[], Any]]]:
 
     for action in ACTIONS:
         # A TensorDict refuses what is no tensor before any of our code is asked.
-        if isinstance(action, list | np.ndarray) and not any(each is None or each == "x" for each in list(action)):
+        if isinstance(action, list | np.ndarray) and not any(
+            each is None or each == "x" for each in list(action)
+        ):
             yield f"env.step(action={action!r})", lambda a=action: step_env(a)
         yield f"make_vec(...).step({action!r})", lambda a=action: step_batch(a)
         yield f"make(...).step({action!r})", lambda a=action: step_gym(a)
     vec = "ganlane/Highway-v0"
     for value in VALUES:
-        yield f"make(...).reset(seed={value!r:.60})", lambda v=value: gymnasium.make(vec).reset(seed=v)
+        yield (
+            f"make(...).reset(seed={value!r:.60})",
+            lambda v=value: gymnasium.make(vec).reset(seed=v),
+        )
         yield (
             f"make_vec(...).reset(seed={value!r:.60})",
             lambda v=value: gymnasium.make_vec(vec, num_envs=3).reset(seed=v),
         )
-        yield f"make(...).reset(options={value!r:.60})", lambda v=value: gymnasium.make(vec).reset(options=v)
+        yield (
+            f"make(...).reset(options={value!r:.60})",
+            lambda v=value: gymnasium.make(vec).reset(options=v),
+        )
         yield (
             f"make(...).reset(options={{'episode': {value!r:.60}}})",
             lambda v=value: gymnasium.make(vec).reset(options={"episode": v}),
@@ -211,9 +338,18 @@ def _of_steps() -> Iterator[tuple[str, Callable[[], Any]]]:
     for number in (2**63, -(2**70), 1.5, "x"):
         yield f"env.set_seed({number})", lambda n=number: ganlane.make_env("idm", 2).set_seed(n)
     yield "env.step before reset", lambda: ganlane.make_env("idm", 2).rand_step()
-    yield "make_vec(...).step before reset", lambda: gymnasium.make_vec(vec, num_envs=2).step(np.zeros(2, np.int64))
-    yield "make(...).step before reset", lambda: gymnasium.make(vec, disable_env_checker=True).unwrapped.step(0)
-    yield "make(...).render before reset", lambda: gymnasium.make(vec, render_mode="rgb_array").unwrapped.render()
+    yield (
+        "make_vec(...).step before reset",
+        lambda: gymnasium.make_vec(vec, num_envs=2).step(np.zeros(2, np.int64)),
+    )
+    yield (
+        "make(...).step before reset",
+        lambda: gymnasium.make(vec, disable_env_checker=True).unwrapped.step(0),
+    )
+    yield (
+        "make(...).render before reset",
+        lambda: gymnasium.make(vec, render_mode="rgb_array").unwrapped.render(),
+    )
     yield "default device meta", _on_meta
 
 
@@ -225,8 +361,13 @@ def _on_meta() -> Any:
 def code(tally: Tally) -> None:
     """Run the tests in which every way to have code executed is tried once."""
     line = [sys.executable, "-m", "pytest", "-n", "0", "-p", "no:cacheprovider", TESTS]
-    done = subprocess.run(line, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
-    counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed|error)", done.stdout)}
+    done = subprocess.run(
+        line, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    counts = {
+        kind: int(number)
+        for number, kind in re.findall(r"(\d+) (passed|failed|error)", done.stdout)
+    }
     tally.what["ways to have code executed"] = sum(counts.values())
     tally.what["that executed nothing"] = counts.get("passed", 0)
     for failed in re.findall(r"^(?:FAILED|ERROR) (.*)$", done.stdout, re.MULTILINE):

@@ -39,9 +39,7 @@ from ganlane.training.phases import identity, make_collector, make_initial_agent
 from ganlane.view.figures import draw_runs, read_runs
 
 #: The files below the folder of the good ones.
-SCENE = (
-    "x_m,lane,speed_mps,desired_speed_mps,length_m,visibility\n0,1,20,25,4.5,body\n40,1,18,22,4.5,\n30,0,15,20,12,\n"
-)
+SCENE = "x_m,lane,speed_mps,desired_speed_mps,length_m,visibility\n0,1,20,25,4.5,body\n40,1,18,22,4.5,\n30,0,15,20,12,\n"
 FEET = 0.3048
 
 
@@ -72,8 +70,12 @@ def make_files(folder: Path) -> None:
     shutil.copy(SHIPPED_REFERENCE, folder / "reference.json")
     (folder / "scene.csv").write_text(SCENE)
     rows = [{"x_m": 40.0 * i, "lane": i % 3, "speed_mps": 20.0 - i} for i in range(3)]
-    (folder / "scene.json").write_text(json.dumps({"lanes": 3, "lane_width_m": 4.0, "vehicles": rows}))
-    frame = synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=6, seconds=4.0, changing_share=0.0), seed=4)
+    (folder / "scene.json").write_text(
+        json.dumps({"lanes": 3, "lane_width_m": 4.0, "vehicles": rows})
+    )
+    frame = synthetic_scenes(
+        SyntheticTraffic(scenes=1, vehicles=6, seconds=4.0, changing_share=0.0), seed=4
+    )
     write_scene_csv(frame, folder / "recording.csv")
     write_prepared(frame, folder / "recording.parquet")
     (folder / "ngsim.csv").write_text(_ngsim(frame))
@@ -81,7 +83,9 @@ def make_files(folder: Path) -> None:
     os.environ[CACHE_VARIABLE] = str(folder / "cache")
     cached("groups", "key", lambda: {"labels": np.arange(500)})
     run = folder / "run"
-    status = runs.train([*runs.TINY, "traffic=idm", "init=none", "total_decisions=192", f"hydra.run.dir={run}"])
+    status = runs.train(
+        [*runs.TINY, "traffic=idm", "init=none", "total_decisions=192", f"hydra.run.dir={run}"]
+    )
     assert status == 0
 
 
@@ -114,7 +118,9 @@ def _highd(folder: Path) -> None:
     head = "frame,id,x,y,width,height,xVelocity,yVelocity,xAcceleration,yAcceleration,laneId"
     (folder / "01_tracks.csv").write_text("\n".join([head, *rows]) + "\n")
     meta = "id,width,height,initialFrame,finalFrame,numFrames,class,drivingDirection"
-    (folder / "01_tracksMeta.csv").write_text(f"{meta}\n1,4.5,1.8,1,100,100,Car,1\n2,4.5,1.8,1,100,100,Car,2\n")
+    (folder / "01_tracksMeta.csv").write_text(
+        f"{meta}\n1,4.5,1.8,1,100,100,Car,1\n2,4.5,1.8,1,100,100,Car,2\n"
+    )
     (folder / "01_recordingMeta.csv").write_text(
         "id,frameRate,upperLaneMarkings,lowerLaneMarkings\n1,25,8.00;12.00;16.00,20.00;24.00;28.00\n"
     )
@@ -183,18 +189,28 @@ def _recording(kind: str, parameters: NgsimParameters | None = None) -> Callable
 TABLE = (*BYTES, damages.in_parquet, damages.in_parquet)
 READERS = {
     "agent": Reader("agent_idm.safetensors", _agent, (*BYTES, damages.in_safetensors), True),
-    "generator": Reader("generator_paper.safetensors", _generator, (*BYTES, damages.in_safetensors), True),
+    "generator": Reader(
+        "generator_paper.safetensors", _generator, (*BYTES, damages.in_safetensors), True
+    ),
     "calibrated generator": Reader(
         "generator_calibrated.safetensors", _generator, (*BYTES, damages.in_safetensors), True
     ),
-    "last.pt": Reader("run/checkpoints/last.pt", _checkpoint, (*BYTES, damages.in_torch, damages.in_torch), True, 1),
+    "last.pt": Reader(
+        "run/checkpoints/last.pt",
+        _checkpoint,
+        (*BYTES, damages.in_torch, damages.in_torch),
+        True,
+        1,
+    ),
     "cached windows": Reader("cache/groups_key.npz", _cache, (*BYTES, damages.in_arrays), True),
     "histograms": Reader("reference.json", _reference, (*TEXT, damages.in_json), True),
     "scene CSV": Reader("scene.csv", read_scene, TEXT),
     "scene JSON": Reader("scene.json", read_scene, (*TEXT, damages.in_json, damages.in_json)),
     "recording CSV": Reader("recording.csv", read_scenes, TEXT),
     "recording Parquet": Reader("recording.parquet", read_scenes, TABLE),
-    "NGSIM CSV": Reader("ngsim.csv", _recording("ngsim", NgsimParameters(locations=("us-101",))), TEXT),
+    "NGSIM CSV": Reader(
+        "ngsim.csv", _recording("ngsim", NgsimParameters(locations=("us-101",))), TEXT
+    ),
     "highD tracks": Reader("highd/01_tracks.csv", _recording("highd"), TEXT),
     "highD vehicles": Reader(
         "highd/01_tracksMeta.csv", lambda path: _recording("highd")(_tracks(path)), TEXT, share=2

@@ -1,4 +1,5 @@
-"""Tiny training runs, each in a forked child of this process, which has imported everything: 2 s instead of 6.
+"""Tiny training runs, each in a forked child of this process, which has imported everything: 2 s
+instead of 6.
 
 A child is a process of its own, so ``kill -9`` of it is what it is to a user's run.
 """
@@ -31,11 +32,26 @@ AT_MOST_S = 300.0
 TINY = (
     *("env.goal_m=12", "env.decision_period_s=0.2", "env.vehicles=4"),
     *("agent=rainbow", "observation=lane_view", "mask=legal", "log_every=48", "evaluate_every=96"),
-    *("selection_episodes=2", "checkpoint_every_s=0.02", "collector.num_envs=8", "agent.hidden=[16,16]"),
-    *("agent.batch_size=16", "agent.warmup=32", "agent.capacity=200", "agent.decisions_per_update=16"),
+    *(
+        "selection_episodes=2",
+        "checkpoint_every_s=0.02",
+        "collector.num_envs=8",
+        "agent.hidden=[16,16]",
+    ),
+    *(
+        "agent.batch_size=16",
+        "agent.warmup=32",
+        "agent.capacity=200",
+        "agent.decisions_per_update=16",
+    ),
     *("evaluation.episodes=2", "evaluation.agents=[mobil,random_legal]", "logger.progress=false"),
 )
-FIRST = ("init=none", "pretrain.total_decisions=240", "traffic@pretrain.traffic=idm_mobil", "total_decisions=240")
+FIRST = (
+    "init=none",
+    "pretrain.total_decisions=240",
+    "traffic@pretrain.traffic=idm_mobil",
+    "total_decisions=240",
+)
 #: One phase, and two of which the second goes on with the agent of the first.
 SCHEMES = {
     "idm_mobil": ("traffic=idm_mobil", "init=none", "total_decisions=480"),
@@ -45,14 +61,23 @@ SCHEMES = {
 }
 #: Two collecting workers; without lost ones, such a run is not the same twice either.
 WORKERS = (
-    *("traffic=idm_mobil", "init=none", "total_decisions=960", "collector=multi", "collector.workers=2"),
+    *(
+        "traffic=idm_mobil",
+        "init=none",
+        "total_decisions=960",
+        "collector=multi",
+        "collector.workers=2",
+    ),
     "collector.weights_every=32",
 )
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """How an attempt ended: the exit status (negative: the signal that ended it), and what it said on stderr."""
+    """How an attempt ended: the exit status (negative.
+
+    The signal that ended it), and what it said on stderr.
+    """
 
     status: int | None
     said: str
@@ -105,7 +130,10 @@ def finish(child: int, log: Path, at_most_s: float = AT_MOST_S) -> Attempt:
 def interrupted(child: int, log: Path, after_s: float, number: int) -> Attempt:
     """Send the child a signal after so many seconds, unless it has ended before."""
     end = time.monotonic() + after_s
-    while time.monotonic() < end and os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+    while (
+        time.monotonic() < end
+        and os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+    ):
         time.sleep(0.001)
     os.kill(child, number)  # not yet waited for, so the number is still its own
     return finish(child, log)
@@ -134,7 +162,10 @@ def folder_of(arguments: list[str]) -> Path:
 
 
 def again(arguments: list[str], folder: Path) -> list[str]:
-    """How the user goes on: with ``resume`` where there is a checkpoint, else with the same command."""
+    """How the user goes on.
+
+    With ``resume`` where there is a checkpoint, else with the same command.
+    """
     return [f"resume={folder}"] if any(folder.rglob("last.pt")) else arguments
 
 
@@ -155,7 +186,9 @@ def differences(folder: Path, whole: Path, exact: bool = True) -> list[str]:
     for name in ("agent.safetensors", "pretrain/agent.safetensors"):
         if (whole / name).is_file() and not same_weights(folder / name, whole / name):
             wrong.append(f"other weights in {name}")
-    one, other = (json.loads((each / "results.json").read_text())["rows"] for each in (folder, whole))
+    one, other = (
+        json.loads((each / "results.json").read_text())["rows"] for each in (folder, whole)
+    )
     if one != other:
         wrong.append("another table of the final evaluation")
     for name in ("metrics.csv", "pretrain/metrics.csv"):
@@ -168,7 +201,9 @@ def same_weights(one: Path, other: Path) -> bool:
     """Whether two agents are the same bit for bit."""
     a, b = read_agent(one)[0], read_agent(other)[0]
     return a.keys() == b.keys() and all(
-        torch.equal(a[name].view(torch.uint8), b[name].view(torch.uint8)) if a[name].dim() else a[name] == b[name]
+        torch.equal(a[name].view(torch.uint8), b[name].view(torch.uint8))
+        if a[name].dim()
+        else a[name] == b[name]
         for name in a
     )
 
@@ -180,11 +215,15 @@ def _rows(path: Path) -> list[dict[str, str]]:
 def _figures(path: Path) -> list[dict[str, str]]:
     """The rows without what depends on the clock."""
     clock = ("wall_s", "decisions_per_s")
-    return [{name: value for name, value in row.items() if name not in clock} for row in _rows(path)]
+    return [
+        {name: value for name, value in row.items() if name not in clock} for row in _rows(path)
+    ]
 
 
 def dies_in_write(number: int, share: float) -> Callable[[], None]:
-    """Makes a child kill itself in its write ``number``, when ``share`` of the bytes have reached the disk."""
+    """Makes a child kill itself in its write ``number``, when ``share`` of the bytes have reached
+    the disk.
+    """
 
     def prepare() -> None:
         fsync, count = os.fsync, iter(range(10**9))

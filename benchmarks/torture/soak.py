@@ -1,4 +1,6 @@
-"""Drives random configurations for a long time and checks after every decision what must hold in all of them."""
+"""Drives random configurations for a long time and checks after every decision what must hold in
+all of them.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from ganlane.sim.collisions import pair_overlaps
 from ganlane.sim.state import Vehicles
 
 #: Recordings, where there are any.
-RECORDINGS = Path(os.environ.get("GANLANE_DATA", "../shared/data")).absolute() / "ngsim" / "us101_scenes.csv"
+RECORDINGS = (
+    Path(os.environ.get("GANLANE_DATA", "../shared/data")).absolute() / "ngsim" / "us101_scenes.csv"
+)
 RULES = ("idm", "idm_mobil")
 TRAFFICS = (*RULES, *RULES, "idm_random", "idm_faults", "gan", "gan_calibrated", "mixed")
 SCENARIOS = ("cut_in", "stalled_car", "stop_and_go", "blocked_lane")
@@ -40,7 +44,8 @@ FLAT = 0.02
 
 
 def soak(tally: Tally, count: int, seed: int, minutes: float, compiled: int = 0) -> None:
-    """Drive ``count`` configurations, each for its share of the minutes; the first ``compiled`` are compiled.
+    """Drive ``count`` configurations, each for its share of the minutes; the first ``compiled`` are
+    compiled.
 
     Where making them takes longer than that, fewer are driven.
     """
@@ -61,7 +66,9 @@ def once(number: int) -> int:
 
 
 def _configuration(tally: Tally, number: int, compiled: bool, until: float) -> None:
-    """The first choice of this number that is not refused, driven until then, or at least for a moment."""
+    """The first choice of this number that is not refused, driven until then, or at least for a
+    moment.
+    """
     for choice in _choices(random.Random(number), compiled):
         try:
             env = made(choice)
@@ -74,12 +81,19 @@ def _configuration(tally: Tally, number: int, compiled: bool, until: float) -> N
 
 
 def _choices(rng: random.Random, compiled: bool) -> Iterator[dict[str, Any]]:
-    """Random arguments of :func:`ganlane.make_env`, and some of ours; some of them do not fit together."""
+    """Random arguments of :func:`ganlane.make_env`, and some of ours.
+
+    Some of them do not fit together.
+    """
     while True:
         kind = rng.choices(("highway", "dense", "scenario", "replay"), (5, 2, 3, 1))[0]
         traffic: dict[str, Any] = {"name": rng.choice(TRAFFICS)}
         chosen: dict[str, Any] = {
-            "env": rng.choice(SCENARIOS) if kind == "scenario" else "dense" if kind == "dense" else "highway",
+            "env": rng.choice(SCENARIOS)
+            if kind == "scenario"
+            else "dense"
+            if kind == "dense"
+            else "highway",
             "num_envs": rng.choice((1, 3, 64, 256, 1024, 1024, 4096)),
             "observation": rng.choice(FORMS),
             "mask": rng.choice(("none", "legal", "safe")),
@@ -103,14 +117,19 @@ def _choices(rng: random.Random, compiled: bool) -> Iterator[dict[str, Any]]:
         if kind in ("highway", "dense", "replay"):
             lanes = rng.randint(1, 6)
             chosen |= {"lanes": lanes, "vehicles": rng.randint(2, min(40, 6 * lanes + 2))}
-            chosen |= {"spread_m": rng.choice((200.0, 400.0, 1500.0)), "truck_share": rng.choice((0.0, 0.0, 0.3))}
+            chosen |= {
+                "spread_m": rng.choice((200.0, 400.0, 1500.0)),
+                "truck_share": rng.choice((0.0, 0.0, 0.3)),
+            }
         pairs = chosen.get("vehicles", IN_SCENARIO) ** 2
         chosen["num_envs"] = min(chosen["num_envs"], MOST_PAIRS // pairs)
         if kind == "replay":
             if not RECORDINGS.is_file():
                 continue
             traffic = {"name": "replay", "path": str(RECORDINGS)}
-            chosen = {name: value for name, value in chosen.items() if name != "vehicles"} | {"recycle": False}
+            chosen = {name: value for name, value in chosen.items() if name != "vehicles"} | {
+                "recycle": False
+            }
         yield {**chosen, "traffic": traffic}
 
 
@@ -122,7 +141,9 @@ def made(choice: dict[str, Any]) -> TransformedEnv:
         return ganlane.make_env(**options)
 
 
-def _driven(tally: Tally, env: TransformedEnv, choice: dict[str, Any], number: int, until: float) -> None:
+def _driven(
+    tally: Tally, env: TransformedEnv, choice: dict[str, Any], number: int, until: float
+) -> None:
     """Drive until the time is over; what breaks is counted once per configuration."""
     base, rows = env.base_env, env.batch_size[0]
     generator = torch.Generator().manual_seed(number)
@@ -144,7 +165,13 @@ def _driven(tally: Tally, env: TransformedEnv, choice: dict[str, Any], number: i
     tally.what["decisions"] += rows * decisions
     tally.what["physics steps"] += rows * decisions * base.episode.substeps()
     kind = "float64" if choice["float64"] else "float32"
-    driver = "compiled" if choice["compile"] else "the native kernel" if base.kernel is not None else "tensor code"
+    driver = (
+        "compiled"
+        if choice["compile"]
+        else "the native kernel"
+        if base.kernel is not None
+        else "tensor code"
+    )
     for name in (kind, driver, choice["traffic"]["name"], choice["env"]):
         tally.detail[f"decisions: {name}"] += rows * decisions
         tally.detail[f"configurations: {name}"] += 1
@@ -152,7 +179,10 @@ def _driven(tally: Tally, env: TransformedEnv, choice: dict[str, Any], number: i
 
 
 def actions(policy: str, td: TensorDictBase, generator: torch.Generator) -> torch.Tensor:
-    """Actions [N]: any, legal ones where there is a mask, none but keeping the lane, or seldom a change."""
+    """Actions [N].
+
+    Any, legal ones where there is a mask, none but keeping the lane, or seldom a change.
+    """
     rows = td.batch_size
     if policy == "keep":
         return torch.zeros(rows, dtype=torch.int64)
@@ -166,9 +196,15 @@ def actions(policy: str, td: TensorDictBase, generator: torch.Generator) -> torc
 
 
 def violations(
-    base: HighwayEnv, choice: dict[str, Any], before: TensorDictBase, after: TensorDictBase, following: TensorDictBase
+    base: HighwayEnv,
+    choice: dict[str, Any],
+    before: TensorDictBase,
+    after: TensorDictBase,
+    following: TensorDictBase,
 ) -> Iterator[str]:
-    """What does not hold after a decision that led from ``before`` to ``after``, and with resets to ``following``."""
+    """What does not hold after a decision that led from ``before`` to ``after``, and with resets to
+    ``following``.
+    """
     was, now = Vehicles.of(before.get(keys.VEHICLES)), Vehicles.of(after.get(keys.VEHICLES))
     yield from _in_the_state(base, choice, before, was, now, after)
     done, steps = after["done"][:, 0], after[keys.STEP] - before[keys.STEP]
@@ -176,9 +212,13 @@ def violations(
     ended = {name: ends[:, i] for i, name in enumerate(keys.END_EVENTS)}
     if not (ends.sum(1) == done).all():
         yield "not exactly one reason for an end"
-    if not (sum(ended[name] for name in keys.TERMINAL_EVENTS).bool() == after["terminated"][:, 0]).all():
+    if not (
+        sum(ended[name] for name in keys.TERMINAL_EVENTS).bool() == after["terminated"][:, 0]
+    ).all():
         yield "terminated without its event, or the reverse"
-    if not (sum(ended[name] for name in keys.TRUNCATING_EVENTS).bool() == after["truncated"][:, 0]).all():
+    if not (
+        sum(ended[name] for name in keys.TRUNCATING_EVENTS).bool() == after["truncated"][:, 0]
+    ).all():
         yield "truncated without its event, or the reverse"
     full = base.episode.substeps()
     # Driving off the road ends an episode before its first physics step.
@@ -193,7 +233,9 @@ def violations(
     if not (after[keys.EVENTS, keys.SOFT_CRASH] >= 0).all():
         yield "a negative number of soft crashes"
     expected = before[keys.EPISODE] + torch.where(done, base.batch_size[0], 0)
-    if not (torch.equal(following[keys.EPISODE], expected) and (following[keys.STEP][done] == 0).all()):
+    if not (
+        torch.equal(following[keys.EPISODE], expected) and (following[keys.STEP][done] == 0).all()
+    ):
         yield "not the next episode, from its start, after an end"
     going = ~done
     if not torch.equal(following[keys.VEHICLES, "x"][going], now.x[going]):
@@ -213,7 +255,12 @@ def _in_the_state(
 ) -> Iterator[str]:
     """What does not hold of the vehicles, the observation and the reward."""
     numbers = [after[keys.VEHICLES, name] for name in keys.VEHICLE_FLOATS]
-    for value in (*numbers, after[keys.OBSERVATION], after[keys.REWARD], after[keys.EGO, "distance"]):
+    for value in (
+        *numbers,
+        after[keys.OBSERVATION],
+        after[keys.REWARD],
+        after[keys.EGO, "distance"],
+    ):
         if not torch.isfinite(value).all():
             yield "not finite"
             break
@@ -231,7 +278,9 @@ def _in_the_state(
     if not (((now.target_lane >= 0) & (now.target_lane < lanes)) | ~now.valid).all():
         yield "a lane that is not there"
     # With an ego that keeps its lane, rule-driven cars never touch each other.
-    alone = traffic in RULES and choice["policy"] == "keep" and "blind_share" not in choice["traffic"]
+    alone = (
+        traffic in RULES and choice["policy"] == "keep" and "blind_share" not in choice["traffic"]
+    )
     if alone and choice["env"] in ("highway", "dense"):
         touching = pair_overlaps(now).any(-1).any(-1) & ~after[keys.EVENTS, "hard_crash"][:, 0]
         if touching.any():
@@ -239,7 +288,10 @@ def _in_the_state(
 
 
 def memory(tally: Tally, minutes: float, seed: int) -> None:
-    """Resident memory of this process while one configuration runs; flat within :data:`FLAT` over the last half."""
+    """Resident memory of this process while one configuration runs.
+
+    Flat within :data:`FLAT` over the last half.
+    """
     env = ganlane.make_env("gan_calibrated", 64, seed=seed, goal_m=500.0, mask="safe")
     generator, td = torch.Generator().manual_seed(seed), env.reset()
     begun, sampled = time.monotonic(), []
@@ -251,7 +303,9 @@ def memory(tally: Tally, minutes: float, seed: int) -> None:
     spread = max(sampled) / min(sampled) - 1.0
     tally.what[f"MiB resident memory, within {spread:.2%} over the last half"] = round(sampled[-1])
     if spread > FLAT:
-        tally.fail(f"resident memory from {min(sampled):.0f} to {max(sampled):.0f} MiB in {minutes / 2:g} minutes")
+        tally.fail(
+            f"resident memory from {min(sampled):.0f} to {max(sampled):.0f} MiB in {minutes / 2:g} minutes"
+        )
 
 
 def resident_mib() -> float:

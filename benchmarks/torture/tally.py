@@ -1,4 +1,6 @@
-"""What a part of the trial counts, and the work that is done in a forked child because it may end there."""
+"""What a part of the trial counts, and the work that is done in a forked child because it may end
+there.
+"""
 
 from __future__ import annotations
 
@@ -63,9 +65,11 @@ class Tally:
 def forked(
     work: Callable[[Any], Any], items: Iterable[Any], at_most_s: float, memory_gib: float = 8.0
 ) -> Iterator[tuple[Any, Any]]:
-    """``(item, work(item))`` for every item, in children of this process; a child that is lost is replaced.
+    """``(item, work(item))`` for every item, in children of this process; a child that is lost is
+    replaced.
 
-    Where the child ended, or took longer than ``at_most_s``, the result is a text that begins with ``LOST``.
+    Where the child ended, or took longer than ``at_most_s``, the result is a text that begins with
+    ``LOST``.
     """
     waiting = list(items)
     while waiting:

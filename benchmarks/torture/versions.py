@@ -1,7 +1,8 @@
-"""Installs the lowest and the highest versions of every dependency, and runs a short list of commands.
+"""Installs the lowest and the highest versions of every dependency, and runs a short list of
+commands.
 
-Environments are made by ``uv`` where it is installed, else by pip. Where the lower bounds of ``pyproject.toml`` do
-not install together, each is tried alone.
+Environments are made by ``uv`` where it is installed, else by pip. Where the lower bounds of
+``pyproject.toml`` do not install together, each is tried alone.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ def lowest(requirement: str) -> str:
 def versions(tally: Tally, scratch: Path, pins: Sequence[str] = ()) -> str:
     """A table, in Markdown: each dependency's version in each environment.
 
-    ``pins`` stand for requirements of which other versions cannot be had, as ``torch==2.13.0``, in all environments.
+    ``pins`` stand for requirements of which other versions cannot be had, as ``torch==2.13.0``, in
+    all environments.
     """
     pinned = {pin.partition("==")[0]: pin for pin in pins}
     named = [pinned.get(re.split("[<>=]", each)[0], each) for each in dependencies()]
@@ -75,7 +77,8 @@ def versions(tally: Tally, scratch: Path, pins: Sequence[str] = ()) -> str:
     names = sorted({re.split(r"[<>=]", each)[0] for each in named})
     rows = ["| dependency | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     rows += [
-        f"| {each} | " + " | ".join(column.get(each, "-") for column in columns.values()) + " |" for each in names
+        f"| {each} | " + " | ".join(column.get(each, "-") for column in columns.values()) + " |"
+        for each in names
     ]
     return "\n".join(rows)
 
@@ -87,7 +90,14 @@ def _install(home: Path, wanted: list[str]) -> str | None:
         install = ["uv", "pip", "install", "--quiet", "--python", str(home / "bin" / "python")]
     else:
         make = [sys.executable, "-m", "venv", str(home)]
-        install = [str(home / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        install = [
+            str(home / "bin" / "python"),
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--disable-pip-version-check",
+        ]
     for line in (make, [*install, *wanted], [*install, "--no-deps", str(ROOT)]):
         done = subprocess.run(line, capture_output=True, text=True)
         if done.returncode != 0:
@@ -97,8 +107,13 @@ def _install(home: Path, wanted: list[str]) -> str | None:
 
 def _installed(home: Path) -> dict[str, str]:
     program = "import importlib.metadata as m; print(*(f'{d.name}={d.version}' for d in m.distributions()))"
-    done = subprocess.run([str(home / "bin" / "python"), "-c", program], capture_output=True, text=True, check=True)
-    return {name.lower().replace("_", "-"): version for name, version in (p.split("=") for p in done.stdout.split())}
+    done = subprocess.run(
+        [str(home / "bin" / "python"), "-c", program], capture_output=True, text=True, check=True
+    )
+    return {
+        name.lower().replace("_", "-"): version
+        for name, version in (p.split("=") for p in done.stdout.split())
+    }
 
 
 def _run(home: Path, command: str, out: Path) -> subprocess.CompletedProcess[str]:

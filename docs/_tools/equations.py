@@ -1,4 +1,5 @@
-"""Equations between double dollar signs become MathML, which browsers show without a script or a network.
+"""Equations between double dollar signs become MathML, which browsers show without a script or a
+network.
 
 A hook of MkDocs (``mkdocs.yml``). Within code, dollar signs stay what they are.
 """

@@ -1,11 +1,12 @@
 """The agent: Rainbow (Hessel et al. 2018) from TorchRL parts.
 
-A decision flows through the files in this order: :mod:`~ganlane.agents.network` turns an observation into a
-distribution over returns for each action, :mod:`~ganlane.agents.drivers` picks one (and holds the drivers that need
-no learning), :mod:`~ganlane.agents.n_step` joins n decisions into a transition, :mod:`~ganlane.agents.replay` keeps
-it and draws it again by priority, :mod:`~ganlane.agents.loss` compares it with the target network, and
-:mod:`~ganlane.agents.rainbow` holds it all together. :mod:`~ganlane.agents.checkpoint` writes the trained network to
-a file, reads it back, and starts another agent from it.
+A decision flows through the files in this order: :mod:`~ganlane.agents.network` turns an
+observation into a distribution over returns for each action, :mod:`~ganlane.agents.drivers` picks
+one (and holds the drivers that need no learning), :mod:`~ganlane.agents.n_step` joins n decisions
+into a transition, :mod:`~ganlane.agents.replay` keeps it and draws it again by priority,
+:mod:`~ganlane.agents.loss` compares it with the target network, and :mod:`~ganlane.agents.rainbow`
+holds it all together. :mod:`~ganlane.agents.checkpoint` writes the trained network to a file, reads
+it back, and starts another agent from it.
 """
 
 from ganlane.agents.checkpoint import agent_file, load_agent, read_agent, save_agent, warm_start

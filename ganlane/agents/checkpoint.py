@@ -1,4 +1,6 @@
-"""Trained agents as files (weights and the network's shape, in safetensors), and agents that start from them."""
+"""Trained agents as files (weights and the network's shape, in safetensors), and agents that start
+from them.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,10 @@ def _seeds_file(recipe: str) -> Path:
 
 
 def names_agent(name: str) -> bool:
-    """Whether ``name`` can only be that of a trained agent: one that ships, or a file; ``@SEED`` may follow."""
+    """Whether ``name`` can only be that of a trained agent: one that ships, or a file.
+
+    ``@SEED`` may follow.
+    """
     recipe, _, digits = name.rpartition("@")
     return any(
         each in SHIPPED or each.endswith(".safetensors") or os.path.isfile(each)
@@ -55,9 +60,11 @@ def names_agent(name: str) -> bool:
 
 
 def with_seeds(name: str) -> list[str]:
-    """``agent_idm@all`` as ``agent_idm@0``, ``agent_idm@1`` ..., all trainings there are; other names alone.
+    """``agent_idm@all`` as ``agent_idm@0``, ``agent_idm@1`` ..., all trainings there are; other
+    names alone.
 
-    ``FILE@all`` stands for all agents of a file of :func:`save_agents`. A mask (``+safe``) may follow.
+    ``FILE@all`` stands for all agents of a file of :func:`save_agents`. A mask (``+safe``) may
+    follow.
 
     Raises:
         UserError: no such agent or file.
@@ -79,13 +86,18 @@ def _read_several(path: Path) -> tuple[dict[str, Tensor], dict[int, dict[str, An
     """Tensors and, by seed, metadata of a file of :func:`save_agents`."""
     tensors, metadata = load_weights(path, SEVERAL)
     agents = metadata.get("agents")
-    if not isinstance(agents, dict) or not all(seed.isdecimal() and type(agents[seed]) is dict for seed in agents):
+    if not isinstance(agents, dict) or not all(
+        seed.isdecimal() and type(agents[seed]) is dict for seed in agents
+    ):
         raise UserError(f"{path}: its list of agents is not understood; pack the trainings anew.")
     return tensors, {int(seed): known for seed, known in agents.items()}
 
 
 def agent_file(name: str | Path) -> Path:
-    """The file of a shipped agent (:data:`SHIPPED`; ``@SEED`` may follow) or of a path; else :class:`UserError`."""
+    """The file of a shipped agent (:data:`SHIPPED`; ``@SEED`` may follow) or of a path.
+
+    Else :class:`UserError`.
+    """
     path, seed = _place(name)
     if not os.path.isfile(path):  # which takes names that are too long for a file
         known = ", ".join(sorted(file.stem for file in CHECKPOINTS.glob("agent_*.safetensors")))
@@ -99,8 +111,9 @@ def agent_file(name: str | Path) -> Path:
 def save_agent(path: str | Path, agent: Rainbow, metadata: Mapping[str, Any]) -> None:
     """Write the agent's online network atomically, as a ``.safetensors`` file.
 
-    ``metadata`` is JSON-serialisable; by convention ``observation`` (the name of the observation) and ``training``
-    (traffic, decisions, results). The network's config and the code version are added here.
+    ``metadata`` is JSON-serialisable; by convention ``observation`` (the name of the observation)
+    and ``training`` (traffic, decisions, results). The network's config and the code version are
+    added here.
     """
     header = {**metadata, "network": asdict(agent.network.config), "code_version": __version__}
     save_weights(path, "agent", agent.weights(), header)
@@ -111,15 +124,18 @@ def save_agents(
 ) -> None:
     """Write several trainings of one recipe into one file; ``path@SEED`` names each of them.
 
-    ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half precision,
-    everything that a greedy agent computes with as it is.
+    ``agents`` holds by seed what :func:`read_agent` gives. The scales of the noise are kept in half
+    precision, everything that a greedy agent computes with as it is.
     """
     tensors = {
         f"{seed}/{name}": value.half() if name.endswith("_sigma") else value
         for seed, (weights, _, _) in agents.items()
         for name, value in weights.items()
     }
-    described = {str(seed): {**known, "network": asdict(network)} for seed, (_, network, known) in agents.items()}
+    described = {
+        str(seed): {**known, "network": asdict(network)}
+        for seed, (_, network, known) in agents.items()
+    }
     save_weights(path, SEVERAL, tensors, {"agents": described})
 
 
@@ -127,7 +143,8 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
     """Weights, network config and metadata of a shipped agent or an agent's file.
 
     Raises:
-        UserError: no such file, not an agent that ganlane wrote, or one that needs an option that was removed.
+        UserError: no such file, not an agent that ganlane wrote, or one that needs an option that
+            was removed.
     """
     path, seed = agent_file(name), _place(name)[1]
     if seed is None:
@@ -136,9 +153,15 @@ def read_agent(name: str | Path) -> tuple[dict[str, Tensor], NetworkConfig, dict
         tensors, agents = _read_several(path)
         if seed not in agents:
             seeds = ", ".join(map(str, sorted(agents)))
-            raise UserError(f"{path}@{seed}: this file has no training with seed {seed}; choose one of {seeds}.")
+            raise UserError(
+                f"{path}@{seed}: this file has no training with seed {seed}; choose one of {seeds}."
+            )
         own, metadata = f"{seed}/", agents[seed]
-        weights = {key.removeprefix(own): value.float() for key, value in tensors.items() if key.startswith(own)}
+        weights = {
+            key.removeprefix(own): value.float()
+            for key, value in tensors.items()
+            if key.startswith(own)
+        }
     for part in ("network", "agent"):
         if isinstance(metadata.get(part), dict):
             metadata[part] = without_removed(metadata[part], str(path))
@@ -191,10 +214,12 @@ def warm_start(
     network: NetworkConfig,
     moments: Mapping[int, Any] | None = None,
 ) -> None:
-    """Start ``agent`` from the ``weights`` of the trained agent ``name``, and from Adam's ``moments`` if given.
+    """Start ``agent`` from the ``weights`` of the trained agent ``name``, and from Adam's
+    ``moments`` if given.
 
     Raises:
-        UserError: the networks differ in what their weights mean, or the moments are those of another network.
+        UserError: the networks differ in what their weights mean, or the moments are those of
+            another network.
     """
     ours = agent.network.config
     check_observation_size(name, network, ours.observation_size)
@@ -204,7 +229,8 @@ def warm_start(
     if differing:
         adopt = "give init.support=trained, " if set(differing) <= set(SUPPORT) else ""
         own, theirs = (
-            " ".join(f"agent.{key}={as_typed(config[key])}" for key in differing) for config in (here, trained)
+            " ".join(f"agent.{key}={as_typed(config[key])}" for key in differing)
+            for config in (here, trained)
         )
         raise UserError(
             f"agent {name}: it has another network than this run (here: {own}); {adopt}set {theirs}, or start with "
@@ -216,10 +242,11 @@ def warm_start(
 
 
 def load_moments(agent: Rainbow, moments: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """Let ``agent``'s Adam go on from the ``moments`` of an agent with the same network, at its own learning rate.
+    """Let ``agent``'s Adam go on from the ``moments`` of an agent with the same network, at its own
+    learning rate.
 
-    ``moments`` is the part ``state`` of an optimiser's state: ``step``, ``exp_avg`` and ``exp_avg_sq`` by the place
-    of the parameter in the network.
+    ``moments`` is the part ``state`` of an optimiser's state: ``step``, ``exp_avg`` and
+    ``exp_avg_sq`` by the place of the parameter in the network.
 
     Raises:
         UserError: they are those of other parameters.

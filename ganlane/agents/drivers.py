@@ -1,7 +1,7 @@
 """Who drives the ego, as TensorDictModules that write ``action``.
 
-A Q-network's best action with and without exploration, any driver behind a mask, and drivers that need no learning:
-random, random but legal, keeping the lane, MOBIL.
+A Q-network's best action with and without exploration, any driver behind a mask, and drivers that
+need no learning: random, random but legal, keeping the lane, MOBIL.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ LegalActions = Callable[[TensorDictBase], Tensor]
 
 
 class GreedyPolicy(TensorDictModuleBase):
-    """Writes the best ``action`` [N] int64 for ``observation`` [N, D]; never any noise, whatever the context says.
+    """Writes the best ``action`` [N] int64 for ``observation`` [N, D]; never any noise, whatever
+    the context says.
 
     Where the environment writes ``action_mask`` [N, A], it is the best of the allowed actions.
     """
@@ -58,11 +59,13 @@ class GreedyPolicy(TensorDictModuleBase):
 
 
 class ExploringPolicy(TensorDictModuleBase):
-    """The policy that collects: network noise drawn anew at every step, mixed with random legal actions.
+    """The policy that collects: network noise drawn anew at every step, mixed with random legal
+    actions.
 
-    It explores unless ``set_exploration_type`` says DETERMINISTIC, MODE or MEAN: outside any context, where TorchRL's
-    noisy layers are silent, collecting would else be greedy by accident. Where the environment writes
-    ``action_mask``, all actions are among the allowed ones, and ``legal`` is not asked.
+    It explores unless ``set_exploration_type`` says DETERMINISTIC, MODE or MEAN: outside any
+    context, where TorchRL's noisy layers are silent, collecting would else be greedy by accident.
+    Where the environment writes ``action_mask``, all actions are among the allowed ones, and
+    ``legal`` is not asked.
 
     Args:
         network: its noise is redrawn in place, in one draw for all environments of the batch.
@@ -73,7 +76,9 @@ class ExploringPolicy(TensorDictModuleBase):
     in_keys = [keys.OBSERVATION]  # noqa: RUF012
     out_keys = [keys.ACTION, keys.CHOSEN_VALUE]  # noqa: RUF012
 
-    def __init__(self, network: QNetwork, generator: torch.Generator, legal: LegalActions | None = None) -> None:
+    def __init__(
+        self, network: QNetwork, generator: torch.Generator, legal: LegalActions | None = None
+    ) -> None:
         super().__init__()
         self.network, self.generator, self.legal = network, generator, legal
         #: Probability of a random action; the agent anneals it.
@@ -85,7 +90,9 @@ class ExploringPolicy(TensorDictModuleBase):
         explore = exploration_type() in (None, ExplorationType.RANDOM)
         if explore:
             redraw_noise(self.network, self.generator)
-        with set_exploration_type(ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC):
+        with set_exploration_type(
+            ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
+        ):
             values = self.network.values(tensordict.get(keys.OBSERVATION))
         mask = tensordict.get(keys.ACTION_MASK, None)
         action = allowed_values(values, mask).argmax(-1)
@@ -95,13 +102,16 @@ class ExploringPolicy(TensorDictModuleBase):
             # A fraction epsilon of the actions becomes a legal one, drawn uniformly.
             draw: dict[str, Any] = {"generator": self.generator, "device": self.generator.device}
             lottery = torch.rand(mask.shape, **draw) * mask
-            action = torch.where(torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action)
+            action = torch.where(
+                torch.rand(action.shape, **draw) < self.epsilon, lottery.argmax(-1), action
+            )
         chosen = values.gather(-1, action[..., None])
         return tensordict.set(keys.ACTION, action).set(keys.CHOSEN_VALUE, chosen)
 
 
 class MaskedPolicy(TensorDictModuleBase):
-    """Any policy behind the environment's ``action_mask``: an action that is not allowed becomes 'keep the lane'.
+    """Any policy behind the environment's ``action_mask``: an action that is not allowed becomes
+    'keep the lane'.
 
     Agents of this package choose among the allowed actions themselves; it does not change them.
 
@@ -132,8 +142,8 @@ class MaskedPolicy(TensorDictModuleBase):
 class Driver(TensorDictModuleBase):
     """A rule-based policy: reads the raw state, writes ``action`` [N] int64 through :meth:`act`.
 
-    Set ``rows_must_stay = True`` in one that remembers something per row in the module itself: an evaluation then
-    never moves a running episode to another row, or into a smaller batch.
+    Set ``rows_must_stay = True`` in one that remembers something per row in the module itself: an
+    evaluation then never moves a running episode to another row, or into a smaller batch.
     """
 
     in_keys = [keys.VEHICLES, keys.EGO, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
@@ -150,7 +160,9 @@ class Driver(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``."""
-        return tensordict.set(keys.ACTION, self.act(Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict))
+        return tensordict.set(
+            keys.ACTION, self.act(Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict)
+        )
 
 
 def legal_actions(tensordict: TensorDictBase, road: Road) -> Tensor:
@@ -195,7 +207,11 @@ class MobilDriver(Driver):
     """The ego driven by MOBIL; with ``politeness_rear=politeness_side=0`` an egoistic one."""
 
     def __init__(
-        self, road: Road, stream: int = Stream.TRAIN, idm: IdmParameters = TABLE_V, mobil: MobilParameters = TABLE_IV
+        self,
+        road: Road,
+        stream: int = Stream.TRAIN,
+        idm: IdmParameters = TABLE_V,
+        mobil: MobilParameters = TABLE_IV,
     ) -> None:
         super().__init__(road, stream)
         self.idm, self.mobil = idm, mobil
@@ -205,7 +221,8 @@ class MobilDriver(Driver):
         road = road_in(tensordict, self.road)
         wish = mobil_wishes(ego_scene(vehicles, road), road, self.idm, self.mobil)[:, 0]
         step, decisions = tensordict.get(keys.STEP), tensordict.get(keys.EGO).get("decisions")
-        # All decisions take the same number of steps, so the last one was at step - step / decisions.
+        # All decisions take the same number of steps, so the last one was at step - step /
+        # decisions.
         last = step - step // decisions.clamp_min(1)
         due = (decisions == 0) | (step // MOBIL_PERIOD_STEPS != last // MOBIL_PERIOD_STEPS)
         wish = torch.where(due, wish, 0)
@@ -214,7 +231,9 @@ class MobilDriver(Driver):
 
 def egoistic_mobil(road: Road, stream: int = Stream.TRAIN) -> MobilDriver:
     """MOBIL with politeness 0."""
-    return MobilDriver(road, stream, mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0))
+    return MobilDriver(
+        road, stream, mobil=replace(TABLE_IV, politeness_rear=0.0, politeness_side=0.0)
+    )
 
 
 #: Name to a constructor from (road, stream).

@@ -1,15 +1,16 @@
 """The loss of a batch of transitions, and a whole update of Rainbow as one function.
 
-:class:`LeanDistributionalLoss` equals :class:`torchrl.objectives.DistributionalDQNLoss` (Bellemare et al. 2017,
-double) to 1e-6 and takes half of its time, by a lean forward on plain tensors; :class:`LeanDQNLoss` does the same for
-the plain DQN loss. Both keep TorchRL's parameter containers, so a TorchRL user finds ``value_network_params`` and the
-target where expected.
+:class:`LeanDistributionalLoss` equals :class:`torchrl.objectives.DistributionalDQNLoss` (Bellemare
+et al. 2017, double) to 1e-6 and takes half of its time, by a lean forward on plain tensors;
+:class:`LeanDQNLoss` does the same for the plain DQN loss. Both keep TorchRL's parameter containers,
+so a TorchRL user finds ``value_network_params`` and the target where expected.
 
-:func:`update` is what :meth:`ganlane.agents.rainbow.Rainbow.update` does with the first of them, autograd,
-``clip_grad_norm_`` and Adam, here without any of these, for the agent with all six components: noise is part of the
-weights, the backward pass is written out, and the duel is folded into the head, since ``Q_a = V + A_a - mean(A)`` is
-linear in its weights. :class:`UpdateGraph` compiles it to one graph. Equal to the other way up to rounding
-(tests/agents/test_agents_loss.py), and faster on a CPU (docs/performance.md).
+:func:`update` is what :meth:`ganlane.agents.rainbow.Rainbow.update` does with the first of them,
+autograd, ``clip_grad_norm_`` and Adam, here without any of these, for the agent with all six
+components: noise is part of the weights, the backward pass is written out, and the duel is folded
+into the head, since ``Q_a = V + A_a - mean(A)`` is linear in its weights. :class:`UpdateGraph`
+compiles it to one graph. Equal to the other way up to rounding (tests/agents/test_agents_loss.py),
+and faster on a CPU (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -36,19 +37,26 @@ _BETA_1, _BETA_2 = 0.9, 0.999
 
 
 class _WithTarget:
-    """Mixin: a second module whose tensors are the loss's target parameters, so that its noise can be drawn anew."""
+    """Mixin.
+
+    A second module whose tensors are the loss's target parameters, so that its noise can be drawn
+    anew.
+    """
 
     target_network: QNetwork
     network: QNetwork
 
     def _attach(self, network: QNetwork, actor: nn.Module) -> None:
-        # The target is updated here, by update_target: TorchRL need not warn that no updater is registered.
+        # The target is updated here, by update_target: TorchRL need not warn that no updater is
+        # registered.
         self._has_update_associated["value_network"] = True  # type: ignore[attr-defined]
         actor_copy = deepcopy(actor)
         self.target_value_network_params.to_module(actor_copy)  # type: ignore[attr-defined]
         # In __dict__, as TorchRL does with the online module, so that no parameter is listed twice.
         self.__dict__["network"] = network
-        self.__dict__["target_network"] = next(m for m in actor_copy.modules() if isinstance(m, QNetwork))
+        self.__dict__["target_network"] = next(
+            m for m in actor_copy.modules() if isinstance(m, QNetwork)
+        )
         # Losses run deterministic by default; without noise the sigmas would never get a gradient.
         self.deterministic_sampling_mode = ExplorationType.RANDOM
 
@@ -66,25 +74,35 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         network: distributional Q-network.
         gamma: discount per decision; a transition over k decisions is discounted by ``gamma ** k``.
         double: choose the next action by the online network rather than by the target network.
-        kl_priority: ``td_error`` is the Kullback-Leibler divergence (Hessel et al. 2018) rather than the
-            cross-entropy, which is larger by the entropy of the target and is what TorchRL uses.
+        kl_priority: ``td_error`` is the Kullback-Leibler divergence (Hessel et al. 2018) rather
+            than the cross-entropy, which is larger by the entropy of the target and is what TorchRL
+            uses.
     """
 
-    def __init__(self, network: QNetwork, gamma: float, double: bool = True, kl_priority: bool = True) -> None:
+    def __init__(
+        self, network: QNetwork, gamma: float, double: bool = True, kl_priority: bool = True
+    ) -> None:
         actor = DistributionalQValueActor(
-            network, network.support, in_keys=["observation"], action_space="categorical", make_log_softmax=False
+            network,
+            network.support,
+            in_keys=["observation"],
+            action_space="categorical",
+            make_log_softmax=False,
         )
-        super().__init__(actor, gamma=gamma, delay_value=True, reduction="none", use_prioritized_weights=False)
+        super().__init__(
+            actor, gamma=gamma, delay_value=True, reduction="none", use_prioritized_weights=False
+        )
         self.double, self.kl_priority = double, kl_priority
         self._attach(network, actor)
 
     def forward(self, batch: TensorDictBase) -> TensorDict:
         """Cross-entropy per transition.
 
-        Reads ``observation`` [B, D], ``action`` [B], ``steps_to_next_obs`` [B, 1] and ``next``'s ``observation``,
-        ``reward`` and ``terminated`` [B, 1]; where ``next`` has ``action_mask`` [B, A], the best next action is one
-        that it allows. Writes ``td_error`` [B, 1]. Returns ``loss`` [B] and, 0-dim,
-        ``clamped_fraction`` (mass of the targets outside the support) and ``mean_q`` (of the best next action).
+        Reads ``observation`` [B, D], ``action`` [B], ``steps_to_next_obs`` [B, 1] and ``next``'s
+        ``observation``, ``reward`` and ``terminated`` [B, 1]; where ``next`` has ``action_mask``
+        [B, A], the best next action is one that it allows. Writes ``td_error`` [B, 1]. Returns
+        ``loss`` [B] and, 0-dim, ``clamped_fraction`` (mass of the targets outside the support) and
+        ``mean_q`` (of the best next action).
         """
         weights = self.network.weights()
         with torch.no_grad():
@@ -99,11 +117,15 @@ class LeanDistributionalLoss(_WithTarget, DistributionalDQNLoss):
         return TensorDict({"loss": loss, "clamped_fraction": clamped, "mean_q": mean_q})
 
     def _target(self, batch: TensorDictBase, weights: Weights) -> tuple[Tensor, Tensor, Tensor]:
-        """Projected distribution of the Bellman targets [B, atoms], its clamped mass, the mean best value."""
+        """Projected distribution of the Bellman targets [B, atoms], its clamped mass, the mean best
+        value.
+        """
         following, support = batch.get(("next", "observation")), self.network.support
         target_logits = self.target_network.logits(following)
         choosing = self.network.logits(following, weights) if self.double else target_logits
-        values = allowed_values(self.network.expected(choosing), batch.get(("next", keys.ACTION_MASK), None))
+        values = allowed_values(
+            self.network.expected(choosing), batch.get(("next", keys.ACTION_MASK), None)
+        )
         best, action = values.max(-1)
         returns = bellman(batch, self.gamma, support)
         return *projected(returns, pick(target_logits, action).softmax(-1), support), best.mean()
@@ -128,33 +150,46 @@ class LeanDQNLoss(_WithTarget, DQNLoss):
         self._attach(network, actor)
 
     def forward(self, batch: TensorDictBase) -> TensorDict:
-        """Huber loss per transition; keys as in :meth:`LeanDistributionalLoss.forward`, ``td_error`` is |error|."""
+        """Huber loss per transition.
+
+        Keys as in :meth:`LeanDistributionalLoss.forward`, ``td_error`` is |error|.
+        """
         following = batch.get(("next", "observation"))
         with torch.no_grad():
             target_values = self.target_network(following)
             values = self.network(following) if self.double_dqn else target_values
-            best, action = allowed_values(values, batch.get(("next", keys.ACTION_MASK), None)).max(-1)
-            target = bellman(batch, self.discount, target_values.gather(-1, action[:, None])).squeeze(-1)
+            best, action = allowed_values(values, batch.get(("next", keys.ACTION_MASK), None)).max(
+                -1
+            )
+            target = bellman(
+                batch, self.discount, target_values.gather(-1, action[:, None])
+            ).squeeze(-1)
             mean_q = best.mean()
         values = self.network(batch.get("observation"))
         value = values.gather(-1, batch.get("action")[:, None]).squeeze(-1)
         loss = nn.functional.smooth_l1_loss(value, target, reduction="none")
         batch.set("td_error", (target - value.detach()).abs()[:, None])
-        return TensorDict({"loss": loss, "clamped_fraction": torch.zeros_like(mean_q), "mean_q": mean_q})
+        return TensorDict(
+            {"loss": loss, "clamped_fraction": torch.zeros_like(mean_q), "mean_q": mean_q}
+        )
 
 
 def bellman(batch: TensorDictBase, gamma: float, value: Tensor) -> Tensor:
-    """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows, unless it terminated."""
+    """Return of each transition plus the discounted ``value`` [B, K] or [K] of what follows, unless
+    it terminated.
+    """
     alive = 1.0 - batch.get(("next", "terminated")).to(value.dtype)
     discount = gamma ** batch.get("steps_to_next_obs")
     return batch.get(("next", "reward")).to(value.dtype) + alive * discount * value
 
 
 def project(values: Tensor, probabilities: Tensor, support: Tensor) -> Tensor:
-    """Project the distribution with ``probabilities`` [B, K] at ``values`` [B, K] onto ``support`` [K].
+    """Project the distribution with ``probabilities`` [B, K] at ``values`` [B, K] onto ``support``
+    [K].
 
-    Values outside the support are clamped to its ends. Each mass is split between its two neighbours in proportion
-    to the nearness of the other (Bellemare et al. 2017, equation 7); the mean is kept but for the clamping.
+    Values outside the support are clamped to its ends. Each mass is split between its two
+    neighbours in proportion to the nearness of the other (Bellemare et al. 2017, equation 7); the
+    mean is kept but for the clamping.
     """
     low, high, atoms = support[0], support[-1], support.numel()
     place = (values.clamp(low, high) - low) * ((atoms - 1) / (high - low))
@@ -181,7 +216,10 @@ def pick(rows: Tensor, action: Tensor) -> Tensor:
 
 
 class Batch(NamedTuple):
-    """Transitions: ``observation`` and ``following`` [B, D], ``allowed`` [B, A] bool (following), the rest [B]."""
+    """Transitions.
+
+    ``observation`` and ``following`` [B, D], ``allowed`` [B, A] bool (following), the rest [B].
+    """
 
     observation: Tensor
     action: Tensor
@@ -194,7 +232,10 @@ class Batch(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """``priority`` [B]; 0-dim: the weighted ``loss``, ``mean_q``, ``clamped_fraction``, ``gradient_norm``."""
+    """``priority`` [B]; 0-dim.
+
+    The weighted ``loss``, ``mean_q``, ``clamped_fraction``, ``gradient_norm``.
+    """
 
     priority: Tensor
     loss: Tensor
@@ -214,7 +255,10 @@ class Settings(NamedTuple):
 
 
 def composed(parameters: Sequence[Tensor], noise: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Weight [O, I] and bias [O] of a noisy layer (Fortunato et al. 2017); ``noise`` of its inputs and outputs."""
+    """Weight [O, I] and bias [O] of a noisy layer (Fortunato et al. 2017).
+
+    ``noise`` of its inputs and outputs.
+    """
     weight_mu, weight_sigma, bias_mu, bias_sigma = parameters
     inputs, outputs = noise
     return weight_mu + weight_sigma * torch.outer(outputs, inputs), bias_mu + bias_sigma * outputs
@@ -241,7 +285,11 @@ def forward(layers: Weights, x: Tensor) -> list[Tensor]:
 
 
 def gradients(
-    layers: Weights, noise: Sequence[Sequence[Tensor]], inputs: Sequence[Tensor], of_logits: Tensor, actions: int
+    layers: Weights,
+    noise: Sequence[Sequence[Tensor]],
+    inputs: Sequence[Tensor],
+    of_logits: Tensor,
+    actions: int,
 ) -> list[Tensor]:
     """Of all parameters, in the layers' order, from that of the folded head's output [B, A K]."""
     found: list[Tensor] = []
@@ -251,9 +299,17 @@ def gradients(
         if number == len(layers) - 1:
             of_weight, of_bias = unfolded(of_weight, actions), unfolded(of_bias, actions)
         drawn_in, drawn_out = noise[number]
-        found = [of_weight, of_weight * torch.outer(drawn_out, drawn_in), of_bias, of_bias * drawn_out, *found]
+        found = [
+            of_weight,
+            of_weight * torch.outer(drawn_out, drawn_in),
+            of_bias,
+            of_bias * drawn_out,
+            *found,
+        ]
         if number:
-            behind = torch.where(inputs[number] > 0, matrix_product(behind, layers[number][0].t()), 0.0)
+            behind = torch.where(
+                inputs[number] > 0, matrix_product(behind, layers[number][0].t()), 0.0
+            )
     return found
 
 
@@ -270,7 +326,8 @@ def update(
     rate: Tensor,
     corrections: Tensor,
 ) -> Learned:
-    """Change ``online`` and Adam's moments ``mean`` and ``square`` in place by one step on ``batch``.
+    """Change ``online`` and Adam's moments ``mean`` and ``square`` in place by one step on
+    ``batch``.
 
     Args:
         settings: fixed numbers.
@@ -301,7 +358,9 @@ def update(
     loss = -(wanted * log_p).sum(-1)
     priority = (loss - torch.special.entr(wanted).sum(-1)).clamp_min(0.0)
 
-    of_chosen = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * (batch.weight / rows)[:, None]
+    of_chosen = (log_p.exp() * wanted.sum(-1, keepdim=True) - wanted) * (batch.weight / rows)[
+        :, None
+    ]
     is_chosen = batch.action[:, None] == torch.arange(actions, device=support.device)
     of_logits = torch.where(is_chosen[..., None], of_chosen[:, None, :], 0.0).flatten(1)
     found = gradients(layers, noise, [each[:rows] for each in inputs], of_logits, actions)
@@ -336,16 +395,25 @@ class UpdateGraph:
         self._update: Callable[..., Learned] = compiled(update) if compile else update
 
     def __call__(self, batch: TensorDictBase, generator: torch.Generator) -> Learned:
-        """One update on ``batch`` (keys as in :class:`LeanDistributionalLoss`); noise from ``generator``."""
+        """One update on ``batch`` (keys as in :class:`LeanDistributionalLoss`).
+
+        Noise from ``generator``.
+        """
         online, target = (
-            [getattr(layer, name) for layer in (*network.trunk, network.head) for name in _PARAMETERS]
+            [
+                getattr(layer, name)
+                for layer in (*network.trunk, network.head)
+                for name in _PARAMETERS
+            ]
             for network in (self.network, self.target)
         )
         moments = [self._moments(parameter) for parameter in online]
         torch._foreach_add_([each["step"] for each in moments], 1.0)
         step, (group,) = float(moments[0]["step"]), self.optimizer.param_groups
         corrections = torch.tensor([1.0 / (1.0 - _BETA_1**step), 1.0 / (1.0 - _BETA_2**step)])
-        noise, target_noise = (noise_of(network, generator) for network in (self.network, self.target))
+        noise, target_noise = (
+            noise_of(network, generator) for network in (self.network, self.target)
+        )
         following, action = batch.get("next"), batch.get("action")
         allowed = following.get(keys.ACTION_MASK, None)
         given = Batch(
@@ -356,7 +424,9 @@ class UpdateGraph:
             (~following.get("terminated")[:, 0]).float(),
             batch.get("steps_to_next_obs")[:, 0].float(),
             batch.get("priority_weight"),
-            torch.ones((len(action), self.settings.actions), dtype=torch.bool) if allowed is None else allowed,
+            torch.ones((len(action), self.settings.actions), dtype=torch.bool)
+            if allowed is None
+            else allowed,
         )
         rate = torch.tensor(float(group["lr"]))
         mean, square = ([each[name] for each in moments] for name in ("exp_avg", "exp_avg_sq"))
@@ -371,5 +441,8 @@ class UpdateGraph:
         state = self.optimizer.state[parameter]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+            state["exp_avg"], state["exp_avg_sq"] = (
+                torch.zeros_like(parameter),
+                torch.zeros_like(parameter),
+            )
         return state

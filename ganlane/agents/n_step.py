@@ -1,6 +1,7 @@
 """n-step returns over a batch of environments, exact across ends.
 
-TorchRL's ``MultiStepTransform`` leaves ``terminated`` of the first step in place, and so bootstraps past a crash.
+TorchRL's ``MultiStepTransform`` leaves ``terminated`` of the first step in place, and so bootstraps
+past a crash.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from ganlane import keys
 class Step(NamedTuple):
     """One decision of N environments; ``following`` is the observation after it, before any reset.
 
-    ``following_mask`` [N, A] bool says which actions are allowed there, where the environment has a mask.
+    ``following_mask`` [N, A] bool says which actions are allowed there, where the environment has a
+    mask.
     """
 
     observation: Tensor
@@ -37,15 +39,24 @@ class Step(NamedTuple):
             after.get(name).clone() for name in ("reward", "observation", "terminated", "done")
         )
         mask = after.get(keys.ACTION_MASK, None)
-        return cls(observation, action, reward, following, terminated, done, None if mask is None else mask.clone())
+        return cls(
+            observation,
+            action,
+            reward,
+            following,
+            terminated,
+            done,
+            None if mask is None else mask.clone(),
+        )
 
 
 class NStepWindow:
     """The last ``n`` steps of N environments; each new one gives the transition of the oldest.
 
-    So every step but the first n - 1 gives one transition per environment, n - 1 steps late. Its return ends at the
-    first ``done`` among its n steps, and so do its next observation and its ``terminated``: a truncated episode
-    bootstraps from its true last observation, a terminated one not at all.
+    So every step but the first n - 1 gives one transition per environment, n - 1 steps late. Its
+    return ends at the first ``done`` among its n steps, and so do its next observation and its
+    ``terminated``: a truncated episode bootstraps from its true last observation, a terminated one
+    not at all.
     """
 
     def __init__(self, n: int, gamma: float) -> None:
@@ -56,18 +67,24 @@ class NStepWindow:
         """Add one step; return the transition of the oldest, batch [N], or None until there are n.
 
         Args:
-            step: batch [N], with ``observation`` [N, D], ``action`` [N] and ``next``'s ``observation`` (before any
-                reset), ``reward``, ``terminated`` and ``done`` [N, 1].
+            step: batch [N], with ``observation`` [N, D], ``action`` [N] and ``next``'s
+                ``observation`` (before any reset), ``reward``, ``terminated`` and ``done`` [N, 1].
 
         Returns:
-            ``observation``, ``action``, ``steps_to_next_obs`` [N, 1] (the exponent of the discount), and ``next``'s
-            ``observation``, ``reward`` (the n-step return), ``terminated``, and ``action_mask`` where there is one.
+            ``observation``, ``action``, ``steps_to_next_obs`` [N, 1] (the exponent of the
+            discount), and ``next``'s ``observation``, ``reward`` (the n-step return),
+            ``terminated``, and ``action_mask`` where there is one.
         """
         self.steps.append(Step.copied(step))
         if len(self.steps) < self.n:
             return None
         first, *later = self.steps
-        reward, following, terminated, mask = first.reward, first.following, first.terminated, first.following_mask
+        reward, following, terminated, mask = (
+            first.reward,
+            first.following,
+            first.terminated,
+            first.following_mask,
+        )
         length, running = torch.ones_like(reward), ~first.done
         for power, after in enumerate(later, start=1):
             reward = reward + running * (self.gamma**power * after.reward)
@@ -81,7 +98,11 @@ class NStepWindow:
         end = {"observation": following, "reward": reward, "terminated": terminated}
         if mask is not None:
             end[keys.ACTION_MASK] = mask
-        begin = {"observation": first.observation, "action": first.action, "steps_to_next_obs": length}
+        begin = {
+            "observation": first.observation,
+            "action": first.action,
+            "steps_to_next_obs": length,
+        }
         return TensorDict({**begin, "next": TensorDict(end, reward.shape[:1])}, reward.shape[:1])
 
     def state_dict(self) -> dict[str, Any]:

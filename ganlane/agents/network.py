@@ -1,9 +1,10 @@
 """The Q-network: two noisy hidden layers, a dueling head, a distribution over returns.
 
-The paper (V.A) asks for 'two NoisyLinear layers, as defined in Rainbow, with 256 neurons'. Our reading: one trunk
-of two noisy hidden layers with ReLU, shared by the value and the advantage, and one noisy linear head that gives
-both. Rainbow's own streams are noisy layer, ReLU, noisy layer on top of a convolutional trunk; there is no
-convolution here, and a second hidden layer per stream would cost half as much again for the same depth.
+The paper (V.A) asks for 'two NoisyLinear layers, as defined in Rainbow, with 256 neurons'. Our
+reading: one trunk of two noisy hidden layers with ReLU, shared by the value and the advantage, and
+one noisy linear head that gives both. Rainbow's own streams are noisy layer, ReLU, noisy layer on
+top of a convolutional trunk; there is no convolution here, and a second hidden layer per stream
+would cost half as much again for the same depth.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_l
 class NetworkConfig:
     """Shape and options of a :class:`QNetwork`; defaults and meaning as in :class:`RainbowConfig`.
 
-    ``observation_size`` D and ``actions`` A come from the environment. Without ``distributional`` the support
-    (``atoms`` points from ``v_min`` to ``v_max``) is ignored.
+    ``observation_size`` D and ``actions`` A come from the environment. Without ``distributional``
+    the support (``atoms`` points from ``v_min`` to ``v_max``) is ignored.
     """
 
     observation_size: int
@@ -53,21 +54,29 @@ class NetworkConfig:
     @classmethod
     def of(cls, config: RainbowConfig, observation_size: int, actions: int = 3) -> NetworkConfig:
         """The network of an agent for observations of size D and A actions."""
-        shared = {own.name: getattr(config, own.name) for own in fields(cls) if hasattr(config, own.name)}
+        shared = {
+            own.name: getattr(config, own.name) for own in fields(cls) if hasattr(config, own.name)
+        }
         return cls(observation_size=observation_size, actions=actions, **shared)
 
     def __post_init__(self) -> None:
         sizes = {name: getattr(self, name) for name in ("observation_size", "actions", "atoms")}
-        for name, size in (sizes | {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}).items():
+        for name, size in (
+            sizes | {f"hidden[{i}]": width for i, width in enumerate(self.hidden)}
+        ).items():
             if not isinstance(size, int) or not 1 <= size <= LARGEST:
-                raise UserError(f"network {name}={size!r}: expected a whole number from 1 to {LARGEST}.")
+                raise UserError(
+                    f"network {name}={size!r}: expected a whole number from 1 to {LARGEST}."
+                )
         for name in ("noisy", "dueling", "distributional"):
             if not isinstance(getattr(self, name), bool):
                 raise UserError(f"network {name}={getattr(self, name)!r}: expected true or false.")
         numbers = (self.v_min, self.v_max, self.noisy_sigma)
         finite = all(isinstance(number, int | float) and isfinite(number) for number in numbers)
         if not finite or self.v_min >= self.v_max:
-            raise UserError(f"network v_min={self.v_min!r}, v_max={self.v_max!r}: expected finite numbers in order.")
+            raise UserError(
+                f"network v_min={self.v_min!r}, v_max={self.v_max!r}: expected finite numbers in order."
+            )
 
     @property
     def outputs(self) -> int:
@@ -78,7 +87,8 @@ class NetworkConfig:
 class QNetwork(nn.Module):
     """Action values [*, A], as a distribution over ``support`` [atoms] or as plain numbers.
 
-    Noise is added under ``ExplorationType.RANDOM`` alone, and is the same until :func:`redraw_noise`.
+    Noise is added under ``ExplorationType.RANDOM`` alone, and is the same until
+    :func:`redraw_noise`.
     """
 
     support: Tensor
@@ -90,16 +100,20 @@ class QNetwork(nn.Module):
         widths = (config.observation_size, *config.hidden)
         self.trunk = nn.ModuleList(layer(*pair) for pair in pairwise(widths))
         self.head = layer(widths[-1], (config.actions + config.dueling) * config.outputs)
-        self.register_buffer("support", torch.linspace(config.v_min, config.v_max, config.atoms), persistent=False)
+        self.register_buffer(
+            "support", torch.linspace(config.v_min, config.v_max, config.atoms), persistent=False
+        )
 
     def weights(self) -> Weights:
         """Weight and bias of every layer, the head last, with the present noise added."""
         return [(layer.weight, layer.bias) for layer in (*self.trunk, self.head)]
 
     def logits(self, observation: Tensor, weights: Weights | None = None) -> Tensor:
-        """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations [*, D].
+        """Unnormalised output [*, A, atoms] (atoms is 1 when not distributional) for observations
+        [*, D].
 
-        ``weights`` of :meth:`weights` save composing them again when several batches see the same noise.
+        ``weights`` of :meth:`weights` save composing them again when several batches see the same
+        noise.
         """
         *hidden_layers, head = self.weights() if weights is None else weights
         hidden = observation.to(self.support.dtype)
@@ -109,13 +123,22 @@ class QNetwork(nn.Module):
         return duel(rows) if self.config.dueling else rows
 
     def forward(self, observation: Tensor) -> Tensor:
-        """What TorchRL's actors and losses expect: log-probabilities [*, atoms, A], or values [*, A]."""
+        """What TorchRL's actors and losses expect.
+
+        Log-probabilities [*, atoms, A], or values [*, A].
+        """
         logits = self.logits(observation)
-        return logits.log_softmax(-1).transpose(-1, -2) if self.config.distributional else logits.squeeze(-1)
+        return (
+            logits.log_softmax(-1).transpose(-1, -2)
+            if self.config.distributional
+            else logits.squeeze(-1)
+        )
 
     def expected(self, logits: Tensor) -> Tensor:
         """Action values [*, A] of the ``logits`` [*, A, atoms]."""
-        return logits.softmax(-1) @ self.support if self.config.distributional else logits.squeeze(-1)
+        return (
+            logits.softmax(-1) @ self.support if self.config.distributional else logits.squeeze(-1)
+        )
 
     def values(self, observation: Tensor) -> Tensor:
         """Action values [*, A]: expected discounted returns."""
@@ -123,12 +146,17 @@ class QNetwork(nn.Module):
 
 
 def allowed_values(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Action values [*, A] with minus infinity where ``mask`` [*, A] forbids; unchanged without a mask."""
+    """Action values [*, A] with minus infinity where ``mask`` [*, A] forbids.
+
+    Unchanged without a mask.
+    """
     return values if mask is None else values.masked_fill(~mask, -torch.inf)
 
 
 def duel(rows: Tensor) -> Tensor:
-    """Join value (row 0) and advantages (the rest) of [*, 1 + A, atoms] into [*, A, atoms] (Wang et al. 2016)."""
+    """Join value (row 0) and advantages (the rest) of [*, 1 + A, atoms] into [*, A, atoms] (Wang et
+    al. 2016).
+    """
     value, advantage = rows[..., :1, :], rows[..., 1:, :]
     return value + advantage - advantage.mean(-2, keepdim=True)
 
@@ -146,9 +174,13 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
         UserError: names or shapes differ.
     """
     own = dict(network.named_parameters())
-    shapes, given = ({name: tuple(value.shape) for name, value in each.items()} for each in (own, weights))
+    shapes, given = (
+        {name: tuple(value.shape) for name, value in each.items()} for each in (own, weights)
+    )
     if shapes != given:
-        name = min(name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name))
+        name = min(
+            name for name in shapes.keys() | given.keys() if shapes.get(name) != given.get(name)
+        )
         raise UserError(
             f"the weights do not fit the network: {name} is {given.get(name, 'absent')} in the checkpoint and "
             f"{shapes.get(name, 'absent')} in the network; use the observation and agent options it was trained with."
@@ -161,7 +193,8 @@ def load_parameters(network: QNetwork, weights: Mapping[str, Tensor]) -> None:
 def redraw_noise(network: nn.Module, generator: torch.Generator) -> None:
     """Draw the factorised Gaussian noise of every noisy layer anew (Fortunato et al. 2017).
 
-    In place of TorchRL's ``reset_noise``, which draws from the global generator; one draw serves all layers.
+    In place of TorchRL's ``reset_noise``, which draws from the global generator; one draw serves
+    all layers.
     """
     for layer, (inputs, outputs) in zip(noisy_layers(network), noise_of(network, generator)):
         torch.outer(outputs, inputs, out=layer.weight_epsilon)
@@ -185,10 +218,12 @@ def noisy_layers(network: nn.Module) -> list[NoisyLinear]:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tensor:
-    """``x @ weight.T + bias`` for ``x`` [*, I], ``weight`` [O, I] and ``bias`` [O]; then a ReLU, if asked for.
+    """``x @ weight.T + bias`` for ``x`` [*, I], ``weight`` [O, I] and ``bias`` [O]; then a ReLU, if
+    asked for.
 
-    By oneDNN on a CPU: PyTorch sends float32 products to MKL, which uses half the vector width on AMD processors;
-    oneDNN computes the same in full precision in half the time there, and in no more time elsewhere.
+    By oneDNN on a CPU: PyTorch sends float32 products to MKL, which uses half the vector width on
+    AMD processors; oneDNN computes the same in full precision in half the time there, and in no
+    more time elsewhere.
     """
     fast = _ONEDNN and x.device.type == "cpu" and x.dtype == torch.float32 and x.dim() == 2
     if fast and not torch.is_grad_enabled():
@@ -197,8 +232,12 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor, relu: bool = False) -> Tenso
     return torch.relu(product) if relu else product
 
 
-def matrix_product(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
-    """:func:`linear` in 2-d float32 without gradients, as an operator that a compiled graph calls as it is."""
+def matrix_product(
+    x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False
+) -> Tensor:
+    """:func:`linear` in 2-d float32 without gradients, as an operator that a compiled graph calls
+    as it is.
+    """
     return torch.ops.ganlane.linear(x, weight, bias, relu)
 
 
@@ -219,7 +258,8 @@ class _OneDnnLinear(torch.autograd.Function):
         return to_x, _product(gradient.t(), x.t()), gradient.sum(0)
 
 
-# Compiled, oneDNN's own operator is replaced by a slower product or, with transposed weights, not understood.
+# Compiled, oneDNN's own operator is replaced by a slower product or, with transposed weights, not
+# understood.
 _LIBRARY = torch.library.Library("ganlane", "FRAGMENT")
 _LIBRARY.define("linear(Tensor x, Tensor weight, Tensor? bias, bool relu) -> Tensor")
 

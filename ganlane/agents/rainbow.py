@@ -37,9 +37,11 @@ class Rainbow:
         actions: A.
         seed: of weights, noise, random actions and replay.
         device: of everything.
-        legal: legal actions for random exploration, see :class:`~ganlane.agents.drivers.ExploringPolicy`.
-        compile: whether an update runs as one compiled graph (:class:`ganlane.agents.loss.UpdateGraph`), where that
-            can do what ``config`` says; the same up to rounding, and faster on a CPU.
+        legal: legal actions for random exploration, see
+            :class:`~ganlane.agents.drivers.ExploringPolicy`.
+        compile: whether an update runs as one compiled graph
+            (:class:`ganlane.agents.loss.UpdateGraph`), where that can do what ``config`` says; the
+            same up to rounding, and faster on a CPU.
     """
 
     def __init__(
@@ -80,7 +82,8 @@ class Rainbow:
         self.greedy = GreedyPolicy(self.network)
         self.updates = 0
         self.graph: UpdateGraph | None = None
-        # The graph is of the whole of Rainbow; with any part left out the update is computed step by step.
+        # The graph is of the whole of Rainbow; with any part left out the update is computed step
+        # by step.
         parts = ("distributional", "double", "dueling", "noisy", "prioritised", "kl_priority")
         if compile and all(getattr(config, part) for part in parts) and self.device.type == "cpu":
             self.graph = UpdateGraph(self.network, self.loss, self.optimizer, config)
@@ -98,9 +101,16 @@ class Rainbow:
     def anneal(self, decisions: int) -> None:
         """Set the share of random actions and the learning rate after ``decisions``."""
         config = self.config
-        self.policy.epsilon = annealed(config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions)
+        self.policy.epsilon = annealed(
+            config.epsilon_start, config.epsilon, decisions, config.epsilon_decisions
+        )
         if config.learning_rate_end is not None:
-            now = annealed(config.learning_rate, config.learning_rate_end, decisions, config.learning_rate_decisions)
+            now = annealed(
+                config.learning_rate,
+                config.learning_rate_end,
+                decisions,
+                config.learning_rate_decisions,
+            )
             for group in self.optimizer.param_groups:
                 group["lr"] = now
 
@@ -113,9 +123,13 @@ class Rainbow:
         """One step of gradient descent; 0-dim tensors to log, read without a host synchronisation."""
         config = self.config
         if config.prioritised:
-            self.replay.sampler.beta = annealed(config.beta_start, 1.0, self.updates, config.beta_updates)
+            self.replay.sampler.beta = annealed(
+                config.beta_start, 1.0, self.updates, config.beta_updates
+            )
         batch = draw(self.replay)
-        learned = (self._descend if self.graph is None else self.graph)(batch, self.generators["learn"])
+        learned = (self._descend if self.graph is None else self.graph)(
+            batch, self.generators["learn"]
+        )
         if config.prioritised:
             self.replay.sampler.update_priority(batch.get("index"), learned.priority)
         self.updates += 1
@@ -136,10 +150,15 @@ class Rainbow:
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip)
         self.optimizer.step()
         priority = batch.get("td_error")[:, 0]
-        return Learned(priority, objective.detach(), terms["mean_q"], terms["clamped_fraction"], norm)
+        return Learned(
+            priority, objective.detach(), terms["mean_q"], terms["clamped_fraction"], norm
+        )
 
     def sigma(self) -> Tensor:
-        """Mean absolute noise parameter over the weights of the noisy layers, 0-dim; 0 without noise."""
+        """Mean absolute noise parameter over the weights of the noisy layers, 0-dim.
+
+        0 without noise.
+        """
         sigmas = [layer.weight_sigma.detach().abs().mean() for layer in noisy_layers(self.network)]
         return torch.stack(sigmas).mean() if sigmas else torch.zeros(())
 
@@ -153,14 +172,18 @@ class Rainbow:
         self.loss.update_target()
 
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
-        """Tensors and plain data for a bit-exact resume; noise is redrawn before use, so it is not among them.
+        """Tensors and plain data for a bit-exact resume; noise is redrawn before use, so it is not
+        among them.
 
         Without the buffer a resume is not exact anyway, so Adam's moments are kept in bfloat16.
         """
         optimizer = self.optimizer.state_dict()
         if not with_replay:  # loading brings the moments back to the weights' type
             optimizer["state"] = {
-                row: {name: value.bfloat16() if name.startswith("exp_avg") else value for name, value in own.items()}
+                row: {
+                    name: value.bfloat16() if name.startswith("exp_avg") else value
+                    for name, value in own.items()
+                }
                 for row, own in optimizer["state"].items()
             }
         return {
@@ -168,16 +191,20 @@ class Rainbow:
             "network": self.weights(),
             "target": parameters_of(self.loss.target_network),
             "optimizer": optimizer,
-            "generators": {name: generator.get_state() for name, generator in self.generators.items()},
+            "generators": {
+                name: generator.get_state() for name, generator in self.generators.items()
+            },
             "updates": self.updates,
             "replay": replay_state(self.replay) if with_replay else None,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore :meth:`state_dict`; if it was made without the buffer, the buffer is empty afterwards.
+        """Restore :meth:`state_dict`; if it was made without the buffer, the buffer is empty
+        afterwards.
 
         Raises:
-            UserError: it is the state of an agent with other hyperparameters or another observation.
+            UserError: it is the state of an agent with other hyperparameters or another
+                observation.
         """
         # An agent saved before there was an option has its default.
         saved = {**asdict(RainbowConfig()), **without_removed(state["config"], "the saved agent")}
@@ -189,7 +216,9 @@ class Rainbow:
         load_parameters(self.network, state["network"])
         load_parameters(self.loss.target_network, state["target"])
         # The moments alone: the groups are those of the configuration.
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state["optimizer"]["state"]})
+        self.optimizer.load_state_dict(
+            {**self.optimizer.state_dict(), "state": state["optimizer"]["state"]}
+        )
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name].cpu())
         self.updates = state["updates"]

@@ -1,7 +1,8 @@
 """TorchRL's replay buffer, with prioritised or uniform sampling from a generator of its own.
 
-TorchRL's prioritised sampler needs a C++ extension that loads only with the one torch release it was built for.
-:class:`RowSampler` (Schaul et al. 2016) works on plain tensors instead, and is as fast at a capacity of a million.
+TorchRL's prioritised sampler needs a C++ extension that loads only with the one torch release it
+was built for. :class:`RowSampler` (Schaul et al. 2016) works on plain tensors instead, and is as
+fast at a capacity of a million.
 """
 
 from __future__ import annotations
@@ -11,7 +12,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, PrioritizedSampler, RandomSampler, TensorDictReplayBuffer
+from torchrl.data import (
+    LazyTensorStorage,
+    PrioritizedSampler,
+    RandomSampler,
+    TensorDictReplayBuffer,
+)
 from torchrl.data.replay_buffers.storages import Storage
 
 from ganlane.errors import UserError
@@ -33,12 +39,17 @@ ROW = 64
 
 
 def make_replay(config: RainbowConfig, generator: torch.Generator) -> TensorDictReplayBuffer:
-    """The replay buffer that ``config`` asks for, on the generator's device; ``sample()`` draws a batch."""
+    """The replay buffer that ``config`` asks for, on the generator's device.
+
+    ``sample()`` draws a batch.
+    """
     capacity, device = config.capacity, generator.device
     prioritised = config.prioritised
     return TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity, device=device),
-        sampler=RowSampler(capacity, config.alpha, config.beta_start, device) if prioritised else RandomSampler(),
+        sampler=RowSampler(capacity, config.alpha, config.beta_start, device)
+        if prioritised
+        else RandomSampler(),
         batch_size=config.batch_size,
         generator=generator,
         priority_key="td_error",
@@ -58,10 +69,14 @@ def draw(buffer: TensorDictReplayBuffer) -> TensorDict:
 
 
 def replay_state(buffer: TensorDictReplayBuffer) -> dict[str, Any]:
-    """The transitions in use (tensors by dotted key), the place of the next one, the sampler: plain data."""
+    """The transitions in use (tensors by dotted key), the place of the next one, the sampler.
+
+    Plain data.
+    """
     rows = buffer[:] if len(buffer) else TensorDict({}, [0])
     tensors = dict(rows.select(*TRANSITION_KEYS, MASK_KEY, strict=False).flatten_keys(".").items())
-    if len(buffer) < buffer.storage.max_size:  # a view would be saved with all of the storage behind it
+    # a view would be saved with all of the storage behind it
+    if len(buffer) < buffer.storage.max_size:
         tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     writer = {"cursor": buffer.writer._cursor, "writes": buffer.write_count}
     return {"rows": tensors, **writer, "sampler": buffer.sampler.state_dict()}
@@ -78,15 +93,18 @@ def load_replay_state(buffer: TensorDictReplayBuffer, state: dict[str, Any]) -> 
 
 
 class RowSampler(PrioritizedSampler):
-    """Draws item i with probability ``(p_i + 1e-8)^alpha / sum``; weights ``(P_i N)^-beta`` over the batch's largest.
+    """Draws item i with probability ``(p_i + 1e-8)^alpha / sum``; weights ``(P_i N)^-beta`` over
+    the batch's largest.
 
-    As in Dopamine, the largest weight is the batch's: the one of the whole buffer belongs to an outlier that is
-    hardly ever drawn, and would shrink every step. New items get the largest priority seen. Draws come from the
-    generator of the replay buffer (``generator=`` at its construction) and from no other.
+    As in Dopamine, the largest weight is the batch's: the one of the whole buffer belongs to an
+    outlier that is hardly ever drawn, and would shrink every step. New items get the largest
+    priority seen. Draws come from the generator of the replay buffer (``generator=`` at its
+    construction) and from no other.
     """
 
     def __init__(self, max_capacity: int, alpha: float, beta: float, device: torch.device) -> None:
-        # Not the parent's constructor: it warns of the missing C++ extension, which is not needed here.
+        # Not the parent's constructor: it warns of the missing C++ extension, which is not needed
+        # here.
         self._max_capacity, self._alpha, self._beta, self._eps = max_capacity, alpha, beta, 1e-8
         self._device, self.dtype, self.reduction = device, torch.float32, "max"
         self._max_priority_within_buffer = False
@@ -118,11 +136,15 @@ class RowSampler(PrioritizedSampler):
     def update_priority(
         self, index: Tensor | int, priority: Tensor | float, *, storage: Storage | None = None
     ) -> None:
-        """Give the items at ``index`` [B] the raw priorities ``priority`` ([B], [B, 1] or one number), at least 0."""
+        """Give the items at ``index`` [B] the raw priorities ``priority`` ([B], [B, 1] or one
+        number), at least 0.
+        """
         index = torch.as_tensor(index, device=self.device).reshape(-1)
         priority = torch.as_tensor(priority, dtype=torch.float32, device=self.device).reshape(-1)
         self.largest = torch.maximum(self.largest, priority.amax())
-        self.priorities.view(-1)[index] = ((priority + self._eps) ** self._alpha).expand(index.shape)
+        self.priorities.view(-1)[index] = ((priority + self._eps) ** self._alpha).expand(
+            index.shape
+        )
         row = index // ROW
         self.row_sums[row] = self.priorities[row].sum(-1, dtype=torch.float64)
 
@@ -132,12 +154,15 @@ class RowSampler(PrioritizedSampler):
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay buffer")
         cumulated = self.row_sums.cumsum(0)
-        if cumulated.device.type == "cpu" and not cumulated[-1].isfinite():  # reading it would make a GPU wait
+        # reading it would make a GPU wait
+        if cumulated.device.type == "cpu" and not cumulated[-1].isfinite():
             raise UserError(
                 "training has diverged: its errors are not finite; lower agent.learning_rate and start again, or go "
                 "on from an earlier checkpoint."
             )
-        uniform = torch.rand(batch_size, generator=self._rng, dtype=torch.float64, device=self.device)
+        uniform = torch.rand(
+            batch_size, generator=self._rng, dtype=torch.float64, device=self.device
+        )
         mass = _below(uniform * cumulated[-1], cumulated[-1])
         row = torch.searchsorted(cumulated, mass, right=True)
         rest = mass - (cumulated[row] - self.row_sums[row])
@@ -151,7 +176,11 @@ class RowSampler(PrioritizedSampler):
     def state_dict(self) -> dict[str, Any]:
         """Priorities of the rows in use, the largest priority, and beta."""
         used = int((self.row_sums > 0).sum())
-        return {"priorities": self.priorities[:used].clone(), "largest": self.largest.clone(), "beta": self._beta}
+        return {
+            "priorities": self.priorities[:used].clone(),
+            "largest": self.largest.clone(),
+            "beta": self._beta,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore :meth:`state_dict`."""

@@ -1,4 +1,5 @@
-"""``ganlane bench``: physics steps and decisions per second, memory, and the ratio to a peer in the same run.
+"""``ganlane bench``: physics steps and decisions per second, memory, and the ratio to a peer in the
+same run.
 
     ganlane bench suite=sim
     ganlane bench suite=sim quick=true
@@ -9,8 +10,8 @@
 
 Writes results.json into its run folder, and with ``report`` the tables into that document.
 
-A suite lists groups of cases. The cases of a group take turns (A B C A B C), so that other work on the machine slows
-all of them alike; each case gives one row of medians and ratios.
+A suite lists groups of cases. The cases of a group take turns (A B C A B C), so that other work on
+the machine slows all of them alike; each case gives one row of medians and ratios.
 
 Modules:
 

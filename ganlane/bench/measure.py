@@ -1,4 +1,7 @@
-"""Side-by-side timing: cases that take turns, their rows of medians and ratios, and their peak memory."""
+"""Side-by-side timing.
+
+Cases that take turns, their rows of medians and ratios, and their peak memory.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,8 @@ from ganlane.errors import UserError
 from ganlane.evaluation.table import NOTHING, Table, count, percent, significant
 from ganlane.runtime import peak_resident_bytes
 
-#: Makes so many decisions in every environment; returns the physics steps simulated in all of them together.
+#: Makes so many decisions in every environment; returns the physics steps simulated in all of them
+#: together.
 Runner = Callable[[int], int]
 #: Labels and figures of a case (:func:`make_row`).
 Row = dict[str, Any]
@@ -36,7 +40,8 @@ _MOST_DECISIONS = 2**20
 class Labels:
     """What was measured: the first columns of a row.
 
-    ``part`` is the question within the suite, ``batch`` the number of environments side by side, ``threads`` torch's.
+    ``part`` is the question within the suite, ``batch`` the number of environments side by side,
+    ``threads`` torch's.
     """
 
     suite: str
@@ -53,14 +58,20 @@ class Labels:
 
 
 class Case(NamedTuple):
-    """Something to measure; ``start`` builds it and can be pickled, so that a fresh process can call it too."""
+    """Something to measure.
+
+    ``start`` builds it and can be pickled, so that a fresh process can call it too.
+    """
 
     labels: Labels
     start: Callable[[], Runner]
 
 
 class Group(NamedTuple):
-    """Cases that take turns under ``threads`` of torch's; ``reference`` is the peer that they are compared with."""
+    """Cases that take turns under ``threads`` of torch's.
+
+    ``reference`` is the peer that they are compared with.
+    """
 
     title: str
     threads: int
@@ -71,8 +82,8 @@ class Group(NamedTuple):
 class Suite(ABC):
     """What the command measures under one name.
 
-    ``notes`` has a sentence for everything that cannot be measured here; with ``memory`` the peak memory of every
-    case of the part ``speed`` is measured, too.
+    ``notes`` has a sentence for everything that cannot be measured here; with ``memory`` the peak
+    memory of every case of the part ``speed`` is measured, too.
     """
 
     name: ClassVar[str]
@@ -95,20 +106,30 @@ class Suite(ABC):
         """Rows and findings for a reader; empty tables are left out."""
 
     def places(self) -> list[tuple[str, int]]:
-        """Devices with numbers of threads; a GPU gets the first number alone, since its work hardly depends on it."""
+        """Devices with numbers of threads.
+
+        A GPU gets the first number alone, since its work hardly depends on it.
+        """
         threads, devices = self.config.threads, self.config.chosen_devices()
         own = [("cpu", number) for number in threads] if "cpu" in devices else []
         return own + [(device, threads[0]) for device in devices if device != "cpu"]
 
-    def labels(self, system: str, traffic: str, mode: str, threads: int, batch: int, **others: Any) -> Labels:
+    def labels(
+        self, system: str, traffic: str, mode: str, threads: int, batch: int, **others: Any
+    ) -> Labels:
         """Labels of a case on the configured road; ``others`` overrides the defaults."""
         env = self.config.env
         road = (threads, env.vehicles, env.lanes, batch)
-        return replace(Labels(self.name, "speed", system, traffic, mode, "float32", "cpu", *road), **others)
+        return replace(
+            Labels(self.name, "speed", system, traffic, mode, "float32", "cpu", *road), **others
+        )
 
 
 class Sample(NamedTuple):
-    """One turn of a case: seconds of wall and CPU time (all threads of the process), and what was done in it."""
+    """One turn of a case.
+
+    Seconds of wall and CPU time (all threads of the process), and what was done in it.
+    """
 
     wall_s: float
     cpu_s: float
@@ -147,8 +168,8 @@ def take_turn(case: Case, run: Runner, decisions: int) -> Sample:
 def decisions_per_turn(case: Case, run: Runner, seconds: float) -> int:
     """How many decisions fill a turn of ``seconds``; measuring it is the warm-up.
 
-    The first decision (compilation, caches) does not count. The number doubles until a turn is much longer than the
-    clock's resolution.
+    The first decision (compilation, caches) does not count. The number doubles until a turn is much
+    longer than the clock's resolution.
     """
     take_turn(case, run, 1)
     decisions, wall_s = 1, take_turn(case, run, 1).wall_s
@@ -161,7 +182,10 @@ def decisions_per_turn(case: Case, run: Runner, seconds: float) -> int:
 def take_turns(
     cases: Sequence[Case], runners: Sequence[Runner], repetitions: int, seconds: float
 ) -> list[list[Sample]]:
-    """Samples of each case, ``repetitions`` turns of about ``seconds`` each: A B C A B C ..., after a warm-up."""
+    """Samples of each case, ``repetitions`` turns of about ``seconds`` each.
+
+    A B C A B C ..., after a warm-up.
+    """
     turns = [decisions_per_turn(case, run, seconds) for case, run in zip(cases, runners)]
     samples: list[list[Sample]] = [[] for _ in cases]
     for _ in range(repetitions):
@@ -174,7 +198,9 @@ def _peak_here(case: Case) -> int | None:
     """Peak bytes: of this process on a CPU, of torch's allocations on a GPU."""
     with torch_threads(case.labels.threads):
         case.start()(3)  # after so many decisions every buffer is allocated
-    return torch.cuda.max_memory_allocated() if case.labels.device == "cuda" else peak_resident_bytes()
+    return (
+        torch.cuda.max_memory_allocated() if case.labels.device == "cuda" else peak_resident_bytes()
+    )
 
 
 def peak_bytes(case: Case) -> int | None:
@@ -184,7 +210,9 @@ def peak_bytes(case: Case) -> int | None:
 
 
 def growth_per_environment(small: Case, large: Case) -> float | None:
-    """Bytes by which peak memory grows with every environment, from two batch sizes in fresh processes."""
+    """Bytes by which peak memory grows with every environment, from two batch sizes in fresh
+    processes.
+    """
     low, high = peak_bytes(small), peak_bytes(large)
     if low is None or high is None:
         return None
@@ -192,23 +220,30 @@ def growth_per_environment(small: Case, large: Case) -> float | None:
 
 
 def make_row(
-    labels: Labels, samples: Sequence[Sample], reference: Sequence[Sample] = (), peak_memory_mb: float | None = None
+    labels: Labels,
+    samples: Sequence[Sample],
+    reference: Sequence[Sample] = (),
+    peak_memory_mb: float | None = None,
 ) -> Row:
     """One row: medians over the turns ``samples`` of a case.
 
-    ``reference``: turns of the case that it is compared with, taken in turn with them; may be empty.
+    ``reference``: turns of the case that it is compared with, taken in turn with them; may be
+    empty.
 
     Returns:
-        The labels; ``physics_steps_per_s``, ``decisions_per_s``, ``vehicle_steps_per_s`` (per second of wall time)
-        and ``physics_steps_per_cpu_s``; ``wall_s`` and ``cpu_s`` of one turn and the ``decisions`` taken in it by all
-        environments together; ``repetitions`` and ``spread`` (interquartile range of the turns' wall time over its
-        median); ``ratio`` and ``ratio_cpu`` (physics steps per second of wall and CPU time over the reference's turn
-        of the same round, median of the rounds; or None); ``peak_memory_mb``.
+        The labels; ``physics_steps_per_s``, ``decisions_per_s``, ``vehicle_steps_per_s`` (per
+        second of wall time) and ``physics_steps_per_cpu_s``; ``wall_s`` and ``cpu_s`` of one turn
+        and the ``decisions`` taken in it by all environments together; ``repetitions`` and
+        ``spread`` (interquartile range of the turns' wall time over its median); ``ratio`` and
+        ``ratio_cpu`` (physics steps per second of wall and CPU time over the reference's turn of
+        the same round, median of the rounds; or None); ``peak_memory_mb``.
     """
     per_s, per_cpu_s = map(median, zip(*(sample.rates for sample in samples)))
     ratio = ratio_cpu = None
     if reference:
-        compared = np.divide([sample.rates for sample in samples], [sample.rates for sample in reference])
+        compared = np.divide(
+            [sample.rates for sample in samples], [sample.rates for sample in reference]
+        )
         ratio, ratio_cpu = np.median(compared, axis=0).tolist()
     walls_s = [sample.wall_s for sample in samples]
     return {
@@ -244,20 +279,28 @@ COLUMNS: dict[str, Callable[[Row], str]] = {
     "times the peer": lambda row: significant(row["ratio"]),
     "in CPU time": lambda row: significant(row["ratio_cpu"]),
     "spread": lambda row: percent(row["spread"]),
-    "peak memory, MB": lambda row: NOTHING if row["peak_memory_mb"] is None else f"{row['peak_memory_mb']:.0f}",
+    "peak memory, MB": lambda row: (
+        NOTHING if row["peak_memory_mb"] is None else f"{row['peak_memory_mb']:.0f}"
+    ),
 }
 
 
 def speed_table(title: str, rows: Sequence[Row], headings: Sequence[str], names: int) -> Table:
     """The rows with these of the :data:`COLUMNS`; the title names vehicles and lanes."""
     where = f", {rows[0]['vehicles']} vehicles on {rows[0]['lanes']} lanes" if rows else ""
-    spread = "Medians; spread is the interquartile range of the repetitions' wall time over its median."
+    spread = (
+        "Medians; spread is the interquartile range of the repetitions' wall time over its median."
+    )
     notes = [spread] if "spread" in headings else []
-    return Table.of(f"{title}{where}", rows, {name: COLUMNS[name] for name in headings}, names, notes)
+    return Table.of(
+        f"{title}{where}", rows, {name: COLUMNS[name] for name in headings}, names, notes
+    )
 
 
 def best_rows(rows: Sequence[Row], figure: str) -> list[Row]:
-    """The row with the highest ``figure`` of each system and traffic on each device, in the order of ``rows``."""
+    """The row with the highest ``figure`` of each system and traffic on each device, in the order
+    of ``rows``.
+    """
     best: dict[tuple[str, str, str], Row] = {}
     for row in rows:
         key = row["device"], row["system"], row["traffic"]
@@ -292,20 +335,37 @@ def measure(suite: Suite, repetitions: int, seconds: float) -> dict[str, Any]:
         reference: list[Sample] = []
         if group.reference is not None:
             (_, *cases), (reference, *samples) = cases, samples
-            references.setdefault(group.reference.labels, (group.reference, []))[1].extend(reference)
-        found = [make_row(case.labels, taken, reference, peak_mb(case)) for case, taken in zip(cases, samples)]
-        figures = ", ".join(f"{row['system']} {row['mode']} {count(row['physics_steps_per_s'])}" for row in found)
-        print(f"{number}/{len(groups)} {group.title}: physics steps/s {figures}", file=sys.stderr, flush=True)
+            references.setdefault(group.reference.labels, (group.reference, []))[1].extend(
+                reference
+            )
+        found = [
+            make_row(case.labels, taken, reference, peak_mb(case))
+            for case, taken in zip(cases, samples)
+        ]
+        figures = ", ".join(
+            f"{row['system']} {row['mode']} {count(row['physics_steps_per_s'])}" for row in found
+        )
+        print(
+            f"{number}/{len(groups)} {group.title}: physics steps/s {figures}",
+            file=sys.stderr,
+            flush=True,
+        )
         rows += found
-    peers = [make_row(case.labels, taken, taken, peak_mb(case)) for case, taken in references.values()]
+    peers = [
+        make_row(case.labels, taken, taken, peak_mb(case)) for case, taken in references.values()
+    ]
     rows = [*peers, *rows]
     return {"rows": rows, **suite.findings(rows), "notes": suite.notes}
 
 
 def _start(group: Group, notes: list[str]) -> tuple[list[Case], list[Runner]]:
-    """The reference, if any, and the cases that run here; a mode that cannot do a case leaves it out, with a note."""
+    """The reference, if any, and the cases that run here.
+
+    A mode that cannot do a case leaves it out, with a note.
+    """
     if any(case.labels.mode == COMPILED for case in group.cases):
-        # Each group compiles for its own sizes; torch would fall back to eager after a few recompilations.
+        # Each group compiles for its own sizes; torch would fall back to eager after a few
+        # recompilations.
         torch.compiler.reset()
     cases, runners = [], []
     for case in [*([] if group.reference is None else [group.reference]), *group.cases]:

@@ -1,4 +1,6 @@
-"""What ``sim`` (speed, growth, memory), ``traffic`` (each model) and ``train`` (with learning) measure."""
+"""What ``sim`` (speed, growth, memory), ``traffic`` (each model) and ``train`` (with learning)
+measure.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,11 @@ from ganlane.parameters.observation import ObservationConfig, RewardParameters
 
 PHYSICS, ENVIRONMENT, GYMNASIUM = "ganlane physics", "ganlane environment", "ganlane gymnasium"
 TRAFFIC, TRAINING = "ganlane traffic", "ganlane training"
-_START: dict[str, Any] = {PHYSICS: start_physics, ENVIRONMENT: start_environment, GYMNASIUM: GymnasiumRunner}
+_START: dict[str, Any] = {
+    PHYSICS: start_physics,
+    ENVIRONMENT: start_environment,
+    GYMNASIUM: GymnasiumRunner,
+}
 #: What stands for the traffic of HighwayEnv.
 _THEIR_TRAFFIC = "its IDM and MOBIL"
 
@@ -57,7 +63,9 @@ class SimSuite(Suite):
         super().__init__(replace(config, env=replace(config.env, recycle=recycle)))
         self.memory = config.memory
         if not recycle:
-            self.notes.append("Not recycled: recorded vehicles go where they went, so the road empties.")
+            self.notes.append(
+                "Not recycled: recorded vehicles go where they went, so the road empties."
+            )
         self.has_peer = config.peers and installed_version("highway-env") is not None
         if config.peers and not self.has_peer:
             self.notes.append(
@@ -68,10 +76,15 @@ class SimSuite(Suite):
         # A scene set by hand has as many vehicles as it has.
         self.grows = type(config.env) in (EnvConfig, DenseEnvConfig)
         if not self.grows:
-            self.notes.append("Not measured: growth with the vehicles; their number belongs to the scene.")
+            self.notes.append(
+                "Not measured: growth with the vehicles; their number belongs to the scene."
+            )
 
     def groups(self) -> list[Group]:
-        """Speed at every batch in turns with HighwayEnv; growth with the batch and with the vehicles."""
+        """Speed at every batch in turns with HighwayEnv.
+
+        Growth with the batch and with the vehicles.
+        """
         reference = self.peer() if self.has_peer else None
         found = []
         for device, threads in self.places():
@@ -84,8 +97,12 @@ class SimSuite(Suite):
                 ]
                 if self.has_envpool and device == "cpu":
                     cases.append(self._envpool(threads, batch))
-                found.append(Group(f"{device}, threads {threads}, batch {batch}", threads, cases, reference))
-        return found + [group for system in (PHYSICS, ENVIRONMENT) for group in self._growth(system)]
+                found.append(
+                    Group(f"{device}, threads {threads}, batch {batch}", threads, cases, reference)
+                )
+        return found + [
+            group for system in (PHYSICS, ENVIRONMENT) for group in self._growth(system)
+        ]
 
     def peer(self) -> Case:
         """HighwayEnv on the suite's road; it does not use torch, so one thread is all it has."""
@@ -95,8 +112,12 @@ class SimSuite(Suite):
 
     def _envpool(self, threads: int, batch: int) -> Case:
         """HighwayEnv in C++ on the suite's road."""
-        labels = self.labels(f"EnvPool {installed_version('envpool')}", _THEIR_TRAFFIC, NATIVE, threads, batch)
-        return Case(labels, partial(start_envpool, self.config.env, batch, threads, self.config.seed))
+        labels = self.labels(
+            f"EnvPool {installed_version('envpool')}", _THEIR_TRAFFIC, NATIVE, threads, batch
+        )
+        return Case(
+            labels, partial(start_envpool, self.config.env, batch, threads, self.config.seed)
+        )
 
     def _growth(self, system: str) -> list[Group]:
         """Two or more sizes side by side, on the first device."""
@@ -107,7 +128,9 @@ class SimSuite(Suite):
         counts = config.vehicle_counts if self.grows else []
         sizes = {
             "batch": [case("batch", batch=batch) for batch in large],
-            "vehicles": [case("vehicles", batch=config.scaling_batch, vehicles=number) for number in counts],
+            "vehicles": [
+                case("vehicles", batch=config.scaling_batch, vehicles=number) for number in counts
+            ],
         }
         return [
             Group(f"{system}, growth with the {what}", threads, cases)
@@ -116,11 +139,19 @@ class SimSuite(Suite):
         ]
 
     def _case(
-        self, part: str, system: str, mode: str, device: str, threads: int, batch: int, vehicles: int | None = None
+        self,
+        part: str,
+        system: str,
+        mode: str,
+        device: str,
+        threads: int,
+        batch: int,
+        vehicles: int | None = None,
     ) -> Case:
         """With so many ``vehicles`` the first scene grows to keep the density of Table II.
 
-        It is then wider than the range of recycling, which would crowd it; in so short a time no ego leaves it.
+        It is then wider than the range of recycling, which would crowd it; in so short a time no
+        ego leaves it.
         """
         scenario = Scenario.of(self.config)
         if vehicles is not None:
@@ -132,9 +163,16 @@ class SimSuite(Suite):
         return Case(labels, partial(_START[system], scenario, mode, device, batch))
 
     def findings(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """``ratios``: each system's best row against the peer; ``scaling``; ``memory`` per environment."""
+        """``ratios``: each system's best row against the peer; ``scaling``.
+
+        ``memory`` per environment.
+        """
         compared = [row for row in rows if row["system"] in _START and row["ratio"] is not None]
-        return {"ratios": best_rows(compared, "ratio"), "scaling": scaling(rows), "memory": self._memory()}
+        return {
+            "ratios": best_rows(compared, "ratio"),
+            "scaling": scaling(rows),
+            "memory": self._memory(),
+        }
 
     def _memory(self) -> dict[str, Any]:
         """Bytes per environment: of the state, and of a process's peak as the batch grows."""
@@ -145,7 +183,10 @@ class SimSuite(Suite):
         state = Scenario.of(self.config).build(EAGER, "cpu", 2).reset()
         return {
             "vehicles": self.config.env.vehicles,
-            "state_bytes": sum(leaf.nbytes for leaf in state.values(include_nested=True, leaves_only=True)) / 2,
+            "state_bytes": sum(
+                leaf.nbytes for leaf in state.values(include_nested=True, leaves_only=True)
+            )
+            / 2,
             "batches": list(batches),
             "peak_growth_bytes": growth,
         }
@@ -153,13 +194,18 @@ class SimSuite(Suite):
     def tables(self, rows: Sequence[Row], findings: Mapping[str, Any]) -> list[Table]:
         """Speed, ratios, growth, memory in kB of 1000 bytes."""
         speed = ("system", "mode", "device", "threads", "batch", "physics steps/s")
-        more, peer = ("decisions/s", "vehicle-steps/s", "physics steps/CPU-s"), ("times the peer", "in CPU time")
+        more, peer = (
+            ("decisions/s", "vehicle-steps/s", "physics steps/CPU-s"),
+            ("times the peer", "in CPU time"),
+        )
         columns: dict[str, Callable[[Mapping[str, Any]], str]] = {
             "system": lambda row: row["system"],
             "with the": lambda row: row["in"],
             "sizes": lambda row: ", ".join(map(str, row["sizes"])),
             "ms per decision": lambda row: ", ".join(map(significant, row["milliseconds"])),
-            "exponent": lambda row: NOTHING if row["exponent"] is None else f"{row['exponent']:.2f}",
+            "exponent": lambda row: (
+                NOTHING if row["exponent"] is None else f"{row['exponent']:.2f}"
+            ),
         }
         memory = findings["memory"]
         kilobytes = [["state, observation included", f"{memory['state_bytes'] / 1000:.2f}"]]
@@ -169,17 +215,27 @@ class SimSuite(Suite):
             kilobytes.append([f"growth of a process's peak between batches {batches}", growth])
         rows = [row for row in rows if row["part"] == "speed"]
         return [
-            speed_table("Speed", rows, [*speed, *more, *peer, "spread", "peak memory, MB"], names=3),
-            speed_table("The best against HighwayEnv", findings["ratios"], [*speed, *peer], names=3),
+            speed_table(
+                "Speed", rows, [*speed, *more, *peer, "spread", "peak memory, MB"], names=3
+            ),
+            speed_table(
+                "The best against HighwayEnv", findings["ratios"], [*speed, *peer], names=3
+            ),
             Table.of("Growth of the cost", findings["scaling"], columns, 2),
-            Table(f"Memory per environment of {memory['vehicles']} vehicles", ["what", "kB"], kilobytes),
+            Table(
+                f"Memory per environment of {memory['vehicles']} vehicles",
+                ["what", "kB"],
+                kilobytes,
+            ),
         ]
 
 
 def scaling(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Per question and system the ``exponent`` of the cost of a decision (1: linear; None with fewer than two sizes).
+    """Per question and system the ``exponent`` of the cost of a decision (1: linear; None with
+    fewer than two sizes).
 
-    With the ``sizes`` and the ``milliseconds`` of wall time that a decision of the whole batch took.
+    With the ``sizes`` and the ``milliseconds`` of wall time that a decision of the whole batch
+    took.
     """
     found = []
     for part in ("batch", "vehicles"):
@@ -197,7 +253,9 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float | None:
     """``p`` of the least-squares fit ``cost ~ size ** p``; None with fewer than two sizes."""
     if len(set(sizes)) < 2:
         return None
-    return float(np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(costs, float)), 1)[0])
+    return float(
+        np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(costs, float)), 1)[0]
+    )
 
 
 class TrafficSuite(Suite):
@@ -217,8 +275,14 @@ class TrafficSuite(Suite):
         """The cases of a group; the road is kept full, except in replayed traffic."""
         cases = []
         for name, traffic in self.config.chosen_traffics().items():
-            env = self.config.env if traffic.label() == "replay" else replace(self.config.env, recycle=True)
-            scenario = Scenario(env, traffic, ObservationConfig(), RewardParameters(), self.config.seed)
+            env = (
+                self.config.env
+                if traffic.label() == "replay"
+                else replace(self.config.env, recycle=True)
+            )
+            scenario = Scenario(
+                env, traffic, ObservationConfig(), RewardParameters(), self.config.seed
+            )
             for mode in self.config.modes:
                 labels = self.labels(TRAFFIC, name, mode, threads, batch)
                 cases.append(Case(labels, partial(start_traffic, scenario, mode, batch)))
@@ -261,27 +325,44 @@ class TrainSuite(Suite):
                     training = Training(Scenario.of(config, traffic), agent, config.train_stored)
                     for mode in config.modes:
                         labels = self.labels(TRAINING, name, mode, threads, batch, device=device)
-                        cases.append(Case(labels, partial(start_training, training, mode, device, batch)))
+                        cases.append(
+                            Case(labels, partial(start_training, training, mode, device, batch))
+                        )
                 title = f"{device}, threads {threads}, {batch} environments"
-                groups.append(Group(title, threads, cases, self.peer(threads) if self.has_peer else None))
+                groups.append(
+                    Group(title, threads, cases, self.peer(threads) if self.has_peer else None)
+                )
         return groups
 
     def peer(self, threads: int) -> Case:
         """The peer on the suite's road; its network uses torch's threads."""
         config = self.config
-        learner, simulator = installed_version("stable-baselines3"), installed_version("highway-env")
+        learner, simulator = (
+            installed_version("stable-baselines3"),
+            installed_version("highway-env"),
+        )
         name = f"stable-baselines3 {learner} DQN on HighwayEnv {simulator}"
         labels = self.labels(name, _THEIR_TRAFFIC, EAGER, threads, 1)
-        return Case(labels, partial(BaselinesRunner, config.env, config.agent.for_phase(1), config.seed))
+        return Case(
+            labels, partial(BaselinesRunner, config.env, config.agent.for_phase(1), config.seed)
+        )
 
     def findings(self, rows: Sequence[Row]) -> dict[str, Any]:
         """``speeds``: per device and traffic the row with the most decisions per second.
 
-        ``times_peer`` is the ratio of its decisions per second to the peer's best; None without a peer.
+        ``times_peer`` is the ratio of its decisions per second to the peer's best; None without a
+        peer.
         """
-        peer = max((row["decisions_per_s"] for row in rows if row["system"] != TRAINING), default=None)
+        peer = max(
+            (row["decisions_per_s"] for row in rows if row["system"] != TRAINING), default=None
+        )
         best = best_rows([row for row in rows if row["system"] == TRAINING], "decisions_per_s")
-        return {"speeds": [{**row, "times_peer": row["decisions_per_s"] / peer if peer else None} for row in best]}
+        return {
+            "speeds": [
+                {**row, "times_peer": row["decisions_per_s"] / peer if peer else None}
+                for row in best
+            ]
+        }
 
     def tables(self, rows: Sequence[Row], findings: Mapping[str, Any]) -> list[Table]:
         """The best rows, then all."""

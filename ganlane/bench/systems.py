@@ -1,4 +1,7 @@
-"""Systems as runners: the simulator bare and whole, behind gymnasium, in training; and the peers on the same road."""
+"""Systems as runners: the simulator bare and whole, behind gymnasium, in training.
+
+And the peers on the same road.
+"""
 
 from __future__ import annotations
 
@@ -54,22 +57,35 @@ class Scenario:
     @classmethod
     def of(cls, config: BenchConfig, traffic: TrafficConfig | None = None) -> Scenario:
         """From the command's configuration; ``traffic`` replaces its traffic."""
-        return cls(config.env, traffic or config.traffic, config.observation, config.reward, config.seed)
+        return cls(
+            config.env, traffic or config.traffic, config.observation, config.reward, config.seed
+        )
 
     def build(self, mode: str, device: str, batch: int) -> TransformedEnv:
         """The environment."""
-        env = replace(self.env, compile=mode == COMPILED, kernel="native" if mode == NATIVE else "torch")
-        return make_env(make_traffic(self.traffic, env), env, self.observation, self.reward, batch, self.seed, device)
+        env = replace(
+            self.env, compile=mode == COMPILED, kernel="native" if mode == NATIVE else "torch"
+        )
+        return make_env(
+            make_traffic(self.traffic, env),
+            env,
+            self.observation,
+            self.reward,
+            batch,
+            self.seed,
+            device,
+        )
 
 
 # The simulator
 
 
 def start_physics(scenario: Scenario, mode: str, device: str, batch: int) -> Runner:
-    """Traffic, ego dynamics, soft crashes and collision test alone; every turn starts from the first scene.
+    """Traffic, ego dynamics, soft crashes and collision test alone; every turn starts from the
+    first scene.
 
-    The ego keeps its lane, and goal and time-out are out of reach, so that in rule-driven traffic no episode ends and
-    every step moves every environment.
+    The ego keeps its lane, and goal and time-out are out of reach, so that in rule-driven traffic
+    no episode ends and every step moves every environment.
     """
     if mode == NATIVE:
         return _start_native_physics(scenario, batch)
@@ -101,7 +117,8 @@ def _start_native_physics(scenario: Scenario, batch: int) -> Runner:
 
 
 def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehicles, Tensor]:
-    """``steps`` physics steps from ``state`` as one long decision: the vehicles, and the counter of steps [N].
+    """``steps`` physics steps from ``state`` as one long decision: the vehicles, and the counter of
+    steps [N].
 
     The rules keep their decision period, so that graphs compiled for one length serve all.
     """
@@ -115,10 +132,12 @@ def bare_steps(env: HighwayEnv, state: TensorDictBase, steps: int) -> tuple[Vehi
 
 
 class EnvironmentRunner:
-    """Steps a TorchRL environment with automatic resets; each turn continues where the last one ended.
+    """Steps a TorchRL environment with automatic resets; each turn continues where the last one
+    ended.
 
-    ``actions`` [decisions, N] are those of consecutive decisions, again and again. Physics steps are counted as
-    simulated: an episode that ends within a decision is not simulated further, one that leaves the road not at all.
+    ``actions`` [decisions, N] are those of consecutive decisions, again and again. Physics steps
+    are counted as simulated: an episode that ends within a decision is not simulated further, one
+    that leaves the road not at all.
     """
 
     def __init__(self, env: Any, actions: Tensor) -> None:
@@ -139,23 +158,44 @@ class EnvironmentRunner:
 
 
 def start_environment(scenario: Scenario, mode: str, device: str, batch: int) -> Runner:
-    """The environment with observation, reward and automatic resets, driven by uniformly random actions."""
-    actions = torch.randint(3, (_DRAWN, batch), generator=torch.Generator().manual_seed(scenario.seed))
+    """The environment with observation, reward and automatic resets, driven by uniformly random
+    actions.
+    """
+    actions = torch.randint(
+        3, (_DRAWN, batch), generator=torch.Generator().manual_seed(scenario.seed)
+    )
     return EnvironmentRunner(scenario.build(mode, device, batch), actions)
 
 
 def start_traffic(scenario: Scenario, mode: str, batch: int) -> Runner:
-    """The environment without observation and reward, its ego keeping its lane; ended episodes start anew."""
-    return EnvironmentRunner(scenario.build(mode, "cpu", batch).base_env, torch.full((1, batch), keys.KEEP))
+    """The environment without observation and reward, its ego keeping its lane.
+
+    Ended episodes start anew.
+    """
+    return EnvironmentRunner(
+        scenario.build(mode, "cpu", batch).base_env, torch.full((1, batch), keys.KEEP)
+    )
 
 
 class GymnasiumRunner:
-    """``gymnasium.make_vec`` (with one environment ``gymnasium.make``), random actions, resets where episodes end."""
+    """``gymnasium.make_vec`` (with one environment ``gymnasium.make``), random actions, resets
+    where episodes end.
+    """
 
     def __init__(self, scenario: Scenario, mode: str, device: str, batch: int) -> None:
-        options: dict[str, Any] = {"traffic": scenario.traffic, "env": replace(scenario.env, kernel=mode)}
-        options |= {"observation": scenario.observation, "reward": scenario.reward, "seed": scenario.seed}
-        self.batch, self.actions = batch, np.random.default_rng(scenario.seed).integers(3, size=(_DRAWN, batch))
+        options: dict[str, Any] = {
+            "traffic": scenario.traffic,
+            "env": replace(scenario.env, kernel=mode),
+        }
+        options |= {
+            "observation": scenario.observation,
+            "reward": scenario.reward,
+            "seed": scenario.seed,
+        }
+        self.batch, self.actions = (
+            batch,
+            np.random.default_rng(scenario.seed).integers(3, size=(_DRAWN, batch)),
+        )
         self.env: Any = (
             gymnasium.make("ganlane/Highway-v0", disable_env_checker=True, **options)
             if batch == 1
@@ -193,7 +233,10 @@ class GymnasiumRunner:
 
 @dataclass(frozen=True)
 class Training:
-    """Scenario and agent of a training; ``stored`` transitions are in the buffer when the clock starts."""
+    """Scenario and agent of a training.
+
+    ``stored`` transitions are in the buffer when the clock starts.
+    """
 
     scenario: Scenario
     agent: RainbowConfig
@@ -201,15 +244,20 @@ class Training:
 
 
 def start_training(training: Training, mode: str, device: str, batch: int) -> Runner:
-    """Decisions of ``batch`` environments and the updates that go with them; no logs, no checkpoints."""
+    """Decisions of ``batch`` environments and the updates that go with them.
+
+    No logs, no checkpoints.
+    """
     return partial(advance, filled_run(training, mode, device, batch)[0])
 
 
-def filled_run(training: Training, mode: str, device: str, batch: int) -> tuple[TrainingState, TransformedEnv]:
+def filled_run(
+    training: Training, mode: str, device: str, batch: int
+) -> tuple[TrainingState, TransformedEnv]:
     """A run that learns from its next decision on, and the environment that it steps.
 
-    Driven transitions are stored until the agent is warm, and the same again until there are ``training.stored``:
-    most of a long run has a full buffer, with all of its memory in use.
+    Driven transitions are stored until the agent is warm, and the same again until there are
+    ``training.stored``: most of a long run has a full buffer, with all of its memory in use.
     """
     env = training.scenario.build(mode, device, batch)
     run = TrainingState(env, make_agent(training, device, mode))
@@ -233,13 +281,18 @@ def make_agent(training: Training, device: str = "cpu", mode: str = EAGER) -> Ra
 
 
 def repeat(agent: Rainbow, transitions: TensorDict, stored: int) -> None:
-    """Store ``transitions`` again and again until there are ``stored``; priorities are uniform in 0 to 1."""
+    """Store ``transitions`` again and again until there are ``stored``.
+
+    Priorities are uniform in 0 to 1.
+    """
     known = transitions.clone()
     while (missing := stored - len(agent.replay)) > 0:
         agent.store(known[:missing])
     if agent.config.prioritised:
         for index in torch.arange(len(agent.replay), device=agent.device).split(_CHUNK):
-            priority = torch.rand(index.shape, generator=agent.generators["replay"], device=agent.device)
+            priority = torch.rand(
+                index.shape, generator=agent.generators["replay"], device=agent.device
+            )
             agent.replay.update_priority(index, priority)
 
 
@@ -265,7 +318,8 @@ def installed_version(package: str) -> str | None:
 
 
 def _highway_env_settings(env: EnvConfig) -> dict[str, Any]:
-    """``config`` of ``highway-v0`` for the same road; what is not named here keeps HighwayEnv's default.
+    """``config`` of ``highway-v0`` for the same road; what is not named here keeps HighwayEnv's
+    default.
 
     ``vehicles_count`` counts the others. Episodes end with a crash or after ``duration`` seconds.
     """
@@ -281,7 +335,10 @@ def _highway_env_settings(env: EnvConfig) -> dict[str, Any]:
 
 
 class HighwayEnvRunner:
-    """``highway-v0`` without rendering and gymnasium's checks: random actions, a reset after every end."""
+    """``highway-v0`` without rendering and gymnasium's checks.
+
+    Random actions, a reset after every end.
+    """
 
     def __init__(self, env: EnvConfig, seed: int) -> None:
         import highway_env
@@ -289,13 +346,16 @@ class HighwayEnvRunner:
         settings = _highway_env_settings(env)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # In some releases the import registers the environments, in others this function; both do no harm.
+            # In some releases the import registers the environments, in others this function; both
+            # do no harm.
             getattr(highway_env, "register_highway_envs", lambda: None)()
             made = gymnasium.make("highway-v0", config=settings, disable_env_checker=True)
         self.env: Any = made.unwrapped
         self.env.reset(seed=seed)
         self.random = np.random.default_rng(seed)
-        self.steps_per_decision = int(settings["simulation_frequency"] // settings["policy_frequency"])
+        self.steps_per_decision = int(
+            settings["simulation_frequency"] // settings["policy_frequency"]
+        )
 
     def __call__(self, decisions: int) -> int:
         """Drive; the physics steps."""
@@ -307,16 +367,24 @@ class HighwayEnvRunner:
 
 
 def start_envpool(env: EnvConfig, batch: int, threads: int, seed: int) -> Runner:
-    """HighwayEnv in EnvPool's C++: random actions; an episode that has ended begins anew in the next step."""
+    """HighwayEnv in EnvPool's C++: random actions.
+
+    An episode that has ended begins anew in the next step.
+    """
     import envpool
 
     settings = _highway_env_settings(env)
     for each in ("observation", "action"):
         del settings[each]
     # Its rates are whole numbers.
-    settings |= {"policy_frequency": max(1, round(1 / env.decision_period_s)), "duration": round(env.timeout_s)}
+    settings |= {
+        "policy_frequency": max(1, round(1 / env.decision_period_s)),
+        "duration": round(env.timeout_s),
+    }
     settings |= {"max_episode_steps": round(env.timeout_s / env.decision_period_s), "seed": seed}
-    made = envpool.make_gymnasium("Highway-v0", num_envs=batch, num_threads=min(threads, batch), **settings)
+    made = envpool.make_gymnasium(
+        "Highway-v0", num_envs=batch, num_threads=min(threads, batch), **settings
+    )
     made.reset()
     actions = cycle(np.random.default_rng(seed).integers(5, size=(_DRAWN, batch)).astype(np.int32))
     steps = batch * env.episode_parameters().substeps()
@@ -330,10 +398,11 @@ def start_envpool(env: EnvConfig, batch: int, threads: int, seed: int) -> Runner
 
 
 class BaselinesRunner:
-    """stable-baselines3's DQN on ``highway-v0``, with the agent's network, batch and rate of updates.
+    """stable-baselines3's DQN on ``highway-v0``, with the agent's network, batch and rate of
+    updates.
 
-    Its loop can be stopped at any decision: ``learn`` itself would end every turn with a whole rollout of
-    ``decisions_per_update``. A batch is in the buffer when the clock starts.
+    Its loop can be stopped at any decision: ``learn`` itself would end every turn with a whole
+    rollout of ``decisions_per_update``. A batch is in the buffer when the clock starts.
     """
 
     @torch.random.fork_rng(devices=[])
@@ -341,7 +410,11 @@ class BaselinesRunner:
         from stable_baselines3 import DQN
 
         road = HighwayEnvRunner(env, seed)
-        self.steps_per_decision, self.every, self.pending = road.steps_per_decision, agent.decisions_per_update, 0
+        self.steps_per_decision, self.every, self.pending = (
+            road.steps_per_decision,
+            agent.decisions_per_update,
+            0,
+        )
         self.model: Any = DQN(
             "MlpPolicy",
             road.env,
@@ -374,4 +447,6 @@ class BaselinesRunner:
         from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
         model, rollout = self.model, TrainFreq(decisions, TrainFrequencyUnit.STEP)
-        model.collect_rollouts(model.env, self.callback, rollout, model.replay_buffer, learning_starts=0)
+        model.collect_rollouts(
+            model.env, self.callback, rollout, model.replay_buffer, learning_starts=0
+        )

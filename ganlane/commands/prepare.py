@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import Final
 
 from ganlane.config.recordings import PrepareConfig
-from ganlane.data import Preparation, SceneSummary, byte_progress, prepare_recordings, recordings_path
+from ganlane.data import (
+    Preparation,
+    SceneSummary,
+    byte_progress,
+    prepare_recordings,
+    recordings_path,
+)
 from ganlane.evaluation import write_results
 from ganlane.evaluation.table import Table
 from ganlane.files import write_bytes
@@ -37,16 +43,31 @@ def prepare(config: PrepareConfig, folder: Path) -> str:
     out = Path(config.out) if config.out else folder / "scenes"
 
     def show(scene: SceneSummary) -> None:  # while the others are still read
-        print(f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km", file=sys.stderr, flush=True)
+        print(
+            f"{scene.name}: {scene.rows:,} rows, {scene.vehicle_km:.1f} vehicle-km",
+            file=sys.stderr,
+            flush=True,
+        )
 
     with byte_progress("read") as progress:
-        prepared = prepare_recordings(config.data.format, source, out, parameters, config.scene_s, progress, show)
+        prepared = prepare_recordings(
+            config.data.format, source, out, parameters, config.scene_s, progress, show
+        )
     sheet = save_figure(draw_recordings(prepared.statistics), folder / "report.png")
     write_bytes(folder / "report.md", long_report(prepared, str(source), sheet.name).encode())
     print(f"{short_report(prepared)}\nscenes: {out}\nreport: {folder / 'report.md'}")
     peak = peak_resident_bytes()
-    cost = {"wall_s": time.perf_counter() - begun, "peak_memory_mb": None if peak is None else peak / 2**20}
-    numbers = {"format": config.data.format, "source": str(source), "out": str(out), **prepared.to_dict(), **cost}
+    cost = {
+        "wall_s": time.perf_counter() - begun,
+        "peak_memory_mb": None if peak is None else peak / 2**20,
+    }
+    numbers = {
+        "format": config.data.format,
+        "source": str(source),
+        "out": str(out),
+        **prepared.to_dict(),
+        **cost,
+    }
     return f"results: {write_results(folder, numbers, asdict(config), {})}"
 
 
@@ -57,7 +78,12 @@ def short_report(prepared: Preparation) -> str:
         f"driving: {exposure.scenes} scenes, {exposure.cars} cars, {exposure.tracks} tracks, "
         f"{exposure.vehicle_km:.1f} vehicle-km"
     )
-    lines = [*_row_lines(prepared), driving, *_lane_change_lines(prepared), *_acceleration_lines(prepared)]
+    lines = [
+        *_row_lines(prepared),
+        driving,
+        *_lane_change_lines(prepared),
+        *_acceleration_lines(prepared),
+    ]
     return "\n".join(lines)
 
 
@@ -102,7 +128,9 @@ def _lane_change_lines(prepared: Preparation) -> list[str]:
             f"{complete.mean:.2f} s over the complete ones alone"
         )
     elif found.count:
-        lines.append(f"their duration (equation 11): unknown, all {duration.censored:,} are censored")
+        lines.append(
+            f"their duration (equation 11): unknown, all {duration.censored:,} are censored"
+        )
     return lines
 
 
@@ -110,7 +138,9 @@ def _acceleration_lines(prepared: Preparation) -> list[str]:
     statistics = prepared.statistics
     titles = {"acceleration_raw": "as recorded", "acceleration_smoothed": "over 1 s"}
     shares = {title: statistics.strong_share(name) for name, title in titles.items()}
-    parts = [f"{100.0 * share:.1f} % {title}" for title, share in shares.items() if share is not None]
+    parts = [
+        f"{100.0 * share:.1f} % {title}" for title, share in shares.items() if share is not None
+    ]
     return [f"accelerations beyond 3 m/s2: {', '.join(parts)}"] if parts else []
 
 
@@ -120,13 +150,32 @@ def _bullets(lines: Iterable[str]) -> str:
 
 def _scene_table(scenes: Sequence[SceneSummary]) -> str:
     head = [
-        *("scene", "rows", "tracks", "s", "lanes", "lane width, m", "rows in the nearest lane, %", "vehicle-km"),
+        *(
+            "scene",
+            "rows",
+            "tracks",
+            "s",
+            "lanes",
+            "lane width, m",
+            "rows in the nearest lane, %",
+            "vehicle-km",
+        ),
         *("mean speed, m/s", "lane changes", "per vehicle-km (95 %)"),
     ]
     rows = [
         [
-            *(each.name, f"{each.rows:,}", f"{each.tracks:,}", f"{each.seconds:g}", f"{each.lanes}"),
-            *(f"{each.lane_width_m:.2f}", f"{100.0 * each.nearest_lane_share:.1f}", f"{each.vehicle_km:.1f}"),
+            *(
+                each.name,
+                f"{each.rows:,}",
+                f"{each.tracks:,}",
+                f"{each.seconds:g}",
+                f"{each.lanes}",
+            ),
+            *(
+                f"{each.lane_width_m:.2f}",
+                f"{100.0 * each.nearest_lane_share:.1f}",
+                f"{each.vehicle_km:.1f}",
+            ),
             *(f"{each.mean_speed_mps:.1f}", f"{each.lane_changes:,}"),
             f"{each.per_vehicle_km:.3f} ({each.per_vehicle_km_low:.3f} to {each.per_vehicle_km_high:.3f})",
         ]
@@ -144,6 +193,8 @@ def _distribution_table(prepared: Preparation) -> str:
     for name, title in _QUANTITIES.items():
         found = prepared.statistics.describe(name)
         quantiles = [found.quantile(level) if found.count else None for level in _SHOWN_LEVELS]
-        numbers = ["" if value is None else f"{value:.2f}" for value in (found.mean, found.sd, *quantiles)]
+        numbers = [
+            "" if value is None else f"{value:.2f}" for value in (found.mean, found.sd, *quantiles)
+        ]
         rows.append([title, f"{found.count:,}", *numbers])
     return Table("", head, rows, len(head)).markdown(heading=False)

@@ -69,9 +69,14 @@ def drive_card(config: RealismConfig, path: Path | None) -> Card:
     ``path`` is None where there are no recordings.
 
     Raises:
-        UserError: recordings, weights or names that do not fit, or I-80 files that were asked for and are not there.
+        UserError: recordings, weights or names that do not fit, or I-80 files that were asked for
+            and are not there.
     """
-    factories, files, traffic = traffic_factories(config), i80_files_wanted(config, path), config.traffic.label()
+    factories, files, traffic = (
+        traffic_factories(config),
+        i80_files_wanted(config, path),
+        config.traffic.label(),
+    )
     starts = drive_from_starts(config, factories, path)
     site = i80_cards(factories, files, starts.options, config.resamples)
     far = factories if config.long_against else {traffic: factories[traffic]}
@@ -90,11 +95,13 @@ def scenes_path(config: RealismConfig) -> Path | None:
         return None
 
 
-def traffic_factories(config: RealismConfig, weights: Mapping[str, Path] | None = None) -> dict[str, Factory]:
+def traffic_factories(
+    config: RealismConfig, weights: Mapping[str, Path] | None = None
+) -> dict[str, Factory]:
     """Factories by name: the card's traffic first, then its rivals.
 
-    ``weights`` of a fold, by preset, replace those that generated traffics name themselves; :class:`UserError` where
-    there are none of a preset.
+    ``weights`` of a fold, by preset, replace those that generated traffics name themselves;
+    :class:`UserError` where there are none of a preset.
     """
     every = {config.traffic.label(): config.traffic, **config.rivals()}
     if weights is not None:
@@ -124,7 +131,11 @@ def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
     if not config.fold_weights:
         everywhere = config.scenes == "all"
         # Nothing is held out of recordings that nothing is fitted to.
-        held_out = () if everywhere and not _fits(config, scenes) else config.data.held_out_scenes(scenes, HELD_OUT)
+        held_out = (
+            ()
+            if everywhere and not _fits(config, scenes)
+            else config.data.held_out_scenes(scenes, HELD_OUT)
+        )
         if not everywhere and not held_out:
             raise UserError(
                 f"recordings of one scene, {', '.join(scenes)}: none is held out to start from; give scenes=all, or "
@@ -133,11 +144,16 @@ def folds_of(config: RealismConfig, scenes: Sequence[str]) -> list[Fold]:
         return [Fold(traffic_factories(config), scenes if everywhere else held_out, held_out)]
     folds = fold_weights([Path(path) for path in config.fold_weights])
     check_folds_cover(list(folds), scenes)
-    return [Fold(traffic_factories(config, weights), held_out, held_out) for held_out, weights in folds.items()]
+    return [
+        Fold(traffic_factories(config, weights), held_out, held_out)
+        for held_out, weights in folds.items()
+    ]
 
 
 def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
-    """Whether anything is, or was, fitted to some of the ``scenes``, or the user says which were held out."""
+    """Whether anything is, or was, fitted to some of the ``scenes``, or the user says which were
+    held out.
+    """
     if config.data.held_out is not None or config.desired_above_mps is None:
         return True
     used = {**config.rivals(), config.traffic.label(): config.traffic}
@@ -149,14 +165,19 @@ def _fits(config: RealismConfig, scenes: Sequence[str]) -> bool:
     return False
 
 
-def drive_from_starts(config: RealismConfig, factories: Mapping[str, Factory], path: Path | None) -> Starts:
+def drive_from_starts(
+    config: RealismConfig, factories: Mapping[str, Factory], path: Path | None
+) -> Starts:
     """Drive every traffic from recorded scenes, or from spawned ones where there are none."""
     if path is None:
         spawn = config.env.spawn_parameters()
         return spawned_starts(factories, make_road(config.env), spawn, config.repeats, config.seed)
     frame = read_scenes(path)
     folds = folds_of(config, sorted(frame["scene"].unique().to_list()))
-    fit, options = config.desired_above_mps is None, StartOptions(repeats=config.repeats, seed=config.seed)
+    fit, options = (
+        config.desired_above_mps is None,
+        StartOptions(repeats=config.repeats, seed=config.seed),
+    )
     if config.desired_above_mps is not None:
         options = replace(options, desired_above_mps=config.desired_above_mps)
     return recorded_starts(folds, frame, options, fit, str(path))
@@ -165,22 +186,36 @@ def drive_from_starts(config: RealismConfig, factories: Mapping[str, Factory], p
 def i80_files_wanted(config: RealismConfig, path: Path | None) -> dict[str, Path]:
     """The I-80 files next to the scenes that ``config`` asks for, by name."""
     folder = None if config.i80 is False or path is None else path.parent
-    files = {name: folder / file for name, file in I80_FILES.items() if folder and (folder / file).is_file()}
+    files = {
+        name: folder / file
+        for name, file in I80_FILES.items()
+        if folder and (folder / file).is_file()
+    }
     if config.i80 and not files:
-        raise UserError(f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use i80=false.")
+        raise UserError(
+            f"i80=true: none of {', '.join(I80_FILES.values())} lies next to the scenes; use i80=false."
+        )
     return files
 
 
 def i80_cards(
-    factories: Mapping[str, Factory], files: Mapping[str, Path], options: Mapping[str, StartOptions], resamples: int
+    factories: Mapping[str, Factory],
+    files: Mapping[str, Path],
+    options: Mapping[str, StartOptions],
+    resamples: int,
 ) -> dict[str, Any]:
     """By I-80 file, the rows of the first of ``factories``; nothing is fitted to the site."""
     cards, once = {}, {name: replace(each, repeats=1) for name, each in options.items()}
     for name, path in files.items():
         recordings = read_i80(name, path)
-        driven, measured = simulate_all(factories, recordings, once), measures.measure_recordings(recordings)
+        driven, measured = (
+            simulate_all(factories, recordings, once),
+            measures.measure_recordings(recordings),
+        )
         recorded = {quantity: measured.counts[quantity] for quantity in I80_QUANTITIES}
-        cards[name] = quantity_rows(next(iter(factories)), driven, recorded, {}, resamples=resamples)
+        cards[name] = quantity_rows(
+            next(iter(factories)), driven, recorded, {}, resamples=resamples
+        )
     return cards
 
 
@@ -188,10 +223,14 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
     """One long run of a traffic per number of vehicles."""
     spawn, runs = config.env.spawn_parameters(), []
     for vehicles in config.long_vehicles if config.vehicle_km > 0 else []:
-        parameters = LongRunParameters(vehicles, config.vehicle_km, config.long_s, config.seed, spawn)
+        parameters = LongRunParameters(
+            vehicles, config.vehicle_km, config.long_s, config.seed, spawn
+        )
 
         def report(km: float, vehicles: int = vehicles) -> None:
-            print_progress(f"{name}, long run of {vehicles} vehicles: {km:.0f} of {config.vehicle_km:g} vehicle-km")
+            print_progress(
+                f"{name}, long run of {vehicles} vehicles: {km:.0f} of {config.vehicle_km:g} vehicle-km"
+            )
 
         runs.append(long_run(make, make_road(config.env), parameters, report))
     return runs
@@ -200,7 +239,9 @@ def long_runs(config: RealismConfig, name: str, make: Factory) -> list[dict[str,
 def check_targets(config: RealismConfig, path: Path | None) -> None:
     """Raise :class:`UserError`, before anything is driven, if the results could not be written."""
     if config.publish and path is None:
-        raise UserError("publish=true: the file that ships is made from recordings; give data.path=FILE.")
+        raise UserError(
+            "publish=true: the file that ships is made from recordings; give data.path=FILE."
+        )
     if config.report is not None:
         split_at_markers(Path(config.report), *markers(config.card()))
     if config.figures is not None and not Path(config.figures).is_dir():
@@ -208,12 +249,18 @@ def check_targets(config: RealismConfig, path: Path | None) -> None:
 
 
 def show(
-    config: RealismConfig, folder: Path, tables: list[str], numbers: Mapping[str, Any], drawn: Sequence[Path]
+    config: RealismConfig,
+    folder: Path,
+    tables: list[str],
+    numbers: Mapping[str, Any],
+    drawn: Sequence[Path],
 ) -> None:
     """Print the tables; write tables and figures into a document if asked for."""
     show_tables(*tables, columns=config.columns)
     if config.report is not None:
-        command = stored_command(folder, "python -m ganlane.realism", without=("report=", "figures=", "hydra."))
+        command = stored_command(
+            folder, "python -m ganlane.realism", without=("report=", "figures=", "hydra.")
+        )
         text = document_text(tables, numbers, command, date.today().isoformat())
         write_between_markers(Path(config.report), *markers(config.card()), f"\n{text}\n")
     for path in drawn if config.figures is not None else []:

@@ -37,7 +37,9 @@ try:
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
 except ImportError as error:
-    raise UserError("record: needs the extra 'minari'; run `pip install \"ganlane[minari]\"`.") from error
+    raise UserError(
+        "record: needs the extra 'minari'; run `pip install \"ganlane[minari]\"`."
+    ) from error
 
 #: Episodes that are written at a time.
 _AT_ONCE = 64
@@ -49,19 +51,36 @@ def record(config: RecordConfig, folder: Path) -> str:
     driver = make_driver(config.driver, config.env, Stream.named(config.stream), config.device)
     mask, policy = driver.behind(config.mask)
     seen = config.observation.read_by(driver.observation)
-    options = {"env": config.env, "observation": seen, "reward": config.reward, "mask": mask, "stream": config.stream}
+    options = {
+        "env": config.env,
+        "observation": seen,
+        "reward": config.reward,
+        "mask": mask,
+        "stream": config.stream,
+    }
     count = min(config.num_envs, config.episodes)
     rows = TensorRows(config.traffic, count, {**options, "device": config.device})
     spec = deepcopy(gymnasium.spec(ENV_ID))
-    spec.kwargs, spec.max_episode_steps = plain({"traffic": config.traffic, **options}), rows.episode.most_decisions()
+    spec.kwargs, spec.max_episode_steps = (
+        plain({"traffic": config.traffic, **options}),
+        rows.episode.most_decisions(),
+    )
     env = next(name for name, kind in SCHEMAS["env"].items() if kind is type(config.env))
     spec.kwargs["traffic"]["name"] = config.traffic.label()
     spec.kwargs["env"]["name"] = env
     name, root = config.dataset_name(), Path(config.out or folder).absolute()
-    about = {"dataset_id": name, "algorithm_name": driver.name, "minari_version": minari.__version__}
-    about["description"] = f"{driver.name} among {config.traffic.label()}, env={env}, seed {config.seed}"
+    about = {
+        "dataset_id": name,
+        "algorithm_name": driver.name,
+        "minari_version": minari.__version__,
+    }
+    about["description"] = (
+        f"{driver.name} among {config.traffic.label()}, env={env}, seed {config.seed}"
+    )
     with _new_folder(root / name) as part:
-        storage = MinariStorage.new(part / "data", rows.space, gymnasium.spaces.Discrete(ACTIONS), spec)
+        storage = MinariStorage.new(
+            part / "data", rows.space, gymnasium.spaces.Discrete(ACTIONS), spec
+        )
         storage.update_metadata(about)
         found = _write(storage, _driven(rows, policy, config), config.episodes)
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": [0, config.episodes - 1]}
@@ -78,7 +97,9 @@ def _new_folder(place: Path) -> Iterator[Path]:
         UserError: there is one already.
     """
     if place.exists():
-        raise UserError(f"{place}: a dataset is there already; give another dataset=NAME or out=FOLDER.")
+        raise UserError(
+            f"{place}: a dataset is there already; give another dataset=NAME or out=FOLDER."
+        )
     with cleared_after_mistakes(place.parent):
         place.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(dir=place.parent, prefix="."))
@@ -147,6 +168,13 @@ def _write(storage: Any, episodes: Iterator[EpisodeBuffer], count: int) -> dict[
         while written + ready in waiting:
             ready += 1
         if ready >= _AT_ONCE or written + ready == count:
-            storage.update_episodes([waiting.pop(number) for number in range(written, written + ready)])
+            storage.update_episodes(
+                [waiting.pop(number) for number in range(written, written + ready)]
+            )
             written += ready
-    return {"episodes": written, "decisions": decisions, "mean_return": round(returns / count, 2), "ends": dict(ends)}
+    return {
+        "episodes": written,
+        "decisions": decisions,
+        "mean_return": round(returns / count, 2),
+        "ends": dict(ends),
+    }

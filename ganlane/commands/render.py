@@ -82,13 +82,22 @@ def _crashes(config: RenderConfig, path: str) -> list[Trajectory]:
     ]
     if not chosen:
         drivers = ", ".join(dict.fromkeys(each.driver for each in listed.crashes)) or "none at all"
-        raise UserError(f"crashes={path}: none of these agents, episodes and traffics; it lists {drivers}.")
+        raise UserError(
+            f"crashes={path}: none of these agents, episodes and traffics; it lists {drivers}."
+        )
     if len(chosen) > MOST_EPISODES:
-        print(f"the first {MOST_EPISODES} of {len(chosen)} crashes; agents, traffics and episodes choose others")
+        print(
+            f"the first {MOST_EPISODES} of {len(chosen)} crashes; agents, traffics and episodes choose others"
+        )
     end_s = config.end_s if config.end_s is not None else float("inf")
     for each in chosen[:MOST_EPISODES]:
-        env, policy = listed.make_env(each.traffic, reward=config.reward), ScriptedPolicy(each.steps())
-        episodes.append(record_episode(env, policy, each.seed, each.episode, each.driver, each.traffic, end_s))
+        env, policy = (
+            listed.make_env(each.traffic, reward=config.reward),
+            ScriptedPolicy(each.steps()),
+        )
+        episodes.append(
+            record_episode(env, policy, each.seed, each.episode, each.driver, each.traffic, end_s)
+        )
         changed = f" (listed: {each.end})" if episodes[-1].outcome not in (each.end, "") else ""
         print(f"{_sentence(episodes[-1])}{changed}")
     return episodes
@@ -98,7 +107,9 @@ def _film(config: RenderConfig, episode: Trajectory, out: Path) -> str:
     """Draw an episode and write the film."""
     film = config.film
     window = WindowParameters(width=film.width, height=film.height, length_m=film.road_m)
-    painter = FramePainter(episode, window, DrawingParameters(film.trail_s, film.speeds, film.leader_line))
+    painter = FramePainter(
+        episode, window, DrawingParameters(film.trail_s, film.speeds, film.leader_line)
+    )
     frames = Film(painter, film.fps, film.speedup, film.start_s, config.end_s)
     return f"film: {write_film(frames, out, film.fps, film_format(out, config.kind), film.max_bytes, film.scale)}"
 

@@ -50,11 +50,15 @@ PAIRS = (
 
 
 def reproduce(config: ReproduceConfig, folder: Path) -> str:
-    """Drive what is missing, then write numbers, tables and figures; the line that names the report."""
+    """Drive what is missing, then write numbers, tables and figures.
+
+    The line that names the report.
+    """
     set_threads(config.threads)
     if config.source == "scratch":
         config = trained_from_scratch(config)
-    drawings.read_transfers(config.runs, [])  # a folder that cannot be read shows before hours of driving
+    # a folder that cannot be read shows before hours of driving
+    drawings.read_transfers(config.runs, [])
     traffics, missing = available(config)
     _print_left_out(missing)
     cells = cells_of(config, traffics)
@@ -84,7 +88,10 @@ def reproduce(config: ReproduceConfig, folder: Path) -> str:
         "failures": failed_episodes(episodes),
         "left_out": missing,
         "seconds": seconds,
-        "cells": {"revisions": revisions, "files": {f"{c.driver} on {c.traffic}": c.path.name for c in cells}},
+        "cells": {
+            "revisions": revisions,
+            "files": {f"{c.driver} on {c.traffic}": c.path.name for c in cells},
+        },
     }
     driven = {name: config.episodes_on(name) for name in traffics}
     seeds = {"stream": config.stream, "seed": config.seed, "episodes": driven}
@@ -108,7 +115,10 @@ def _tables(rows: list[Row], compared: list[Row], folder: Path) -> dict[str, Tab
 def _figures(
     config: ReproduceConfig, traffics: Mapping[str, Any], rows: list[Row], folder: Path
 ) -> tuple[dict[str, Figure], dict[str, str]]:
-    """The figures of the report by name, and why others are missing; the numbers behind each as a CSV file."""
+    """The figures of the report by name, and why others are missing.
+
+    The numbers behind each as a CSV file.
+    """
     drawn = drawings.draw_all(config, traffics)
     _print_left_out(drawn.missing)
     figures = {"matrix": drawings.draw_matrix(rows), **drawn.figures}
@@ -117,7 +127,11 @@ def _figures(
     transfer = drawings.read_transfers(config.runs, rows)
     if transfer is not None:
         figures["figure_4"] = drawings.draw_transfer(transfer)
-        curves = [{"run": name, **row} for name, frame in transfer.runs.items() for row in frame.to_dicts()]
+        curves = [
+            {"run": name, **row}
+            for name, frame in transfer.runs.items()
+            for row in frame.to_dicts()
+        ]
         report.write_csv(folder / "figure_4.csv", curves)
     return figures, drawn.missing
 
@@ -130,22 +144,31 @@ def _print_left_out(missing: Mapping[str, str]) -> None:
 def _list_crashes(episodes: pl.DataFrame, config: ReproduceConfig, folder: Path) -> None:
     """Write the earliest crashes of every driver but the controls, as ``crashes.json``."""
     if config.crashes:
-        compared = episodes.filter(~episodes["agent"].is_in(["random", "random_legal", "keep_lane"]))
+        compared = episodes.filter(
+            ~episodes["agent"].is_in(["random", "random_legal", "keep_lane"])
+        )
         listed, others = find_crashes(compared, config, config.crashes)
         write_crashes(folder / "crashes.json", listed)
-        print(f"crashes.json: {len(listed.crashes)} crashes; {others} ended otherwise when driven again, not listed")
+        print(
+            f"crashes.json: {len(listed.crashes)} crashes; {others} ended otherwise when driven again, not listed"
+        )
 
 
 def _pairs(by_recipe: dict[tuple[str, str], Any]) -> list[tuple[str, str]]:
-    """:data:`PAIRS` by the names of the drivers here, of which ``agent_idm+none`` may stand for ``agent_idm``."""
+    """:data:`PAIRS` by the names of the drivers here, of which ``agent_idm+none`` may stand for
+    ``agent_idm``.
+    """
     names = {recipe for recipe, _ in by_recipe}
     explicit = {name: name if name in names else f"{name}+none" for pair in PAIRS for name in pair}
-    explicit["agent_general"] = "agent_general" if "agent_general" in names else "agent_general+safe"
+    explicit["agent_general"] = (
+        "agent_general" if "agent_general" in names else "agent_general+safe"
+    )
     return [(explicit[one], explicit[other]) for one, other in PAIRS]
 
 
 def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
-    """Train the paper's schedule for every seed, and put those agents in the place of the ones that ship.
+    """Train the paper's schedule for every seed, and put those agents in the place of the ones that
+    ship.
 
     Raises:
         UserError: a training did not end well; its own sentence stands above.
@@ -153,17 +176,34 @@ def trained_from_scratch(config: ReproduceConfig) -> ReproduceConfig:
     for name in config.agents:
         with_seeds(name)  # a training that is not installed shows before hours of training
     folders = {seed: Path(config.trained) / f"seed_{seed}" for seed in config.training_seeds}
-    open_ones = {seed: path for seed, path in folders.items() if not (path / "results.json").is_file()}
+    open_ones = {
+        seed: path for seed, path in folders.items() if not (path / "results.json").is_file()
+    }
     hours = HOURS_PER_SEED * len(open_ones)
-    print(f"{len(open_ones)} trainings, one after the other: about {hours:.1f} hours on one core.", file=sys.stderr)
+    print(
+        f"{len(open_ones)} trainings, one after the other: about {hours:.1f} hours on one core.",
+        file=sys.stderr,
+    )
     for seed, path in open_ones.items():
         stopped = any(path.rglob("last.pt"))
-        asked = [f"resume={path}"] if stopped else ["experiment=paper", f"seed={seed}", f"hydra.run.dir={path}"]
+        asked = (
+            [f"resume={path}"]
+            if stopped
+            else ["experiment=paper", f"seed={seed}", f"hydra.run.dir={path}"]
+        )
         if subprocess.run([sys.executable, "-m", "ganlane.train", *asked], check=False).returncode:
-            raise UserError(f"source=scratch: the training in {path} stopped; the same command goes on with it.")
+            raise UserError(
+                f"source=scratch: the training in {path} stopped; the same command goes on with it."
+            )
     agents = config.agents
     for recipe, phase in (("agent_idm", "pretrain"), ("agent_gan", ".")):
         file = Path(config.trained) / f"{recipe}.safetensors"
-        save_agents(file, {seed: read_agent(path / phase / "agent.safetensors") for seed, path in folders.items()})
+        save_agents(
+            file,
+            {
+                seed: read_agent(path / phase / "agent.safetensors")
+                for seed, path in folders.items()
+            },
+        )
         agents = [name.replace(f"{recipe}@all", f"{file}@all") for name in agents]
     return replace(config, agents=agents, runs=[str(path) for path in folders.values()])

@@ -23,9 +23,12 @@ TRAINED = "trained"
 def train(config: TrainConfig, folder: Path) -> str:
     """Run the phases, then evaluate the trained agent; the line that names the results."""
     if config.resume is None and earned(folder):
-        raise UserError(f"{folder}: a run is there already; go on with resume={folder}, or give another folder.")
+        raise UserError(
+            f"{folder}: a run is there already; go on with resume={folder}, or give another folder."
+        )
     set_threads(config.threads)
-    for traffic in config.all_traffic():  # a mistake in any of them shows before hours of training, not after
+    # a mistake in any of them shows before hours of training, not after
+    for traffic in config.all_traffic():
         make_traffic(traffic, config.env)
     others = make_drivers(config.evaluation.agents, config.env, config.device)
     lengths: dict[str, dict[str, float]] = {}
@@ -40,9 +43,19 @@ def train(config: TrainConfig, folder: Path) -> str:
         if result.stopped_by is not None:
             print(f"saved; go on with: ganlane train resume={folder}", file=sys.stderr)
             raise Stopped(result.stopped_by)
-        lengths[phase.name] = {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
-    trained = replace(make_driver(str(folder / AGENT_FILE), config.env, device=config.device), name=TRAINED)
+        lengths[phase.name] = {
+            "decisions": result.decisions,
+            "updates": result.updates,
+            "wall_s": result.wall_s,
+        }
+    trained = replace(
+        make_driver(str(folder / AGENT_FILE), config.env, device=config.device), name=TRAINED
+    )
     table = compare([trained, *others], config.final_evaluation())
-    seeds = {"training": config.seed, "stream": "report", "episodes": [0, config.evaluation.episodes - 1]}
+    seeds = {
+        "training": config.seed,
+        "stream": "report",
+        "episodes": [0, config.evaluation.episodes - 1],
+    }
     numbers = {**lengths["train"], "phases": lengths, "agent": str(folder / AGENT_FILE)}
     return publish(table, folder, asdict(config), seeds, numbers)

@@ -23,7 +23,8 @@ from ganlane.torch_settings import set_threads
 _ERRORS = ("ade_m", "fde_m", "end_m")
 _BASELINE = "constant_velocity"
 _PUBLISHED_VELOCITY_M = (0.73, 1.78, 3.13, 4.78, 6.68)
-#: RMSE in m after 1 to 5 s on NGSIM, as published: on other test sets than ours, so only roughly comparable.
+#: RMSE in m after 1 to 5 s on NGSIM, as published: on other test sets than ours, so only roughly
+#: comparable.
 _PUBLISHED_RMSE_M = {
     "constant velocity (published)": _PUBLISHED_VELOCITY_M,
     "CS-LSTM (published)": (0.61, 1.27, 2.09, 3.10, 4.37),
@@ -46,12 +47,15 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
     held_out = config.data.held_out_scenes([scene.name for scene in scenes], generator.HELD_OUT)
     split = generator.split_for_fit(scenes, held_out)
     if config.folds:
-        generator.assign_folds(scenes, config.folds)  # too many are refused now rather than after hours of ablations
+        # too many are refused now rather than after hours of ablations
+        generator.assign_folds(scenes, config.folds)
     states = Path(config.resume or folder) / "fits"
     further: dict[str, Any] = {}
     if config.ablations:
         with FitProgress() as progress:
-            further["ablations"] = generator.ablate(frame, fit_config, held_out, states, progress.next_fit, progress)
+            further["ablations"] = generator.ablate(
+                frame, fit_config, held_out, states, progress.next_fit, progress
+            )
         show(ablation_table(further["ablations"]), columns=config.columns)
     if config.folds:
 
@@ -60,7 +64,14 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
 
         with FitProgress() as progress:
             further["folds"] = generator.cross_validate(
-                frame, fit_config, config.folds, states, progress.next_fit, progress, save, source=str(source)
+                frame,
+                fit_config,
+                config.folds,
+                states,
+                progress.next_fit,
+                progress,
+                save,
+                source=str(source),
             )
         show(fold_tables(further["folds"]), columns=config.columns)
     with FitProgress() as progress:
@@ -84,7 +95,10 @@ def train_generator(config: TrainGeneratorConfig, folder: Path) -> str:
 
 
 class FitProgress(AbstractContextManager["FitProgress"]):
-    """Shows a fit: a bar on a terminal, else a line per improvement and a last one; a context that closes the bar."""
+    """Shows a fit: a bar on a terminal, else a line per improvement and a last one.
+
+    A context that closes the bar.
+    """
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
@@ -99,7 +113,11 @@ class FitProgress(AbstractContextManager["FitProgress"]):
     def __call__(self, progress: Progress) -> None:
         """Called by the fit after every update."""
         update, updates = progress.update, progress.updates
-        scores = "" if progress.score is None else f"validation score {progress.score:.4f}, best {progress.best:.4f}"
+        scores = (
+            ""
+            if progress.score is None
+            else f"validation score {progress.score:.4f}, best {progress.best:.4f}"
+        )
         if sys.stderr.isatty():
             if self._bar is None:
                 self._bar = tqdm(total=updates, desc="fit", unit="update", file=sys.stderr)
@@ -109,7 +127,11 @@ class FitProgress(AbstractContextManager["FitProgress"]):
         elif progress.best < self._best or update == updates:
             self._best = progress.best
             left_s = progress.seconds / update * (updates - update)
-            parts = [f"{update} of {updates} updates", f"at most {left_s:.0f} s left", *([scores] if scores else [])]
+            parts = [
+                f"{update} of {updates} updates",
+                f"at most {left_s:.0f} s left",
+                *([scores] if scores else []),
+            ]
             print(", ".join(parts), file=sys.stderr, flush=True)
 
     def __exit__(self, *error: object) -> None:
@@ -118,7 +140,10 @@ class FitProgress(AbstractContextManager["FitProgress"]):
 
 
 def _by_kind(measured: Mapping[str, float]) -> dict[str, Any]:
-    """``{"ade_m/mean": x, ..., "windows": n}`` as ``{"ade_m": {"mean": x, ...}, ..., "windows": n}``."""
+    """``{"ade_m/mean": x, ..., "windows": n}`` as ``{"ade_m": {"mean": x, ...}, ..., "windows".
+
+    N}``.
+    """
     nested: dict[str, Any] = {}
     for name, value in measured.items():
         error, _, kind = name.partition("/")
@@ -131,8 +156,16 @@ def _by_kind(measured: Mapping[str, float]) -> dict[str, Any]:
 
 def results_of(result: FitResult) -> dict[str, Any]:
     """The numbers of ``results.json``: errors over all held-out scenes, and per scene."""
-    scenes = {name: _by_kind(values) for name, values in result.metrics.items() if name in result.data["held_out"]}
-    other = {name: dict(values) for name, values in result.metrics.items() if name != "all" and name not in scenes}
+    scenes = {
+        name: _by_kind(values)
+        for name, values in result.metrics.items()
+        if name in result.data["held_out"]
+    }
+    other = {
+        name: dict(values)
+        for name, values in result.metrics.items()
+        if name != "all" and name not in scenes
+    }
     return {
         "preset": result.preset,
         **_by_kind(result.metrics["all"]),
@@ -156,16 +189,28 @@ def metrics_table(metrics: Mapping[str, Mapping[str, float]]) -> str:
     lines = [["held-out scenes", *(error.replace("_m", ", m") for error in errors), "ADE to CV"]]
     for kind, ade in overall["ade_m"].items():
         change = _percent(100.0 * (ade / overall["ade_m"][_BASELINE] - 1.0))
-        lines.append([kind, *(f"{overall[error].get(kind, math.nan):.3f}" for error in errors), change])
+        lines.append(
+            [kind, *(f"{overall[error].get(kind, math.nan):.3f}" for error in errors), change]
+        )
     return aligned(lines)
 
 
 def ablation_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """The ablations as text: change of ADE over all predicted steps and over 0.4 s, ratio of the RMSE at 5 s."""
+    """The ablations as text.
+
+    Change of ADE over all predicted steps and over 0.4 s, ratio of the RMSE at 5 s.
+    """
     first = next(iter(rows.values()))
     kinds = [kind for kind in first["ade_change_percent"] if kind != _BASELINE]
     at_5_s = ["RMSE 5 s"] if "rmse_5_s_ratio" in first else []
-    lines = [["ADE to CV, a quarter of the updates", *kinds, *(f"{kind}, 0.4 s" for kind in kinds), *at_5_s]]
+    lines = [
+        [
+            "ADE to CV, a quarter of the updates",
+            *kinds,
+            *(f"{kind}, 0.4 s" for kind in kinds),
+            *at_5_s,
+        ]
+    ]
     for name, row in rows.items():
         parts = (row["ade_change_percent"], row["ade_change_percent_0.4_s"])
         ratio = [f"{row['rmse_5_s_ratio']['mean']:.2f}"] if at_5_s else []
@@ -177,7 +222,11 @@ def fold_tables(folds: Mapping[str, Any]) -> str:
     """All tables of :func:`ganlane.generator.cross_validate`'s result, as text."""
     scores = folds["open_loop"]
     titles = {"folds": "by fold", "scenes": "by scene", "parts": "by lane (1 leftmost) and class"}
-    tables = [_pooled(scores), *(_rows(title, scores[name]) for name, title in titles.items()), _direction(scores)]
+    tables = [
+        _pooled(scores),
+        *(_rows(title, scores[name]) for name, title in titles.items()),
+        _direction(scores),
+    ]
     if "rollout" in folds:
         tables.append(_rollout(folds["rollout"]))
     return "\n\n".join(map(aligned, tables))
@@ -195,7 +244,9 @@ def _pooled(scores: Mapping[str, Any]) -> Lines:
 def _rows(title: str, rows: Mapping[str, Any]) -> Lines:
     """Windows, constant velocity's ADE and the generator's change relative to it, for every row."""
     first = next(iter(rows.values()))
-    kinds = [kind for kind in first["ade_m"] if kind in ("mean", "single") or kind.startswith("best_of")]
+    kinds = [
+        kind for kind in first["ade_m"] if kind in ("mean", "single") or kind.startswith("best_of")
+    ]
     lines = [[title, "windows", "CV, m", *kinds]]
     for name, row in rows.items():
         changes = [_percent(row["ade_change_percent"][kind]) for kind in kinds]
@@ -224,5 +275,8 @@ def _rollout(rollout: Mapping[str, Any]) -> Lines:
         rmse[kind], ratios[kind] = list(published), published[-1] / _PUBLISHED_VELOCITY_M[-1]
     seconds = next(iter(rollout["rmse_m"].values()))
     lines = [[f"RMSE, m ({rollout['windows']} windows)", *seconds, "to CV"]]
-    lines += [[kind, *(f"{value:.2f}" for value in values), f"{ratios[kind]:.2f}"] for kind, values in rmse.items()]
+    lines += [
+        [kind, *(f"{value:.2f}" for value in values), f"{ratios[kind]:.2f}"]
+        for kind, values in rmse.items()
+    ]
     return lines

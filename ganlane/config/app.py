@@ -1,7 +1,8 @@
 """Runs a command: Hydra composes and sweeps; errors become one sentence and an exit status.
 
-Exit statuses: 0 done; 2 a user's mistake or a failing disk (one sentence on stderr, nothing left on disk); 130
-stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the output has closed it.
+Exit statuses: 0 done; 2 a user's mistake or a failing disk (one sentence on stderr, nothing left on
+disk); 130 stopped by Ctrl-C, 143 by SIGTERM (training saves first); 141 the reader of the output
+has closed it.
 """
 
 from __future__ import annotations
@@ -43,21 +44,33 @@ from ganlane.config.runs import (
 from ganlane.config.schemas import register
 from ganlane.errors import USER_ERROR, UserError, numbered_refusals
 from ganlane.files import conf_folder
-from ganlane.runtime import check_process, keep_freed_memory, open_closed_streams, register_envs, status_of
+from ganlane.runtime import (
+    check_process,
+    keep_freed_memory,
+    open_closed_streams,
+    register_envs,
+    status_of,
+)
 
 #: A command's function of config and run folder; it returns the last line to print, or None.
 Task = Callable[[Any, Path], str | None]
-#: Modules of the commands' functions, each named as its command, that are not in :mod:`ganlane.commands`.
+#: Modules of the commands' functions, each named as its command, that are not in
+#: :mod:`ganlane.commands`.
 _ELSEWHERE = {"evaluate": "ganlane.compare"}
 
 
 def function_of(command: str) -> Callable[[Any, Path], str]:
     """The command's function; importing its module imports torch, which takes seconds."""
-    return getattr(importlib.import_module(_ELSEWHERE.get(command, f"ganlane.commands.{command}")), command)
+    return getattr(
+        importlib.import_module(_ELSEWHERE.get(command, f"ganlane.commands.{command}")), command
+    )
 
 
 class Stopped(BaseException):
-    """Raised when a signal ended the command after an orderly stop; the exit status is 128 plus its number."""
+    """Raised when a signal ended the command after an orderly stop.
+
+    The exit status is 128 plus its number.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -80,8 +93,11 @@ class Job(NamedTuple):
     overrides: list[str]
 
 
-def run_command(command: str, arguments: Sequence[str] | None = None, task: Task | None = None) -> int:
-    """Run ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit status.
+def run_command(
+    command: str, arguments: Sequence[str] | None = None, task: Task | None = None
+) -> int:
+    """Run ``ganlane COMMAND`` with command-line ``arguments`` (None: the process's); the exit
+    status.
 
     A ``task`` takes the place of the command's function.
     """
@@ -115,7 +131,10 @@ def run_command(command: str, arguments: Sequence[str] | None = None, task: Task
 
 
 def _signal_behind(error: BaseException | None) -> int | None:
-    """The signal behind ``error``, or None; omegaconf, when interrupted, raises an error of its own from it."""
+    """The signal behind ``error``, or None.
+
+    Omegaconf, when interrupted, raises an error of its own from it.
+    """
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return signal.SIGINT
@@ -126,7 +145,10 @@ def _signal_behind(error: BaseException | None) -> int | None:
 
 
 def _checked(command: str, task: Task | None, arguments: list[str]) -> Job | None:
-    """The run that ``arguments`` ask for; None if they ask for something else, such as help or a sweep, done here."""
+    """The run that ``arguments`` ask for.
+
+    None if they ask for something else, such as help or a sweep, done here.
+    """
     flags = parse_arguments(command, arguments)
     if flags.help or flags.help_all:
         print(help_text(command, flags.help_all))
@@ -145,7 +167,8 @@ def _checked(command: str, task: Task | None, arguments: list[str]) -> Job | Non
     if flags.multirun:
         folder = checked.sweep_folder.absolute()
         with cleared_after_mistakes(folder):
-            # The default name holds the time; passed on, so that Hydra uses the folder that was checked.
+            # The default name holds the time; passed on, so that Hydra uses the folder that was
+            # checked.
             swept = without_repetitions([*overrides, f"hydra.sweep.dir={quoted(folder)}"])
             _hydra(command, task, ["-m", *with_shares_replaced(swept)])
             _show_sweep(folder, checked.config.columns)
@@ -172,7 +195,8 @@ def _show_sweep(folder: Path, columns: str) -> None:
 @contextmanager
 def _in_folder(job: Job) -> Iterator[None]:
     """Hold the run folder, with the configuration written into it."""
-    register_envs()  # for a user's own driver or traffic; ganlane/__init__.py leaves it to the commands
+    # for a user's own driver or traffic; ganlane/__init__.py leaves it to the commands
+    register_envs()
     with held(job.folder):
         write_config(job.composed, job.overrides, job.folder)
         with numbered_refusals():
@@ -196,12 +220,15 @@ def _hydra(command: str, task: Task | None, arguments: list[str]) -> None:
             if last_line:
                 print(last_line, flush=True)
         except (UserError, OSError) as error:
-            # Kept rather than raised, because Hydra would print it too; a worker process must raise.
+            # Kept rather than raised, because Hydra would print it too; a worker process must
+            # raise.
             mistakes.append(error)
             if os.getpid() != here:
                 raise
 
-    application = hydra.main(version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command)(run)
+    application = hydra.main(
+        version_base=VERSION_BASE, config_path=str(conf_folder()), config_name=command
+    )(run)
     with _process([f"ganlane {command}", *arguments]):
         application()
     if mistakes:
@@ -210,14 +237,18 @@ def _hydra(command: str, task: Task | None, arguments: list[str]) -> None:
 
 @contextmanager
 def _process(argv: list[str]) -> Iterator[None]:
-    """Set ``sys.argv`` for Hydra, and make it raise errors rather than print them and exit with status 1."""
+    """Set ``sys.argv`` for Hydra, and make it raise errors rather than print them and exit with
+    status 1.
+    """
     before, full = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     sys.argv, os.environ["HYDRA_FULL_ERROR"] = argv, "1"
     try:
         yield
     except SystemExit as end:
         if end.code not in (0, None):
-            raise UserError(f"Hydra stopped with status {end.code}; run with --help to see what it takes.") from end
+            raise UserError(
+                f"Hydra stopped with status {end.code}; run with --help to see what it takes."
+            ) from end
     finally:
         sys.argv = before
         if full is None:

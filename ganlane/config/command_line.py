@@ -1,4 +1,7 @@
-"""The command line: flags, overrides, the runs of a sweep, their checked configurations; errors as one sentence."""
+"""The command line: flags, overrides, the runs of a sweep, their checked configurations.
+
+Errors as one sentence.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +42,12 @@ VERSION_BASE = "1.3"
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
 #: Errors while values are read; a whole number of hundreds of digits raises OverflowError.
 VALUE_ERRORS = (*CONFIG_ERRORS, OverflowError)
-#: The keys of Hydra's own configuration that a command line may set, besides launcher and sweeper and their
-#: parameters: most others name code that Hydra would import.
+#: The keys of Hydra's own configuration that a command line may set, besides launcher and sweeper
+#: and their parameters: most others name code that Hydra would import.
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.num")
 HYDRA_PLUGINS = ("launcher", "sweeper")
-#: Keys that a command calls by another name, because ``agent=`` would choose an option of the group ``agent``.
+#: Keys that a command calls by another name, because ``agent=`` would choose an option of the group
+#: ``agent``.
 ALIASES = {"render": {"agent": "driver"}, "record": {"agent": "driver"}}
 #: A number with an exponent, and the functions of a sweep.
 _EXPONENT, _SWEPT = (
@@ -56,8 +60,8 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
     """Hydra's flags and the overrides of a command.
 
     Raises:
-        UserError: an unknown flag, or one that would have no effect; one of those (experimental_rerun) would load a
-            pickle.
+        UserError: an unknown flag, or one that would have no effect; one of those
+            (experimental_rerun) would load a pickle.
     """
     parser = get_args_parser()
     parser.add_argument("--help-all", action="store_true")
@@ -69,18 +73,24 @@ def parse_arguments(command: str, arguments: Sequence[str]) -> Namespace:
     flags = parser.parse_args(list(arguments))
     for name in ("config_path", "config_name", "config_dir", "experimental_rerun"):
         if getattr(flags, name) is not None:
-            raise UserError(f"--{name.replace('_', '-')}: ganlane has its own configuration; give key=value instead.")
+            raise UserError(
+                f"--{name.replace('_', '-')}: ganlane has its own configuration; give key=value instead."
+            )
     for name in ("resolve", "package"):
         if getattr(flags, name) and flags.cfg is None and not flags.help:
-            raise UserError(f"--{name}: it goes with --cfg alone, which shows the configuration; add --cfg job.")
+            raise UserError(
+                f"--{name}: it goes with --cfg alone, which shows the configuration; add --cfg job."
+            )
     flags.overrides = [as_meant(command, override, flags.multirun) for override in flags.overrides]
     return flags
 
 
 def as_meant(command: str, override: str, multirun: bool = False) -> str:
-    """An override in Hydra's syntax: ``agents=mobil`` as a list of one, ``1e5`` for a whole number as ``100000``.
+    """An override in Hydra's syntax: ``agents=mobil`` as a list of one, ``1e5`` for a whole number
+    as ``100000``.
 
-    In the value of a list commas separate entries, which need no quotes; in a sweep they separate runs.
+    In the value of a list commas separate entries, which need no quotes; in a sweep they separate
+    runs.
     """
     key, equals, value = override.partition("=")
     key = ALIASES.get(command, {}).get(key, key)
@@ -89,7 +99,9 @@ def as_meant(command: str, override: str, multirun: bool = False) -> str:
         value = re.sub(_EXPONENT, _whole, value)
     if kinds & {list, tuple} and value != "null" and not re.match(rf"[\[{{$]|$|{_SWEPT}", value):
         entries = (
-            value.split(",") if int in kinds or float in kinds or value[0] in "'\"" else map(quoted, value.split(","))
+            value.split(",")
+            if int in kinds or float in kinds or value[0] in "'\""
+            else map(quoted, value.split(","))
         )
         value = "],[".join(entries) if multirun else ",".join(entries)
         value = f"[{value}]"
@@ -102,7 +114,9 @@ def _whole(number: re.Match[str]) -> str:
 
 
 def _kinds(hint: Any, path: Sequence[str]) -> set[Any]:
-    """The types allowed at ``path`` below ``hint``, including those inside unions and lists and of subclasses."""
+    """The types allowed at ``path`` below ``hint``, including those inside unions and lists and of
+    subclasses.
+    """
     inner = set().union(*(_kinds(each, path) for each in get_args(hint)))
     if not path:
         return {get_origin(hint) or hint, *inner}
@@ -123,14 +137,17 @@ def parse(overrides: Sequence[str]) -> list[Override]:
     """Parse overrides by Hydra's grammar, and refuse some.
 
     Raises:
-        UserError: an override would add or delete keys, names no option, or would make Hydra import something.
+        UserError: an override would add or delete keys, names no option, or would make Hydra import
+            something.
         hydra.errors.OverrideParseException: one is not of the form key=value.
     """
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
     except (ValueError, RecursionError) as error:  # limits of Python
         longest = max(overrides, key=len)
-        raise UserError(f"{longest:.60}...: too long a number or too deep a list; give a shorter value.") from error
+        raise UserError(
+            f"{longest:.60}...: too long a number or too deep a list; give a shorter value."
+        ) from error
     for override in parsed:
         if of_hydra(override):
             _refuse_hydras(override)
@@ -141,16 +158,29 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 
 def of_hydra(override: Override) -> bool:
     """Whether an override changes Hydra's own configuration."""
-    return re.match(r"hydra\b", override.key_or_group) is not None or (override.package or "").startswith("hydra")
+    return re.match(r"hydra\b", override.key_or_group) is not None or (
+        override.package or ""
+    ).startswith("hydra")
 
 
 def _refuse_hydras(override: Override) -> None:
-    """Refuse keys by which Hydra would import and call the ``_target_`` of a callback, launcher or log handler."""
+    """Refuse keys by which Hydra would import and call the ``_target_`` of a callback, launcher or
+    log handler.
+    """
     key, value = override.key_or_group, override.value()
-    group = any(key == f"hydra/{plugin}" for plugin in HYDRA_PLUGINS) and re.fullmatch(r"\w+", str(value))
-    if override.type == OverrideType.CHANGE and override.package is None and (group or key in HYDRA_KEYS):
+    group = any(key == f"hydra/{plugin}" for plugin in HYDRA_PLUGINS) and re.fullmatch(
+        r"\w+", str(value)
+    )
+    if (
+        override.type == OverrideType.CHANGE
+        and override.package is None
+        and (group or key in HYDRA_KEYS)
+    ):
         return
-    parameter = any(key.startswith(f"hydra.{plugin}.") for plugin in HYDRA_PLUGINS) and not override.is_delete()
+    parameter = (
+        any(key.startswith(f"hydra.{plugin}.") for plugin in HYDRA_PLUGINS)
+        and not override.is_delete()
+    )
     if parameter and "_target_" not in {*key.split("."), *leaves(value)}:
         return
     raise UserError(
@@ -173,8 +203,8 @@ def leaves(value: object) -> Iterator[str]:
 def _refuse_own(override: Override) -> None:
     """Refuse what bypasses the schemas.
 
-    That is ``+key``, ``++key`` and ``~key``, but for the free parameters of a target, and a value of a group that is
-    not the name of one option, such as a path to a file elsewhere.
+    That is ``+key``, ``++key`` and ``~key``, but for the free parameters of a target, and a value
+    of a group that is not the name of one option, such as a path to a file elsewhere.
     """
     key, line = override.key_or_group, str(override.input_line)
     if override.is_delete():
@@ -185,8 +215,12 @@ def _refuse_own(override: Override) -> None:
             "(+ is for traffic.parameters.NAME alone)."
         )
     named = override.is_sweep_override() or isinstance(override.value(), str)
-    if (conf_folder() / key).is_dir() and (not named or re.search(r"[/\\]|\.\.", line.partition("=")[2])):
-        raise UserError(f"{line}: expected the name of one option; choose one of {', '.join(options_of(key))}.")
+    if (conf_folder() / key).is_dir() and (
+        not named or re.search(r"[/\\]|\.\.", line.partition("=")[2])
+    ):
+        raise UserError(
+            f"{line}: expected the name of one option; choose one of {', '.join(options_of(key))}."
+        )
 
 
 def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:
@@ -200,12 +234,20 @@ def refuse_unknown_keys(command: str, overrides: Sequence[Override]) -> None:
     options = [kind for schemas in SCHEMAS.values() for kind in schemas.values()]
     for override in overrides:
         key = override.key_or_group
-        if override.type != OverrideType.CHANGE or of_hydra(override) or (conf_folder() / key).is_dir():
+        if (
+            override.type != OverrideType.CHANGE
+            or of_hydra(override)
+            or (conf_folder() / key).is_dir()
+        ):
             continue
         kind, path = SCHEMAS[""][command], key.split(".")
         for depth, name in enumerate(path, 1):
             kinds = [kind] if depth == 1 else _with_subclasses(kind)
-            known = {field.name for each in kinds for field in fields(each)} if is_dataclass(kind) else set()
+            known = (
+                {field.name for each in kinds for field in fields(each)}
+                if is_dataclass(kind)
+                else set()
+            )
             if not known or (len(kinds) > 1 and kind not in options):
                 break
             if name not in known:
@@ -223,12 +265,17 @@ def _with_subclasses(kind: Any) -> list[Any]:
 
 def without_repetitions(overrides: Sequence[str]) -> list[str]:
     """The last override of each key; Hydra refuses to choose an option twice."""
-    last = {override.get_key_element().lstrip("+"): str(override.input_line) for override in parse(overrides)}
+    last = {
+        override.get_key_element().lstrip("+"): str(override.input_line)
+        for override in parse(overrides)
+    }
     return list(last.values())
 
 
 def with_shares_replaced(overrides: Sequence[str]) -> list[str]:
-    """The overrides, with a null before each ``traffic.shares=...``, which Hydra would merge into an experiment's."""
+    """The overrides, with a null before each ``traffic.shares=...``, which Hydra would merge into
+    an experiment's.
+    """
     replaced = []
     for override in parse(overrides):
         key = override.key_or_group
@@ -269,7 +316,8 @@ def typed(composed: DictConfig) -> Any:
 
 
 def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Checked:
-    """Compose and check every run that ``overrides``, as on the command line, mean; return the first.
+    """Compose and check every run that ``overrides``, as on the command line, mean; return the
+    first.
 
     Raises:
         UserError: an unknown key or option, a value of the wrong type or out of range.
@@ -287,7 +335,9 @@ def check(command: str, overrides: Sequence[str], multirun: bool = False) -> Che
 
 def _check_one(command: str, overrides: Sequence[str]) -> Checked:
     try:
-        composed = compose(command, overrides=with_shares_replaced(overrides), return_hydra_config=True)
+        composed = compose(
+            command, overrides=with_shares_replaced(overrides), return_hydra_config=True
+        )
     except AssertionError as error:  # OmegaConf's own check
         below = [key for key in (each.partition("=")[0] for each in overrides) if "." in key]
         nested = ", ".join(key for key in below if not key.startswith("hydra."))
@@ -302,7 +352,10 @@ def _check_one(command: str, overrides: Sequence[str]) -> Checked:
 
 
 def sentence(error: BaseException) -> str:
-    """An error of Hydra, OmegaConf or the file system in one sentence: the value, what was expected, what to do."""
+    """An error of Hydra, OmegaConf or the file system in one sentence.
+
+    The value, what was expected, what to do.
+    """
     if isinstance(error, UserError):
         return one_line(error) + "."
     if isinstance(error, MissingConfigException):  # an OSError, too
@@ -317,9 +370,13 @@ def sentence(error: BaseException) -> str:
         return f"{error.override}: not of the form key=value; quote values with spaces or brackets, {HELP}."
     if isinstance(error, OverflowError):
         key = re.search(r"full_key: (\S+)", str(error))
-        return f"{key[1] if key else 'one of the numbers'}: too large; give a number of fewer digits."
+        return (
+            f"{key[1] if key else 'one of the numbers'}: too large; give a number of fewer digits."
+        )
     found = error if isinstance(error, OmegaConfBaseException) else error.__cause__
-    return value_sentence(found) if isinstance(found, OmegaConfBaseException) else _composition(error)
+    return (
+        value_sentence(found) if isinstance(found, OmegaConfBaseException) else _composition(error)
+    )
 
 
 def _composition(error: BaseException) -> str:
@@ -327,7 +384,9 @@ def _composition(error: BaseException) -> str:
     text = one_line(error)
     group = re.search(r"Could not override '([^']+)'", text)
     if group:
-        hint = f" (did you mean {group[1]}s=[NAME,NAME]?)" if group[1] in ("agent", "traffic") else ""
+        hint = (
+            f" (did you mean {group[1]}s=[NAME,NAME]?)" if group[1] in ("agent", "traffic") else ""
+        )
         return f"{group[1]}: not an option of this command{hint}; {HELP}."
     sweep = re.search(r"Ambiguous value for argument '([^']+)'", text)
     if sweep:

@@ -1,4 +1,7 @@
-"""Roots of the commands: what all share; ``ganlane evaluate``, ``reproduce``, ``record`` and ``bench``."""
+"""Roots of the commands: what all share.
+
+``ganlane evaluate``, ``reproduce``, ``record`` and ``bench``.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,8 @@ class RunConfig(Record):
 
     Attributes:
         seed: of all random numbers.
-        threads: torch's threads; 0: one, which measured fastest (more are far slower where other work runs).
+        threads: torch's threads; 0: one, which measured fastest (more are far slower where other
+            work runs).
         device: cpu or cuda.
         columns: of printed tables; auto: as many as the terminal has room for; all.
     """
@@ -42,7 +46,9 @@ class RunConfig(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.device == "cuda" and not has_cuda():
-            raise UserError("device=cuda: torch sees no CUDA device here; use device=cpu or install torch for CUDA.")
+            raise UserError(
+                "device=cuda: torch sees no CUDA device here; use device=cpu or install torch for CUDA."
+            )
 
 
 def has_cuda() -> bool:
@@ -94,12 +100,14 @@ FEWER = {
 }
 _COUNTS = Rule(
     lambda counts: (
-        counts is None or (isinstance(counts, dict) and all(type(n) is int and n >= 2 for n in counts.values()))
+        counts is None
+        or (isinstance(counts, dict) and all(type(n) is int and n >= 2 for n in counts.values()))
     ),
     "names of traffics with whole numbers of at least 2",
 )
 _WITH_MOBIL = Rule(
-    lambda names: "mobil" in names and len(names) > 1, "mobil and others, since every lead is one over mobil"
+    lambda names: "mobil" in names and len(names) > 1,
+    "mobil and others, since every lead is one over mobil",
 )
 _DATASET = Rule(
     lambda name: re.fullmatch(r"(\w[\w-]*/)*\w[\w-]*-v\d+", name, re.ASCII) is not None,
@@ -112,9 +120,10 @@ class EvaluateConfig(DrivingConfig):
     """Agents x traffics, the same episodes for all of them.
 
     Attributes:
-        agents: mobil, mobil_egoistic, keep_lane, random_legal, random; agent_idm and others that ship (agent_idm@1:
-            its recipe trained with seed 1, agent_idm@all: with every seed there is); a checkpoint's path; the import
-            path of a policy of your own. The normalised score needs mobil and random_legal.
+        agents: mobil, mobil_egoistic, keep_lane, random_legal, random; agent_idm and others that
+            ship (agent_idm@1: its recipe trained with seed 1, agent_idm@all: with every seed there
+            is); a checkpoint's path; the import path of a policy of your own. The normalised score
+            needs mobil and random_legal.
         traffics: options of the group traffic, or the import path of a traffic model of your own.
         episodes: the episodes 0 to episodes - 1 of the seed and stream.
         num_envs: episodes driven side by side, at most.
@@ -122,7 +131,9 @@ class EvaluateConfig(DrivingConfig):
         traffic_options: the traffics' keys.
     """
 
-    agents: Names = field(default_factory=lambda: ["mobil", "keep_lane", "random_legal", "agent_idm"])
+    agents: Names = field(
+        default_factory=lambda: ["mobil", "keep_lane", "random_legal", "agent_idm"]
+    )
     traffics: Names = field(default_factory=lambda: ["idm", "idm_mobil", "gan", "gan_calibrated"])
     episodes: Episodes = 100
     num_envs: Environments = 512
@@ -139,8 +150,19 @@ class EvaluateConfig(DrivingConfig):
 
 
 def _paper_agents() -> list[str]:
-    behind = [f"{agent}@all+{mask}" for agent in ("agent_idm", "agent_gan") for mask in ("none", "legal", "safe")]
-    return ["random_legal", "keep_lane", "mobil", "mobil_egoistic", *behind, "agent_general@all+safe"]
+    behind = [
+        f"{agent}@all+{mask}"
+        for agent in ("agent_idm", "agent_gan")
+        for mask in ("none", "legal", "safe")
+    ]
+    return [
+        "random_legal",
+        "keep_lane",
+        "mobil",
+        "mobil_egoistic",
+        *behind,
+        "agent_general@all+safe",
+    ]
 
 
 @dataclass
@@ -148,16 +170,21 @@ class ReproduceConfig(EvaluateConfig):
     """Every driver on every traffic, on the same episodes: tables and figures in one folder.
 
     Attributes:
-        source: shipped: the agents that ship; scratch: train the paper's agents first, seed by seed (hours). May be
-            given as from=.
+        source: shipped: the agents that ship; scratch: train the paper's agents first, seed by seed
+            (hours). May be given as from=.
         agents: as of ganlane evaluate; agent_idm@all: every training of its recipe.
-        traffics: options of the group traffic; what is not installed or not at hand is left out, with the reason.
-        fewer: number of episodes on slow traffics, where it is smaller than episodes; it changes or adds to
-            {idm_faults: 500, idm_random: 400, gan: 120, gan_calibrated: 100, replay: 100, sumo: 8, highway_env: 3}.
+        traffics: options of the group traffic; what is not installed or not at hand is left out,
+            with the reason.
+        fewer: number of episodes on slow traffics, where it is smaller than episodes; it changes or
+            adds to {idm_faults: 500, idm_random: 400, gan: 120, gan_calibrated: 100, replay: 100,
+            sumo: 8, highway_env: 3}.
         workers: processes that drive.
-        cells: folder of what was driven; a pair of driver and traffic that is there is not driven again.
-        crashes: so many per driver and traffic, the earliest, are listed in crashes.json with their actions.
-        runs: folders of training runs for the learning curves, each with the folder pretrain of its first phase.
+        cells: folder of what was driven; a pair of driver and traffic that is there is not driven
+            again.
+        crashes: so many per driver and traffic, the earliest, are listed in crashes.json with their
+            actions.
+        runs: folders of training runs for the learning curves, each with the folder pretrain of its
+            first phase.
         training_seeds: of source=scratch.
         trained: of source=scratch: folder of the trainings; those in it go on where they stopped.
     """
@@ -172,7 +199,9 @@ class ReproduceConfig(EvaluateConfig):
     cells: str = "outputs/cells"
     crashes: Annotated[int, between(0, 100)] = 3
     runs: list[str] = field(default_factory=list)
-    training_seeds: Annotated[list[Seed], DIFFERENT] = field(default_factory=lambda: [0, 1, 2, 3, 4])
+    training_seeds: Annotated[list[Seed], DIFFERENT] = field(
+        default_factory=lambda: [0, 1, 2, 3, 4]
+    )
     trained: str = "outputs/scratch"
 
     def episodes_on(self, traffic: str) -> int:
@@ -204,7 +233,10 @@ class RecordConfig(DrivingConfig):
 
     def dataset_name(self) -> str:
         """The dataset's name; by default made from traffic and driver."""
-        parts = (re.sub(r"[^A-Za-z0-9_]+", "_", part).strip("_") for part in (self.traffic.label(), self.driver))
+        parts = (
+            re.sub(r"[^A-Za-z0-9_]+", "_", part).strip("_")
+            for part in (self.traffic.label(), self.driver)
+        )
         return self.dataset or f"ganlane/{'/'.join(parts)}-v0"
 
 
@@ -215,7 +247,9 @@ _QUICK_STORED = 1000
 
 Batch: TypeAlias = Annotated[int, between(1, 2**20)]
 Batches: TypeAlias = Annotated[list[Batch], DIFFERENT]
-_PAIR = Rule(lambda pair: len(pair) == 2 and pair[0] < pair[1], "two batch sizes, the smaller one first")
+_PAIR = Rule(
+    lambda pair: len(pair) == 2 and pair[0] < pair[1], "two batch sizes, the smaller one first"
+)
 
 
 @dataclass
@@ -223,18 +257,20 @@ class BenchConfig(Record):
     """What to measure, how often, and where to write the results.
 
     Attributes:
-        suite: sim: the simulator, bare and as a whole environment; traffic: every traffic model; train: the training
-            loop, compared with stable-baselines3 on HighwayEnv.
-        quick: true: a check that it runs: small batches, two short repetitions, no memory, training in one mode.
+        suite: sim: the simulator, bare and as a whole environment; traffic: every traffic model;
+            train: the training loop, compared with stable-baselines3 on HighwayEnv.
+        quick: true: a check that it runs: small batches, two short repetitions, no memory, training
+            in one mode.
         batches: environments side by side.
-        modes: eager: env.kernel=torch; compiled: the same with env.compile=true; native: env.kernel=native.
-            Training is compiled in the last two.
+        modes: eager: env.kernel=torch; compiled: the same with env.compile=true; native:
+            env.kernel=native. Training is compiled in the last two.
         threads: torch's threads; a GPU is measured with the first number alone.
         devices: [cpu], [cuda] or both; null: the CPU, and a GPU where there is one.
         vehicle_counts: for the growth with the vehicles, at the density of env=dense.
         scaling_batch: the batch at which that is measured.
         linear_from: batches from here on are measured side by side for the growth with the batch.
-        memory_batches: memory per environment is measured between these two, each in a fresh process.
+        memory_batches: memory per environment is measured between these two, each in a fresh
+            process.
         traffics: of suite=traffic: options of the group traffic.
         traffic_batches: environments side by side, of suite=traffic.
         train_traffics: of suite=train: options of the group traffic.
@@ -242,7 +278,8 @@ class BenchConfig(Record):
         train_stored: transitions in the replay buffer when the clock starts.
         repetitions: turns of every case; cases of a group take turns, medians are reported.
         seconds: a turn lasts about so long, or as long as one decision does, s.
-        peers: a peer's simulator or learner in every group, if it is installed (extra 'bench'; EnvPool by itself).
+        peers: a peer's simulator or learner in every group, if it is installed (extra 'bench';
+            EnvPool by itself).
         memory: peak memory of every case, each in a fresh process.
         report: a document whose tables to rewrite, for instance docs/performance.md.
         seed: of all random numbers.
@@ -252,10 +289,16 @@ class BenchConfig(Record):
     suite: Annotated[str, one_of(("sim", "traffic", "train"))] = "sim"
     quick: bool = False
     batches: Batches = field(default_factory=lambda: [1, 16, 64, 256, 1024, 4096, 16384])
-    modes: Annotated[list[Annotated[str, one_of(MODES)]], DIFFERENT] = field(default_factory=lambda: list(MODES))
-    threads: Annotated[list[Annotated[int, between(1, 1024)]], DIFFERENT] = field(default_factory=lambda: [1, 2])
+    modes: Annotated[list[Annotated[str, one_of(MODES)]], DIFFERENT] = field(
+        default_factory=lambda: list(MODES)
+    )
+    threads: Annotated[list[Annotated[int, between(1, 1024)]], DIFFERENT] = field(
+        default_factory=lambda: [1, 2]
+    )
     devices: Annotated[list[Annotated[str, one_of(DEVICES)]], DIFFERENT] | None = None
-    vehicle_counts: Annotated[list[Vehicles], DIFFERENT] = field(default_factory=lambda: [9, 15, 30, 60])
+    vehicle_counts: Annotated[list[Vehicles], DIFFERENT] = field(
+        default_factory=lambda: [9, 15, 30, 60]
+    )
     scaling_batch: Batch = 1024
     linear_from: Batch = 1024
     memory_batches: Annotated[list[Batch], _PAIR] = field(default_factory=lambda: [1024, 4096])
@@ -280,7 +323,9 @@ class BenchConfig(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         if "cuda" in (self.devices or ()) and not has_cuda():
-            raise UserError("devices: torch sees no CUDA device here; leave cuda out or install torch for CUDA.")
+            raise UserError(
+                "devices: torch sees no CUDA device here; leave cuda out or install torch for CUDA."
+            )
         least, most = self.agent.batch_size, self.agent.capacity
         if not least <= self.train_stored <= most:
             raise UserError(
@@ -306,7 +351,8 @@ class BenchConfig(Record):
         return DEVICES if has_cuda() else DEVICES[:1]
 
     def shortened(self) -> BenchConfig:
-        """With ``quick``, at most seconds of measuring: small batches, two short repetitions, no memory.
+        """With ``quick``, at most seconds of measuring: small batches, two short repetitions, no
+        memory.
 
         Training is not compiled then: that alone takes longer.
         """

@@ -1,8 +1,8 @@
 """``env=...``: road, vehicles, initial scenes, and the end of an episode.
 
-``env=highway`` and ``env=dense`` start with random scenes. ``env=cut_in, stalled_car, blocked_lane, stop_and_go``
-start with a scene made by :mod:`ganlane.sim.scenarios`, ``env=scene`` with one from a file
-(:mod:`ganlane.sim.scenarios`).
+``env=highway`` and ``env=dense`` start with random scenes.
+``env=cut_in, stalled_car, blocked_lane, stop_and_go`` start with a scene made by
+:mod:`ganlane.sim.scenarios`, ``env=scene`` with one from a file (:mod:`ganlane.sim.scenarios`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 Vehicles: TypeAlias = Annotated[int, between(2, 1000)]
 #: Keys of Table II, which do not apply to a given scene.
-TABLE_II_KEYS = tuple(field.name for field in fields(SpawnParameters) if field.name != "ego_desired_speed_mps")
+TABLE_II_KEYS = tuple(
+    field.name for field in fields(SpawnParameters) if field.name != "ego_desired_speed_mps"
+)
 
 
 @dataclass(frozen=True)
@@ -42,14 +44,17 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
     Attributes:
         vehicles: M, the ego included, 2 (Table III has no entry for fewer) to 1000.
         lanes: 1 to 20.
-        lane_width_m: above the vehicles' width; the paper gives none. In narrower lanes noise alone makes cars of
-            2.5 m touch.
-        recycle: true: vehicles that the ego leaves 200 m behind return ahead of it, and the reverse.
+        lane_width_m: above the vehicles' width; the paper gives none. In narrower lanes noise alone
+            makes cars of 2.5 m touch.
+        recycle: true: vehicles that the ego leaves 200 m behind return ahead of it, and the
+            reverse.
         recycle_share: share of the episodes in which they do, 0 to 1.
-        compile: true: physics, traffic and the agent's update as compiled graphs (needs a C++ compiler); faster,
-            after a minute or so of compiling, and the same up to rounding (docs/performance.md).
-        kernel: what drives a decision: the tensor code (torch), the native kernel (native), which does the same up to
-            rounding for traffic=idm and idm_mobil on a CPU, or the kernel where it can (auto).
+        compile: true: physics, traffic and the agent's update as compiled graphs (needs a C++
+            compiler); faster, after a minute or so of compiling, and the same up to rounding
+            (docs/performance.md).
+        kernel: what drives a decision: the tensor code (torch), the native kernel (native), which
+            does the same up to rounding for traffic=idm and idm_mobil on a CPU, or the kernel where
+            it can (auto).
         ego: how the ego drives.
         idm: how all follow, Table V.
         mobil: how the others change lanes, Table IV.
@@ -83,7 +88,8 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
 
     def _check_start(self) -> None:
         """Raise an error if initial scenes do not fit on the road, or make a crash unavoidable."""
-        # The check imports torch. The defaults are valid, so a mistake elsewhere is reported without it.
+        # The check imports torch. The defaults are valid, so a mistake elsewhere is reported
+        # without it.
         asked = (self.spawn_parameters(), self.vehicles, self.lanes, self.idm)
         if asked == (SpawnParameters(), EnvConfig.vehicles, EnvConfig.lanes, IdmParameters()):
             return
@@ -105,7 +111,9 @@ class EnvConfig(SpawnParameters, EpisodeParameters):
 
 
 def check_reward(env: EnvConfig, reward: RewardParameters) -> None:
-    """Raise an error unless the ego's desired speed, where the speed reward is 1, is above its base speed (0)."""
+    """Raise an error unless the ego's desired speed, where the speed reward is 1, is above its base
+    speed (0).
+    """
     if env.ego_desired_speed_mps <= reward.base_speed_mps:
         raise ParameterError(
             f"{{env.ego_desired_speed_mps}}={env.ego_desired_speed_mps:g}: expected more than "
@@ -116,7 +124,8 @@ def check_reward(env: EnvConfig, reward: RewardParameters) -> None:
 
 @dataclass(frozen=True)
 class DenseEnvConfig(EnvConfig):
-    """``env=dense``: more vehicles, with a spread that grows with their number at the paper's density.
+    """``env=dense``: more vehicles, with a spread that grows with their number at the paper's
+    density.
 
     Attributes:
         metres_per_vehicle: spread_m is at least this times vehicles, m; Table II has 200 m for 9.
@@ -192,7 +201,9 @@ class SceneEnvConfig(EnvConfig):
             jitter_m=self.scene.jitter_m,
             jitter_mps=self.scene.jitter_mps,
             ego_visibility=Visibility.named(self.ego.visibility),
-            others_visibility=Visibility.SIGNALLED if others_visibility is None else others_visibility,
+            others_visibility=Visibility.SIGNALLED
+            if others_visibility is None
+            else others_visibility,
             name=self.name(),
         )
 
@@ -237,7 +248,8 @@ class CutInOptions(SceneOptions):
 
 @dataclass(frozen=True)
 class CutInEnvConfig(SceneEnvConfig):
-    """``env=cut_in`` (:func:`ganlane.sim.scenarios.cut_in`); what matters is over in seconds, hence the near goal.
+    """``env=cut_in`` (:func:`ganlane.sim.scenarios.cut_in`); what matters is over in seconds, hence
+    the near goal.
 
     Attributes:
         vehicles: 0: as many as the scene has (6).
@@ -267,7 +279,8 @@ class StalledCarOptions(SceneOptions):
 
 @dataclass(frozen=True)
 class StalledCarEnvConfig(SceneEnvConfig):
-    """``env=stalled_car`` (:func:`ganlane.sim.scenarios.stalled_car`); who does not pass in two minutes never will.
+    """``env=stalled_car`` (:func:`ganlane.sim.scenarios.stalled_car`); who does not pass in two
+    minutes never will.
 
     Attributes:
         vehicles: 0: as many as the scene has (8; 3 on a road of one lane).
@@ -386,7 +399,9 @@ class FileSceneEnvConfig(SceneEnvConfig):
         from ganlane.sim.scenarios import read_scene, with_ego_speed
 
         if self.scene.path is None:
-            raise ParameterError("{scene.path}: no file; give one, env=scene {scene.path}=my_scene.csv.")
+            raise ParameterError(
+                "{scene.path}: no file; give one, env=scene {scene.path}=my_scene.csv."
+            )
         scene = read_scene(self.scene.path, self.lanes or None, self.lane_width_m or None)
         speed = self.ego_desired_speed_mps
         return with_ego_speed(scene, speed) if speed else scene

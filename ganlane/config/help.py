@@ -1,4 +1,7 @@
-"""``--help`` and ``--help-all`` from docstrings and YAML files; options and keys completed in a shell by Hydra."""
+"""``--help`` and ``--help-all`` from docstrings and YAML files.
+
+Options and keys completed in a shell by Hydra.
+"""
 
 from __future__ import annotations
 
@@ -45,17 +48,26 @@ def help_text(command: str, everything: bool = True) -> str:
     """The text of ``ganlane COMMAND --help-all``; unless ``everything``, that of ``--help``."""
     chosen = chosen_options(command)
     groups = {mount: option for mount, option in chosen.items() if "@" not in mount}
-    listed = [_options(*each) for each in chosen.items()] if everything else map(_names, groups, groups.values())
+    listed = (
+        [_options(*each) for each in chosen.items()]
+        if everything
+        else map(_names, groups, groups.values())
+    )
     parts = [
         _purpose(command),
         "options (GROUP=NAME; * is the default)\n" + "\n".join(listed),
-        "keys (KEY=VALUE)\n" + "\n".join(key_lines(SCHEMAS[""][command], {}, 2, {*groups, "traffic_options"})),
+        "keys (KEY=VALUE)\n"
+        + "\n".join(key_lines(SCHEMAS[""][command], {}, 2, {*groups, "traffic_options"})),
     ]
     for group, option in groups.items() if everything else ():
         if option is not None:
             lines = key_lines(*option_of(group, option), 4)
             parts.append("\n".join([f"keys of {group}={option}", f"  {group}:", *lines]))
-    more = [] if everything else [f"ganlane {command} --help-all explains every option, and lists their keys."]
+    more = (
+        []
+        if everything
+        else [f"ganlane {command} --help-all explains every option, and lists their keys."]
+    )
     return "\n\n".join([*parts, *more, _FLAGS.format(command=command)])
 
 
@@ -77,7 +89,10 @@ def _options(mount: str, default: str | None) -> str:
         return f"  {place}.KEY: the keys of traffic={default} (ganlane train --help shows some)"
     if place:
         return f"  {mount}: the options of {group}; {as_typed(default)} by default"
-    lines = [f"   {'*' if name == default else ' '} {name:<18}{summary(group, name)}" for name in options_of(group)]
+    lines = [
+        f"   {'*' if name == default else ' '} {name:<18}{summary(group, name)}"
+        for name in options_of(group)
+    ]
     return "\n".join([f"  {mount}", *lines])
 
 
@@ -89,16 +104,24 @@ def summary(group: str, name: str) -> str:
 
 
 def key_lines(
-    kind: Any, values: Mapping[str, Any], indent: int, without: set[str] | frozenset[str] = frozenset()
+    kind: Any,
+    values: Mapping[str, Any],
+    indent: int,
+    without: set[str] | frozenset[str] = frozenset(),
 ) -> Iterator[str]:
-    """A line for every key of a dataclass: its default, or its value in ``values``, and what it means."""
+    """A line for every key of a dataclass.
+
+    Its default, or its value in ``values``, and what it means.
+    """
     for field in fields(kind):
         if field.name in without or field.metadata == NO_KEY:
             continue
         default = field.default if field.default_factory is MISSING else field.default_factory()
         value, key = values.get(field.name, default), f"{' ' * indent}{field.name}:"
         # The first sentence on it in the docstring of its class or of a base class.
-        meaning = next((found for base in kind.__mro__ if (found := _attributes(base).get(field.name))), "")
+        meaning = next(
+            (found for base in kind.__mro__ if (found := _attributes(base).get(field.name))), ""
+        )
         if is_dataclass(value):
             yield from _lines(key, meaning)
             own = {known.name: getattr(value, known.name) for known in fields(value)}
@@ -120,7 +143,10 @@ def _attributes(kind: type) -> dict[str, str]:
     _, _, section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
     items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, flags=re.MULTILINE)
     joined = {name: " ".join(text.split()) for name, text in items}
-    return {name: _plain(re.split(r"\.(?= [A-Z])", text)[0].rstrip(".")) for name, text in joined.items()}
+    return {
+        name: _plain(re.split(r"\.(?= [A-Z])", text)[0].rstrip("."))
+        for name, text in joined.items()
+    }
 
 
 def _plain(text: str) -> str:

@@ -1,4 +1,7 @@
-"""Configurations of the commands that read recordings: ``ganlane prepare``, ``train_generator``, ``realism``."""
+"""Configurations of the commands that read recordings.
+
+``ganlane prepare``, ``train_generator``, ``realism``.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,8 @@ _QUICK_S = 30.0
 
 @dataclass
 class PrepareConfig(RunConfig):
-    """Recordings, and where their Parquet goes. Nothing is drawn at random; polars takes its own number of threads.
+    """Recordings, and where their Parquet goes. Nothing is drawn at random; polars takes its own
+    number of threads.
 
     Attributes:
         seed: of no effect.
@@ -46,7 +50,9 @@ class PrepareConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.device != "cpu":
-            raise UserError(f"device={self.device}: recordings are prepared on the CPU; use device=cpu.")
+            raise UserError(
+                f"device={self.device}: recordings are prepared on the CPU; use device=cpu."
+            )
         if self.data.format != "scenes" and self.data.path is None:
             raise UserError(f"data={self.data.format}: which file is missing; give data.path=FILE.")
 
@@ -56,8 +62,10 @@ class TrainGeneratorConfig(RunConfig):
     """Recordings, what is fitted to them, and how it is measured.
 
     Attributes:
-        folds: fit this many more, each without the scenes of its fold, and pool their errors; 0: none.
-        ablations: true: fit the preset with one part changed at a time, each with a quarter of the updates.
+        folds: fit this many more, each without the scenes of its fold, and pool their errors; 0:
+            none.
+        ablations: true: fit the preset with one part changed at a time, each with a quarter of the
+            updates.
         resume: folder of an earlier run: what was fitted there is not fitted again.
     """
 
@@ -70,11 +78,17 @@ class TrainGeneratorConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.folds == 1:
-            raise UserError("folds=1: one fold leaves nothing to fit to; use 2 or more, or 0 for none.")
+            raise UserError(
+                "folds=1: one fold leaves nothing to fit to; use 2 or more, or 0 for none."
+            )
         if self.resume is not None and not Path(self.resume).is_dir():
-            raise UserError(f"resume={self.resume}: no such folder; give the folder of an earlier run.")
+            raise UserError(
+                f"resume={self.resume}: no such folder; give the folder of an earlier run."
+            )
         if self.device != "cpu":
-            raise UserError(f"device={self.device}: generators are fitted on the CPU, in minutes; use device=cpu.")
+            raise UserError(
+                f"device={self.device}: generators are fitted on the CPU, in minutes; use device=cpu."
+            )
 
 
 @dataclass
@@ -82,11 +96,12 @@ class RealismConfig(RunConfig):
     """A traffic, what it is compared with, the recordings, and how much is driven.
 
     Attributes:
-        against: further traffics from the same starts: options of the group traffic, or the import path of a model of
-            your own.
+        against: further traffics from the same starts: options of the group traffic, or the import
+            path of a model of your own.
         scenes: starts: held_out (data.held_out) or all, those that the generator was fitted to too.
         repeats: times that every scene is driven, with other random numbers.
-        desired_above_mps: mean excess of desired speeds over the speed at entry, m/s; null: fitted per traffic.
+        desired_above_mps: mean excess of desired speeds over the speed at entry, m/s; null: fitted
+            per traffic.
         long_vehicles: long runs without an ego, with so many vehicles each.
         vehicle_km: at least so many in every long run; 0 leaves them out.
         long_s: no episode of a long run lasts longer, s.
@@ -98,7 +113,8 @@ class RealismConfig(RunConfig):
         report: write the tables into this document, between the markers of this card.
         figures: write the figures into this folder too, as realism_NAME.png.
         generator: weights of generated traffic.
-        fold_weights: generators of k folds: every scene is driven by the one that was fitted without it.
+        fold_weights: generators of k folds: every scene is driven by the one that was fitted
+            without it.
         traffic_options: the keys of the traffics of against.
     """
 
@@ -128,16 +144,22 @@ class RealismConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.device != "cpu":
-            raise UserError(f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu.")
+            raise UserError(
+                f"device={self.device}: the card is made on the CPU, in minutes; use device=cpu."
+            )
         if self.traffic.label() in _WITHOUT_CARD:
-            raise UserError(f"traffic={self.traffic.label()}: {_WITHOUT_CARD[self.traffic.label()]}.")
+            raise UserError(
+                f"traffic={self.traffic.label()}: {_WITHOUT_CARD[self.traffic.label()]}."
+            )
         if self.data.format != "scenes":
             raise UserError(
                 f"data={self.data.format}: the card reads scenes; run ganlane prepare data={self.data.format} first, "
                 "and give data=scenes data.path=FOLDER with what it wrote."
             )
         if self.publish and self.scenes != "all":
-            raise UserError("publish=true: the file that ships is made from all recorded scenes; give scenes=all.")
+            raise UserError(
+                "publish=true: the file that ships is made from all recorded scenes; give scenes=all."
+            )
         self.rivals()
 
     def card(self) -> str:
@@ -153,7 +175,10 @@ class RealismConfig(RunConfig):
         return chosen_traffics("against", names, self.traffic_options)
 
     def shortened(self) -> RealismConfig:
-        """With ``quick``, a check that it runs: one repeat, nothing fitted, few vehicle-km, I-80 if asked for."""
+        """With ``quick``, a check that it runs.
+
+        One repeat, nothing fitted, few vehicle-km, I-80 if asked for.
+        """
         if not self.quick:
             return self
         return replace(

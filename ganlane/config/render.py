@@ -69,7 +69,9 @@ class FilmConfig(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.end_s is not None and self.end_s <= self.start_s:
-            raise ParameterError(f"{{end_s}}={self.end_s:g}: expected more than {{start_s}}={self.start_s:g}.")
+            raise ParameterError(
+                f"{{end_s}}={self.end_s:g}: expected more than {{start_s}}={self.start_s:g}."
+            )
 
 
 @dataclass
@@ -77,7 +79,8 @@ class CurvesConfig(Record):
     """``curves``: learning curves of training runs.
 
     Attributes:
-        columns: of metrics.csv and evaluation_NAME of evaluation.csv; null: the ones that matter most.
+        columns: of metrics.csv and evaluation_NAME of evaluation.csv; null: the ones that matter
+            most.
         smooth: rows that a running mean takes in.
     """
 
@@ -92,14 +95,15 @@ class RenderConfig(DrivingConfig):
     Attributes:
         driver: agent=NAME says the same: a name, path or import path as in ganlane evaluate.
         episode: of the seed, on the stream kept for reports: the episodes of ganlane evaluate.
-        agents: html, csv, parquet: several instead of driver, for instance agents=[mobil,agent_idm].
+        agents: html, csv, parquet: several instead of driver, for instance
+            agents=[mobil,agent_idm].
         episodes: html, csv, parquet: several instead of episode, for instance episodes=[0,1,2].
         run: instead of an episode: learning curves of runs, run=FOLDER or run=FOLDER,FOLDER.
-        crashes: instead of an episode: the crashes.json of ganlane reproduce, whose episodes are driven again with
-            their actions; agents, episodes and traffics choose among them.
+        crashes: instead of an episode: the crashes.json of ganlane reproduce, whose episodes are
+            driven again with their actions; agents, episodes and traffics choose among them.
         traffics: of crashes: on these traffics alone.
-        format: gif, mp4 (needs the extra 'video'), png (a strip of four frames), html (a player), csv or parquet
-            (trajectories); null: the ending of out, else gif.
+        format: gif, mp4 (needs the extra 'video'), png (a strip of four frames), html (a player),
+            csv or parquet (trajectories); null: the ending of out, else gif.
         out: file to write; null: into the run folder.
         film: how a film looks.
         curves: how learning curves look.
@@ -132,7 +136,9 @@ class RenderConfig(DrivingConfig):
                 f"out={self.out}: expected one of {', '.join(FORMATS)}; give the file one of these endings."
             )
         if ending and ending != self.kind:
-            raise UserError(f"out={self.out}: the ending says {ending} and format {self.kind}; give one of them.")
+            raise UserError(
+                f"out={self.out}: the ending says {ending} and format {self.kind}; give one of them."
+            )
         if self.run is not None and self.kind not in CHARTS:
             raise UserError(
                 f"format={self.kind}: learning curves are one of {', '.join(CHARTS)}; choose one of these."
@@ -151,10 +157,14 @@ class RenderConfig(DrivingConfig):
                     "crashes and run: either crashes or learning curves are drawn; leave one of them out."
                 )
             if self.kind in FILMS:
-                raise UserError(f"format={self.kind}: shows one episode; crashes are html, csv or parquet.")
+                raise UserError(
+                    f"format={self.kind}: shows one episode; crashes are html, csv or parquet."
+                )
             return
         if self.traffics is not None:
-            raise UserError(f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give traffic=NAME.")
+            raise UserError(
+                f"traffics={as_typed(self.traffics)}: goes with crashes=FILE; else give traffic=NAME."
+            )
         count = len(self.pairs())
         if self.kind in FILMS and count > 1:
             raise UserError(
@@ -169,7 +179,9 @@ class RenderConfig(DrivingConfig):
 
     @property
     def kind(self) -> str:
-        """``format``, else the ending of ``out``, else png for ``run``, html for ``crashes``, gif for episodes."""
+        """``format``, else the ending of ``out``, else png for ``run``, html for ``crashes``, gif
+        for episodes.
+        """
         default = "png" if self.run is not None else "gif" if self.crashes is None else "html"
         return self.format or self._ending() or default
 

@@ -48,9 +48,11 @@ CHANGED_SINCE_0_1 = ("total_decisions", "collector.num_envs", "evaluation.episod
 
 @contextmanager
 def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterator[None]:
-    """Context that removes a newly made folder, and newly made folders above it, if a mistake ends the run.
+    """Context that removes a newly made folder, and newly made folders above it, if a mistake ends
+    the run.
 
-    A folder with results, trained weights or a checkpoint is never removed, nor one that another process uses.
+    A folder with results, trained weights or a checkpoint is never removed, nor one that another
+    process uses.
 
     Args:
         folder: of the run or the sweep.
@@ -62,7 +64,11 @@ def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterato
         yield
     except BaseException as error:
         is_mistake = isinstance(error, UserError | OSError)
-        if is_mistake and not existed and not any(any(folder.rglob(name)) for name in (*EARNED, LOCK)):
+        if (
+            is_mistake
+            and not existed
+            and not any(any(folder.rglob(name)) for name in (*EARNED, LOCK))
+        ):
             shutil.rmtree(folder, ignore_errors=True)
             for parent in made:  # innermost first
                 if parent.is_dir() and not any(parent.iterdir()):
@@ -74,15 +80,20 @@ def cleared_after_mistakes(folder: Path, existed: bool | None = None) -> Iterato
 def held(folder: Path) -> Iterator[None]:
     """Context that makes and locks a run's folder.
 
-    Partial files of killed writes are removed. A refused run restores the command line of the run before it; a run
-    that fails after it has saved something keeps its own, so that it can be resumed.
+    Partial files of killed writes are removed. A refused run restores the command line of the run
+    before it; a run that fails after it has saved something keeps its own, so that it can be
+    resumed.
 
     Raises:
         UserError: another run uses the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder):
-        kept = {name: (folder / name).read_bytes() for name in (OVERRIDES, CONFIG) if (folder / name).is_file()}
+        kept = {
+            name: (folder / name).read_bytes()
+            for name in (OVERRIDES, CONFIG)
+            if (folder / name).is_file()
+        }
         before = earned(folder)
         try:
             yield
@@ -98,10 +109,11 @@ def held(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the system's lock on a file that names this process; the system releases it when the process dies.
+    """Hold the system's lock on a file that names this process; the system releases it when the
+    process dies.
 
-    So the file of a killed run blocks nobody, even if its process number is in use again. Without locks in the
-    operating or file system, nothing is locked.
+    So the file of a killed run blocks nobody, even if its process number is in use again. Without
+    locks in the operating or file system, nothing is locked.
 
     Raises:
         UserError: another run holds the lock.
@@ -142,8 +154,12 @@ def unused(folder: Path) -> Path:
 
     The name holds time and process, so two runs of a process within a second would share it.
     """
-    names = itertools.chain([folder.name], (f"{folder.name}_{number}" for number in itertools.count(2)))
-    return next(folder.with_name(name) for name in names if not (folder.with_name(name) / CONFIG).exists())
+    names = itertools.chain(
+        [folder.name], (f"{folder.name}_{number}" for number in itertools.count(2))
+    )
+    return next(
+        folder.with_name(name) for name in names if not (folder.with_name(name) / CONFIG).exists()
+    )
 
 
 def earned(folder: Path) -> set[tuple[Path, int]]:
@@ -159,7 +175,8 @@ def write_config(composed: Any, overrides: list[str], folder: Path) -> None:
 
 
 def stored_command(folder: Path, program: str, without: Sequence[str] = ()) -> str:
-    """The command line of the run in ``folder``, ``program`` first, without overrides that start as ``without`` says.
+    """The command line of the run in ``folder``, ``program`` first, without overrides that start as
+    ``without`` says.
 
     For a run that was started from Python, it says so in place of a command.
     """
@@ -174,7 +191,8 @@ def stored_command(folder: Path, program: str, without: Sequence[str] = ()) -> s
 
 
 def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list[str]:
-    """The overrides, preceded by those of the resumed run, with its folder as run folder; only ``train`` resumes so.
+    """The overrides, preceded by those of the resumed run, with its folder as run folder; only
+    ``train`` resumes so.
 
     Raises:
         UserError: there is no such run, or the command line is a sweep (``multirun``).
@@ -187,16 +205,22 @@ def with_resumed(command: str, overrides: Sequence[str], multirun: bool) -> list
         raise UserError(f"resume={asked}: one run is resumed at a time; start without -m.")
     run = newest_unfinished(_RUNS / command) if asked == "auto" else run_folder(Path(asked))
     if run is None:
-        print(f"resume=auto: no unfinished run below {_RUNS / command}; a new one is started.", file=sys.stderr)
+        print(
+            f"resume=auto: no unfinished run below {_RUNS / command}; a new one is started.",
+            file=sys.stderr,
+        )
         return without_repetitions([*overrides, "resume=null"])
     stored = [*_old_defaults(run), *_stored(run / OVERRIDES)]
-    return without_repetitions([*stored, *overrides, f"resume={quoted(run)}", f"hydra.run.dir={quoted(run)}"])
+    return without_repetitions(
+        [*stored, *overrides, f"resume={quoted(run)}", f"hydra.run.dir={quoted(run)}"]
+    )
 
 
 def _old_defaults(run: Path) -> list[str]:
     """Overrides with the old defaults, for a run that was started before train's defaults changed.
 
-    Such a run has no ``compile`` in its config.yaml, from which the numbers and the form of the mask are taken.
+    Such a run has no ``compile`` in its config.yaml, from which the numbers and the form of the
+    mask are taken.
     """
     try:
         config: Any = OmegaConf.load(run / CONFIG)
@@ -227,17 +251,22 @@ def _stored(path: Path) -> list[str]:
     kept = without_removed_overrides(map(str, found), str(path))
     for override in OverridesParser.create().parse_overrides(kept):
         if of_hydra(override):
-            raise UserError(f"{path}: {override.input_line}: Hydra is not set by a run's files; remove that line.")
+            raise UserError(
+                f"{path}: {override.input_line}: Hydra is not set by a run's files; remove that line."
+            )
     return kept
 
 
 def refuse_stored_imports(config: TrainConfig, overrides: Sequence[str]) -> None:
-    """Refuse code from outside the package that the run's files name, unless ``overrides``, the command line, do too.
+    """Refuse code from outside the package that the run's files name, unless ``overrides``, the
+    command line, do too.
 
     Raises:
         UserError: the run's files name a class or function of another package, or a Ray cluster.
     """
-    asked = [each for each in parse(overrides) if each.key_or_group.rpartition(".")[2] in _IMPORTED_BY]
+    asked = [
+        each for each in parse(overrides) if each.key_or_group.rpartition(".")[2] in _IMPORTED_BY
+    ]
     named = {name.partition("+")[0] for override in asked for name in leaves(override.value())}
     for key, path in _imports(config):
         if not path.startswith("ganlane.") and path not in named:
@@ -256,11 +285,15 @@ def _imports(config: TrainConfig) -> Iterator[tuple[str, str]]:
     for key, traffic in {**traffics, "evaluation.traffic": config.evaluation.traffic}.items():
         if traffic is not None:
             yield f"{key}._target_={traffic._target_}", traffic._target_
-            shares = ",".join(f"{name}:{share}" for name, share in getattr(traffic, "shares", {}).items())
+            shares = ",".join(
+                f"{name}:{share}" for name, share in getattr(traffic, "shares", {}).items()
+            )
             for name, part in traffic.parts().items():
                 known = name in getattr(traffic, "options", {})
                 yield (
-                    f"{key}.options.{name}._target_={part._target_}" if known else f"'{key}.shares={{{shares}}}'",
+                    f"{key}.options.{name}._target_={part._target_}"
+                    if known
+                    else f"'{key}.shares={{{shares}}}'",
                     part._target_,
                 )
     agents = config.evaluation.agents
@@ -277,21 +310,29 @@ def run_folder(path: Path) -> Path:
         UserError: there is no run.
     """
     if path.is_file() and path.name != "last.pt":
-        raise UserError(f"resume={path}: a run continues from its last.pt only; give the run's folder.")
+        raise UserError(
+            f"resume={path}: a run continues from its last.pt only; give the run's folder."
+        )
     for folder in [path, *path.parents[:3]] if path.exists() else []:
         if (folder / OVERRIDES).is_file() and any(folder.rglob("last.pt")):
             return folder
     expected = path / LAST if path.is_dir() else path
     if not expected.is_file():
-        raise UserError(f"resume={path}: no checkpoint there ({expected}); give a run's folder, its {LAST}, or auto.")
-    raise UserError(f"resume={path}: {OVERRIDES} is missing there; give the folder that the run was written to.")
+        raise UserError(
+            f"resume={path}: no checkpoint there ({expected}); give a run's folder, its {LAST}, or auto."
+        )
+    raise UserError(
+        f"resume={path}: {OVERRIDES} is missing there; give the folder that the run was written to."
+    )
 
 
 def newest_unfinished(runs: Path) -> Path | None:
     """The run with the newest checkpoint among those without results; None if there is none."""
     checkpoints = sorted(runs.rglob("last.pt"), key=lambda path: path.stat().st_mtime, reverse=True)
     for checkpoint in checkpoints:
-        folder = next((parent for parent in checkpoint.parents if (parent / OVERRIDES).is_file()), None)
+        folder = next(
+            (parent for parent in checkpoint.parents if (parent / OVERRIDES).is_file()), None
+        )
         if folder is not None and not (folder / "results.json").is_file():
             return folder
     return None

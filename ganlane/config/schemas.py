@@ -1,7 +1,9 @@
-"""Every option's dataclass as Hydra's schema: the ConfigStore, OmegaConf's nodes, and back to dataclasses.
+"""Every option's dataclass as Hydra's schema: the ConfigStore, OmegaConf's nodes, and back to
+dataclasses.
 
-A schema is called ``GROUP/NAME_schema``. The YAML of the same name under conf/ starts from it and holds what differs
-from its defaults. A key or value that does not fit a schema becomes one sentence.
+A schema is called ``GROUP/NAME_schema``. The YAML of the same name under conf/ starts from it and
+holds what differs from its defaults. A key or value that does not fit a schema becomes one
+sentence.
 """
 
 from __future__ import annotations
@@ -21,7 +23,13 @@ from ganlane.errors import ParameterError
 from ganlane.files import conf_folder
 from ganlane.parameters import did_you_mean
 from ganlane.parameters.agent import RainbowConfig
-from ganlane.parameters.generator import CalibratedConfig, DataConfig, HighdDataConfig, NgsimDataConfig, PaperConfig
+from ganlane.parameters.generator import (
+    CalibratedConfig,
+    DataConfig,
+    HighdDataConfig,
+    NgsimDataConfig,
+    PaperConfig,
+)
 from ganlane.parameters.observation import MaskParameters, ObservationConfig, RewardParameters
 
 #: Group (empty at the root) to schema name to dataclass.
@@ -64,7 +72,12 @@ SCHEMAS: dict[str, dict[str, Any]] = {
 }
 SUFFIX = "_schema"
 #: OmegaConf's names of types, in words.
-_TYPES = {"Integer": "a whole number", "Float": "a number", "bool": "true or false", "String": "a text"}
+_TYPES = {
+    "Integer": "a whole number",
+    "Float": "a number",
+    "bool": "true or false",
+    "String": "a text",
+}
 HELP = "run the command with --help to see all keys"
 
 
@@ -74,9 +87,15 @@ def register(command: str) -> None:
     for group, options in SCHEMAS.items():
         kept = store.repo.get(group, {}) if group else store.repo
         for name, schema in options.items():
-            # Storing a schema takes milliseconds, that of a command up to 80, and a command registers twice.
+            # Storing a schema takes milliseconds, that of a command up to 80, and a command
+            # registers twice.
             if f"{name}{SUFFIX}.yaml" not in kept and (group or name == command):
-                store.store(group=group or None, name=name + SUFFIX, node=node_of(schema), provider="ganlane")
+                store.store(
+                    group=group or None,
+                    name=name + SUFFIX,
+                    node=node_of(schema),
+                    provider="ganlane",
+                )
     OmegaConf.register_new_resolver("process_id", os.getpid, replace=True)
 
 
@@ -88,7 +107,12 @@ def options_of(group: str) -> list[str]:
 def chosen_options(command: str) -> dict[str, str | None]:
     """Mounted group to the option that the command's YAML chooses, in its order."""
     listed: Any = OmegaConf.to_container(OmegaConf.load(conf_folder() / f"{command}.yaml"))
-    return {mount: name for entry in listed["defaults"] if isinstance(entry, dict) for mount, name in entry.items()}
+    return {
+        mount: name
+        for entry in listed["defaults"]
+        if isinstance(entry, dict)
+        for mount, name in entry.items()
+    }
 
 
 def option_of(group: str, name: str) -> tuple[Any, dict[str, Any]]:
@@ -153,11 +177,17 @@ def value_sentence(error: OmegaConfBaseException) -> str:
     if isinstance(error, (ConfigKeyError, ConfigAttributeError)):
         if key.rpartition(".")[0].endswith(".parameters"):
             return f"{key}: to be added with +; write +{key}=VALUE."
-        known = sorted(map(str, error.parent_node.keys())) if OmegaConf.is_dict(error.parent_node) else []
+        known = (
+            sorted(map(str, error.parent_node.keys()))
+            if OmegaConf.is_dict(error.parent_node)
+            else []
+        )
         return unknown_key(key, [other for other in known if other != "hydra"])
     text = one_line(error.msg or str(error))
     value = re.search(r"[Vv]alue '(.*?)' ", text)
-    wanted = re.search(r"could not be converted to (\w+)", text) or re.search(r"not a valid (bool)", text)
+    wanted = re.search(r"could not be converted to (\w+)", text) or re.search(
+        r"not a valid (bool)", text
+    )
     if wanted and value and wanted[1] in _TYPES:
         typed = {"None": "null", "True": "true", "False": "false"}.get(value[1], value[1])
         return f"{key}={typed}: expected {_TYPES[wanted[1]]}; {HELP}."

@@ -1,8 +1,9 @@
 """``traffic=...``: who drives the other vehicles.
 
-``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function annotated to return one. It is called with
-those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks for, with the option's further keys and
-with ``parameters``. A model of your own needs no more than its import path::
+``_target_`` names a :class:`ganlane.traffic.TrafficModule` or a function annotated to return one.
+It is called with those of ``road, stream, idm, mobil, steering, spawn`` that its signature asks
+for, with the option's further keys and with ``parameters``. A model of your own needs no more than
+its import path::
 
     python -m ganlane.evaluate 'traffics=[my.module.MyTraffic]'
     python -m ganlane.train traffic=idm traffic._target_=my.module.MyTraffic +traffic.parameters.pace=0.9
@@ -28,7 +29,9 @@ from ganlane.parameters.driving import (
     SumoParameters,
 )
 
-ImportPath: TypeAlias = Annotated[str, Rule(is_import_path, "an import path such as my.module.MyTraffic")]
+ImportPath: TypeAlias = Annotated[
+    str, Rule(is_import_path, "an import path such as my.module.MyTraffic")
+]
 #: A larger sum would be a period of more episodes than anybody drives side by side.
 _MOST = 1000
 _SHARES = Rule(
@@ -66,15 +69,25 @@ class TrafficConfig(Record):
     def arguments(self) -> dict[str, Any]:
         """Keyword arguments that this option gives its target."""
         shared = {known.name for known in fields(TrafficConfig)}
-        own = {known.name: getattr(self, known.name) for known in fields(self) if known.name not in shared}
+        own = {
+            known.name: getattr(self, known.name)
+            for known in fields(self)
+            if known.name not in shared
+        }
         return {**own, **self.parameters}
 
     def parts(self) -> dict[str, TrafficConfig]:
-        """Traffics that the target is made of, by name; it is given the models made of them as ``parts``."""
+        """Traffics that the target is made of, by name.
+
+        It is given the models made of them as ``parts``.
+        """
         return {}
 
     def description(self) -> dict[str, Any]:
-        """Plain data by which a run is recognised; what has no effect, and older runs do not hold, is left out."""
+        """Plain data by which a run is recognised.
+
+        What has no effect, and older runs do not hold, is left out.
+        """
         described = _listed(asdict(self))
         if not self.blind_share:
             del described["blind_share"]
@@ -180,12 +193,14 @@ REACTING: dict[str, type[TrafficConfig]] = {
 class MixedTrafficConfig(TrafficConfig):
     """``traffic=mixed`` (:class:`ganlane.traffic.MixedTraffic`).
 
-    ``shares`` is null rather than its value, and of a free type, since a YAML file would add to names that are there.
-    A command line replaces them (:func:`ganlane.config.command_line.with_shares_replaced`).
+    ``shares`` is null rather than its value, and of a free type, since a YAML file would add to
+    names that are there. A command line replaces them
+    (:func:`ganlane.config.command_line.with_shares_replaced`).
 
     Attributes:
-        shares: options of this group (not replay), or import paths of your own models, with whole numbers: how many
-            of the episodes of a period belong to each; null: {idm_mobil: 1, gan: 1}.
+        shares: options of this group (not replay), or import paths of your own models, with whole
+            numbers: how many of the episodes of a period belong to each; null: {idm_mobil: 1, gan:
+            1}.
         options: the parts' keys: traffic.options.gan.noise_scale=0.5.
     """
 
@@ -241,7 +256,8 @@ def all_traffics() -> dict[str, TrafficConfig]:
 def chosen_traffics(
     key: str, names: Iterable[str], options: Mapping[str, TrafficConfig], own: bool = True
 ) -> dict[str, TrafficConfig]:
-    """The traffics of these names: ``options``, or (``own``) the import paths of a user's own models.
+    """The traffics of these names: ``options``, or (``own``) the import paths of a user's own
+    models.
 
     Raises:
         ParameterError: one is not known; ``key`` is the field that names it.

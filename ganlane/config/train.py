@@ -22,8 +22,10 @@ class InitConfig(Record):
 
     Attributes:
         path: a shipped agent's name, a .safetensors file, or a training run's folder or last.pt.
-        support: trained: its atoms, v_min and v_max instead of those of agent; run: both must agree.
-        optimizer: true: Adam's moments too; they are in a run's last.pt, not in a .safetensors file.
+        support: trained: its atoms, v_min and v_max instead of those of agent; run: both must
+            agree.
+        optimizer: true: Adam's moments too; they are in a run's last.pt, not in a .safetensors
+            file.
     """
 
     path: str | None = "agent_idm"
@@ -58,7 +60,8 @@ class CollectorConfig(Record):
     """``collector=single``: one process steps all environments side by side.
 
     Attributes:
-        num_envs: environments of the process, 1 to 65536; a step of the loop has a decision of each.
+        num_envs: environments of the process, 1 to 65536; a step of the loop has a decision of
+            each.
     """
 
     num_envs: Environments = 512
@@ -119,7 +122,8 @@ class RayCollectorConfig(MultiCollectorConfig):
     """``collector=ray``: the same on a Ray cluster.
 
     Attributes:
-        address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own here.
+        address: of the cluster's head: HOST:6379, ray://HOST:10001 or auto; null: a Ray of its own
+            here.
     """
 
     address: Text | None = None
@@ -130,7 +134,8 @@ class LoggerConfig(Record):
     """``logger=...``: logs of a training run in addition to ``metrics.csv``.
 
     Attributes:
-        kind: csv: nowhere else; tensorboard: event files in the run folder; wandb: Weights & Biases.
+        kind: csv: nowhere else; tensorboard: event files in the run folder; wandb: Weights &
+            Biases.
         progress: a bar on a terminal, plain lines elsewhere.
         project: of Weights & Biases.
     """
@@ -184,15 +189,18 @@ class TrainConfig(DrivingConfig):
 
     Attributes:
         total_decisions: of all environments together.
-        compile: always, never; auto: where compiling is known to work (:func:`ganlane.torch_settings.can_compile`)
-            and the training is long enough to gain by it (:data:`WORTH_COMPILING`). The final evaluation is compiled
-            with ``env.compile=true`` alone.
+        compile: always, never; auto: where compiling is known to work
+            (:func:`ganlane.torch_settings.can_compile`) and the training is long enough to gain by
+            it (:data:`WORTH_COMPILING`). The final evaluation is compiled with ``env.compile=true``
+            alone.
         log_every: decisions between two rows of metrics.csv.
-        evaluate_every: decisions between two evaluations while training (0: none); the best agent is kept.
+        evaluate_every: decisions between two evaluations while training (0: none); the best agent
+            is kept.
         selection_episodes: of each of those, on the stream kept for model selection.
         checkpoint_every_s: seconds between two resume checkpoints.
         checkpoint_replay: with the replay buffer: needed for a resumed run to be exact.
-        resume: PATH of a run's folder or checkpoint to go on with, or auto (the newest unfinished run).
+        resume: PATH of a run's folder or checkpoint to go on with, or auto (the newest unfinished
+            run).
         pretrain: a first phase on other traffic.
         evaluation: when training is over.
     """
@@ -230,7 +238,9 @@ class TrainConfig(DrivingConfig):
     def final_evaluation(self) -> EvaluateConfig:
         """Config of the final comparison, by default on the traffic of the training."""
         traffic = self.evaluation.traffic or self.traffic
-        shared = {name: getattr(self, name) for name in ("seed", "device", "env", "observation", "reward")}
+        shared = {
+            name: getattr(self, name) for name in ("seed", "device", "env", "observation", "reward")
+        }
         return EvaluateConfig(
             **shared,
             traffics=[traffic.label()],

@@ -1,9 +1,12 @@
 """Recorded traffic: readers of trajectory recordings into one schema, and statistics of driving.
 
-- ``schema`` defines the common form, validates it, and reads text tables with errors traced to line and column;
+- ``schema`` defines the common form, validates it, and reads text tables with errors traced to line
+  and column;
 - ``sources`` finds, fetches or generates recordings;
-- readers: ``ngsim``, ``highd``, and ``recordings`` (scene CSV, Parquet, any kind), which also prepares Parquet;
-- measuring: ``lanes`` treats recordings and simulations alike, ``statistics`` combines all measurements.
+- readers: ``ngsim``, ``highd``, and ``recordings`` (scene CSV, Parquet, any kind), which also
+  prepares Parquet;
+- measuring: ``lanes`` treats recordings and simulations alike, ``statistics`` combines all
+  measurements.
 """
 
 from ganlane.data.highd import highd_scenes
@@ -26,7 +29,16 @@ from ganlane.data.recordings import (
     write_prepared,
     write_scene_csv,
 )
-from ganlane.data.schema import FRAME_S, SCHEMA, TRACK, TRACK_STRIDE, RowCount, Scene, sort, validate
+from ganlane.data.schema import (
+    FRAME_S,
+    SCHEMA,
+    TRACK,
+    TRACK_STRIDE,
+    RowCount,
+    Scene,
+    sort,
+    validate,
+)
 from ganlane.data.sources import (
     SyntheticTraffic,
     byte_progress,

@@ -1,10 +1,12 @@
-"""highD recordings (Krajewski et al. 2018): three files each, 25 Hz, two directions of travel, into the schema.
+"""highD recordings (Krajewski et al. 2018): three files each, 25 Hz, two directions of travel, into
+the schema.
 
-Each direction becomes a scene of its own, in its drivers' view: ``x`` forward, ``y`` to the left, lane 0 rightmost.
-highD's images have ``y`` downwards and call the length of a vehicle its ``width``; ``x, y`` are the upper left
-corner of its bounding box. Vehicles of the upper lanes (direction 1) drive to the left in the image, those of the
-lower lanes (direction 2) to the right. Positions and speeds are interpolated linearly to 10 Hz; the lane is that of
-the nearest recorded frame. Positions are not smoothed.
+Each direction becomes a scene of its own, in its drivers' view: ``x`` forward, ``y`` to the left,
+lane 0 rightmost. highD's images have ``y`` downwards and call the length of a vehicle its
+``width``; ``x, y`` are the upper left corner of its bounding box. Vehicles of the upper lanes
+(direction 1) drive to the left in the image, those of the lower lanes (direction 2) to the right.
+Positions and speeds are interpolated linearly to 10 Hz; the lane is that of the nearest recorded
+frame. Positions are not smoothed.
 """
 
 from __future__ import annotations
@@ -45,7 +47,10 @@ LOWER: Final = 2
 
 @dataclass(frozen=True)
 class _Direction:
-    """One direction of travel; ``lane_ids`` from the rightmost, ``right_edge`` is the image's ``y`` in m."""
+    """One direction of travel.
+
+    ``lane_ids`` from the rightmost, ``right_edge`` is the image's ``y`` in m.
+    """
 
     number: int
     lane_ids: tuple[int, ...]
@@ -56,8 +61,8 @@ class _Direction:
 def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Scene]:
     """Two scenes, ``highd-XX-upper`` and ``highd-XX-lower``, for each recording.
 
-    ``path`` is an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``, or a folder of
-    them; rows read and dropped are added to ``count``.
+    ``path`` is an ``XX_tracks.csv`` next to its ``XX_tracksMeta.csv`` and ``XX_recordingMeta.csv``,
+    or a folder of them; rows read and dropped are added to ``count``.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
@@ -66,7 +71,9 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
     if path.is_dir():
         recordings = sorted(path.glob(f"*{_TRACKS}"))
         if not recordings:
-            raise UserError(f"{path}: no XX{_TRACKS} in this folder; give highD's data folder or one such file.")
+            raise UserError(
+                f"{path}: no XX{_TRACKS} in this folder; give highD's data folder or one such file."
+            )
     elif not path.name.endswith(_TRACKS):
         raise UserError(f"{path}: expected highD's XX{_TRACKS} or a folder of recordings.")
     else:
@@ -82,8 +89,15 @@ def highd_scenes(path: str | Path, count: RowCount | None = None) -> Iterator[Sc
 
 
 def _read_recording_meta(path: Path) -> tuple[float, tuple[_Direction, _Direction]]:
-    """Frame rate in Hz, and both directions. Lane ids grow downwards; the id between the directions is unused."""
-    columns = {"framerate": pl.Float64, "upperlanemarkings": pl.String, "lowerlanemarkings": pl.String}
+    """Frame rate in Hz, and both directions. Lane ids grow downwards.
+
+    The id between the directions is unused.
+    """
+    columns = {
+        "framerate": pl.Float64,
+        "upperlanemarkings": pl.String,
+        "lowerlanemarkings": pl.String,
+    }
     rate_hz, *markings = read_table(path, columns).select(columns.keys()).row(0)
     if rate_hz < 10.0:
         raise UserError(f"{path}, line 2, column framerate: {rate_hz}, expected 10 Hz or more.")
@@ -111,7 +125,10 @@ def _markings(text: str, path: Path, column: str) -> tuple[float, ...]:
 
 
 def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
-    """Rows of a recording, sorted by vehicle and frame; ``direction`` is its vehicle's in the ``meta`` file."""
+    """Rows of a recording, sorted by vehicle and frame.
+
+    ``direction`` is its vehicle's in the ``meta`` file.
+    """
     cars = read_table(meta, {"id": pl.Int64, "drivingdirection": pl.Int64})
     direction = cars["drivingdirection"]
     what = "is neither 1 (upper lanes) nor 2 (lower lanes)"
@@ -121,14 +138,27 @@ def _read_rows(path: Path, meta: Path, count: RowCount) -> pl.DataFrame:
     for name in ("width", "height"):
         raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
     step = rows.select(pl.col("frame").diff().over("id")).to_series()
-    raise_where(step <= 0, rows, "frame", path, "is not after the last frame of its vehicle; frames must grow")
-    directions = rows["id"].replace_strict(cars["id"], direction, default=None, return_dtype=pl.Int64)
+    raise_where(
+        step <= 0,
+        rows,
+        "frame",
+        path,
+        "is not after the last frame of its vehicle; frames must grow",
+    )
+    directions = rows["id"].replace_strict(
+        cars["id"], direction, default=None, return_dtype=pl.Int64
+    )
     raise_where(directions.is_null(), rows, "id", path, "is not in the tracksMeta file")
     return rows.with_columns(directions.alias("direction")).sort("id", "frame")
 
 
 def _scene(
-    rows: pl.DataFrame, direction: _Direction, rate_hz: float, name: str, path: Path, count: RowCount
+    rows: pl.DataFrame,
+    direction: _Direction,
+    rate_hz: float,
+    name: str,
+    path: Path,
+    count: RowCount,
 ) -> Scene | None:
     """One direction in the schema, with a frame every 0.1 s; None where it has no vehicles."""
     rows = rows.filter(pl.col("direction") == direction.number)
@@ -158,12 +188,20 @@ def _scene(
     old = {name: tracks[name].to_numpy() for name in SCHEMA}
     new = resample(begins, old["frame"], rate_hz)
     nearest = np.where(new.share > 0.5, new.after, new.before)
-    columns = {"scene": old["scene"][new.before], "vehicle": old["vehicle"][new.before], "frame": new.frame}
+    columns = {
+        "scene": old["scene"][new.before],
+        "vehicle": old["vehicle"][new.before],
+        "frame": new.frame,
+    }
     columns |= {name: new.linear(old[name]) for name in ("x", "y", "speed", "length", "width")}
-    frame = pl.DataFrame(columns | {"lane": old["lane"][nearest]}, schema_overrides=SCHEMA).select(SCHEMA.names())
+    frame = pl.DataFrame(columns | {"lane": old["lane"][nearest]}, schema_overrides=SCHEMA).select(
+        SCHEMA.names()
+    )
     if frame.is_empty():
         return None
-    return Scene(name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width)
+    return Scene(
+        name, sort(validate(frame, f"{path}, {name}", first_line=None)), direction.lane_width
+    )
 
 
 class Resampling(NamedTuple):
@@ -188,7 +226,8 @@ class Resampling(NamedTuple):
 def resample(begins: Flags, frame: Integers, rate_hz: float) -> Resampling:
     """Samples every 0.1 s within each track, none beyond its ends.
 
-    ``begins`` [S] is true at the first old sample of each track; within a track ``frame`` [S] grows by one.
+    ``begins`` [S] is true at the first old sample of each track; within a track ``frame`` [S] grows
+    by one.
     """
     starts = np.flatnonzero(begins)
     ends = np.append(starts[1:], len(frame)) - 1
@@ -203,4 +242,6 @@ def resample(begins: Flags, frame: Integers, rate_hz: float) -> Resampling:
     place = new * per_step - frame[starts][track]
     whole = np.floor(place + 1e-9)
     before = starts[track] + whole.astype(np.int64)
-    return Resampling(new, before, np.minimum(before + 1, ends[track]), np.clip(place - whole, 0.0, 1.0))
+    return Resampling(
+        new, before, np.minimum(before + 1, ends[track]), np.clip(place - whole, 0.0, 1.0)
+    )

@@ -1,16 +1,20 @@
-"""Lane widths of recordings, and the lane changes of recordings and simulations with their durations (equation 11).
+"""Lane widths of recordings, and the lane changes of recordings and simulations with their
+durations (equation 11).
 
-Recordings and simulations are measured in the same form, :class:`Tracks`: flat arrays, vectorised over all samples.
+Recordings and simulations are measured in the same form, :class:`Tracks`: flat arrays, vectorised
+over all samples.
 
-**What counts.** The nearest lane changes between two samples, and it is the old one during the 0.5 s before and the
-new one during the 0.5 s after, without interruption. A vehicle that only touches the boundary has not changed lanes.
+**What counts.** The nearest lane changes between two samples, and it is the old one during the 0.5
+s before and the new one during the 0.5 s after, without interruption. A vehicle that only touches
+the boundary has not changed lanes.
 
-**Duration** (equation 11, after Thiemann et al. 2008, in our reading). Going back from the crossing, the change
-starts at the first sample at which the vehicle is within 0.3 m of the old lane's centre or moves towards the new
-lane at less than 0.1 m/s; ``tau_s`` is the time in between. ``tau_e`` is the time from the crossing to the first
-sample within 0.3 m of the new lane's centre or slower than 0.1 m/s. The lateral speed is the mean over 1 s,
-centred, since recorded positions are noisy; the offset alone is not enough, since a fitted road is accurate to a few
-decimetres and drivers keep an offset. Where the track ends first, the change is censored on that side.
+**Duration** (equation 11, after Thiemann et al. 2008, in our reading). Going back from the
+crossing, the change starts at the first sample at which the vehicle is within 0.3 m of the old
+lane's centre or moves towards the new lane at less than 0.1 m/s; ``tau_s`` is the time in between.
+``tau_e`` is the time from the crossing to the first sample within 0.3 m of the new lane's centre or
+slower than 0.1 m/s. The lateral speed is the mean over 1 s, centred, since recorded positions are
+noisy; the offset alone is not enough, since a fitted road is accurate to a few decimetres and
+drivers keep an offset. Where the track ends first, the change is censored on that side.
 """
 
 from __future__ import annotations
@@ -31,15 +35,20 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-#: Samples, 0.1 s each: least in the old lane before a change and in the new one after it; half the window of the mean
-#: lateral speed; longest search for start and end, before and after the crossing.
+#: Samples, 0.1 s each: least in the old lane before a change and in the new one after it; half the
+#: window of the mean lateral speed; longest search for start and end, before and after the
+#: crossing.
 _HOLD, _HALF_WINDOW, _REACH = 5, 5, 200
-#: Offset from the lane's centre and lateral speed below which the change has not begun or is over, m and m/s.
+#: Offset from the lane's centre and lateral speed below which the change has not begun or is over,
+#: m and m/s.
 _CENTRED_M, _STILL_MPS = 0.3, 0.1
 
 
 def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
-    """Lane width in metres of every scene of a frame in the schema; errors are :func:`lane_width`'s."""
+    """Lane width in metres of every scene of a frame in the schema.
+
+    Errors are :func:`lane_width`'s.
+    """
     return {
         str(name): lane_width(rows["y"].to_numpy(), rows["lane"].to_numpy(), str(name))
         for (name,), rows in frame.group_by("scene", maintain_order=True)
@@ -48,16 +57,20 @@ def scene_lane_widths(frame: pl.DataFrame) -> dict[str, float]:
 
 def scene_lane_counts(frame: pl.DataFrame) -> dict[str, int]:
     """Number of lanes of every scene of a frame in the schema: its highest lane number plus one."""
-    return dict(frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows())
+    return dict(
+        frame.group_by("scene", maintain_order=True).agg(pl.col("lane").max() + 1).iter_rows()
+    )
 
 
 def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
-    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane number [R].
+    """Lane width, m, at which the nearest lane of each row agrees best with its recorded lane
+    number [R].
 
-    The first estimate is the median slope between the median positions of each pair of lanes (Theil and Sen), which
-    is robust to outliers. It is kept if no other width within 10 % of it puts more rows into their recorded lane;
-    otherwise the result is the middle of the best range. Lane changes make that range narrow, since a vehicle's lane
-    number changes just where it crosses the boundary. ``y`` [R] in m is 0 at the centre of lane 0.
+    The first estimate is the median slope between the median positions of each pair of lanes (Theil
+    and Sen), which is robust to outliers. It is kept if no other width within 10 % of it puts more
+    rows into their recorded lane; otherwise the result is the middle of the best range. Lane
+    changes make that range narrow, since a vehicle's lane number changes just where it crosses the
+    boundary. ``y`` [R] in m is 0 at the centre of lane 0.
 
     Raises:
         UserError: the estimate is below 2 m or above 6 m.
@@ -75,7 +88,8 @@ def lane_width(y: Floats, lane: Integers, scene: str = "scene") -> float:
 
 
 def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
-    """Lane width (:func:`lane_width`) and position of lane 0's centre, both m, where ``y`` has any origin.
+    """Lane width (:func:`lane_width`) and position of lane 0's centre, both m, where ``y`` has any
+    origin.
 
     Each lane's median position gives an estimate of the centre; their median is returned.
     """
@@ -87,8 +101,12 @@ def lane_grid(y: Floats, lane: Integers, scene: str) -> tuple[float, float]:
 
 
 def _best_range(y: Floats, lane: Integers, guess: float) -> tuple[float, float]:
-    """Widths within 10 % of the guess that most rows agree with; of several ranges, the nearest to the guess."""
-    # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no upper end.
+    """Widths within 10 % of the guess that most rows agree with.
+
+    Of several ranges, the nearest to the guess.
+    """
+    # A row of lane k agrees with the widths from y / (k + 1/2) to y / (k - 1/2); lane 0 has no
+    # upper end.
     begin = np.where(lane == 0, 2.0 * np.abs(y), y / (lane + 0.5))
     end = np.where(lane == 0, np.inf, y / np.where(lane == 0, 1.0, lane - 0.5))
     begin, end = np.clip(begin, 0.9 * guess, 1.1 * guess), np.clip(end, 0.9 * guess, 1.1 * guess)
@@ -117,7 +135,8 @@ def _centres(y: Floats, lane: Integers) -> tuple[Integers, Floats]:
 
 @dataclass(frozen=True)
 class Tracks:
-    """R samples, 0.1 s apart, of any number of tracks, track by track; a missing sample ends a track.
+    """R samples, 0.1 s apart, of any number of tracks, track by track; a missing sample ends a
+    track.
 
     Attributes:
         y: [R] m; lane k's centre is at ``k * lane_width``.
@@ -147,7 +166,10 @@ class Tracks:
 
 
 def tracks_of_frame(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> Tracks:
-    """Tracks of a frame in the schema, sorted; each scene's lane width in m is estimated where not given."""
+    """Tracks of a frame in the schema, sorted.
+
+    Each scene's lane width in m is estimated where not given.
+    """
     widths = scene_lane_widths(frame) if lane_widths is None else lane_widths
     continues = (pl.col("frame").diff() == 1) & (pl.col("vehicle").diff() == 0)
     same_scene = pl.col("scene") == pl.col("scene").shift(1)
@@ -156,7 +178,9 @@ def tracks_of_frame(frame: pl.DataFrame, lane_widths: dict[str, float] | None = 
         width=pl.col("scene").replace_strict(widths, return_dtype=pl.Float64),
         begins=~(continues & same_scene).fill_null(False),
     )
-    return Tracks(columns["y"].to_numpy(), columns["width"].to_numpy(), columns["begins"].to_numpy())
+    return Tracks(
+        columns["y"].to_numpy(), columns["width"].to_numpy(), columns["begins"].to_numpy()
+    )
 
 
 @dataclass(frozen=True)
@@ -195,7 +219,10 @@ class LaneChanges:
 
 
 def find_lane_changes(tracks: Tracks) -> LaneChanges:
-    """All lane changes of ``tracks``; the module's docstring defines what counts and how it is timed."""
+    """All lane changes of ``tracks``.
+
+    The module's docstring defines what counts and how it is timed.
+    """
     lane = tracks.lane
     sample = _crossings(lane, tracks)
     old, new = lane[sample], lane[sample + 1]
@@ -207,18 +234,23 @@ def find_lane_changes(tracks: Tracks) -> LaneChanges:
     tau_s = (sample - start + part) * FRAME_S
     tau_e = (end - sample - part) * FRAME_S
     moved = side * (tracks.y[end] - tracks.y[start])
-    return LaneChanges(sample, old, new, tau_s, tau_e, ~start_found, ~end_found, moved / (tau_s + tau_e))
+    return LaneChanges(
+        sample, old, new, tau_s, tau_e, ~start_found, ~end_found, moved / (tau_s + tau_e)
+    )
 
 
 def lane_changes_of_arrays(y: ArrayLike, lane_width: float) -> LaneChanges:
-    """Lane changes of a simulation: ``y`` [T, K] are the lateral positions, m, of K vehicles every 0.1 s.
+    """Lane changes of a simulation: ``y`` [T, K] are the lateral positions, m, of K vehicles every
+    0.1 s.
 
     ``sample`` counts vehicle by vehicle.
     """
     columns = np.asarray(y, dtype=np.float64).T
     begins = np.zeros(columns.shape, bool)
     begins[:, 0] = True
-    return find_lane_changes(Tracks(columns.ravel(), np.full(columns.size, lane_width), begins.ravel()))
+    return find_lane_changes(
+        Tracks(columns.ravel(), np.full(columns.size, lane_width), begins.ravel())
+    )
 
 
 def _crossings(lane: Integers, tracks: Tracks) -> Integers:
@@ -234,16 +266,20 @@ def _crossings(lane: Integers, tracks: Tracks) -> Integers:
 def _find_end(
     tracks: Tracks, sample: Integers, side: Integers, lane: Integers, direction: int
 ) -> tuple[Integers, Flags]:
-    """Start (``direction`` -1) or end (1) of lane changes: first sample that is centred or without lateral movement.
+    """Start (``direction`` -1) or end (1) of lane changes: first sample that is centred or without
+    lateral movement.
 
-    Returns [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies within the track.
+    Returns [C] the samples, or the first or last ones of their tracks, and [C] whether the end lies
+    within the track.
     """
     limit = (tracks.first if direction < 0 else tracks.last)[sample]
     path = sample[:, None] + direction * np.arange(_REACH + 1)
     inside = (path <= limit[:, None]) if direction > 0 else (path >= limit[:, None])
     path = np.where(inside, path, limit[:, None])
     offset = tracks.y[path] - (lane * tracks.lane_width[sample])[:, None]
-    done = (np.abs(offset) < _CENTRED_M) | (side[:, None] * _lateral_speed(tracks, path) < _STILL_MPS)
+    done = (np.abs(offset) < _CENTRED_M) | (
+        side[:, None] * _lateral_speed(tracks, path) < _STILL_MPS
+    )
     done &= inside
     found = done.any(axis=1)
     at = np.where(found, done.argmax(axis=1), inside.sum(axis=1) - 1)
@@ -251,7 +287,10 @@ def _find_end(
 
 
 def _lateral_speed(tracks: Tracks, at: Integers) -> Floats:
-    """Mean lateral speed over 1 s, centred at the samples ``at``, m/s; the window is shorter at a track's ends."""
+    """Mean lateral speed over 1 s, centred at the samples ``at``, m/s.
+
+    The window is shorter at a track's ends.
+    """
     before = np.maximum(at - _HALF_WINDOW, tracks.first[at])
     after = np.minimum(at + _HALF_WINDOW, tracks.last[at])
     return (tracks.y[after] - tracks.y[before]) / (np.maximum(after - before, 1) * FRAME_S)

@@ -1,14 +1,15 @@
 """NGSIM recordings: raw text files and the data portal's CSV, in feet, converted into the schema.
 
-Feet become metres; the front centre becomes the centre of the body; lanes, which NGSIM counts from the left, are
-counted from the right, and ``y``, in NGSIM positive to the right from the left edge, is positive to the left from
-the rightmost lane's centre. Rows on ramps (lanes beyond ``lanes``) are dropped, since a ramp is not parallel to the
-lanes. US-101's auxiliary lane (6) is kept, as the rightmost. A car's track ends where a frame is missing or a ramp
-begins.
+Feet become metres; the front centre becomes the centre of the body; lanes, which NGSIM counts from
+the left, are counted from the right, and ``y``, in NGSIM positive to the right from the left edge,
+is positive to the left from the rightmost lane's centre. Rows on ramps (lanes beyond ``lanes``) are
+dropped, since a ramp is not parallel to the lanes. US-101's auxiliary lane (6) is kept, as the
+rightmost. A car's track ends where a frame is missing or a ramp begins.
 
-Vehicle and frame numbers start again in every recording period; ``global_time - 100 ms * frame_id``, the time of
-frame 0, is the same for all rows of one. Rows are stored on disk by the minute of that time, block by block; adjacent
-minutes are one period. So memory holds one block, then one period, and tracks that extend over blocks are not cut.
+Vehicle and frame numbers start again in every recording period;
+``global_time - 100 ms * frame_id``, the time of frame 0, is the same for all rows of one. Rows are
+stored on disk by the minute of that time, block by block; adjacent minutes are one period. So
+memory holds one block, then one period, and tracks that extend over blocks are not cut.
 """
 
 from __future__ import annotations
@@ -44,7 +45,16 @@ FOOT_M: Final = 0.3048
 FRAME_MS: Final = 100
 #: The 18 columns of the raw text files, which have no header.
 RAW_NAMES: Final = (
-    *("vehicle_id", "frame_id", "total_frames", "global_time", "local_x", "local_y", "global_x", "global_y"),
+    *(
+        "vehicle_id",
+        "frame_id",
+        "total_frames",
+        "global_time",
+        "local_x",
+        "local_y",
+        "global_x",
+        "global_y",
+    ),
     *("v_length", "v_width", "v_class", "v_vel", "v_acc", "lane_id", "preceding", "following"),
     *("space_headway", "time_headway"),
 )
@@ -57,14 +67,15 @@ COLUMNS: Final = {
 LOCATION: Final = "location"
 #: Further locations in the portal's file: streets with intersections.
 STREETS: Final = ("lankershim", "peachtree")
-#: A file has about six periods; a damaged column of times or frames makes hundreds, or one of a few rows. The least
-#: number of rows, where there are several periods, are those of a vehicle for 5 s.
+#: A file has about six periods; a damaged column of times or frames makes hundreds, or one of a few
+#: rows. The least number of rows, where there are several periods, are those of a vehicle for 5 s.
 MAX_PERIODS, MIN_ROWS = 500, 50
 #: Maximum number of rows from which lane width and position are estimated.
 ROWS_FOR_LANES: Final = 500_000
 #: Medians of vehicle lengths that can be feet: 15 is usual, 4.5 would be metres, 450 centimetres.
 LENGTHS_FT: Final = (8.0, 40.0)
-#: Distance covered divided by speed times time. Recordings give 1.00; km/h give 0.91, miles per hour 1.47.
+#: Distance covered divided by speed times time. Recordings give 1.00; km/h give 0.91, miles per
+#: hour 1.47.
 PACE: Final = (0.94, 1.06)
 #: The pace is measured on tracks of at least 2 s at 10 ft/s or more.
 _PACE_FRAMES, _PACE_FT_S = 20, 10.0
@@ -79,9 +90,10 @@ def ngsim_scenes(
 ) -> Iterator[Scene]:
     """The periods of an NGSIM file, one scene each, in bounded memory (a block, then a period).
 
-    ``path`` is a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any case and order;
-    with a column ``location`` it may hold several locations. Rows read and dropped are added to ``count``;
-    ``scratch`` is a folder for temporary files, which are removed at the end, by default the system's.
+    ``path`` is a raw text file (18 columns, no header), or a CSV with NGSIM's column names in any
+    case and order; with a column ``location`` it may hold several locations. Rows read and dropped
+    are added to ``count``; ``scratch`` is a folder for temporary files, which are removed at the
+    end, by default the system's.
 
     Raises:
         UserError: a missing or damaged file; the message names file, line and column.
@@ -92,7 +104,9 @@ def ngsim_scenes(
     with tempfile.TemporaryDirectory(dir=scratch, prefix="rows-") as folder:
         periods = _store_by_period(rows, Path(folder), str(path))
         if not periods:
-            raise UserError(f"{path}: no rows of {', '.join(parameters.locations)}; check data.locations.")
+            raise UserError(
+                f"{path}: no rows of {', '.join(parameters.locations)}; check data.locations."
+            )
         for name, parts in periods.items():
             if scene := _scene(name, _read(parts), path, parameters.lanes, count):
                 yield scene
@@ -124,7 +138,9 @@ def _read_rows(
             text = _keep_locations(text, path, parameters.locations, count)
         else:
             text = text.with_columns(pl.lit(path.stem).alias(LOCATION))
-        columns = [convert(text, name, kind, path, thousands=True) for name, kind in COLUMNS.items()]
+        columns = [
+            convert(text, name, kind, path, thousands=True) for name, kind in COLUMNS.items()
+        ]
         rows = pl.DataFrame([*columns, text[LOCATION], text[LINE]])
         for name in ("v_length", "v_width"):
             raise_where(rows[name] <= 0.0, rows, name, path, "is not above 0")
@@ -132,7 +148,9 @@ def _read_rows(
         yield rows
 
 
-def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount) -> pl.DataFrame:
+def _keep_locations(
+    text: pl.DataFrame, path: Path, locations: tuple[str, ...], count: RowCount
+) -> pl.DataFrame:
     """Rows of the wanted locations; rows of others are dropped and counted."""
     text = text.with_columns(convert(text, LOCATION, pl.String, path).str.to_lowercase())
     known = sorted({*MOTORWAYS, *STREETS, *locations})
@@ -144,12 +162,19 @@ def _keep_locations(text: pl.DataFrame, path: Path, locations: tuple[str, ...], 
     return text.filter(kept)
 
 
-def _store_by_period(blocks: Iterable[pl.DataFrame], folder: Path, source: str) -> dict[str, list[Path]]:
-    """Store the rows of all blocks under ``folder``; the files of each period, by its name: ``us-101-1``."""
+def _store_by_period(
+    blocks: Iterable[pl.DataFrame], folder: Path, source: str
+) -> dict[str, list[Path]]:
+    """Store the rows of all blocks under ``folder``; the files of each period, by its name.
+
+    ``us-101-1``.
+    """
     parts: dict[tuple[str, int], list[Path]] = {}
     start = (pl.col("global_time") - FRAME_MS * pl.col("frame_id")) // 60_000
     for number, block in enumerate(blocks):
-        for (location, minute), rows in block.group_by(LOCATION, start.alias("minute"), maintain_order=True):
+        for (location, minute), rows in block.group_by(
+            LOCATION, start.alias("minute"), maintain_order=True
+        ):
             part = folder / f"{len(parts):04d}-{number:05d}-{minute}.arrow"
             rows.drop(LOCATION).write_ipc(part, compression="lz4")
             parts.setdefault((str(location), int(minute)), []).append(part)  # type: ignore[call-overload]
@@ -213,12 +238,17 @@ def _scene(name: str, rows: pl.DataFrame, path: Path, lanes: int, count: RowCoun
 
 
 def _drop_duplicates(rows: pl.DataFrame, count: RowCount) -> pl.DataFrame:
-    """Rows by vehicle and time; of several rows of one vehicle at one time the first in the file is kept."""
+    """Rows by vehicle and time.
+
+    Of several rows of one vehicle at one time the first in the file is kept.
+    """
     rows = rows.sort("vehicle_id", "global_time", LINE)
     again = (pl.col("vehicle_id").diff() == 0) & (pl.col("global_time").diff() == 0)
     values = [name for name in COLUMNS if name not in ("vehicle_id", "global_time")]
     equal = pl.all_horizontal(pl.col(name) == pl.col(name).shift(1) for name in values)
-    repeated, same = rows.select(again.fill_null(False).alias("again"), equal.fill_null(False)).get_columns()
+    repeated, same = rows.select(
+        again.fill_null(False).alias("again"), equal.fill_null(False)
+    ).get_columns()
     count.drop("duplicate", (repeated & same).sum())
     count.drop("same vehicle and time, other values", (repeated & ~same).sum())
     return rows.filter(~repeated)
@@ -233,7 +263,9 @@ def _check_order(rows: pl.DataFrame, path: Path) -> None:
     )
     what = "does not grow with global_time within its vehicle"
     raise_where(flags["backwards"], rows, "frame_id", path, what)
-    raise_where(flags["apart"], rows, "global_time", path, "is not 100 ms a frame after the row before")
+    raise_where(
+        flags["apart"], rows, "global_time", path, "is not 100 ms a frame after the row before"
+    )
 
 
 def _check_units(rows: pl.DataFrame, source: str) -> None:

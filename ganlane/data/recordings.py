@@ -1,7 +1,8 @@
-"""Recordings of any kind: read, measured scene by scene, and written, so that every command reads them again.
+"""Recordings of any kind: read, measured scene by scene, and written, so that every command reads
+them again.
 
-Scene CSV and Parquet hold recordings that are already straightened and in metres. A scene CSV counts lanes from the
-left; Parquet holds the schema itself: ``ganlane prepare`` writes it.
+Scene CSV and Parquet hold recordings that are already straightened and in metres. A scene CSV
+counts lanes from the left; Parquet holds the schema itself: ``ganlane prepare`` writes it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,13 @@ import numpy as np
 import polars as pl
 
 from ganlane.data.highd import highd_scenes
-from ganlane.data.lanes import LaneChanges, find_lane_changes, lane_width, scene_lane_widths, tracks_of_frame
+from ganlane.data.lanes import (
+    LaneChanges,
+    find_lane_changes,
+    lane_width,
+    scene_lane_widths,
+    tracks_of_frame,
+)
 from ganlane.data.ngsim import ngsim_scenes
 from ganlane.data.schema import (
     FRAME_S,
@@ -49,23 +56,25 @@ from ganlane.errors import UserError
 from ganlane.files import PLACE, atomic_path, has_checksum, sealed, write_bytes
 from ganlane.parameters.generator import NgsimParameters
 
-#: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0 at the centre of
-#: lane 1, which is the leftmost.
+#: Columns of a scene CSV: the schema's, but the speed is ``v``; ``y`` is positive to the left and 0
+#: at the centre of lane 1, which is the leftmost.
 COLUMNS: Final = {"v" if name == "speed" else name: kind for name, kind in SCHEMA.items()}
 _ENDING: Final = ".parquet"
 
 
 def read_scenes(path: str | Path) -> pl.DataFrame:
-    """Read a scene CSV, or what ``ganlane prepare`` wrote, into the schema, sorted by scene, vehicle and frame.
+    """Read a scene CSV, or what ``ganlane prepare`` wrote, into the schema, sorted by scene,
+    vehicle and frame.
 
-    Lanes of a CSV are renumbered from the right (a scene's highest number becomes 0), and ``y`` is shifted so that it
-    is 0 at the centre of that lane. Positions are not smoothed.
+    Lanes of a CSV are renumbered from the right (a scene's highest number becomes 0), and ``y`` is
+    shifted so that it is 0 at the centre of that lane. Positions are not smoothed.
 
-    ``path``: CSV with :data:`COLUMNS` (others are ignored), in metres, m/s and 0.1 s a frame; or Parquet in the
-    schema, a file ``*.parquet`` or a folder of them.
+    ``path``: CSV with :data:`COLUMNS` (others are ignored), in metres, m/s and 0.1 s a frame; or
+    Parquet in the schema, a file ``*.parquet`` or a folder of them.
 
     Raises:
-        UserError: a missing or damaged file, or a scene in two files; the message names file, line and column.
+        UserError: a missing or damaged file, or a scene in two files; the message names file, line
+            and column.
     """
     return sort(pl.concat(_read_files(Path(path))))
 
@@ -78,15 +87,23 @@ def write_prepared(frame: pl.DataFrame, path: str | Path) -> None:
 
 
 def write_scene_csv(frame: pl.DataFrame, path: str | Path) -> None:
-    """Write a frame in the schema, with lanes of 3.5 m, as a scene CSV; lane 1 is the leftmost in use in a scene."""
+    """Write a frame in the schema, with lanes of 3.5 m, as a scene CSV.
+
+    Lane 1 is the leftmost in use in a scene.
+    """
     with atomic_path(path) as part:
         scene_csv(frame, pl.col("lane").max().over("scene"), 3.5).write_csv(part)
 
 
 def scene_csv(frame: pl.DataFrame, leftmost: pl.Expr, lane_width_m: float) -> pl.DataFrame:
-    """A frame in the schema as the columns of a scene CSV; ``leftmost`` is the number of the leftmost lane."""
+    """A frame in the schema as the columns of a scene CSV.
+
+    ``leftmost`` is the number of the leftmost lane.
+    """
     y = pl.col("y") - leftmost * lane_width_m
-    return frame.with_columns(v=pl.col("speed"), lane=leftmost + 1 - pl.col("lane"), y=y).select(COLUMNS.keys())
+    return frame.with_columns(v=pl.col("speed"), lane=leftmost + 1 - pl.col("lane"), y=y).select(
+        COLUMNS.keys()
+    )
 
 
 def cut_into_scenes(frame: pl.DataFrame, seconds: float) -> pl.DataFrame:
@@ -104,13 +121,17 @@ def _read_files(path: Path) -> Iterator[pl.DataFrame]:
     """The CSV, or the Parquet files one by one; a scene must not be in two of them."""
     files = sorted(path.glob(f"*{_ENDING}")) if path.is_dir() else [path]
     if not files:
-        raise UserError(f"{path}: no such file as *{_ENDING} in this folder; give what ganlane prepare wrote.")
+        raise UserError(
+            f"{path}: no such file as *{_ENDING} in this folder; give what ganlane prepare wrote."
+        )
     file_of: dict[str, Path] = {}
     for file in files:
         frame = _read_parquet(file) if file.suffix == _ENDING else _read_csv(file)
         for scene in frame["scene"].unique():
             if file_of.setdefault(scene, file) != file:
-                raise UserError(f"{file}: scene {scene} is in {file_of[scene]} too; remove one of them.")
+                raise UserError(
+                    f"{file}: scene {scene} is in {file_of[scene]} too; remove one of them."
+                )
         yield frame
 
 
@@ -122,19 +143,25 @@ def _read_csv(path: Path) -> pl.DataFrame:
         from_left = scene["lane"].to_numpy() - 1
         width = lane_width(-scene["y"].to_numpy(), from_left, f"{path}, scene {name}")
         last = int(from_left.max())
-        scenes.append(scene.with_columns(y=pl.col("y") + last * width, lane=last + 1 - pl.col("lane")))
+        scenes.append(
+            scene.with_columns(y=pl.col("y") + last * width, lane=last + 1 - pl.col("lane"))
+        )
     return pl.concat(scenes)
 
 
 def _read_parquet(path: Path) -> pl.DataFrame:
     if not path.is_file():
-        raise UserError(f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder.")
+        raise UserError(
+            f"{path}: no such file; give a Parquet file that ganlane prepare wrote, or its folder."
+        )
     content = path.read_bytes()
     has_checksum(content, path)  # tables of other programs have none
     try:
         frame = pl.read_parquet(content)
     except (pl.exceptions.PolarsError, OSError) as error:
-        raise UserError(f"{path}: not a readable Parquet file ({reason(error)}); prepare it again.") from error
+        raise UserError(
+            f"{path}: not a readable Parquet file ({reason(error)}); prepare it again."
+        ) from error
     return validate(frame, str(path), first_line=None)
 
 
@@ -153,8 +180,8 @@ QUANTITIES: Final = {
 class SceneSummary:
     """One scene in numbers; rates as in :class:`LaneChangeStatistics`.
 
-    ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre is nearest: near 1 where
-    the road is straight in the recording's coordinates.
+    ``nearest_lane_share`` is the share of rows whose recorded lane is the one whose centre is
+    nearest: near 1 where the road is straight in the recording's coordinates.
     """
 
     name: str
@@ -221,23 +248,34 @@ class PooledStatistics:
     @property
     def exposure(self) -> Exposure:
         """Total amount of driving; the road's length is the mean over the cars."""
-        parts = {field.name: [getattr(each, field.name) for each in self._exposures] for field in fields(Exposure)}
+        parts = {
+            field.name: [getattr(each, field.name) for each in self._exposures]
+            for field in fields(Exposure)
+        }
         road_m = float(np.average(parts.pop("road_m"), weights=parts["cars"]))
         return Exposure(road_m=road_m, **{name: sum(values) for name, values in parts.items()})
 
     @property
     def changes(self) -> LaneChanges:
         """All lane changes; ``sample`` counts within each scene."""
-        parts = {field.name: [getattr(each, field.name) for each in self._changes] for field in fields(LaneChanges)}
+        parts = {
+            field.name: [getattr(each, field.name) for each in self._changes]
+            for field in fields(LaneChanges)
+        }
         return LaneChanges(**{name: np.concatenate(values) for name, values in parts.items()})
 
     @property
     def lane_changes(self) -> LaneChangeStatistics:
         """Rates, durations and lateral speeds over all scenes."""
-        return lane_change_statistics(self.changes, self.exposure, float(self.describe("speed").mean or 0.0))
+        return lane_change_statistics(
+            self.changes, self.exposure, float(self.describe("speed").mean or 0.0)
+        )
 
     def describe(self, quantity: str) -> Distribution:
-        """Summary of a quantity: exact for headways, for others with quantiles accurate to a bin's width."""
+        """Summary of a quantity.
+
+        Exact for headways, for others with quantiles accurate to a bin's width.
+        """
         if quantity == "headway":
             return describe(np.concatenate([np.empty(0), *self._headways]))
         return self.histograms[quantity].describe()
@@ -260,7 +298,10 @@ class PooledStatistics:
 
 @dataclass(frozen=True)
 class Preparation:
-    """Result of :func:`prepare_recordings`: rows read, dropped and written, files, and statistics of all scenes."""
+    """Result of :func:`prepare_recordings`.
+
+    Rows read, dropped and written, files, and statistics of all scenes.
+    """
 
     count: RowCount
     written: int
@@ -269,8 +310,16 @@ class Preparation:
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers for ``results.json``."""
-        rows = {"read": self.count.read, "kept": self.count.kept, "dropped": dict(self.count.dropped)}
-        return {"rows": rows | {"written": self.written}, "files": list(self.files), **self.statistics.to_dict()}
+        rows = {
+            "read": self.count.read,
+            "kept": self.count.kept,
+            "dropped": dict(self.count.dropped),
+        }
+        return {
+            "rows": rows | {"written": self.written},
+            "files": list(self.files),
+            **self.statistics.to_dict(),
+        }
 
 
 def open_scenes(
@@ -283,8 +332,8 @@ def open_scenes(
 ) -> Iterator[Scene]:
     """The scenes of recordings of a ``kind``: ``scenes``, ``ngsim`` or ``highd``.
 
-    ``path`` is a file, or a folder where the reader takes one; rows read and dropped are added to ``count``. The
-    other arguments are :func:`ngsim_scenes`'s, and for NGSIM only.
+    ``path`` is a file, or a folder where the reader takes one; rows read and dropped are added to
+    ``count``. The other arguments are :func:`ngsim_scenes`'s, and for NGSIM only.
 
     Raises:
         UserError: a damaged or missing file, or an unknown kind.
@@ -304,15 +353,22 @@ def open_scenes(
 
 
 def read_recordings(
-    kind: str, path: str | Path, parameters: NgsimParameters | None = None, on_progress: OnProgress | None = None
+    kind: str,
+    path: str | Path,
+    parameters: NgsimParameters | None = None,
+    on_progress: OnProgress | None = None,
 ) -> pl.DataFrame:
     """All scenes of recordings in one frame, sorted; for recordings that fit into memory.
 
-    Arguments and errors are those of :func:`open_scenes`; a recording without any usable row is an error too.
+    Arguments and errors are those of :func:`open_scenes`; a recording without any usable row is an
+    error too.
     """
     if kind == "scenes":
         return read_scenes(path)
-    frames = [scene.frame for scene in open_scenes(kind, path, RowCount(), parameters, on_progress=on_progress)]
+    frames = [
+        scene.frame
+        for scene in open_scenes(kind, path, RowCount(), parameters, on_progress=on_progress)
+    ]
     if not frames:
         raise UserError(
             f"{path}: no vehicle on any of the lanes kept; give a recording of a road with traffic on it."
@@ -331,8 +387,9 @@ def prepare_recordings(
 ) -> Preparation:
     """Read recordings, write each as a Parquet file into the new folder ``out``, and measure them.
 
-    The folder appears only when everything is written. Recordings are measured first, then cut into scenes of
-    ``scene_s`` seconds if it is given. The other arguments are those of :func:`open_scenes`.
+    The folder appears only when everything is written. Recordings are measured first, then cut into
+    scenes of ``scene_s`` seconds if it is given. The other arguments are those of
+    :func:`open_scenes`.
 
     Raises:
         UserError: a damaged or missing file, no moving vehicle in it, or ``out`` exists already.
@@ -344,22 +401,30 @@ def prepare_recordings(
                 count.drop("scene in which nobody drives", scene.frame.height)
                 continue
             # Letters, digits, dots and dashes.
-            summary, file = statistics.add(scene), re.sub(r"[^\w.-]+", "_", scene.name).lstrip(".") + _ENDING
+            summary, file = (
+                statistics.add(scene),
+                re.sub(r"[^\w.-]+", "_", scene.name).lstrip(".") + _ENDING,
+            )
             if file in files:
                 raise UserError(f"{path}: a second scene that {file} is the file of; rename one.")
             files.append(file)
-            write_prepared(cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame, folder / file)
+            write_prepared(
+                cut_into_scenes(scene.frame, scene_s) if scene_s else scene.frame, folder / file
+            )
             written += scene.frame.height
             if on_scene is not None:
                 on_scene(summary)
         if not files:
-            raise UserError(f"{path}: no scene in which anybody drives; give a recording of moving traffic.")
+            raise UserError(
+                f"{path}: no scene in which anybody drives; give a recording of moving traffic."
+            )
     return Preparation(count, written, tuple(files), statistics)
 
 
 @contextmanager
 def whole_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary folder next to ``path`` to write into; on success it is renamed to ``path``, else removed.
+    """Yield a temporary folder next to ``path`` to write into; on success it is renamed to
+    ``path``, else removed.
 
     Raises:
         UserError: there is something at ``path`` already.
@@ -367,7 +432,9 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     if path.is_file() or (path.is_dir() and any(path.iterdir())):
-        raise UserError(f"{path}: there already; choose another folder with out=FOLDER, or remove it.")
+        raise UserError(
+            f"{path}: there already; choose another folder with out=FOLDER, or remove it."
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -381,6 +448,8 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
         name = str(error.filename)
         if not name.startswith(str(part)):
             raise
-        raise OSError(error.errno, error.strerror, str(path) + name.removeprefix(str(part))) from error
+        raise OSError(
+            error.errno, error.strerror, str(path) + name.removeprefix(str(part))
+        ) from error
     finally:
         shutil.rmtree(part, ignore_errors=True)

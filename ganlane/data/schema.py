@@ -1,8 +1,9 @@
-"""The common form of all recordings, and text tables on their way to it, with every error traced to its line.
+"""The common form of all recordings, and text tables on their way to it, with every error traced to
+its line.
 
-A recording is a polars frame of tracks in SI units, one row per vehicle and frame (:data:`SCHEMA`), sorted by scene,
-vehicle and frame. A car that leaves the recorded road and returns has several tracks; their numbers differ by
-multiples of :data:`TRACK_STRIDE`.
+A recording is a polars frame of tracks in SI units, one row per vehicle and frame (:data:`SCHEMA`),
+sorted by scene, vehicle and frame. A car that leaves the recorded road and returns has several
+tracks; their numbers differ by multiples of :data:`TRACK_STRIDE`.
 """
 
 from __future__ import annotations
@@ -25,12 +26,16 @@ TRACK_STRIDE: Final = 10_000
 SCHEMA: Final = pl.Schema(
     {
         "scene": pl.String(),  # one recording; scenes are independent of each other
-        "vehicle": pl.Int64(),  # number of the track in its scene; ``vehicle % TRACK_STRIDE`` is the car
+        # number of the track in its scene; ``vehicle % TRACK_STRIDE`` is the car
+        "vehicle": pl.Int64(),
         "frame": pl.Int64(),  # frame number; frames are 0.1 s apart
-        "x": pl.Float64(),  # centre of the body along the road, m, growing in the direction of travel
-        "y": pl.Float64(),  # centre of the body across the road, m, positive to the left; 0 at lane 0's centre
+        # centre of the body along the road, m, growing in the direction of travel
+        "x": pl.Float64(),
+        # centre of the body across the road, m, positive to the left; 0 at lane 0's centre
+        "y": pl.Float64(),
         "speed": pl.Float64(),  # m/s, as recorded
-        "lane": pl.Int64(),  # as recorded; 0 is the scene's rightmost, its centre is at ``lane * lane_width``
+        # as recorded; 0 is the scene's rightmost, its centre is at ``lane * lane_width``
+        "lane": pl.Int64(),
         "length": pl.Float64(),  # m
         "width": pl.Float64(),  # m
     }
@@ -68,7 +73,9 @@ class Scene:
 
 @dataclass
 class RowCount:
-    """Number of rows read from files, before any interpolation, and how many were dropped for which reason."""
+    """Number of rows read from files, before any interpolation, and how many were dropped for which
+    reason.
+    """
 
     read: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
@@ -90,9 +97,11 @@ def sort(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def number_tracks(frame: pl.DataFrame, source: str) -> pl.DataFrame:
-    """Split each car's rows into tracks without a missing frame; one scene, sorted by ``vehicle`` and ``frame``.
+    """Split each car's rows into tracks without a missing frame; one scene, sorted by ``vehicle``
+    and ``frame``.
 
-    A car's second track is numbered ``vehicle + TRACK_STRIDE``, its third ``vehicle + 2 TRACK_STRIDE``.
+    A car's second track is numbered ``vehicle + TRACK_STRIDE``, its third
+    ``vehicle + 2 TRACK_STRIDE``.
 
     Raises:
         UserError: a vehicle number is negative or not below :data:`TRACK_STRIDE`.
@@ -113,11 +122,12 @@ def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LI
     Args:
         frame: rows in the order of the file they come from.
         source: name of the file, for messages.
-        first_line: line of the file that holds the first row; None where rows are not lines (they count from 0).
+        first_line: line of the file that holds the first row; None where rows are not lines (they
+            count from 0).
 
     Raises:
-        UserError: a missing column, no rows, NaN or null, a frame number that does not grow within its track, a size
-            of 0 or less, or units that cannot be metres and metres per second.
+        UserError: a missing column, no rows, NaN or null, a frame number that does not grow within
+            its track, a size of 0 or less, or units that cannot be metres and metres per second.
     """
     missing = [name for name in SCHEMA if name not in frame.columns]
     if missing:
@@ -128,10 +138,14 @@ def validate(frame: pl.DataFrame, source: str, first_line: int | None = FIRST_LI
         try:
             frame = frame.with_columns(frame[name].cast(kind))
         except pl.exceptions.PolarsError as error:
-            raise UserError(f"{source}, column {name}: {frame[name].dtype} found, {kind} expected.") from error
+            raise UserError(
+                f"{source}, column {name}: {frame[name].dtype} found, {kind} expected."
+            ) from error
 
     def place(row: int) -> str:
-        return f"{source}, row {row}" if first_line is None else f"{source}, line {row + first_line}"
+        return (
+            f"{source}, row {row}" if first_line is None else f"{source}, line {row + first_line}"
+        )
 
     frame = frame.select(SCHEMA.names())
     _check_rows(frame, place)
@@ -143,12 +157,22 @@ def _check_rows(frame: pl.DataFrame, place: Callable[[int], str]) -> None:
     """Errors that one row, or one row and its predecessor in the track, are enough to show."""
     step = pl.col("frame").diff().over(TRACK)
     right: list[tuple[str, str, pl.Expr]] = [
-        *((name, "is not a finite number", pl.col(name).is_finite()) for name in ("x", "y", "speed")),
-        *((name, "is missing", pl.col(name).is_not_null()) for name in ("scene", "vehicle", "frame", "lane")),
+        *(
+            (name, "is not a finite number", pl.col(name).is_finite())
+            for name in ("x", "y", "speed")
+        ),
+        *(
+            (name, "is missing", pl.col(name).is_not_null())
+            for name in ("scene", "vehicle", "frame", "lane")
+        ),
         *((name, "is not above 0", pl.col(name) > 0.0) for name in ("length", "width")),
         # The first frame of a track has no step.
         ("frame", "comes twice in its track", (step != 0).fill_null(True)),
-        ("frame", "is before its track's last frame; frames must grow", (step >= 0).fill_null(True)),
+        (
+            "frame",
+            "is before its track's last frame; frames must grow",
+            (step >= 0).fill_null(True),
+        ),
     ]
     for column, what, expression in right:
         rows = frame.select((~expression.fill_null(False)).arg_true()).to_series()
@@ -157,7 +181,10 @@ def _check_rows(frame: pl.DataFrame, place: Callable[[int], str]) -> None:
 
 
 def _check_units(frame: pl.DataFrame, place: Callable[[int], str]) -> None:
-    """Frames, positions, speeds or sizes that cannot be in 0.1 s and metres; the first row that shows it is named."""
+    """Frames, positions, speeds or sizes that cannot be in 0.1 s and metres.
+
+    The first row that shows it is named.
+    """
     frames = pl.col("frame").diff().over(TRACK)
     # With most rows further apart than a frame, nothing could be measured between them.
     steps = frame.select("scene", step=frames).with_row_index("row")
@@ -168,18 +195,24 @@ def _check_units(frame: pl.DataFrame, place: Callable[[int], str]) -> None:
             f"one; expected {1 / FRAME_S:.0f} frames a second, numbered one by one: resample the recording."
         )
     rates = pl.col("x").diff().over(TRACK) / (frames * FRAME_S)
-    speed, length, rate = frame.select(pl.col("speed", "length").median(), rate=rates.median()).row(0)
+    speed, length, rate = frame.select(pl.col("speed", "length").median(), rate=rates.median()).row(
+        0
+    )
     for column, median, bound, unit in (
         ("speed", speed, MAX_MEDIAN_SPEED_MPS, "m/s; convert to m/s"),
         ("length", length, MAX_MEDIAN_LENGTH_M, "m; convert feet to m"),
     ):
         if median > bound:
             row = int((frame[column] > bound).arg_max() or 0)
-            raise UserError(f"{place(row)}, column {column}: the median is {median:.1f}, which cannot be {unit}.")
+            raise UserError(
+                f"{place(row)}, column {column}: the median is {median:.1f}, which cannot be {unit}."
+            )
     if rate is None or max(abs(rate), abs(speed)) < 1.0:
         return
     if not speed / MAX_SPEED_RATIO < rate < speed * MAX_SPEED_RATIO:
-        agrees = rates.is_between(pl.col("speed") / MAX_SPEED_RATIO, pl.col("speed") * MAX_SPEED_RATIO)
+        agrees = rates.is_between(
+            pl.col("speed") / MAX_SPEED_RATIO, pl.col("speed") * MAX_SPEED_RATIO
+        )
         row = frame.select((~agrees).fill_null(False).arg_true().first()).item()
         raise UserError(
             f"{place(int(row or 0))}, columns x and speed: x moves by {rate:.1f} m per second where speed says "
@@ -202,15 +235,18 @@ class TextTable:
 
 
 def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
-    """The named ``columns`` of a CSV file, typed by :func:`convert`, and ``line``; rows in the order of the file.
+    """The named ``columns`` of a CSV file, typed by :func:`convert`, and ``line``; rows in the
+    order of the file.
 
     Raises:
-        UserError: no such file, no text table, no rows, a missing column or a wrong field; the message names file,
-            line and column.
+        UserError: no such file, no text table, no rows, a missing column or a wrong field; the
+            message names file, line and column.
     """
     path = Path(path)
     blocks = [
-        pl.DataFrame([*(convert(text, name, kind, path) for name, kind in columns.items()), text[LINE]])
+        pl.DataFrame(
+            [*(convert(text, name, kind, path) for name, kind in columns.items()), text[LINE]]
+        )
         for text in read_blocks(csv_table(path, columns), list(columns))
     ]
     if not blocks:
@@ -219,7 +255,9 @@ def read_table(path: str | Path, columns: Mapping[str, Kind]) -> pl.DataFrame:
 
 
 def csv_table(path: Path, wanted: Iterable[str]) -> TextTable:
-    """Layout of a CSV file according to its header line, which must hold the ``wanted`` columns in any case."""
+    """Layout of a CSV file according to its header line, which must hold the ``wanted`` columns in
+    any case.
+    """
     names = tuple(name.strip().lower() for name in _fields(first_line(path), f"{path}, line 1"))
     missing = [name for name in wanted if name not in names]
     if missing:
@@ -238,7 +276,9 @@ def first_line(path: Path) -> str:
     try:
         text = raw.decode("utf-8-sig").strip()
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}, line 1: not text ({error.reason}); give an unpacked text or CSV file.") from error
+        raise UserError(
+            f"{path}, line 1: not text ({error.reason}); give an unpacked text or CSV file."
+        ) from error
     if not text:
         raise UserError(f"{path}: the file is empty; a table of text was expected.")
     return text
@@ -249,17 +289,23 @@ def reason(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")
 
 
-def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path, thousands: bool = False) -> pl.Series:
-    """A ``column`` of text as ``String``, ``Int64`` (``3.0`` counts as a whole number) or ``Float64`` (finite).
+def convert(
+    text: pl.DataFrame, column: str, kind: Kind, path: Path, thousands: bool = False
+) -> pl.Series:
+    """A ``column`` of text as ``String``, ``Int64`` (``3.0`` counts as a whole number) or
+    ``Float64`` (finite).
 
     ``thousands``: whether commas may separate thousands.
 
     Raises:
-        UserError: a field is empty or not what was expected; the first one is named by file, line and column.
+        UserError: a field is empty or not what was expected; the first one is named by file, line
+            and column.
     """
     text = text.select(pl.col(column).str.strip_chars(), LINE)
     field = text[column]
-    raise_where(field.is_null() | (field == ""), text, column, path, "is empty; the row is incomplete")
+    raise_where(
+        field.is_null() | (field == ""), text, column, path, "is empty; the row is incomplete"
+    )
     if kind == pl.String:
         return field
     if thousands:
@@ -277,20 +323,29 @@ def convert(text: pl.DataFrame, column: str, kind: Kind, path: Path, thousands: 
 
 
 def raise_where(bad: pl.Series, rows: pl.DataFrame, column: str, path: Path, what: str) -> None:
-    """Raise a UserError that names the first of the ``rows`` (with ``line``) that is ``bad``; null is not bad."""
+    """Raise a UserError that names the first of the ``rows`` (with ``line``) that is ``bad``.
+
+    Null is not bad.
+    """
     if bad.any():
         row = rows.row(bad.fill_null(False).arg_max(), named=True)  # type: ignore[arg-type]
         field = "the field" if row[column] in (None, "") else repr(row[column])
-        raise UserError(f"{path}, line {row[LINE]}, column {column}: {field} {what}; correct or remove the row.")
+        raise UserError(
+            f"{path}, line {row[LINE]}, column {column}: {field} {what}; correct or remove the row."
+        )
 
 
 def read_blocks(
-    table: TextTable, wanted: Sequence[str], block_bytes: int = BLOCK_BYTES, on_progress: OnProgress | None = None
+    table: TextTable,
+    wanted: Sequence[str],
+    block_bytes: int = BLOCK_BYTES,
+    on_progress: OnProgress | None = None,
 ) -> Iterator[pl.DataFrame]:
     """The ``wanted`` columns as text, and ``line``, block by block; rows in the order of the file.
 
     Raises:
-        UserError: a row that does not fit, is not text, empty or cut off; the message names file and line.
+        UserError: a row that does not fit, is not text, empty or cut off; the message names file
+            and line.
     """
     number = FIRST_LINE if table.has_header else 1
     done, total = 0, table.path.stat().st_size
@@ -298,7 +353,10 @@ def read_blocks(
         place = f"{table.path}, line {number}"
         # A last line without a line break is a row only if it has all its fields.
         if has_no_end:
-            found, expected = len(_fields(block.decode(errors="replace"), place, table.blanks)), len(table.names)
+            found, expected = (
+                len(_fields(block.decode(errors="replace"), place, table.blanks)),
+                len(table.names),
+            )
             if found < expected:
                 raise UserError(
                     f"{place}, column {table.names[max(found - 1, 0)]}: the file breaks off here, {found} of "
@@ -313,7 +371,10 @@ def read_blocks(
 
 
 def _whole_lines(table: TextTable, block_bytes: int) -> Iterator[tuple[bytes, bool]]:
-    """Blocks of whole lines; true for a last line without a line break. Empty lines at the end are left out."""
+    """Blocks of whole lines; true for a last line without a line break.
+
+    Empty lines at the end are left out.
+    """
     with table.path.open("rb") as file:
         if table.has_header:
             file.readline()
@@ -338,7 +399,9 @@ def _fields(line: str, place: str, blanks: bool = False) -> list[str]:
         ) from error
 
 
-def _parse(table: TextTable, block: bytes, wanted: Sequence[str], number: int, rows: int) -> pl.DataFrame:
+def _parse(
+    table: TextTable, block: bytes, wanted: Sequence[str], number: int, rows: int
+) -> pl.DataFrame:
     """One block of ``rows`` lines, the first of which is line ``number``."""
     separator = b","
     if table.blanks:
@@ -350,7 +413,8 @@ def _parse(table: TextTable, block: bytes, wanted: Sequence[str], number: int, r
     # Columns are named by their position while parsing, since a file may use a name twice.
     columns = [b"c%d" % k for k in range(len(table.names))]
     places = {f"c{table.names.index(name)}": name for name in wanted}
-    # The parser does not check columns that it skips, so extra fields are found by counting separators.
+    # The parser does not check columns that it skips, so extra fields are found by counting
+    # separators.
     has_quotes = b'"' in block
     if not has_quotes and block.count(separator) != rows * (len(columns) - 1):
         _raise_at_bad_line(table, block, number)
@@ -363,7 +427,9 @@ def _parse(table: TextTable, block: bytes, wanted: Sequence[str], number: int, r
         )
     except (pl.exceptions.PolarsError, UnicodeDecodeError) as error:
         _raise_at_bad_line(table, block, number)
-        raise UserError(f"{table.path}, from line {number}: not a readable table ({error}).") from error
+        raise UserError(
+            f"{table.path}, from line {number}: not a readable table ({error})."
+        ) from error
     if frame.height != rows:
         _raise_at_bad_line(table, block, number)
         raise UserError(f"{table.path}, from line {number}: a row stretches over several lines.")
@@ -381,12 +447,18 @@ def _raise_at_bad_line(table: TextTable, block: bytes, number: int) -> None:
         try:
             text = raw.decode()
         except UnicodeDecodeError as error:
-            raise UserError(f"{place}: the line is not text; copy or download the file again.") from error
+            raise UserError(
+                f"{place}: the line is not text; copy or download the file again."
+            ) from error
         if raw.count(b'"') % 2:
-            raise UserError(f"{place}: a quotation mark without its counterpart; correct or remove the row.")
+            raise UserError(
+                f"{place}: a quotation mark without its counterpart; correct or remove the row."
+            )
         found = len(_fields(text, place, table.blanks))
         if found > expected:
-            raise UserError(f"{place}: {found} fields, expected {expected}; correct or remove the row.")
+            raise UserError(
+                f"{place}: {found} fields, expected {expected}; correct or remove the row."
+            )
         if found < expected:
             column = table.names[found - 1]
             raise UserError(

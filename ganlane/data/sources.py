@@ -1,13 +1,15 @@
-"""Where recordings come from: this machine's folder, a download that resumes, or a random generator.
+"""Where recordings come from: this machine's folder, a download that resumes, or a random
+generator.
 
-**Downloads.** Bytes are written to ``.NAME.part`` next to the file, and the server's version of it to
-``.NAME.part.json``. After a broken connection, or an earlier run that was interrupted, the download resumes with
-HTTP's Range, guarded by If-Range, so that two versions of a file are never joined. If the server ignores Range, the
-download starts again. Errors of the disk are not retried. The file gets its name only when it is complete.
+**Downloads.** Bytes are written to ``.NAME.part`` next to the file, and the server's version of it
+to ``.NAME.part.json``. After a broken connection, or an earlier run that was interrupted, the
+download resumes with HTTP's Range, guarded by If-Range, so that two versions of a file are never
+joined. If the server ignores Range, the download starts again. Errors of the disk are not retried.
+The file gets its name only when it is complete.
 
-**Synthetic recordings** are deterministic and free to share: for tests and for machines without data. They are not a
-driver model: vehicles start in slots of their own along the road, keep about one speed, and some change lanes along
-half a cosine. No two vehicles overlap.
+**Synthetic recordings** are deterministic and free to share: for tests and for machines without
+data. They are not a driver model: vehicles start in slots of their own along the road, keep about
+one speed, and some change lanes along half a cosine. No two vehicles overlap.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ MOST_BYTES: Final = 64 * 2**30
 
 
 def data_folder() -> Path | None:
-    """Folder of the recordings: ``GANLANE_DATA``, else ``../shared/data`` next to the checkout or the current folder.
+    """Folder of the recordings: ``GANLANE_DATA``, else ``../shared/data`` next to the checkout or
+    the current folder.
 
     Raises:
         UserError: the folder in ``GANLANE_DATA`` does not exist.
@@ -65,7 +68,8 @@ def data_folder() -> Path | None:
 
 
 def default_scenes() -> Path:
-    """Path of the US-101 scene CSV: ``ngsim/us101_scenes.csv`` in :func:`data_folder`, or the file directly in it.
+    """Path of the US-101 scene CSV: ``ngsim/us101_scenes.csv`` in :func:`data_folder`, or the file
+    directly in it.
 
     Raises:
         UserError: it does not exist.
@@ -118,11 +122,12 @@ def download(
         timeout_s: without a byte for this long, the connection counts as broken.
         attempts: connections without any progress before giving up.
         wait_s: before the second attempt; doubled each time.
-        most_bytes: a larger file is refused, as soon as the server tells its size or that many bytes have come.
+        most_bytes: a larger file is refused, as soon as the server tells its size or that many
+            bytes have come.
 
     Raises:
-        UserError: not an http address, the server sends to one, refuses or cannot be reached, the file is too large,
-            or the checksum differs.
+        UserError: not an http address, the server sends to one, refuses or cannot be reached, the
+            file is too large, or the checksum differs.
         OSError: the disk's error; it names ``path``. Received bytes are kept for the next run.
     """
     path = Path(path)
@@ -190,8 +195,13 @@ class _Part:
         self._note.unlink(missing_ok=True)
 
 
-def _fetch(part: _Part, on_progress: OnProgress | None, timeout_s: float, attempts: int, wait_s: float) -> None:
-    """Connect until the file is complete; give up after ``attempts`` connections in a row that bring nothing."""
+def _fetch(
+    part: _Part, on_progress: OnProgress | None, timeout_s: float, attempts: int, wait_s: float
+) -> None:
+    """Connect until the file is complete.
+
+    Give up after ``attempts`` connections in a row that bring nothing.
+    """
     failures = 0
     while True:
         before = part.size
@@ -221,7 +231,9 @@ def _fetch(part: _Part, on_progress: OnProgress | None, timeout_s: float, attemp
 class _HttpOnly(urllib.request.HTTPRedirectHandler):
     """Follows no redirection to another protocol."""
 
-    def redirect_request(self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, newurl: str) -> Any:
+    def redirect_request(
+        self, req: Any, fp: Any, code: Any, msg: Any, headers: Any, newurl: str
+    ) -> Any:
         if urllib.parse.urlsplit(newurl).scheme not in _SCHEMES:
             raise UserError(
                 f"{req.full_url}: the server sends to {newurl[:200]}; expected http:// or https://, check data.url."
@@ -240,7 +252,9 @@ def _connect(part: _Part, on_progress: OnProgress | None, timeout_s: float) -> N
     with answer:
         resumes = answer.status == http.HTTPStatus.PARTIAL_CONTENT
         # Content-Range is ``bytes 100-199/200``.
-        if resumes and not (answer.headers.get("Content-Range") or "").startswith(f"bytes {received}-"):
+        if resumes and not (answer.headers.get("Content-Range") or "").startswith(
+            f"bytes {received}-"
+        ):
             part.remove()
             raise _BrokenConnection("the server sent another part than the one asked for")
         received = received if resumes else 0
@@ -274,7 +288,9 @@ def _network_errors() -> Iterator[None]:
         raise
     # A ValueError comes from an address that is none.
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise _BrokenConnection(str(getattr(error, "reason", None) or error) or type(error).__name__) from error
+        raise _BrokenConnection(
+            str(getattr(error, "reason", None) or error) or type(error).__name__
+        ) from error
 
 
 def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
@@ -286,15 +302,25 @@ def _check_sha256(path: Path, sha256: str | None, advice: str) -> None:
         while piece := file.read(2**20):
             digest.update(piece)
     if digest.hexdigest() != sha256.lower():
-        raise UserError(f"{path}: its SHA-256 is {digest.hexdigest()}, expected {sha256.lower()}; {advice}.")
+        raise UserError(
+            f"{path}: its SHA-256 is {digest.hexdigest()}, expected {sha256.lower()}; {advice}."
+        )
 
 
 @contextmanager
 def byte_progress(what: str) -> Iterator[OnProgress]:
-    """Shows bytes done, rate and time left on stderr; without a terminal every 10 s, and nothing of shorter work."""
+    """Shows bytes done, rate and time left on stderr.
+
+    Without a terminal every 10 s, and nothing of shorter work.
+    """
     quiet_s = 0.0 if sys.stderr.isatty() else 10.0
     with tqdm(
-        desc=what, unit="B", unit_scale=True, file=sys.stderr, delay=quiet_s, mininterval=max(0.1, quiet_s)
+        desc=what,
+        unit="B",
+        unit_scale=True,
+        file=sys.stderr,
+        delay=quiet_s,
+        mininterval=max(0.1, quiet_s),
     ) as bar:
 
         def show(done: int, total: int | None) -> None:
@@ -306,9 +332,11 @@ def byte_progress(what: str) -> Iterator[OnProgress]:
 
 @dataclass(frozen=True)
 class SyntheticTraffic:
-    """Speeds follow ``speed_mps`` plus a sine of up to ``speed_swing_mps`` and a period of 6 to 10 s.
+    """Speeds follow ``speed_mps`` plus a sine of up to ``speed_swing_mps`` and a period of 6 to 10
+    s.
 
-    With the default slots no two vehicles can collide. A lane change takes 3 to 5 s and ends within the recording.
+    With the default slots no two vehicles can collide. A lane change takes 3 to 5 s and ends within
+    the recording.
     """
 
     scenes: int = 2
@@ -324,9 +352,13 @@ class SyntheticTraffic:
 
 
 def synthetic_scenes(traffic: SyntheticTraffic | None = None, seed: int = 0) -> pl.DataFrame:
-    """A frame in the schema with ``traffic.scenes`` scenes named ``synthetic-0``, ``synthetic-1`` and so on."""
+    """A frame in the schema with ``traffic.scenes`` scenes named ``synthetic-0``, ``synthetic-1``
+    and so on.
+    """
     traffic = traffic or SyntheticTraffic()
-    return sort(pl.concat(_synthetic_scene(traffic, number, seed) for number in range(traffic.scenes)))
+    return sort(
+        pl.concat(_synthetic_scene(traffic, number, seed) for number in range(traffic.scenes))
+    )
 
 
 def _synthetic_scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.DataFrame:
@@ -350,20 +382,34 @@ def _synthetic_scene(traffic: SyntheticTraffic, number: int, seed: int) -> pl.Da
         "x": x.ravel(),
         "y": y.ravel(),
         "speed": speed.ravel(),
-        "lane": np.rint(y / traffic.lane_width_m).astype(np.int64).clip(0, traffic.lanes - 1).ravel(),
+        "lane": np.rint(y / traffic.lane_width_m)
+        .astype(np.int64)
+        .clip(0, traffic.lanes - 1)
+        .ravel(),
         "length": np.repeat(random.uniform(4.0, 5.5, n).round(2), frames),
         "width": np.repeat(random.uniform(1.7, 2.2, n).round(2), frames),
     }
     return pl.DataFrame(columns, schema=SCHEMA)
 
 
-def _across(traffic: SyntheticTraffic, time: np.ndarray, home: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Offsets from the first lane's centre, [vehicles, frames]: a slow wander, and for some a lane change."""
+def _across(
+    traffic: SyntheticTraffic, time: np.ndarray, home: np.ndarray, random: np.random.Generator
+) -> np.ndarray:
+    """Offsets from the first lane's centre, [vehicles, frames].
+
+    A slow wander, and for some a lane change.
+    """
     n, end = traffic.vehicles, time[-1]
-    wander = traffic.wander_m * np.sin(random.uniform(0.3, 0.8, (n, 1)) * time + random.uniform(0.0, 6.28, (n, 1)))
-    side = np.where(home == 0, 1, np.where(home == traffic.lanes - 1, -1, random.choice([-1, 1], n)))
+    wander = traffic.wander_m * np.sin(
+        random.uniform(0.3, 0.8, (n, 1)) * time + random.uniform(0.0, 6.28, (n, 1))
+    )
+    side = np.where(
+        home == 0, 1, np.where(home == traffic.lanes - 1, -1, random.choice([-1, 1], n))
+    )
     changes = (random.uniform(size=n) < traffic.changing_share) & (traffic.lanes > 1) & (end > 6.0)
     lasts = random.uniform(3.0, 5.0, n)
     begins = random.uniform(0.5, np.maximum(end - lasts - 0.5, 0.6))
     done = np.clip((time - begins[:, None]) / lasts[:, None], 0.0, 1.0)
-    return wander + (changes * side * traffic.lane_width_m)[:, None] * 0.5 * (1.0 - np.cos(math.pi * done))
+    return wander + (changes * side * traffic.lane_width_m)[:, None] * 0.5 * (
+        1.0 - np.cos(math.pi * done)
+    )

@@ -1,4 +1,7 @@
-"""Driving statistics of a recording or simulation: exposure, lane changes, speeds, accelerations, headways."""
+"""Driving statistics of a recording or simulation.
+
+Exposure, lane changes, speeds, accelerations, headways.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +23,15 @@ from ganlane.errors import UserError
 _Record = TypeVar("_Record")
 #: Levels of the stored quantiles: fine enough to sample from by linear interpolation.
 LEVELS: Final = (0.01, *(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
-#: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s. The gap of a standing car, m
-#: (Table V's ``s_0``), is not part of the headway.
+#: A vehicle follows its leader up to this gap, m, and at this speed or faster, m/s. The gap of a
+#: standing car, m (Table V's ``s_0``), is not part of the headway.
 _FOLLOWING_GAP_M, _MIN_FOLLOWER_MPS, _STANDSTILL_GAP_M = 70.0, 2.0, 2.0
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample, in its own unit.
+    """Number, mean, standard deviation and quantiles (at :data:`LEVELS`) of a sample, in its own
+    unit.
 
     An empty sample has ``mean`` None and no quantiles; fewer than two samples have ``sd`` None.
     """
@@ -48,7 +52,9 @@ def describe(values: ArrayLike) -> Distribution:
     if not len(sample):
         return Distribution(0, None, None, ())
     sd = float(sample.std(ddof=1)) if len(sample) > 1 else None
-    return Distribution(len(sample), float(sample.mean()), sd, tuple(float(q) for q in np.quantile(sample, LEVELS)))
+    return Distribution(
+        len(sample), float(sample.mean()), sd, tuple(float(q) for q in np.quantile(sample, LEVELS))
+    )
 
 
 @dataclass(frozen=True)
@@ -56,9 +62,11 @@ class Durations:
     """Durations of which some are censored, s.
 
     Attributes:
-        complete: the complete ones; their mean is too low, since long durations are censored more often.
+        complete: the complete ones; their mean is too low, since long durations are censored more
+            often.
         censored: number of censored ones.
-        survival_mean_s: area under :func:`survival_curve`, up to the longest duration; None without complete ones.
+        survival_mean_s: area under :func:`survival_curve`, up to the longest duration; None without
+            complete ones.
         survival_median_s: where that curve falls to one half; None if it never does.
     """
 
@@ -78,13 +86,17 @@ def describe_durations(duration_s: ArrayLike, complete: ArrayLike) -> Durations:
         mean = float(np.sum(np.diff(edges) * np.concatenate(([1.0], survival))))
         halved = np.flatnonzero(survival <= 0.5)
         median = float(ends[halved[0]]) if len(halved) else None
-    return Durations(describe(times[is_complete]), int(np.count_nonzero(~is_complete)), mean, median)
+    return Durations(
+        describe(times[is_complete]), int(np.count_nonzero(~is_complete)), mean, median
+    )
 
 
 def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Kaplan and Meier's (1958) survival curve of durations [C], of which those not ``complete`` are lower bounds.
+    """Kaplan and Meier's (1958) survival curve of durations [C], of which those not ``complete``
+    are lower bounds.
 
-    Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations, falling.
+    Returns [E] the distinct complete durations, growing, and [E] the shares of longer durations,
+    falling.
     """
     times, is_complete = np.asarray(duration_s, dtype=np.float64), np.asarray(complete, bool)
     ends, ending = np.unique(times[is_complete], return_counts=True)
@@ -94,7 +106,10 @@ def survival_curve(duration_s: ArrayLike, complete: ArrayLike) -> tuple[np.ndarr
 
 @dataclass(frozen=True)
 class Bins:
-    """Bins of equal width from ``low`` to ``high``; values beyond are counted in the outermost ones."""
+    """Bins of equal width from ``low`` to ``high``.
+
+    Values beyond are counted in the outermost ones.
+    """
 
     low: float
     high: float
@@ -107,7 +122,9 @@ class Bins:
 
 
 class Histogram:
-    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part by part."""
+    """Counts per bin, and exact number, mean and standard deviation, of samples that are added part
+    by part.
+    """
 
     def __init__(self, bins: Bins) -> None:
         self.bins = bins
@@ -124,7 +141,9 @@ class Histogram:
         """Count more samples, without NaN."""
         sample = np.asarray(values, dtype=np.float64)
         bins = self.bins
-        self.counts += np.histogram(np.clip(sample, bins.low, bins.high), bins.number, (bins.low, bins.high))[0]
+        self.counts += np.histogram(
+            np.clip(sample, bins.low, bins.high), bins.number, (bins.low, bins.high)
+        )[0]
         self._sum += float(sample.sum())
         self._squares += float(np.square(sample).sum())
 
@@ -141,7 +160,13 @@ class Histogram:
         """Value at ``level``, linear within its bin, so accurate to a bin's width."""
         below = np.concatenate(([0], np.cumsum(self.counts)))
         occupied = np.flatnonzero(self.counts)
-        k = int(occupied[min(int(np.searchsorted(below[occupied + 1], level * self.total)), len(occupied) - 1)])
+        k = int(
+            occupied[
+                min(
+                    int(np.searchsorted(below[occupied + 1], level * self.total)), len(occupied) - 1
+                )
+            ]
+        )
         share = (level * self.total - below[k]) / self.counts[k]
         edges = self.bins.edges
         return float(edges[k] + min(max(share, 0.0), 1.0) * (edges[k + 1] - edges[k]))
@@ -154,7 +179,10 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Amount of driving; ``cars`` are counted once per scene, ``road_m`` is the road's mean length over the cars."""
+    """Amount of driving.
+
+    ``cars`` are counted once per scene, ``road_m`` is the road's mean length over the cars.
+    """
 
     scenes: int
     tracks: int
@@ -167,7 +195,8 @@ class Exposure:
 def measure_exposure(frame: pl.DataFrame) -> Exposure:
     """Scenes, tracks, cars, length of road and distance driven of a frame in the schema."""
     roads = frame.group_by("scene").agg(
-        road=pl.col("x").max() - pl.col("x").min(), cars=(pl.col("vehicle") % TRACK_STRIDE).n_unique()
+        road=pl.col("x").max() - pl.col("x").min(),
+        cars=(pl.col("vehicle") % TRACK_STRIDE).n_unique(),
     )
     driven = (pl.col(name).diff().over(TRACK) ** 2 for name in ("x", "y"))
     return Exposure(
@@ -183,10 +212,13 @@ def measure_exposure(frame: pl.DataFrame) -> Exposure:
 def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
     """Rows of a frame in the schema that have a leader, with its ``gap`` and ``leader_speed``.
 
-    The leader is the next vehicle ahead in the same lane and frame, at any distance; ``gap`` is net (bumper to
-    bumper), m, negative where two bodies overlap along the road.
+    The leader is the next vehicle ahead in the same lane and frame, at any distance; ``gap`` is net
+    (bumper to bumper), m, negative where two bodies overlap along the road.
     """
-    ahead = {name: pl.col(name).shift(-1).over("scene", "frame", "lane") for name in ("x", "length", "speed")}
+    ahead = {
+        name: pl.col(name).shift(-1).over("scene", "frame", "lane")
+        for name in ("x", "length", "speed")
+    }
     gap = ahead["x"] - pl.col("x") - 0.5 * (ahead["length"] + pl.col("length"))
     ordered = frame.sort("scene", "frame", "lane", "x")
     return ordered.with_columns(gap=gap, leader_speed=ahead["speed"]).drop_nulls("gap")
@@ -195,22 +227,27 @@ def leader_gaps(frame: pl.DataFrame) -> pl.DataFrame:
 def quantities(frame: pl.DataFrame) -> dict[str, np.ndarray]:
     """Samples of every quantity of a frame in the schema, sorted: ``speed`` and those below.
 
-    ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in raw recordings.
-    ``acceleration_smoothed``: ``(x[t] - 2 x[t - 1 s] + x[t - 2 s]) / (1 s)^2``, the true acceleration weighted by a
-    triangle of two seconds' width, m/s2; none in tracks of less than two seconds. ``gap``: to the leader
-    (:func:`leader_gaps`), m. ``time_headway``: ``gap / speed`` of followers, s: a gap of 0 to 70 m, at least 2 m/s.
-    ``headway``: each follower's median of ``(gap - 2 m) / speed``, s, over at least 1 s; in the order of the tracks.
+    ``acceleration_raw``: differences of the recorded speed between frames, m/s2; mostly noise in
+    raw recordings. ``acceleration_smoothed``: ``(x[t] - 2 x[t - 1 s] + x[t - 2 s]) / (1 s)^2``, the
+    true acceleration weighted by a triangle of two seconds' width, m/s2; none in tracks of less
+    than two seconds. ``gap``: to the leader (:func:`leader_gaps`), m. ``time_headway``:
+    ``gap / speed`` of followers, s: a gap of 0 to 70 m, at least 2 m/s. ``headway``: each
+    follower's median of ``(gap - 2 m) / speed``, s, over at least 1 s; in the order of the tracks.
     """
     lag = round(1.0 / FRAME_S)
 
     def earlier(column: str, frames: int) -> pl.Expr:
-        """The column's value ``frames`` earlier in the same track; null where any frame in between is missing."""
+        """The column's value ``frames`` earlier in the same track.
+
+        Null where any frame in between is missing.
+        """
         same = pl.col("frame").shift(frames).over(TRACK) == pl.col("frame") - frames
         return pl.when(same).then(pl.col(column).shift(frames).over(TRACK))
 
     accelerations = frame.select(
         raw=(pl.col("speed") - earlier("speed", 1)) / FRAME_S,
-        smoothed=(pl.col("x") - 2.0 * earlier("x", lag) + earlier("x", 2 * lag)) / (lag * FRAME_S) ** 2,
+        smoothed=(pl.col("x") - 2.0 * earlier("x", lag) + earlier("x", 2 * lag))
+        / (lag * FRAME_S) ** 2,
     )
     # Sorting needs most memory: only once, and with no more columns than needed.
     columns = frame.select("scene", "vehicle", "frame", "x", "speed", "lane", "length")
@@ -242,12 +279,16 @@ class LaneChangeStatistics:
 
     Attributes:
         count: number of lane changes (:mod:`ganlane.data.lanes` defines what counts).
-        srlc: equation 9, per vehicle and km of road; too low where tracks cover only part of the road.
-        per_vehicle_km, per_vehicle_km_low, per_vehicle_km_high: per driven km, with its exact 95 % interval.
-        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m``, the mean time between two lane changes of a
-            vehicle, from either rate and the mean speed, in steps of 0.1 s; None without lane changes.
+        srlc: equation 9, per vehicle and km of road; too low where tracks cover only part of the
+            road.
+        per_vehicle_km, per_vehicle_km_low, per_vehicle_km_high: per driven km, with its exact 95 %
+            interval.
+        t_m_srlc_steps, t_m_vehicle_km_steps: equation 10's ``t_m``, the mean time between two lane
+            changes of a vehicle, from either rate and the mean speed, in steps of 0.1 s; None
+            without lane changes.
         duration: equation 11, s.
-        lateral_speed: mean lateral speed of each complete change, m/s; its ``mean`` and ``sd`` are the Gaussian.
+        lateral_speed: mean lateral speed of each complete change, m/s; its ``mean`` and ``sd`` are
+            the Gaussian.
         lateral_speed_with_censored: the same of all changes, over their recorded parts.
     """
 
@@ -263,7 +304,9 @@ class LaneChangeStatistics:
     lateral_speed_with_censored: Distribution
 
 
-def lane_change_statistics(changes: LaneChanges, exposure: Exposure, speed_mps: float) -> LaneChangeStatistics:
+def lane_change_statistics(
+    changes: LaneChanges, exposure: Exposure, speed_mps: float
+) -> LaneChangeStatistics:
     """Statistics of lane changes found in that much driving at that mean speed, m/s."""
     n, km = len(changes), exposure.vehicle_km
     low, high = poisson_interval(n)
@@ -284,11 +327,12 @@ def lane_change_statistics(changes: LaneChanges, exposure: Exposure, speed_mps: 
 
 @dataclass(frozen=True)
 class DrivingStatistics:
-    """Statistics of a recording in SI units; :meth:`to_dict` and :meth:`from_dict` are exact inverses.
+    """Statistics of a recording in SI units; :meth:`to_dict` and :meth:`from_dict` are exact
+    inverses.
 
-    ``speed_sd_in_frame`` and ``speed_sd_in_lane`` are standard deviations of the speeds within a frame, and within a
-    frame and lane, m/s: the mean over those with two vehicles or more, None without any. The distributions are of
-    :func:`quantities`.
+    ``speed_sd_in_frame`` and ``speed_sd_in_lane`` are standard deviations of the speeds within a
+    frame, and within a frame and lane, m/s: the mean over those with two vehicles or more, None
+    without any. The distributions are of :func:`quantities`.
     """
 
     exposure: Exposure
@@ -314,7 +358,9 @@ class DrivingStatistics:
         try:
             return _record(cls, numbers)
         except (KeyError, TypeError) as error:
-            raise UserError(f"not the statistics of a recording ({error}); measure them again.") from error
+            raise UserError(
+                f"not the statistics of a recording ({error}); measure them again."
+            ) from error
 
 
 def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
@@ -328,8 +374,13 @@ def _record(kind: type[_Record], numbers: Mapping[str, Any]) -> _Record:
     return kind(**values)
 
 
-def driving_statistics(frame: pl.DataFrame, lane_widths: dict[str, float] | None = None) -> DrivingStatistics:
-    """Measure a frame in the schema, sorted; each scene's lane width in m is estimated where not given."""
+def driving_statistics(
+    frame: pl.DataFrame, lane_widths: dict[str, float] | None = None
+) -> DrivingStatistics:
+    """Measure a frame in the schema, sorted.
+
+    Each scene's lane width in m is estimated where not given.
+    """
     exposure, samples = measure_exposure(frame), quantities(frame)
     changes = find_lane_changes(tracks_of_frame(frame, lane_widths))
     described = ("speed", "acceleration_raw", "acceleration_smoothed", "headway")
@@ -344,5 +395,7 @@ def driving_statistics(frame: pl.DataFrame, lane_widths: dict[str, float] | None
 
 def _mean_spread(frame: pl.DataFrame, groups: list[str]) -> float | None:
     # In the order of the rows, so that the mean is the same to the last bit in every run.
-    spread = frame.group_by(groups, maintain_order=True).agg(sd=pl.col("speed").std())["sd"].drop_nulls()
+    spread = (
+        frame.group_by(groups, maintain_order=True).agg(sd=pl.col("speed").std())["sd"].drop_nulls()
+    )
     return float(spread.mean()) if len(spread) else None  # type: ignore[arg-type]

@@ -1,7 +1,8 @@
 """One decision of the ego through its physics steps.
 
-The ego in one physics step and the outcome of a decision are pure functions on tensors, each of which compiles to one
-graph (:meth:`Physics.compile`); :func:`run_decision` joins them with the traffic.
+The ego in one physics step and the outcome of a decision are pure functions on tensors, each of
+which compiles to one graph (:meth:`Physics.compile`); :func:`run_decision` joins them with the
+traffic.
 """
 
 from __future__ import annotations
@@ -20,7 +21,14 @@ from ganlane.parameters.driving import EgoParameters, IdmParameters, SteeringPar
 from ganlane.parameters.episode import EpisodeParameters
 from ganlane.runtime import check_compiler
 from ganlane.sim.collisions import ego_overlaps
-from ganlane.sim.dynamics import Command, apply_action, change_progress, ego_scene, ego_surroundings, move_ego
+from ganlane.sim.dynamics import (
+    Command,
+    apply_action,
+    change_progress,
+    ego_scene,
+    ego_surroundings,
+    move_ego,
+)
 from ganlane.sim.idm import following_acceleration
 from ganlane.sim.spawn import recycle
 from ganlane.sim.state import Road, Vehicles, lane_change_done, reads_are_cheap
@@ -47,14 +55,18 @@ class Rules(NamedTuple):
 
 def scene_over(rules: Rules, step: Tensor) -> Tensor:
     """Whether the recorded scene has ended at physics step ``step``, bool [N]."""
-    return torch.zeros_like(step, dtype=torch.bool) if rules.scene_steps is None else step >= rules.scene_steps
+    return (
+        torch.zeros_like(step, dtype=torch.bool)
+        if rules.scene_steps is None
+        else step >= rules.scene_steps
+    )
 
 
 class Substep(NamedTuple):
     """State between two physics steps of a decision; fields [N] except the vehicles [N, M].
 
-    ``acceleration`` is the ego's for the next step, m/s2. ``ahead`` and ``behind`` are its soft crashes, ``onsets``
-    counts their beginnings.
+    ``acceleration`` is the ego's for the next step, m/s2. ``ahead`` and ``behind`` are its soft
+    crashes, ``onsets`` counts their beginnings.
     """
 
     vehicles: Vehicles
@@ -70,8 +82,13 @@ class Substep(NamedTuple):
     goal: Tensor
 
 
-def begin(rules: Rules, action: Tensor, vehicles: Vehicles, ego: EgoMemory, step: Tensor) -> tuple[Substep, Command]:
-    """The first moment of a decision, before anything moves. Rows whose command leaves the road have ended."""
+def begin(
+    rules: Rules, action: Tensor, vehicles: Vehicles, ego: EgoMemory, step: Tensor
+) -> tuple[Substep, Command]:
+    """The first moment of a decision, before anything moves.
+
+    Rows whose command leaves the road have ended.
+    """
     lanes = rules.road.lanes if isinstance(rules.road.lanes, int) else rules.road.lanes[:, 0]
     target, direction = vehicles.target_lane[:, EGO_INDEX], ego["change_direction"]
     command = apply_action(action, target, direction, lanes, rules.ego.abort_lane_change)
@@ -97,17 +114,24 @@ def begin(rules: Rules, action: Tensor, vehicles: Vehicles, ego: EgoMemory, step
 def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -> Substep:
     """One physics step in which the others have ``moved``: moves the ego and finds the events.
 
-    A hard crash has precedence over the goal, and both over the time-out. With ``all_running`` no row has ended,
-    which saves the copies that keep ended rows as they are.
+    A hard crash has precedence over the goal, and both over the time-out. With ``all_running`` no
+    row has ended, which saves the copies that keep ended rows as they are.
     """
     ego, steering = move_ego(
-        before.vehicles, before.acceleration, before.steering, rules.road, rules.steering, PHYSICS_STEP_S
+        before.vehicles,
+        before.acceleration,
+        before.steering,
+        rules.road,
+        rules.steering,
+        PHYSICS_STEP_S,
     )
     running, vehicles = before.running, moved.with_first(ego)
     if not all_running:
         vehicles = vehicles.where(running, before.vehicles)
         steering = torch.where(running, steering, before.steering)
-    acceleration, ahead, behind = ego_surroundings(ego_scene(vehicles, rules.road), rules.idm, rules.ego)
+    acceleration, ahead, behind = ego_surroundings(
+        ego_scene(vehicles, rules.road), rules.idm, rules.ego
+    )
     crash = ego_overlaps(vehicles, rules.road).any(-1) & running
     goal = (vehicles.x[:, EGO_INDEX] >= rules.episode.goal_m) & running & ~crash
     step = before.step + running
@@ -127,7 +151,9 @@ def advance(rules: Rules, before: Substep, moved: Vehicles, all_running: bool) -
     )
 
 
-def remember(rules: Rules, before: EgoMemory, start: Substep, end: Substep, command: Command) -> EgoMemory:
+def remember(
+    rules: Rules, before: EgoMemory, start: Substep, end: Substep, command: Command
+) -> EgoMemory:
     """The ego's memory after a decision from ``start`` to ``end``."""
     ego, speed = end.vehicles.at(EGO_INDEX), start.vehicles.speed[:, EGO_INDEX]
     arrived = lane_change_done(end.vehicles.columns(slice(0, 1)), rules.road)[:, 0]
@@ -147,7 +173,9 @@ def remember(rules: Rules, before: EgoMemory, start: Substep, end: Substep, comm
     }
 
 
-def outcome(rules: Rules, end: Substep, command: Command) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def outcome(
+    rules: Rules, end: Substep, command: Command
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Events and done flags of a decision, each [N, 1]; every end has exactly one reason."""
     terminated = end.goal | end.hard_crash | command.off_road
     truncated = ~end.running & ~terminated
@@ -162,7 +190,9 @@ def outcome(rules: Rules, end: Substep, command: Command) -> tuple[dict[str, Ten
         keys.SOFT_CRASH_BEHIND: end.onsets_behind,
     }
     flags = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-    return {name: value[:, None] for name, value in events.items()}, {k: v[:, None] for k, v in flags.items()}
+    return {name: value[:, None] for name, value in events.items()}, {
+        k: v[:, None] for k, v in flags.items()
+    }
 
 
 class Physics:
@@ -195,8 +225,8 @@ def known_false(flag: Tensor) -> bool:
 class EndedRows:
     """The traffic's memory of the rows that end within a decision, kept as it was when they ended.
 
-    The traffic goes on computing them, in vain: restoring their memory in every physics step would copy that of all
-    rows each time, and generated traffic's is large.
+    The traffic goes on computing them, in vain: restoring their memory in every physics step would
+    copy that of all rows each time, and generated traffic's is large.
     """
 
     def __init__(self) -> None:
@@ -208,7 +238,8 @@ class EndedRows:
         if ended.any():
             rows = ended.nonzero()[:, 0]
             self.rows.append(rows)
-            # TorchRL drops empty parts between decisions, so the first moment's would differ from later ones.
+            # TorchRL drops empty parts between decisions, so the first moment's would differ from
+            # later ones.
             self.memories.append(memory[rows].filter_empty_())
 
     def restore(self, memory: TensorDictBase) -> TensorDictBase:
@@ -247,8 +278,8 @@ def run_decision(
 ) -> tuple[Substep, TensorDictBase]:
     """All physics steps of a decision: where they lead, and the traffic's memory after it.
 
-    Rows that end stay as they are. Their memory is put aside, or on a GPU, where finding them would wait for the
-    queue, kept in every step.
+    Rows that end stay as they are. Their memory is put aside, or on a GPU, where finding them would
+    wait for the queue, kept in every step.
 
     Args:
         state, start: at the beginning of the decision, and its first moment.
@@ -256,7 +287,11 @@ def run_decision(
         substeps: number of physics steps; None: those of the decision period.
     """
     memory, now, ended = memory_of(state), start, EndedRows()
-    counters = {keys.SEED: state.get(keys.SEED), keys.EPISODE: state.get(keys.EPISODE), keys.EPISODE_KEY: key}
+    counters = {
+        keys.SEED: state.get(keys.SEED),
+        keys.EPISODE: state.get(keys.EPISODE),
+        keys.EPISODE_KEY: key,
+    }
     size, can_read = memory.batch_size, reads_are_cheap(now.running)
     if can_read:
         ended.keep(~now.running, memory)
@@ -267,7 +302,12 @@ def run_decision(
         # The traffic's clock continues in ended rows: stopped at a moment of decision it would make
         # these rows' drivers decide in all remaining steps, in vain.
         vehicles = TensorDict._new_unsafe(before.vehicles.as_dict(), batch_size=size)
-        fields = {keys.VEHICLES: vehicles, keys.TRAFFIC: memory, **counters, keys.STEP: start.step + count}
+        fields = {
+            keys.VEHICLES: vehicles,
+            keys.TRAFFIC: memory,
+            **counters,
+            keys.STEP: start.step + count,
+        }
         after = traffic(TensorDict._new_unsafe(fields, batch_size=size))
         # In a graph the copies cost nothing, so one graph serves both cases.
         all_running = not physics.compiled and known_false((~before.running).any())

@@ -1,4 +1,7 @@
-"""The environment's state: fields, specs, and the start of an episode; and what is handed in, checked."""
+"""The environment's state: fields, specs, and the start of an episode.
+
+And what is handed in, checked.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,11 @@ from ganlane.native.tensors import Outcome
 from ganlane.sim.state import Vehicles
 from ganlane.torch_settings import check_default_device
 
-#: Steering angle (rad), mean acceleration in the last decision (m/s2), lane change progress (0 to 1), distance (m).
+#: Steering angle (rad), mean acceleration in the last decision (m/s2), lane change progress (0 to
+#: 1), distance (m).
 EGO_FLOATS = ("steering", "mean_acceleration", "change_progress", "distance")
-#: Direction of the current lane change (-1, 0, 1), decisions and started lane changes in this episode.
+#: Direction of the current lane change (-1, 0, 1), decisions and started lane changes in this
+#: episode.
 EGO_INTEGERS = ("change_direction", "decisions", "lane_changes")
 #: Soft crash in the last physics step (ahead, behind), lane change started in the last decision.
 EGO_FLAGS = ("soft_crash", "soft_crash_behind", "started_change")
@@ -28,18 +33,29 @@ DONE_FLAGS = ("done", "terminated", "truncated")
 COUNTERS = (keys.SEED, keys.EPISODE, keys.STEP)
 
 
-def state_spec(n: int, m: int, dtype: torch.dtype, memory: dict[str, Any], own_roads: bool) -> Composite:
-    """Spec of everything that a step writes except done flags and reward; ``memory`` is the traffic's."""
-    vehicles = _fields((n, m), dtype, keys.VEHICLE_FLOATS, keys.VEHICLE_INTEGERS, keys.VEHICLE_FLAGS)
+def state_spec(
+    n: int, m: int, dtype: torch.dtype, memory: dict[str, Any], own_roads: bool
+) -> Composite:
+    """Spec of everything that a step writes except done flags and reward.
+
+    ``memory`` is the traffic's.
+    """
+    vehicles = _fields(
+        (n, m), dtype, keys.VEHICLE_FLOATS, keys.VEHICLE_INTEGERS, keys.VEHICLE_FLAGS
+    )
     parts = {
         keys.VEHICLES: Composite(vehicles, shape=(n,)),
         keys.EGO: Composite(_fields((n,), dtype, EGO_FLOATS, EGO_INTEGERS, EGO_FLAGS), shape=(n,)),
-        keys.EVENTS: Composite(_fields((n, 1), dtype, (), EVENT_COUNTS, keys.END_EVENTS), shape=(n,)),
+        keys.EVENTS: Composite(
+            _fields((n, 1), dtype, (), EVENT_COUNTS, keys.END_EVENTS), shape=(n,)
+        ),
         keys.TRAFFIC: _memory_spec(memory, n),
         **_fields((n,), dtype, (), COUNTERS, ()),
     }
     if own_roads:
-        parts[keys.ROAD] = Composite(_fields((n, 1), dtype, ("lane_width_m",), ("lanes",), ()), shape=(n,))
+        parts[keys.ROAD] = Composite(
+            _fields((n, 1), dtype, ("lane_width_m",), ("lanes",), ()), shape=(n,)
+        )
     return Composite(parts, shape=(n,))
 
 
@@ -63,42 +79,69 @@ def _fields(
 def _memory_spec(memory: dict[str, Any], n: int) -> Composite:
     """Composite spec of a traffic module's memory, nested like the modules."""
     specs = {
-        name: _memory_spec(value, n) if isinstance(value, dict) else Unbounded(shape=value[0], dtype=value[1])
+        name: _memory_spec(value, n)
+        if isinstance(value, dict)
+        else Unbounded(shape=value[0], dtype=value[1])
         for name, value in memory.items()
     }
     return Composite(specs, shape=(n,))
 
 
-def first_state(seed: Tensor, episode: Tensor, vehicles: Vehicles, memory: TensorDictBase) -> TensorDictBase:
-    """The state of episodes that begin, without roads of their own; ``seed`` and ``episode`` are [N]."""
+def first_state(
+    seed: Tensor, episode: Tensor, vehicles: Vehicles, memory: TensorDictBase
+) -> TensorDictBase:
+    """The state of episodes that begin, without roads of their own.
+
+    ``seed`` and ``episode`` are [N].
+    """
     zero = torch.zeros(seed.shape, dtype=vehicles.x.dtype, device=seed.device)
     integer, column = zero.long(), zero[:, None]
     ego = {name: zero for name in EGO_FLOATS} | {name: integer for name in EGO_INTEGERS}
     ego |= {name: zero.bool() for name in EGO_FLAGS}
-    events = {name: column.bool() for name in keys.END_EVENTS} | {name: column.long() for name in EVENT_COUNTS}
+    events = {name: column.bool() for name in keys.END_EVENTS} | {
+        name: column.long() for name in EVENT_COUNTS
+    }
     rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: torch.zeros_like(seed)}
     return pack(vehicles, ego, memory, events, rest | {name: column.bool() for name in DONE_FLAGS})
 
 
 def pack(
-    vehicles: Vehicles, ego: dict[str, Tensor], traffic: TensorDictBase, events: dict[str, Tensor], rest: dict
+    vehicles: Vehicles,
+    ego: dict[str, Tensor],
+    traffic: TensorDictBase,
+    events: dict[str, Tensor],
+    rest: dict,
 ) -> TensorDictBase:
     """The state as one TensorDict [N]; ``rest`` is not nested."""
     batch, device = ego["distance"].shape, ego["distance"].device
     nested = {keys.VEHICLES: vehicles.as_dict(), keys.EGO: ego, keys.EVENTS: events}
-    made = {name: TensorDict._new_unsafe(value, batch_size=batch, device=device) for name, value in nested.items()}
-    return TensorDict._new_unsafe({**made, keys.TRAFFIC: traffic, **rest}, batch_size=batch, device=device)
+    made = {
+        name: TensorDict._new_unsafe(value, batch_size=batch, device=device)
+        for name, value in nested.items()
+    }
+    return TensorDict._new_unsafe(
+        {**made, keys.TRAFFIC: traffic, **rest}, batch_size=batch, device=device
+    )
 
 
-def outcome_state(seed: Tensor, episode: Tensor, out: Outcome, vehicles: Vehicles) -> TensorDictBase:
-    """The state of the episodes (``seed``, ``episode``) [N] after what the kernel did, without a reward."""
+def outcome_state(
+    seed: Tensor, episode: Tensor, out: Outcome, vehicles: Vehicles
+) -> TensorDictBase:
+    """The state of the episodes (``seed``, ``episode``) [N] after what the kernel did, without a
+    reward.
+    """
     ego = {
-        name: out["ego_steering" if name == "steering" else name] for name in EGO_FLOATS + EGO_INTEGERS + EGO_FLAGS
+        name: out["ego_steering" if name == "steering" else name]
+        for name in EGO_FLOATS + EGO_INTEGERS + EGO_FLAGS
     }
     memory = TensorDict._new_unsafe({"steering": out["steering"]}, batch_size=out["step"].shape)
     events = {name: out[name] for name in ("goal", "hard_crash", "out_of_road", "timeout")}
-    events["scene_end"] = torch.zeros_like(out["timeout"])  # of recorded scenes, which the kernel does not drive
-    events |= {keys.SOFT_CRASH: out["soft_crashes"], keys.SOFT_CRASH_BEHIND: out["soft_crashes_behind"]}
+    # of recorded scenes, which the kernel does not drive
+    events["scene_end"] = torch.zeros_like(out["timeout"])
+    events |= {
+        keys.SOFT_CRASH: out["soft_crashes"],
+        keys.SOFT_CRASH_BEHIND: out["soft_crashes_behind"],
+    }
     rest = {keys.SEED: seed, keys.EPISODE: episode, keys.STEP: out["step"]}
     return pack(vehicles, ego, memory, events, rest | {name: out[name] for name in DONE_FLAGS})
 
@@ -107,19 +150,26 @@ def outcome_state(seed: Tensor, episode: Tensor, out: Outcome, vehicles: Vehicle
 
 
 def check_counter(name: str, counter: Tensor | None, rows: int) -> Tensor:
-    """``counter`` [N] int64 of a reset; :class:`UserError` if it is none, or of another shape or type."""
+    """``counter`` [N] int64 of a reset.
+
+    :class:`UserError` if it is none, or of another shape or type.
+    """
     if counter is None or counter.shape != (rows,) or counter.dtype != torch.int64:
         found = "missing" if counter is None else f"{list(counter.shape)} in {counter.dtype}"
         given = "next_episode" if name == "next_episode" else "'seed' and 'episode'"
-        raise UserError(f"reset(): {name} is {found}; give {given} as int64 of shape [{rows}], or leave it out.")
+        raise UserError(
+            f"reset(): {name} is {found}; give {given} as int64 of shape [{rows}], or leave it out."
+        )
     return counter
 
 
 def usable_device(device: Any, dtype: Any) -> torch.device:
-    """The device; :class:`UserError` where torch has no such device, or puts new tensors elsewhere, or for a type
-    other than float32 and float64."""
+    """The device; :class:`UserError` where torch has no such device, or puts new tensors elsewhere,
+    or for a type other than float32 and float64."""
     if dtype not in (torch.float32, torch.float64):
-        raise UserError(f"dtype={dtype}: the simulation runs in torch.float32 or torch.float64; give one of them.")
+        raise UserError(
+            f"dtype={dtype}: the simulation runs in torch.float32 or torch.float64; give one of them."
+        )
     try:
         chosen = torch.empty(0, device=device or "cpu").device
     except (RuntimeError, AssertionError, TypeError) as error:
@@ -133,14 +183,17 @@ def usable_device(device: Any, dtype: Any) -> torch.device:
 class ActionCheck:
     """Refuses actions other than 0, 1 and 2.
 
-    The native kernel looks at their values itself, which costs nothing: there :meth:`form` is enough.
-    On a GPU a step does not wait for the answer: it is looked at in later steps, when it has arrived.
+    The native kernel looks at their values itself, which costs nothing: there :meth:`form` is
+    enough. On a GPU a step does not wait for the answer: it is looked at in later steps, when it
+    has arrived.
     """
 
     def __init__(self, rows: int, device: torch.device) -> None:
         self.rows, self._shape = rows, torch.Size([rows])
         # Where a copy arrives by itself; elsewhere the answer is read at once.
-        self._arrived = torch.zeros((), dtype=torch.bool).pin_memory() if device.type == "cuda" else None
+        self._arrived = (
+            torch.zeros((), dtype=torch.bool).pin_memory() if device.type == "cuda" else None
+        )
         self._wrong = torch.zeros((), dtype=torch.bool, device=device)
 
     def form(self, action: Tensor | None) -> Tensor:
@@ -148,7 +201,9 @@ class ActionCheck:
         if action is not None and action.dtype is torch.int64 and action.shape == self._shape:
             return action
         if action is None:
-            raise UserError(f"step(): no action; give 'action' [{self.rows}], int64, from 0 to {keys.ACTIONS - 1}.")
+            raise UserError(
+                f"step(): no action; give 'action' [{self.rows}], int64, from 0 to {keys.ACTIONS - 1}."
+            )
         if action.shape != self._shape or action.is_floating_point() or action.dtype == torch.bool:
             raise _refused(f"of shape {list(action.shape)} in {action.dtype}", self.rows)
         return action.long()
@@ -156,9 +211,12 @@ class ActionCheck:
     def values(self, action: Tensor) -> None:
         """Raise :class:`UserError` where ``action`` [N] int64 is not from 0 to 2."""
         if action.device.type == "cpu":
-            # As unsigned numbers, in which those below 0 are large, and by NumPy: a few microseconds.
+            # As unsigned numbers, in which those below 0 are large, and by NumPy: a few
+            # microseconds.
             if action.numpy().view(np.uint64).max() >= keys.ACTIONS:
-                raise _refused(str(int(action[(action < 0) | (action >= keys.ACTIONS)][0])), self.rows)
+                raise _refused(
+                    str(int(action[(action < 0) | (action >= keys.ACTIONS)][0])), self.rows
+                )
         else:
             self._look_later(action)
 

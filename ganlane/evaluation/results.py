@@ -34,10 +34,19 @@ class Run:
         return f"{type(self).__name__}(folder={str(self.folder)!r}, results: {', '.join(self.results)})"
 
     def _repr_html_(self) -> str:
-        """For notebooks: the table of an evaluation, else the results that are single numbers or texts."""
+        """For notebooks.
+
+        The table of an evaluation, else the results that are single numbers or texts.
+        """
         rows = self.results.get("rows")
         if not isinstance(rows, list):
-            rows = [{name: value for name, value in self.results.items() if isinstance(value, int | float | str)}]
+            rows = [
+                {
+                    name: value
+                    for name, value in self.results.items()
+                    if isinstance(value, int | float | str)
+                }
+            ]
         return f"<p>{escape(str(self.folder))}</p>{pl.DataFrame(rows, infer_schema_length=None)._repr_html_()}"
 
 
@@ -50,7 +59,10 @@ class TrainingRun(Run):
 
 
 def write_results(
-    folder: str | Path, numbers: Mapping[str, Any], config: Mapping[str, Any], seeds: Mapping[str, Any]
+    folder: str | Path,
+    numbers: Mapping[str, Any],
+    config: Mapping[str, Any],
+    seeds: Mapping[str, Any],
 ) -> Path:
     """Write ``results.json`` into ``folder`` atomically and return its path.
 
@@ -68,9 +80,11 @@ def write_results(
 
 
 def names_of_runs(folders: Sequence[Path]) -> list[str]:
-    """What tells runs apart: the options on their command lines in which they differ, else ends of their paths.
+    """What tells runs apart: the options on their command lines in which they differ, else ends of
+    their paths.
 
-    ``seed=0`` comes last. Two runs of the same options, or one without its command line, are named by their paths.
+    ``seed=0`` comes last. Two runs of the same options, or one without its command line, are named
+    by their paths.
     """
     given = [_overrides(folder) for folder in folders]
     keys = sorted({key for each in given for key in each}, key=lambda key: (key == "seed", key))
@@ -86,15 +100,34 @@ def names_of_runs(folders: Sequence[Path]) -> list[str]:
 def _overrides(folder: Path) -> dict[str, str]:
     """The command line of a run by key, the newest value of each."""
     file = folder / "overrides.yaml"
-    lines = re.findall(r"^- (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE) if file.is_file() else []
-    return {key.strip("'\" +"): value.strip("'\"") for key, _, value in (line.partition("=") for line in lines)}
+    lines = (
+        re.findall(r"^- (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+        if file.is_file()
+        else []
+    )
+    return {
+        key.strip("'\" +"): value.strip("'\"")
+        for key, _, value in (line.partition("=") for line in lines)
+    }
 
 
 def runs_below(folder: Path, file: str) -> list[Path]:
-    """The folder itself if it holds ``file``, else those of its own folders that do, by number: those of a sweep."""
-    found = [folder] if (folder / file).is_file() else [path.parent for path in folder.glob(f"*/{file}")]
+    """The folder itself if it holds ``file``, else those of its own folders that do, by number.
+
+    Those of a sweep.
+    """
+    found = (
+        [folder]
+        if (folder / file).is_file()
+        else [path.parent for path in folder.glob(f"*/{file}")]
+    )
     return sorted(
-        found, key=lambda path: (not path.name.isdigit(), int(path.name) if path.name.isdigit() else 0, path)
+        found,
+        key=lambda path: (
+            not path.name.isdigit(),
+            int(path.name) if path.name.isdigit() else 0,
+            path,
+        ),
     )
 
 
@@ -108,7 +141,9 @@ def sweep_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
-    """Write one row per episode as ``episodes.parquet`` into ``folder`` atomically and return its path."""
+    """Write one row per episode as ``episodes.parquet`` into ``folder`` atomically and return its
+    path.
+    """
     path = Path(folder) / "episodes.parquet"
     with atomic_path(path) as part:
         episodes.write_parquet(part)
@@ -116,7 +151,10 @@ def write_episodes(folder: str | Path, episodes: pl.DataFrame) -> Path:
 
 
 def plain(value: Any) -> Any:
-    """``value`` as JSON can hold it: plain numbers, strings, lists and dictionaries; NaN and infinity as None."""
+    """``value`` as JSON can hold it: plain numbers, strings, lists and dictionaries.
+
+    NaN and infinity as None.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, Mapping):
@@ -131,9 +169,11 @@ def plain(value: Any) -> Any:
 
 
 def code_version() -> dict[str, Any]:
-    """``version`` of the package, and ``revision`` and ``modified`` where it lies in a checkout of its own.
+    """``version`` of the package, and ``revision`` and ``modified`` where it lies in a checkout of
+    its own.
 
-    An installed copy inside somebody else's checkout has no revision: git must know the package's own file.
+    An installed copy inside somebody else's checkout has no revision: git must know the package's
+    own file.
     """
     version: dict[str, Any] = {"version": __version__, "revision": None, "modified": None}
     if _git("ls-files", "--error-unmatch", "__init__.py") is not None:
@@ -155,10 +195,14 @@ def _git(*arguments: str) -> str | None:
 def machine() -> dict[str, Any]:
     """CPU, usable cores, torch's threads, system, accelerator (or None), and the versions that ran."""
     info = Path("/proc/cpuinfo")
-    named = re.search(r"^model name\s*:(.*)$", info.read_text(errors="replace") if info.is_file() else "", re.M)
+    named = re.search(
+        r"^model name\s*:(.*)$", info.read_text(errors="replace") if info.is_file() else "", re.M
+    )
     return {
         "cpu": named[1].strip() if named else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1,
         "threads": torch.get_num_threads(),
         "system": platform.platform(),
         "accelerator": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -168,11 +212,18 @@ def machine() -> dict[str, Any]:
 
 
 def machine_sentence(threads: Sequence[int]) -> str:
-    """Where and on which code the figures were taken, without host names or paths; ``threads`` are torch's."""
+    """Where and on which code the figures were taken, without host names or paths.
+
+    ``threads`` are torch's.
+    """
     here, code = machine(), code_version()
     usable = f"{here['cores']} usable core{'s' if here['cores'] != 1 else ''}"
     accelerator = f", {here['accelerator']}" if here["accelerator"] else ""
-    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    revision = (
+        f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})"
+        if code["revision"]
+        else ""
+    )
     return (
         f"{here['cpu']}, {usable}{accelerator}; Python {here['python']}, torch {here['torch']} (threads: "
         f"{', '.join(map(str, threads))}); ganlane {code['version']}{revision}."

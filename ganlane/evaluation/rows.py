@@ -1,4 +1,7 @@
-"""The numbers of an evaluation, from one row per episode: by driver and traffic, by pair of drivers, by scene."""
+"""The numbers of an evaluation, from one row per episode.
+
+By driver and traffic, by pair of drivers, by scene.
+"""
 
 from __future__ import annotations
 
@@ -40,27 +43,30 @@ Row = dict[str, Any]
 def evaluation_rows(episodes: pl.DataFrame) -> list[Row]:
     """Rows of the ``evaluate`` command, in the order in which agents and traffics first appear.
 
-    ``episodes`` are what :func:`ganlane.evaluation.run_episodes` returns, with ``agent`` and ``traffic`` added, for
-    every pair, one below the other.
+    ``episodes`` are what :func:`ganlane.evaluation.run_episodes` returns, with ``agent`` and
+    ``traffic`` added, for every pair, one below the other.
 
     Returns:
         Per pair ``agent, traffic, episodes``; the counts ``goal, hard_crash, out_of_road, timeout,
         scene_end`` (how episodes ended) and ``soft_crash`` (episodes with at least one),
-        ``soft_crash_onsets``, ``soft_crash_behind_onsets`` and the latter's mean ``soft_crash_behind_per_episode``;
-        ``mean_reward`` and ``reward_sd``;
+        ``soft_crash_onsets``, ``soft_crash_behind_onsets`` and the latter's mean
+        ``soft_crash_behind_per_episode``; ``mean_reward`` and ``reward_sd``;
         ``mean_speed_mps`` (distance over time of all episodes together); ``lane_changes_per_km``;
-        ``distance_km``; ``hard_crash_share`` and ``out_of_road_share`` of the episodes (exact intervals);
-        ``crashes_per_1000_km`` (hard crashes);
+        ``distance_km``; ``hard_crash_share`` and ``out_of_road_share`` of the episodes (exact
+        intervals); ``crashes_per_1000_km`` (hard crashes);
         ``minus_mobil`` (paired difference of the mean reward to MOBIL's on the same episodes);
-        ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with ``_ci``
-        holds the 95 % interval of its namesake as ``[low, high]``, or None.
+        ``normalized_percent``, with ``normalized_percent_reason`` where it is None. A key with
+        ``_ci`` holds the 95 % interval of its namesake as ``[low, high]``, or None.
     """
     pairs = episodes.partition_by(["agent", "traffic"], maintain_order=True)
     return [_row(pair, episodes.filter(pl.col("traffic") == pair["traffic"][0])) for pair in pairs]
 
 
 def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
-    """The row of one agent on one traffic; ``same_traffic`` also holds the drivers that give the scale."""
+    """The row of one agent on one traffic.
+
+    ``same_traffic`` also holds the drivers that give the scale.
+    """
     ended = {reason: int((pair["reason"] == reason).sum()) for reason in keys.END_EVENTS}
     returns = pair["reward"].to_numpy()
     distance_m, duration_s = float(pair["distance_m"].sum()), float(pair["duration_s"].sum())
@@ -68,7 +74,9 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
     score = _score(pair, same_traffic)
     # MOBIL has no lead over itself, and without it nobody has one.
     mobil = same_traffic.filter(pl.col("agent") == SCALE_TOP)
-    lead = None if pair["agent"][0] == SCALE_TOP or mobil.height == 0 else paired_lead(pair, mobil)[0]
+    lead = (
+        None if pair["agent"][0] == SCALE_TOP or mobil.height == 0 else paired_lead(pair, mobil)[0]
+    )
     return {
         "agent": pair["agent"][0],
         "traffic": pair["traffic"][0],
@@ -81,11 +89,15 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
         "scene_end": ended["scene_end"],
         "soft_crash_onsets": int(pair["soft_crash"].sum()),
         "soft_crash_behind_onsets": int(pair["soft_crash_behind"].sum()),
-        **entries("soft_crash_behind_per_episode", mean_interval(pair["soft_crash_behind"].to_numpy())),
+        **entries(
+            "soft_crash_behind_per_episode", mean_interval(pair["soft_crash_behind"].to_numpy())
+        ),
         **entries("mean_reward", mean_interval(returns)),
         "reward_sd": float(np.std(returns, ddof=1)) if len(returns) > 1 else None,
         "mean_speed_mps": distance_m / duration_s if duration_s > 0 else None,
-        "lane_changes_per_km": int(pair["lane_changes"].sum()) / distance_m * 1000.0 if distance_m > 0 else None,
+        "lane_changes_per_km": int(pair["lane_changes"].sum()) / distance_m * 1000.0
+        if distance_m > 0
+        else None,
         "distance_km": distance_m / 1000.0,
         **entries("hard_crash_share", clopper_pearson(ended["hard_crash"], pair.height)),
         **entries("out_of_road_share", clopper_pearson(ended["out_of_road"], pair.height)),
@@ -98,16 +110,21 @@ def _row(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> Row:
 
 
 def _paired_rewards(*drivers: pl.DataFrame) -> list[Array]:
-    """The returns of each of ``drivers`` on the episodes that all of them drove, in one order, each [E]."""
+    """The returns of each of ``drivers`` on the episodes that all of them drove, in one order, each
+    [E].
+    """
     shared = drivers[0].select(_EPISODE)
     for column, driver in enumerate(drivers):
-        shared = shared.join(driver.select(*_EPISODE, pl.col("reward").alias(str(column))), on=_EPISODE)
+        shared = shared.join(
+            driver.select(*_EPISODE, pl.col("reward").alias(str(column))), on=_EPISODE
+        )
     ordered = shared.sort(_EPISODE)
     return [ordered[str(column)].cast(pl.Float64).to_numpy() for column in range(len(drivers))]
 
 
 def paired_lead(driver: pl.DataFrame, other: pl.DataFrame) -> tuple[Estimate | None, int]:
-    """Mean return of ``driver`` minus that of ``other``, and the number of episodes that both drove.
+    """Mean return of ``driver`` minus that of ``other``, and the number of episodes that both
+    drove.
 
     No estimate for fewer than two episodes.
     """
@@ -116,12 +133,14 @@ def paired_lead(driver: pl.DataFrame, other: pl.DataFrame) -> tuple[Estimate | N
 
 
 def paired_rows(episodes: pl.DataFrame) -> list[Row]:
-    """The first driver against each of the others, traffic by traffic; ``episodes`` as for :func:`evaluation_rows`.
+    """The first driver against each of the others, traffic by traffic; ``episodes`` as for
+    :func:`evaluation_rows`.
 
     Returns:
-        Per traffic and other driver ``agent, over, traffic, episodes`` (driven by both), ``lead`` (mean return of
-        ``agent`` minus that of ``over``), ``lead_ci`` (95 %) and ``verdict``: ``above`` or ``below`` where the
-        interval lies on one side of 0, else ``undecided``. Pairs that share fewer than two episodes are left out.
+        Per traffic and other driver ``agent, over, traffic, episodes`` (driven by both), ``lead``
+        (mean return of ``agent`` minus that of ``over``), ``lead_ci`` (95 %) and ``verdict``:
+        ``above`` or ``below`` where the interval lies on one side of 0, else ``undecided``. Pairs
+        that share fewer than two episodes are left out.
     """
     first, rows = episodes["agent"][0], []
     for (traffic,), there in episodes.group_by("traffic", maintain_order=True):
@@ -130,14 +149,21 @@ def paired_rows(episodes: pl.DataFrame) -> list[Row]:
             lead, shared = paired_lead(own, driven) if other != first else (None, 0)
             if lead is not None:
                 row = {"agent": first, "over": other, "traffic": traffic, "episodes": shared}
-                verdict = ("above" if lead.value > 0.0 else "below") if lead.excludes_zero() else "undecided"
+                verdict = (
+                    ("above" if lead.value > 0.0 else "below")
+                    if lead.excludes_zero()
+                    else "undecided"
+                )
                 rows.append({**row, **entries("lead", lead), "verdict": verdict})
     return rows
 
 
 @dataclass(frozen=True)
 class NormalizedScore:
-    """Percent of the way from the random driver to MOBIL; without a value, the reason why there is none."""
+    """Percent of the way from the random driver to MOBIL.
+
+    Without a value, the reason why there is none.
+    """
 
     percent: float | None = None
     interval: list[float] | None = None
@@ -145,12 +171,16 @@ class NormalizedScore:
 
 
 def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
-    """The normalised score of one agent, from the episodes that it shares with the two drivers of the scale."""
+    """The normalised score of one agent, from the episodes that it shares with the two drivers of
+    the scale.
+    """
     drivers = [pair]
     for name in (SCALE_TOP, SCALE_BOTTOM):
         driver = same_traffic.filter(pl.col("agent") == name)
         if driver.height == 0:
-            return NormalizedScore(reason=f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing")
+            return NormalizedScore(
+                reason=f"needs {SCALE_TOP} and {SCALE_BOTTOM} among the agents; {name} is missing"
+            )
         drivers.append(driver)
     agent, mobil, random_legal = _paired_rewards(*drivers)
     if len(agent) < 2:
@@ -159,22 +189,32 @@ def _score(pair: pl.DataFrame, same_traffic: pl.DataFrame) -> NormalizedScore:
 
 
 def normalized_percent(
-    agent: npt.ArrayLike, mobil: npt.ArrayLike, random_legal: npt.ArrayLike, resamples: int = RESAMPLES, seed: int = 0
+    agent: npt.ArrayLike,
+    mobil: npt.ArrayLike,
+    random_legal: npt.ArrayLike,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
 ) -> NormalizedScore:
-    """The paper's '% of MOBIL', ``100 (R - R_0) / (R_MOBIL - R_0)``: 0 for ``random_legal``, 100 for MOBIL.
+    """The paper's '% of MOBIL', ``100 (R - R_0) / (R_MOBIL - R_0)``: 0 for ``random_legal``, 100
+    for MOBIL.
 
-    This form fits both rows of the paper's Table VII; a plain ratio of mean rewards has no meaning where rewards can
-    be negative. Returns [E] of the three drivers are on the same episodes, in the same order. The interval resamples
-    episodes, all drivers together; resamples in which MOBIL's lead over the random driver is exactly 0 are left out.
-    There is no score where the paired interval of that lead includes 0: the scale would have no length.
+    This form fits both rows of the paper's Table VII; a plain ratio of mean rewards has no meaning
+    where rewards can be negative. Returns [E] of the three drivers are on the same episodes, in the
+    same order. The interval resamples episodes, all drivers together; resamples in which MOBIL's
+    lead over the random driver is exactly 0 are left out. There is no score where the paired
+    interval of that lead includes 0: the scale would have no length.
     """
-    returns = np.stack([np.asarray(values, dtype=np.float64) for values in (agent, mobil, random_legal)], axis=1)
+    returns = np.stack(
+        [np.asarray(values, dtype=np.float64) for values in (agent, mobil, random_legal)], axis=1
+    )
     lead = paired_difference(returns[:, 1], returns[:, 2], resamples, seed)
     if lead.interval is None:
         return NormalizedScore(reason="fewer than two episodes")
     if not lead.excludes_zero():
         interval = f"{lead.low:.1f} to {lead.high:.1f}"
-        return NormalizedScore(reason=f"the interval of mobil's lead over random_legal includes 0 ({interval})")
+        return NormalizedScore(
+            reason=f"the interval of mobil's lead over random_legal includes 0 ({interval})"
+        )
     means = bootstrap_means(returns, resamples, seed)
     low, high = np.quantile(_percent_of_way(means[means[:, 1] != means[:, 2]]), TAIL_LEVELS)
     return NormalizedScore(float(_percent_of_way(returns.mean(axis=0))), [float(low), float(high)])
@@ -190,11 +230,12 @@ class CrashesByScene:
     """Hard crashes per km.
 
     Attributes:
-        per_km: of all scenes together, with the 95 % interval of the bootstrap over scenes; no interval with fewer
-            than two scenes. Where nobody crashed the upper bound is Poisson's exact one for the distance driven,
-            since resampling zeros gives zero.
-        rows: one per scene, by name: ``scene, episodes, hard_crash, distance_km, crashes_per_km`` (None where
-            nothing was driven) and ``crashes_per_km_ci`` (exact, Poisson, as if its episodes were independent).
+        per_km: of all scenes together, with the 95 % interval of the bootstrap over scenes; no
+            interval with fewer than two scenes. Where nobody crashed the upper bound is Poisson's
+            exact one for the distance driven, since resampling zeros gives zero.
+        rows: one per scene, by name: ``scene, episodes, hard_crash, distance_km, crashes_per_km``
+            (None where nothing was driven) and ``crashes_per_km_ci`` (exact, Poisson, as if its
+            episodes were independent).
     """
 
     per_km: Estimate
@@ -204,21 +245,26 @@ class CrashesByScene:
 def crashes_by_scene(
     episodes: pl.DataFrame, scenes: Sequence[str], resamples: int = RESAMPLES, seed: int = 0
 ) -> CrashesByScene:
-    """Crashes per km on recorded scenes, in all and by scene, with intervals that know how few scenes there are.
+    """Crashes per km on recorded scenes, in all and by scene, with intervals that know how few
+    scenes there are.
 
-    Episodes of one scene start a tenth of a second apart among the same drivers, so they are no independent
-    observations: whole scenes are resampled, and the ratio (all crashes over all km) is taken anew in each resample.
+    Episodes of one scene start a tenth of a second apart among the same drivers, so they are no
+    independent observations: whole scenes are resampled, and the ratio (all crashes over all km) is
+    taken anew in each resample.
 
     Args:
         episodes: ``reason`` and ``distance_m`` per episode, of one driver.
-        scenes: the scene of each of them (:meth:`ganlane.traffic.ReplayTraffic.scenes_of_episodes`).
+        scenes: the scene of each of them
+            (:meth:`ganlane.traffic.ReplayTraffic.scenes_of_episodes`).
         resamples, seed: of the bootstrap.
 
     Raises:
         UserError: not one scene per episode, or nobody drove.
     """
     if len(scenes) != episodes.height:
-        raise UserError(f"{len(scenes)} scenes for {episodes.height} episodes: expected one for each.")
+        raise UserError(
+            f"{len(scenes)} scenes for {episodes.height} episodes: expected one for each."
+        )
     by_scene = (
         episodes.select("reason", "distance_m", pl.Series("scene", scenes, pl.String))
         .group_by("scene")
@@ -231,27 +277,45 @@ def crashes_by_scene(
     )
     crashes, km = (by_scene[name].to_numpy().astype(np.float64) for name in (_CRASH, "distance_km"))
     if not km.sum() > 0.0:
-        raise UserError("crashes per km: nobody drove; give episodes that last at least one decision.")
+        raise UserError(
+            "crashes per km: nobody drove; give episodes that last at least one decision."
+        )
     rows = []
     for row in by_scene.to_dicts():
-        rate = poisson_interval(row[_CRASH]).scaled(per=row["distance_km"]) if row["distance_km"] > 0.0 else None
+        rate = (
+            poisson_interval(row[_CRASH]).scaled(per=row["distance_km"])
+            if row["distance_km"] > 0.0
+            else None
+        )
         rows.append({**row, **entries("crashes_per_km", rate)})
     value = float(crashes.sum() / km.sum())
     if len(km) < 2:
         return CrashesByScene(Estimate(value), rows)
     if crashes.sum() == 0:
-        return CrashesByScene(Estimate(value, 0.0, (poisson_interval(0).high or 0.0) / float(km.sum())), rows)
+        return CrashesByScene(
+            Estimate(value, 0.0, (poisson_interval(0).high or 0.0) / float(km.sum())), rows
+        )
     driven = km.clip(min=np.finfo(np.float64).tiny)
-    ratios = [counts @ crashes / (counts @ driven) for counts in resample_counts(len(km), resamples, seed)]
+    ratios = [
+        counts @ crashes / (counts @ driven) for counts in resample_counts(len(km), resamples, seed)
+    ]
     low, high = np.quantile(np.concatenate(ratios), TAIL_LEVELS)
     return CrashesByScene(Estimate(value, float(low), float(high)), rows)
 
 
 def failed_episodes(episodes: pl.DataFrame) -> list[Row]:
-    """Every crash and departure: per ``driver, traffic, seed`` the numbers of the episodes that ended so."""
+    """Every crash and departure.
+
+    Per ``driver, traffic, seed`` the numbers of the episodes that ended so.
+    """
     failed = episodes.filter(pl.col("reason").is_in(FAILURES))
     return [
         {"driver": driver, "traffic": traffic, "seed": seed}
-        | {end: frame.filter(pl.col("reason") == end)["episode"].sort().to_list() for end in FAILURES}
-        for (driver, traffic, seed), frame in failed.group_by("agent", "traffic", "seed", maintain_order=True)
+        | {
+            end: frame.filter(pl.col("reason") == end)["episode"].sort().to_list()
+            for end in FAILURES
+        }
+        for (driver, traffic, seed), frame in failed.group_by(
+            "agent", "traffic", "seed", maintain_order=True
+        )
     ]

@@ -1,12 +1,14 @@
-"""95 % intervals: the bootstrap for means, exact ones for rare events, and both for several trainings of a recipe.
+"""95 % intervals: the bootstrap for means, exact ones for rare events, and both for several
+trainings of a recipe.
 
-All bootstraps are seeded and vectorised: a resample is a row of counts (how often each episode was drawn), so a mean
-over thousands of resamples is one matrix product, and paired episodes stay together.
+All bootstraps are seeded and vectorised: a resample is a row of counts (how often each episode was
+drawn), so a mean over thousands of resamples is one matrix product, and paired episodes stay
+together.
 
-Sources: Efron 1987 (BCa); Clopper and Pearson 1934 (binomial); Garwood 1936 (Poisson); Agarwal et al. 2021
-(interquartile mean, bootstrap, probability of improvement); Owen 2007 (resampling both factors of a crossed table);
-Hesterberg 2015 (how much too narrow the bootstrap of few values is); Satterthwaite 1946 (degrees of freedom of a sum
-of variances); McNemar 1947, in its exact form.
+Sources: Efron 1987 (BCa); Clopper and Pearson 1934 (binomial); Garwood 1936 (Poisson); Agarwal et
+al. 2021 (interquartile mean, bootstrap, probability of improvement); Owen 2007 (resampling both
+factors of a crossed table); Hesterberg 2015 (how much too narrow the bootstrap of few values is);
+Satterthwaite 1946 (degrees of freedom of a sum of variances); McNemar 1947, in its exact form.
 """
 
 from __future__ import annotations
@@ -59,36 +61,56 @@ class Estimate:
 
     def scaled(self, factor: float = 1.0, per: float = 1.0) -> Estimate:
         """Value and bounds times ``factor``, divided by ``per``; both are positive."""
-        low, high = (None if bound is None else bound * factor / per for bound in (self.low, self.high))
+        low, high = (
+            None if bound is None else bound * factor / per for bound in (self.low, self.high)
+        )
         return Estimate(self.value * factor / per, low, high)
 
 
 def entries(name: str, estimate: Estimate | None) -> dict[str, Any]:
-    """``{name: value, name_ci: [low, high]}`` for a table's row; None for what is missing or not finite."""
+    """``{name: value, name_ci: [low, high]}`` for a table's row.
+
+    None for what is missing or not finite.
+    """
     if estimate is None:
         return {name: None, f"{name}_ci": None}
-    return {name: estimate.value if math.isfinite(estimate.value) else None, f"{name}_ci": estimate.interval}
+    return {
+        name: estimate.value if math.isfinite(estimate.value) else None,
+        f"{name}_ci": estimate.interval,
+    }
 
 
 def resample_counts(size: int, resamples: int, seed: int) -> Iterator[Array]:
-    """Chunks [R, size] of how often each of ``size`` episodes occurs in a resample of ``size`` with replacement."""
+    """Chunks [R, size] of how often each of ``size`` episodes occurs in a resample of ``size`` with
+    replacement.
+    """
     generator = np.random.default_rng(seed)
     for start in range(0, resamples, _CHUNK):
         rows = min(_CHUNK, resamples - start)
         drawn = generator.integers(size, size=(rows, size)) + size * np.arange(rows)[:, None]
-        yield np.bincount(drawn.ravel(), minlength=rows * size).reshape(rows, size).astype(np.float64)
+        yield (
+            np.bincount(drawn.ravel(), minlength=rows * size).reshape(rows, size).astype(np.float64)
+        )
 
 
 @lru_cache(maxsize=2)
 def kept_counts(size: int, resamples: int, seed: int) -> tuple[npt.NDArray[np.uint16], ...]:
-    """The chunks of :func:`resample_counts`: a table's intervals draw the same ones, 0.25 s for 1000 episodes."""
+    """The chunks of :func:`resample_counts`.
+
+    A table's intervals draw the same ones, 0.25 s for 1000 episodes.
+    """
     return tuple(counts.astype(np.uint16) for counts in resample_counts(size, resamples, seed))
 
 
 def bootstrap_means(values: Array, resamples: int = RESAMPLES, seed: int = 0) -> Array:
-    """Means [R] or [R, K] of resampled ``values`` [E] or [E, K]; the K columns of an episode stay together."""
+    """Means [R] or [R, K] of resampled ``values`` [E] or [E, K].
+
+    The K columns of an episode stay together.
+    """
     size = len(values)
-    drawn = (kept_counts if size * resamples <= _MOST_KEPT else resample_counts)(size, resamples, seed)
+    drawn = (kept_counts if size * resamples <= _MOST_KEPT else resample_counts)(
+        size, resamples, seed
+    )
     return np.concatenate([counts.astype(np.float64) @ values / size for counts in drawn])
 
 
@@ -99,7 +121,8 @@ def _bca_levels(values: Array, means: Array) -> Array:
     """
     mean = values.mean()
     centred = values - mean
-    # The jackknife's acceleration; for a mean the leave-one-out values differ from it by -centred / (E - 1).
+    # The jackknife's acceleration; for a mean the leave-one-out values differ from it by -centred /
+    # (E - 1).
     acceleration = (centred**3).sum() / (6.0 * (centred**2).sum() ** 1.5)
     below = ((means < mean).mean() + (means <= mean).mean()) / 2.0
     edge = 0.5 / len(means)
@@ -109,7 +132,10 @@ def _bca_levels(values: Array, means: Array) -> Array:
 
 
 def mean_interval(values: npt.ArrayLike, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
-    """Mean of ``values`` [E] with its BCa bootstrap interval; no interval for fewer than two values."""
+    """Mean of ``values`` [E] with its BCa bootstrap interval.
+
+    No interval for fewer than two values.
+    """
     data = np.asarray(values, dtype=np.float64)
     mean = float(data.mean())
     if len(data) < 2:
@@ -146,11 +172,12 @@ def poisson_interval(count: int) -> Estimate:
 
 # The training as the unit: several trainings of one recipe (seeds) on the same episodes.
 #
-# An interval over episodes says what other episodes would give; it says nothing about another training. Here both are
-# resampled: the trainings of a recipe, and the episodes, which are the same for all trainings and drivers and so are
-# drawn once for all of them. Tables are [S, E]: S trainings (1 for a driver that is not trained), E episodes. A plain
-# bootstrap of three to five trainings is too narrow: where trainings differ, its intervals hold the truth in 75 to 91
-# of 100 draws. _estimate corrects it as a t interval would.
+# An interval over episodes says what other episodes would give; it says nothing about another
+# training. Here both are resampled: the trainings of a recipe, and the episodes, which are the same
+# for all trainings and drivers and so are drawn once for all of them. Tables are [S, E]: S
+# trainings (1 for a driver that is not trained), E episodes. A plain bootstrap of three to five
+# trainings is too narrow: where trainings differ, its intervals hold the truth in 75 to 91 of 100
+# draws. _estimate corrects it as a t interval would.
 
 
 def interquartile_mean(scores: npt.ArrayLike) -> Array:
@@ -172,9 +199,11 @@ def difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
 
 
 def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
-    """How likely a training of ``first`` [S, E] has a higher mean score than one of ``second`` [S', E]; ties half.
+    """How likely a training of ``first`` [S, E] has a higher mean score than one of ``second`` [S',
+    E]; ties half.
 
-    Where all trainings at hand of one are above all of the other it is 1, from 1 to 1: it says nothing of others.
+    Where all trainings at hand of one are above all of the other it is 1, from 1 to 1: it says
+    nothing of others.
     """
     return _estimate(_pair(first, second), _share_above, bounds=(0.0, 1.0))
 
@@ -182,7 +211,8 @@ def probability_of_improvement(first: npt.ArrayLike, second: npt.ArrayLike) -> E
 def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate | None:
     """All events over all of ``per`` (km, say), both [S, E]; None where the latter is 0.
 
-    Where nothing happened the upper bound is Poisson's exact one, since resampling zeros gives zero.
+    Where nothing happened the upper bound is Poisson's exact one, since resampling zeros gives
+    zero.
     """
     happened, amount = _pair(events, per)
     total = float(amount.sum())
@@ -202,9 +232,11 @@ def rate_over_trainings(events: npt.ArrayLike, per: npt.ArrayLike) -> Estimate |
 def normalized_over_trainings(
     agent: npt.ArrayLike, mobil: npt.ArrayLike, random_legal: npt.ArrayLike
 ) -> Estimate | None:
-    """The normalised score (:func:`ganlane.evaluation.normalized_percent`) of several trainings, each [S, E].
+    """The normalised score (:func:`ganlane.evaluation.normalized_percent`) of several trainings,
+    each [S, E].
 
-    None where the interval of MOBIL's lead over the random driver includes 0: the scale would have no length.
+    None where the interval of MOBIL's lead over the random driver includes 0: the scale would have
+    no length.
     """
     tables = [_pair(each, mobil)[0] for each in (agent, mobil, random_legal)]
     if not difference(tables[1], tables[2]).excludes_zero():
@@ -219,7 +251,10 @@ def normalized_over_trainings(
 
 @dataclass(frozen=True)
 class McNemar:
-    """Episodes in which one of two drivers alone failed; the exact two-sided probability of so unequal numbers."""
+    """Episodes in which one of two drivers alone failed.
+
+    The exact two-sided probability of so unequal numbers.
+    """
 
     only_first: int
     only_second: int
@@ -227,12 +262,17 @@ class McNemar:
 
 
 def mcnemar(first: npt.ArrayLike, second: npt.ArrayLike) -> McNemar:
-    """Exact test whether two drivers fail equally often: ``first`` and ``second`` [E] bool on the same episodes."""
+    """Exact test whether two drivers fail equally often.
+
+    ``first`` and ``second`` [E] bool on the same episodes.
+    """
     a, b = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
     if a.shape != b.shape:
         raise ValueError(f"paired episodes must have one shape, found {a.shape} and {b.shape}")
     one, other = int((a & ~b).sum()), int((b & ~a).sum())
-    return McNemar(one, other, float(scipy.stats.binomtest(one, one + other).pvalue) if one + other else 1.0)
+    return McNemar(
+        one, other, float(scipy.stats.binomtest(one, one + other).pvalue) if one + other else 1.0
+    )
 
 
 def _table(values: npt.ArrayLike) -> Array:
@@ -250,14 +290,18 @@ def _pair(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[Array, Array]:
 
 
 def _estimate(
-    tables: Sequence[Array], statistic: Callable[..., Array], bounds: tuple[float, float] = (-np.inf, np.inf)
+    tables: Sequence[Array],
+    statistic: Callable[..., Array],
+    bounds: tuple[float, float] = (-np.inf, np.inf),
 ) -> Estimate:
-    """``statistic`` of the trainings' means of ``tables`` [..., S, E], with its interval within ``bounds``.
+    """``statistic`` of the trainings' means of ``tables`` [..., S, E], with its interval within
+    ``bounds``.
 
-    ``statistic`` takes means [R, ..., S] of every table and returns [R]. The episodes and each table's trainings are
-    resampled apart. S resampled trainings have (S - 1) / S of the variance that they should have, and few trainings
-    tell it badly. So each table's part is widened by the root of S / (S - 1), and the sum of all parts by Student's t
-    over the normal distribution, with Satterthwaite's degrees of freedom (infinite for the episodes).
+    ``statistic`` takes means [R, ..., S] of every table and returns [R]. The episodes and each
+    table's trainings are resampled apart. S resampled trainings have (S - 1) / S of the variance
+    that they should have, and few trainings tell it badly. So each table's part is widened by the
+    root of S / (S - 1), and the sum of all parts by Student's t over the normal distribution, with
+    Satterthwaite's degrees of freedom (infinite for the episodes).
     """
     means = [table.mean(axis=-1)[None] for table in tables]
     value = float(statistic(*means)[0])
@@ -265,7 +309,9 @@ def _estimate(
         return Estimate(value)
     generator, episodes = np.random.default_rng((0, 1)), tables[0].shape[-1]
     counts = np.concatenate(kept_counts(episodes, FEWER_RESAMPLES, 0)).astype(np.float64).T
-    parts = [statistic(*(np.moveaxis(table @ counts, -1, 0) / episodes for table in tables)) - value]
+    parts = [
+        statistic(*(np.moveaxis(table @ counts, -1, 0) / episodes for table in tables)) - value
+    ]
     freedom = [np.inf]
     for index, table in enumerate(tables):
         trainings = table.shape[-2]

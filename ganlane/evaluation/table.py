@@ -22,25 +22,35 @@ def aligned(lines: Sequence[Sequence[str]], names: int = 1) -> str:
     widths = [max(map(len, column)) for column in zip(*lines)]
 
     def line(cells: Sequence[str]) -> str:
-        fitted = [cell.ljust(w) if i < names else cell.rjust(w) for i, (cell, w) in enumerate(zip(cells, widths))]
+        fitted = [
+            cell.ljust(w) if i < names else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(cells, widths))
+        ]
         return "  ".join(fitted).rstrip()
 
-    return "\n".join([line(lines[0]), "  ".join("-" * width for width in widths), *map(line, lines[1:])])
+    return "\n".join(
+        [line(lines[0]), "  ".join("-" * width for width in widths), *map(line, lines[1:])]
+    )
 
 
 def show(*texts: str, columns: str = "auto") -> None:
-    """Print texts, a blank line between them, their tables as wide as the terminal (``columns`` auto) or whole (all).
+    """Print texts, a blank line between them, their tables as wide as the terminal (``columns``
+    auto) or whole (all).
 
     Where the output is no terminal, tables are whole.
     """
-    width = shutil.get_terminal_size().columns if columns == "auto" and sys.stdout.isatty() else None
+    width = (
+        shutil.get_terminal_size().columns if columns == "auto" and sys.stdout.isatty() else None
+    )
     print("\n\n".join(texts) if width is None else fitting("\n\n".join(texts), width))
 
 
 def fitting(text: str, width: int) -> str:
-    """``text``, without some columns of each table of :func:`aligned` that is wider; a line below names them.
+    """``text``, without some columns of each table of :func:`aligned` that is wider; a line below
+    names them.
 
-    A table ends with a blank line. Columns go from the right, those of :data:`_FIRST_TO_GO` before the others.
+    A table ends with a blank line. Columns go from the right, those of :data:`_FIRST_TO_GO` before
+    the others.
     """
     return "\n\n".join(_narrowed(part.split("\n"), width) for part in text.split("\n\n"))
 
@@ -56,7 +66,10 @@ def _narrowed(lines: Sequence[str], width: int) -> str:
     for column in [*order, *reversed(range(1, len(spans)))]:
         if sum(spans[each].stop - spans[each].start + 2 for each in kept) > width + 2:
             kept.discard(column)
-    rows = ["  ".join(line[spans[each]] for each in sorted(kept)).rstrip() for line in lines[ruler - 1 :]]
+    rows = [
+        "  ".join(line[spans[each]] for each in sorted(kept)).rstrip()
+        for line in lines[ruler - 1 :]
+    ]
     gone = ", ".join(name for each, name in enumerate(names) if each not in kept and name)
     return "\n".join([*lines[: ruler - 1], *rows, f"(columns=all shows: {gone})"])
 
@@ -67,7 +80,9 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def with_interval(row: Row, key: str, digits: int = 3) -> str:
-    """A cell with ``row[key]``, followed by ``[low, high]`` where the row has an interval for it (``key_ci``)."""
+    """A cell with ``row[key]``, followed by ``[low, high]`` where the row has an interval for it
+    (``key_ci``).
+    """
     text, interval = number(row.get(key), digits), row.get(f"{key}_ci")
     return text if not interval else f"{text} [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]"
 
@@ -76,7 +91,8 @@ def with_interval(row: Row, key: str, digits: int = 3) -> str:
 class Table:
     """A title, headings, lines of cells, and notes.
 
-    The first ``names`` columns hold words and are set to the left, the others hold numbers and are set to the right.
+    The first ``names`` columns hold words and are set to the left, the others hold numbers and are
+    set to the right.
     """
 
     title: str
@@ -94,7 +110,10 @@ class Table:
         names: int = 1,
         notes: Sequence[str] = (),
     ) -> Table:
-        """One line per row; ``columns`` maps each heading to the function that makes a cell of a row."""
+        """One line per row.
+
+        ``columns`` maps each heading to the function that makes a cell of a row.
+        """
         lines = [[cell(row) for cell in columns.values()] for row in rows]
         return cls(title, list(columns), lines, names, notes)
 
@@ -135,7 +154,8 @@ def percent(share: float | None, digits: int = 0) -> str:
     return NOTHING if share is None else f"{100 * share:.{digits}f} %"
 
 
-#: Heading, key and digits of each column of an evaluation, names before numbers; ``run``: of a sweep.
+#: Heading, key and digits of each column of an evaluation, names before numbers; ``run``: of a
+#: sweep.
 _COLUMNS: Mapping[str, tuple[str, int | None]] = {
     **{name: (name, None) for name in ("run", "agent", "traffic", "episodes", "goal")},
     "hard": ("hard_crash", None),
@@ -152,26 +172,45 @@ _COLUMNS: Mapping[str, tuple[str, int | None]] = {
 }
 #: Columns that are left out where no row has anything in them.
 _OPTIONAL = ("run", "time-out", "scene end", "minus MOBIL, paired")
-#: Columns that a narrow terminal does without, the least telling first; the paired leads have a table of their own.
+#: Columns that a narrow terminal does without, the least telling first; the paired leads have a
+#: table of their own.
 _FIRST_TO_GO = (
-    *("crashes/1000 km [95 %]", "% of MOBIL [95 %]", "changes/km", "minus MOBIL, paired", "episodes"),
+    *(
+        "crashes/1000 km [95 %]",
+        "% of MOBIL [95 %]",
+        "changes/km",
+        "minus MOBIL, paired",
+        "episodes",
+    ),
     *("time-out", "scene end", "soft", "m/s", "goal"),
 )
 
 
 def text_table(rows: Sequence[Row]) -> str:
-    """The rows of :func:`ganlane.evaluation.evaluation_rows`, and a line for each reason why a score is missing."""
+    """The rows of :func:`ganlane.evaluation.evaluation_rows`, and a line for each reason why a
+    score is missing.
+    """
     cells = {
-        heading: [str(row.get(key, NOTHING)) if digits is None else with_interval(row, key, digits) for row in rows]
+        heading: [
+            str(row.get(key, NOTHING)) if digits is None else with_interval(row, key, digits)
+            for row in rows
+        ]
         for heading, (key, digits) in _COLUMNS.items()
     }
-    cells = {name: column for name, column in cells.items() if name not in _OPTIONAL or {*column} - {"0", NOTHING}}
+    cells = {
+        name: column
+        for name, column in cells.items()
+        if name not in _OPTIONAL or {*column} - {"0", NOTHING}
+    }
     reasons: dict[str, dict[str, None]] = {}
     for row in rows:
         reason = row.get("normalized_percent_reason")
         if reason is not None:
             reasons.setdefault(reason, {})[row["traffic"]] = None
-    notes = [f"% of MOBIL on {', '.join(traffics)}: none, {reason}" for reason, traffics in reasons.items()]
+    notes = [
+        f"% of MOBIL on {', '.join(traffics)}: none, {reason}"
+        for reason, traffics in reasons.items()
+    ]
     table = aligned([list(cells), *map(list, zip(*cells.values()))], 2 + ("run" in cells))
     return "\n".join([table, *(["", *notes] if notes else [])])
 

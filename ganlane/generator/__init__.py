@@ -3,10 +3,13 @@
 Read in this order:
 
 - ``networks``: generator and discriminator; ``checkpoint``: their files, and arrays that are kept;
-- ``windows``: recordings to batches (segments of scenes; 9 positions observed, 8 to predict; k-means groups);
-- ``closed_loop``: one step of each preset, in fitting and in simulation, and rollouts of whole scenes;
+- ``windows``: recordings to batches (segments of scenes; 9 positions observed, 8 to predict;
+  k-means groups);
+- ``closed_loop``: one step of each preset, in fitting and in simulation, and rollouts of whole
+  scenes;
 - ``forecasts``: of networks, IDM and baselines, and their scores;
-- ``tasks``: what each preset fits, and the loop; ``fit``: splits, one call, folds by scene, ablations.
+- ``tasks``: what each preset fits, and the loop; ``fit``: splits, one call, folds by scene,
+  ablations.
 """
 
 from ganlane.generator.checkpoint import FitResult, Preset, load_generator, shipped_generator
@@ -23,7 +26,13 @@ from ganlane.generator.fit import (
 from ganlane.generator.networks import Discriminator, Generator
 from ganlane.generator.tasks import Progress
 from ganlane.generator.windows import scene_tracks
-from ganlane.parameters.generator import CalibratedConfig, GeneratorSizes, LoopConfig, LossWeights, PaperConfig
+from ganlane.parameters.generator import (
+    CalibratedConfig,
+    GeneratorSizes,
+    LoopConfig,
+    LossWeights,
+    PaperConfig,
+)
 
 __all__ = [
     "ANCHOR",

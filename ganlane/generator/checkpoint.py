@@ -1,4 +1,8 @@
-"""Files: fitted generators with their description, and arrays that are kept so that they are not computed again."""
+"""Files.
+
+Fitted generators with their description, and arrays that are kept so that they are not computed
+again.
+"""
 
 from __future__ import annotations
 
@@ -39,10 +43,12 @@ class FitResult:
 
     Attributes:
         metrics: on the held-out scenes, for ``"all"`` and each scene; the paper's preset also has
-            ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored together.
+            ``"discriminator": {"held_out_accuracy"}``. Empty for a fold's fit: folds are scored
+            together.
         config: settings of the fit, as plain data.
         data: file, rows and tracks, and the names of the fitted, validation and held-out scenes.
-        statistics: ``DrivingStatistics.to_dict()`` of all recordings; for a fold's fit of its other scenes.
+        statistics: ``DrivingStatistics.to_dict()`` of all recordings; for a fold's fit of its other
+            scenes.
         updates: updates after which the weights were taken (early stopping).
         seconds: duration of the fit, with its evaluations on the validation scenes.
     """
@@ -57,19 +63,25 @@ class FitResult:
     seconds: float
 
     def save(
-        self, path: str | Path, folds: Mapping[str, Any] | None = None, code: Mapping[str, Any] | None = None
+        self,
+        path: str | Path,
+        folds: Mapping[str, Any] | None = None,
+        code: Mapping[str, Any] | None = None,
     ) -> None:
         """Write weights and metadata, atomically.
 
-        ``folds`` is the result of :func:`ganlane.generator.cross_validate`, if it was called; ``code`` the code's
-        version in more detail than the package's number.
+        ``folds`` is the result of :func:`ganlane.generator.cross_validate`, if it was called;
+        ``code`` the code's version in more detail than the package's number.
         """
         metadata = {
             "preset": self.preset,
             "sizes": asdict(self.module.sizes),
             "config": self.config,
             "data": self.data,
-            "metrics": {**self.metrics, "fit": {"updates": self.updates, "seconds": round(self.seconds, 1)}},
+            "metrics": {
+                **self.metrics,
+                "fit": {"updates": self.updates, "seconds": round(self.seconds, 1)},
+            },
             "driving_statistics": self.statistics,
             "folds": None if folds is None else dict(folds),
             "code": {} if code is None else dict(code),
@@ -83,13 +95,17 @@ def shipped_generator(preset: Preset) -> Path:
     return CHECKPOINTS / f"generator_{preset}.safetensors"
 
 
-def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Generator, dict[str, Any]]:
-    """The generator in evaluation mode, without gradients, and its metadata, as :meth:`FitResult.save` wrote them.
+def load_generator(
+    path: str | Path, preset: Preset | None = None
+) -> tuple[Generator, dict[str, Any]]:
+    """The generator in evaluation mode, without gradients, and its metadata, as
+    :meth:`FitResult.save` wrote them.
 
     ``preset`` is the required one; None accepts any.
 
     Raises:
-        UserError: no such file, another kind of file, another preset, or weights that do not fit the stored sizes.
+        UserError: no such file, another kind of file, another preset, or weights that do not fit
+            the stored sizes.
     """
     tensors, metadata = load_weights(path, KIND)
     found = str(metadata.get("preset"))
@@ -103,9 +119,12 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
     complete = isinstance(sizes, dict) and set(kinds) - {"differences"} <= set(sizes) <= set(kinds)
     # The bound keeps a damaged file from requesting all memory.
     if not complete or not all(
-        isinstance(value, int) and 0 <= value <= 4096 and type(value) is kinds[name] for name, value in sizes.items()
+        isinstance(value, int) and 0 <= value <= 4096 and type(value) is kinds[name]
+        for name, value in sizes.items()
     ):
-        raise UserError(f"{path}: sizes {sizes} are not those of a generator ({sorted(kinds)}); fit it again.")
+        raise UserError(
+            f"{path}: sizes {sizes} are not those of a generator ({sorted(kinds)}); fit it again."
+        )
     try:
         with torch.random.fork_rng(devices=[]):
             generator = Generator(GeneratorSizes(**sizes))
@@ -125,7 +144,10 @@ def load_generator(path: str | Path, preset: Preset | None = None) -> tuple[Gene
 
 
 def cache_folder() -> Path | None:
-    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder; None if switched off."""
+    """Folder of the cache: ``GANLANE_CACHE``, else ``ganlane`` in the user's cache folder.
+
+    None if switched off.
+    """
     named = os.environ.get(CACHE_VARIABLE)
     if named is not None:
         return Path(named) if named else None
@@ -141,7 +163,9 @@ def content_hash(settings: Any, *arrays: np.ndarray) -> str:
     return digest.hexdigest()[:32]
 
 
-def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def cached(
+    name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
     """The arrays that ``compute`` returns, from the cache if it ran for this ``key`` before.
 
     A damaged file is computed again, and a folder that cannot be written to is ignored.
@@ -161,15 +185,26 @@ def cached(name: str, key: str, compute: Callable[[], dict[str, np.ndarray]]) ->
 def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write named arrays as .npz with a checksum, atomically."""
     file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # numpy's stub takes a name for an option
+    # numpy's stub takes a name for an option
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
     write_bytes(path, sealed_archive(file.getvalue()))
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """What :func:`save_arrays` wrote, without pickle; None where it is absent, with a note where damaged."""
+    """What :func:`save_arrays` wrote, without pickle.
+
+    None where it is absent, with a note where damaged.
+    """
     if not path.is_file():
         return None
-    of_numpy = (KeyError, EOFError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)
+    of_numpy = (
+        KeyError,
+        EOFError,
+        SyntaxError,
+        tokenize.TokenError,
+        zipfile.BadZipFile,
+        zlib.error,
+    )
     with suppress(UserError, OSError, ValueError, *of_numpy):
         content = path.read_bytes()
         if has_checksum(content, path):

@@ -1,4 +1,5 @@
-"""Closed loop: one step of each preset, in fitting and in simulation alike, and rollouts of recorded scenes.
+"""Closed loop: one step of each preset, in fitting and in simulation alike, and rollouts of
+recorded scenes.
 
 **paper**: positions only, the first predicted displacement moves the vehicle (:func:`paper_step`).
 
@@ -8,13 +9,15 @@
     acceleration         = IDM(own desired speed, own headway) + r - mean(r)
     lateral acceleration = 0.3 (target lane centre - y) - 1.1 v_y + q - mean(q)
 
-with ``r = 4 tanh(. / 4)`` and ``q = 2 tanh(. / 2)`` in m/s2, and exponential means over 3 s (a washout); what would
-move the body out of its lane is left out. The anchor keeps vehicles on the road, apart, and at their own speeds; the
-network adds the variety and the reactions of recorded drivers.
+with ``r = 4 tanh(. / 4)`` and ``q = 2 tanh(. / 2)`` in m/s2, and exponential means over 3 s (a
+washout); what would move the body out of its lane is left out. The anchor keeps vehicles on the
+road, apart, and at their own speeds; the network adds the variety and the reactions of recorded
+drivers.
 
-Every vehicle carries a history of its motions (:class:`History`) and a latent vector that changes slowly
-(:func:`wander`). Each driver has a headway and a desired speed of its own: in rollouts of recorded scenes the headway
-at which IDM is in balance, where it is known (:func:`balanced_headway`).
+Every vehicle carries a history of its motions (:class:`History`) and a latent vector that changes
+slowly (:func:`wander`). Each driver has a headway and a desired speed of its own: in rollouts of
+recorded scenes the headway at which IDM is in balance, where it is known
+(:func:`balanced_headway`).
 """
 
 from __future__ import annotations
@@ -38,28 +41,32 @@ from ganlane.sim.state import ENTRY_M, Road, Vehicles, Visibility
 
 #: Tangent of the largest heading.
 STEEPEST = 0.3
-#: The body keeps this distance from the lane's edge; outward residuals fade over the distance before it, m.
+#: The body keeps this distance from the lane's edge; outward residuals fade over the distance
+#: before it, m.
 _MARGIN_M, _FADE_M = 0.1, 0.3
 #: Levels of the headway quantiles.
 QUANTILE_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
-#: Quantiles of (gap - 2 m) / speed of recorded followers on US-101, s: the default where no statistics are given.
+#: Quantiles of (gap - 2 m) / speed of recorded followers on US-101, s: the default where no
+#: statistics are given.
 HEADWAY_QUANTILES_S = (0.50, 0.93, 1.27, 1.93, 3.27)
 #: Lower bound of a recorded driver's headway, s.
 SHORTEST_HEADWAY_S = 0.1
-#: Desired speed above the present one, m/s: range drawn from in fitting, and the middle used in evaluation.
+#: Desired speed above the present one, m/s: range drawn from in fitting, and the middle used in
+#: evaluation.
 DESIRED_EXCESS_MPS = (1.0, 11.0)
 #: Desired speed of all drivers if they do not differ: the middle of Table II's range, m/s.
 COMMON_SPEED_MPS = 22.0
-#: In fitting, standard deviation of the headways' logarithm about the balanced ones, so that drivers are off balance.
+#: In fitting, standard deviation of the headways' logarithm about the balanced ones, so that
+#: drivers are off balance.
 _SCATTER = 0.25
 
 
 class History(NamedTuple):
     """Past motions of [N, M] vehicles.
 
-    ``motions`` are observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest first; separate
-    ones, because a single one would be copied whole at every step. ``displacement`` [N, M, 2] is the newest motion's,
-    m per 0.1 s.
+    ``motions`` are observed - 1 tensors [N, M, 4H], input projections of the last motions, oldest
+    first; separate ones, because a single one would be copied whole at every step. ``displacement``
+    [N, M, 2] is the newest motion's, m per 0.1 s.
     """
 
     motions: tuple[Tensor, ...]
@@ -69,18 +76,24 @@ class History(NamedTuple):
 def start(generator: Generator, displacement: Tensor) -> History:
     """The history of vehicles that have always moved by ``displacement`` [N, M, 2] per step."""
     one = generator.encoder.project(displacement, torch.zeros_like(displacement))
-    # Equal, but separate tensors: a compiled graph assumes that inputs which share memory always do.
+    # Equal, but separate tensors: a compiled graph assumes that inputs which share memory always
+    # do.
     return History(tuple(one.clone() for _ in range(generator.sizes.observed - 1)), displacement)
 
 
 def recorded(generator: Generator, displacements: Tensor) -> History:
-    """The history after recorded ``displacements`` [N, M, observed - 1, 2]; the oldest motion is repeated."""
+    """The history after recorded ``displacements`` [N, M, observed - 1, 2].
+
+    The oldest motion is repeated.
+    """
     motions = generator.project(displacements).unbind(dim=-2)
     return History((motions[0], *motions), displacements[..., -1, :])
 
 
 def push(generator: Generator, history: History, displacement: Tensor) -> tuple[History, Tensor]:
-    """The history with the new motion, the only one projected, and its difference [N, M, 2] to the last one, m."""
+    """The history with the new motion, the only one projected, and its difference [N, M, 2] to the
+    last one, m.
+    """
     difference = displacement - history.displacement
     new = generator.encoder.project(displacement, difference)
     return History((*history.motions[1:], new), displacement), difference
@@ -89,22 +102,29 @@ def push(generator: Generator, history: History, displacement: Tensor) -> tuple[
 def observe(history: History, difference: Tensor, vehicles: Vehicles, extra: Tensor) -> Observation:
     """The generator's input after :func:`push`."""
     position = torch.stack([vehicles.x, vehicles.y], dim=-1)
-    return Observation(history.motions, history.displacement, difference, position, vehicles.valid, extra)
+    return Observation(
+        history.motions, history.displacement, difference, position, vehicles.valid, extra
+    )
 
 
 def displacement_of(vehicles: Vehicles) -> Tensor:
     """Displacement [N, M, 2] in the last step, m.
 
-    Computed from speed and heading: differences of float32 positions lose 0.5 mm, or 0.05 m/s2, after 5 km.
+    Computed from speed and heading: differences of float32 positions lose 0.5 mm, or 0.05 m/s2,
+    after 5 km.
     """
     length = vehicles.speed * PHYSICS_STEP_S
-    return torch.stack([length * torch.cos(vehicles.heading), length * torch.sin(vehicles.heading)], dim=-1)
+    return torch.stack(
+        [length * torch.cos(vehicles.heading), length * torch.sin(vehicles.heading)], dim=-1
+    )
 
 
 def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehicles:
-    """The vehicles 0.1 s later at a new velocity (m/s, [N, M]), without driving backwards or sliding sideways.
+    """The vehicles 0.1 s later at a new velocity (m/s, [N, M]), without driving backwards or
+    sliding sideways.
 
-    The lateral velocity is limited to :data:`STEEPEST` times the longitudinal one, so a standing car stays in place.
+    The lateral velocity is limited to :data:`STEEPEST` times the longitudinal one, so a standing
+    car stays in place.
     """
     forward = velocity_x.clamp_min(0.0)
     limit = STEEPEST * forward
@@ -121,28 +141,38 @@ def moved_by(vehicles: Vehicles, velocity_x: Tensor, velocity_y: Tensor) -> Vehi
 
 
 def wander(noise: Tensor, fresh: Tensor, period_s: float) -> Tensor:
-    """``noise`` 0.1 s later: an Ornstein-Uhlenbeck process with unit variance and time constant ``period_s``.
+    """``noise`` 0.1 s later: an Ornstein-Uhlenbeck process with unit variance and time constant
+    ``period_s``.
 
-    ``fresh`` are independent standard normal numbers of the same shape. A period of 0 draws anew at every step.
+    ``fresh`` are independent standard normal numbers of the same shape. A period of 0 draws anew at
+    every step.
     """
     kept = math.exp(-PHYSICS_STEP_S / period_s) if period_s > 0 else 0.0
     return kept * noise + math.sqrt(1.0 - kept * kept) * fresh
 
 
 class Plan(NamedTuple):
-    """Predicted displacements not yet driven: ``ahead`` [N, M, execute_k, 2] in m, next first; ``left`` of them."""
+    """Predicted displacements not yet driven: ``ahead`` [N, M, execute_k, 2] in m, next first.
+
+    ``left`` of them.
+    """
 
     ahead: Tensor
     left: Tensor
 
 
 def paper_step(
-    generator: Generator, vehicles: Vehicles, history: History, noise: Tensor, plan: Plan | None = None
+    generator: Generator,
+    vehicles: Vehicles,
+    history: History,
+    noise: Tensor,
+    plan: Plan | None = None,
 ) -> tuple[Vehicles, History, Plan | None]:
-    """One step of the paper's preset: vehicles 0.1 s later, their history, and the rest of the plan.
+    """One step of the paper's preset: vehicles 0.1 s later, their history, and the rest of the
+    plan.
 
-    Without a plan (``execute_k`` = 1) one decoder step is run and driven. With one, ``execute_k`` steps are run
-    for the vehicles whose last plan is finished.
+    Without a plan (``execute_k`` = 1) one decoder step is run and driven. With one, ``execute_k``
+    steps are run for the vehicles whose last plan is finished.
     """
     history, difference = push(generator, history, displacement_of(vehicles))
     steps = 1 if plan is None else plan.ahead.shape[-2]
@@ -164,8 +194,10 @@ class AnchorParameters:
         lane_stiffness: pull to the target lane's centre, 1/s2.
         lane_damping: of the lateral velocity, 1/s; with the stiffness critically damped.
         residual: largest residual along and across the road.
-        washout_s: time constant of the residual's mean, which is subtracted; infinite never does (an ablation).
-        further_inputs: whether the network gets :func:`extra_inputs`; if not, they are 0 (an ablation).
+        washout_s: time constant of the residual's mean, which is subtracted; infinite never does
+            (an ablation).
+        further_inputs: whether the network gets :func:`extra_inputs`; if not, they are 0 (an
+            ablation).
     """
 
     idm: IdmParameters = field(default_factory=lambda: IdmParameters(min_acceleration=-8.0))
@@ -180,7 +212,10 @@ ANCHOR = AnchorParameters()
 
 
 class DriverMemory(NamedTuple):
-    """State of the calibrated preset: history, the residual's mean [N, M, 2] in m/s2, and the headway [N, M] in s."""
+    """State of the calibrated preset.
+
+    History, the residual's mean [N, M, 2] in m/s2, and the headway [N, M] in s.
+    """
 
     history: History
     mean: Tensor
@@ -188,23 +223,31 @@ class DriverMemory(NamedTuple):
 
 
 def extra_inputs(scene: Scene, anchor: Tensor, offset: Tensor) -> Tensor:
-    """The further inputs [N, M, 4], each bounded and of order 1; without a leader the gap input is 1.
+    """The further inputs [N, M, 4], each bounded and of order 1; without a leader the gap input is
+    1.
 
     ``anchor`` is IDM's acceleration, m/s2, ``offset`` the distance to the target lane's centre, m.
     """
     ahead = leader(scene, scene.vehicles.target_lane.to(anchor.dtype))
     gap = ahead.gap.clamp_min(0.0)
     closing = (scene.vehicles.speed - ahead.speed) / 5.0
-    columns = [anchor.clamp(-4.0, 4.0), gap / (gap + 20.0), closing.clamp(-3.0, 3.0), (offset / 2.0).clamp(-3.0, 3.0)]
+    columns = [
+        anchor.clamp(-4.0, 4.0),
+        gap / (gap + 20.0),
+        closing.clamp(-3.0, 3.0),
+        (offset / 2.0).clamp(-3.0, 3.0),
+    ]
     return torch.stack(columns, dim=-1)
 
 
-def inside_lane(residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float) -> Tensor:
+def inside_lane(
+    residual: Tensor, offset: Tensor, velocity: Tensor, room: Tensor, damping: float
+) -> Tensor:
     """Lateral ``residual`` [N, M] in m/s2 without what would move the body out of its lane.
 
-    Outward residuals fade to 0 over :data:`_FADE_M` before the point at which the vehicle, left alone, would come to
-    rest ``room`` off the lane's centre: damping alone carries it another ``velocity / damping``. ``offset`` is the
-    distance to the target lane's centre, m.
+    Outward residuals fade to 0 over :data:`_FADE_M` before the point at which the vehicle, left
+    alone, would come to rest ``room`` off the lane's centre: damping alone carries it another
+    ``velocity / damping``. ``offset`` is the distance to the target lane's centre, m.
     """
     rest = velocity / damping - offset
     outwards = torch.where(residual > 0, rest, -rest)
@@ -221,8 +264,9 @@ def anchored_step(
 ) -> tuple[Vehicles, DriverMemory]:
     """One step of the calibrated preset: vehicles [N, M] 0.1 s later and their new memory.
 
-    The vehicles' ``target_lane`` is the lane to keep or to change to, ``desired_speed`` the driver's own; ``road`` is
-    one per row in recorded scenes; latent vectors ``noise`` [N, M, Z] of zeros give the mean driver.
+    The vehicles' ``target_lane`` is the lane to keep or to change to, ``desired_speed`` the
+    driver's own; ``road`` is one per row in recorded scenes; latent vectors ``noise`` [N, M, Z] of
+    zeros give the mean driver.
     """
     p = parameters
     displacement = displacement_of(vehicles)
@@ -233,7 +277,9 @@ def anchored_step(
     velocity = displacement / PHYSICS_STEP_S
     anchor_y = p.lane_stiffness * offset - p.lane_damping * velocity[..., 1]
     extra = extra_inputs(scene, anchor_x, offset)
-    observation = observe(history, difference, vehicles, extra if p.further_inputs else torch.zeros_like(extra))
+    observation = observe(
+        history, difference, vehicles, extra if p.further_inputs else torch.zeros_like(extra)
+    )
     outputs = generator.decode(generator.summarise(observation), noise, observation, 1)[..., 0, :]
     limit = outputs.new_tensor(p.residual)
     residual = limit * torch.tanh(outputs / limit)
@@ -247,10 +293,12 @@ def anchored_step(
 
 
 def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> Vehicles:
-    """The recorded vehicles [B, V] at ``frame`` (1 or later), their velocity the last displacement's.
+    """The recorded vehicles [B, V] at ``frame`` (1 or later), their velocity the last
+    displacement's.
 
-    Each occupies the lane of its centre only, with a small width: recorded lanes are narrow and straightened to some
-    decimetres, so by its body one vehicle in ten would occupy two lanes and make others brake.
+    Each occupies the lane of its centre only, with a small width: recorded lanes are narrow and
+    straightened to some decimetres, so by its body one vehicle in ten would occupy two lanes and
+    make others brake.
     """
     position, target = segments.positions[:, frame], segments.target_lane[:, frame]
     velocity = (position - segments.positions[:, frame - 1]) / PHYSICS_STEP_S
@@ -270,12 +318,15 @@ def recorded_vehicles(segments: Segments, frame: int, desired_speed: Tensor) -> 
     )
 
 
-def driven_positions(segments: Segments, desired_speed: Tensor, move: Callable[[Vehicles, int], Vehicles]) -> Tensor:
-    """Positions [B, H, V, 2] in m when ``move`` drives all vehicles jointly for H steps after the observed frames.
+def driven_positions(
+    segments: Segments, desired_speed: Tensor, move: Callable[[Vehicles, int], Vehicles]
+) -> Tensor:
+    """Positions [B, H, V, 2] in m when ``move`` drives all vehicles jointly for H steps after the
+    observed frames.
 
-    ``move`` takes the vehicles now and the step's number to the vehicles 0.1 s later. A vehicle that appears later
-    starts at its first recorded position with the velocity of its first displacement. A vehicle is removed at the
-    frame where its recording ends.
+    ``move`` takes the vehicles now and the step's number to the vehicles 0.1 s later. A vehicle
+    that appears later starts at its first recorded position with the velocity of its first
+    displacement. A vehicle is removed at the frame where its recording ends.
     """
     vehicles, positions = recorded_vehicles(segments, PRESENT, desired_speed), []
     appeared = segments.present.cumsum(dim=1) > 0
@@ -290,12 +341,17 @@ def driven_positions(segments: Segments, desired_speed: Tensor, move: Callable[[
 
 
 def rollout(
-    generator: Generator, segments: Segments, drivers: tuple[Tensor, Tensor], noise: Tensor, config: CalibratedConfig
+    generator: Generator,
+    segments: Segments,
+    drivers: tuple[Tensor, Tensor],
+    noise: Tensor,
+    config: CalibratedConfig,
 ) -> Tensor:
-    """Positions [K, B, H, V, 2] in m of K joint rollouts (:func:`driven_positions`) by the calibrated preset.
+    """Positions [K, B, H, V, 2] in m of K joint rollouts (:func:`driven_positions`) by the
+    calibrated preset.
 
-    ``drivers`` are the headways in s and desired speeds in m/s, [B, V] each; ``noise`` [1 + H, K, B, V, Z] the latent
-    vectors at the start, then the numbers that change them (:func:`wander`).
+    ``drivers`` are the headways in s and desired speeds in m/s, [B, V] each; ``noise`` [1 + H, K,
+    B, V, Z] the latent vectors at the start, then the numbers that change them (:func:`wander`).
     """
     parameters = replace(ANCHOR, washout_s=config.washout_s, further_inputs=config.further_inputs)
     samples = noise.shape[1]
@@ -322,7 +378,10 @@ def headway_quantiles(statistics: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUANTILES_S) -> Tensor:
-    """Headways in s from uniform numbers, by linear interpolation of the quantiles; flat beyond the outer ones."""
+    """Headways in s from uniform numbers, by linear interpolation of the quantiles.
+
+    Flat beyond the outer ones.
+    """
     values, levels = u.new_tensor(quantiles_s), u.new_tensor(QUANTILE_LEVELS)
     upper = torch.searchsorted(levels, u.contiguous()).clamp(1, len(QUANTILE_LEVELS) - 1)
     low, high = levels[upper - 1], levels[upper]
@@ -331,10 +390,11 @@ def headway_from_uniform(u: Tensor, quantiles_s: tuple[float, ...] = HEADWAY_QUA
 
 
 def balanced_headway(vehicles: Vehicles, road: Road, otherwise: Tensor) -> Tensor:
-    """The headway [N, M] in s at which IDM neither speeds up nor brakes now; ``otherwise`` where it is unknown.
+    """The headway [N, M] in s at which IDM neither speeds up nor brakes now; ``otherwise`` where it
+    is unknown.
 
-    Uses gap, speed and desired speed. It is unknown for vehicles without a leader, or further behind it than the
-    largest quantile.
+    Uses gap, speed and desired speed. It is unknown for vehicles without a leader, or further
+    behind it than the largest quantile.
     """
     ahead = leader(perceive(vehicles, road), vehicles.target_lane.to(vehicles.x.dtype))
     ratio = vehicles.speed / vehicles.desired_speed
@@ -349,14 +409,18 @@ def driver_params(
 ) -> tuple[Tensor, Tensor]:
     """Headways in s and desired speeds in m/s of the drivers, [B, V] each.
 
-    With ``random``, for fitting: random ones, about the balanced headways and above the present speeds, since in
-    congestion the recordings do not show the desired speeds. Without it, for evaluation: the balanced headway or the
-    median one, and the middle desired speed. Without ``traits`` (an ablation): Table V's headway and 22 m/s for all.
+    With ``random``, for fitting: random ones, about the balanced headways and above the present
+    speeds, since in congestion the recordings do not show the desired speeds. Without it, for
+    evaluation: the balanced headway or the median one, and the middle desired speed. Without
+    ``traits`` (an ablation): Table V's headway and 22 m/s for all.
     """
     if not traits:
         headway = torch.full_like(segments.length, TABLE_V.headway_s)
         return headway, torch.full_like(headway, COMMON_SPEED_MPS)
-    now, (low, high) = recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length)), DESIRED_EXCESS_MPS
+    now, (low, high) = (
+        recorded_vehicles(segments, PRESENT, torch.ones_like(segments.length)),
+        DESIRED_EXCESS_MPS,
+    )
     if random is None:
         scatter = torch.ones_like(segments.length)
         otherwise = torch.full_like(scatter, HEADWAY_QUANTILES_S[len(HEADWAY_QUANTILES_S) // 2])
@@ -366,4 +430,6 @@ def driver_params(
         scatter = torch.exp(_SCATTER * torch.randn(segments.length.shape, generator=random))
         otherwise = headway_from_uniform(u[1])
         desired = now.speed + low + (high - low) * u[0]
-    return balanced_headway(now.with_(desired_speed=desired), segments.road, otherwise) * scatter, desired
+    return balanced_headway(
+        now.with_(desired_speed=desired), segments.road, otherwise
+    ) * scatter, desired

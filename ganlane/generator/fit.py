@@ -1,7 +1,8 @@
-"""Fits of a preset, scored on the scenes that they have not used: one split, k folds by scene, ablations.
+"""Fits of a preset, scored on the scenes that they have not used: one split, k folds by scene,
+ablations.
 
-State and forecasts of folds and ablations are kept in a folder under a hash of recordings and settings, so that an
-interrupted run resumes and nothing is fitted twice.
+State and forecasts of folds and ablations are kept in a folder under a hash of recordings and
+settings, so that an interrupted run resumes and nothing is fitted twice.
 """
 
 from __future__ import annotations
@@ -18,7 +19,14 @@ import polars as pl
 
 from ganlane.data import TRACK, driving_statistics
 from ganlane.errors import UserError
-from ganlane.generator.checkpoint import FitResult, Metrics, Preset, content_hash, load_arrays, save_arrays
+from ganlane.generator.checkpoint import (
+    FitResult,
+    Metrics,
+    Preset,
+    content_hash,
+    load_arrays,
+    save_arrays,
+)
 from ganlane.generator.forecasts import (
     BASELINE,
     SAMPLES,
@@ -72,10 +80,12 @@ class Split(NamedTuple):
 
 
 def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]:
-    """Names of the scenes in each fold, balanced: the largest first, each to the fold with the fewest windows so far.
+    """Names of the scenes in each fold, balanced: the largest first, each to the fold with the
+    fewest windows so far.
 
     Raises:
-        UserError: fewer than 2 folds, more folds than scenes with windows, or fewer than 3 such scenes.
+        UserError: fewer than 2 folds, more folds than scenes with windows, or fewer than 3 such
+            scenes.
     """
     sizes = {scene.name: count for scene in scenes if (count := count_windows(scene))}
     if not 2 <= folds <= len(sizes) or len(sizes) < 3:
@@ -95,11 +105,12 @@ def assign_folds(scenes: list[SceneTracks], folds: int) -> list[tuple[str, ...]]
 def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split:
     """The three parts of a fit that reports ``held_out``.
 
-    The smallest of the other scenes are for validation, as few as hold a twelfth of their windows. A single other
-    scene is used for both fitting and validation.
+    The smallest of the other scenes are for validation, as few as hold a twelfth of their windows.
+    A single other scene is used for both fitting and validation.
 
     Raises:
-        UserError: there is only one scene, a held-out name is not among them, or one of the two parts is empty.
+        UserError: there is only one scene, a held-out name is not among them, or one of the two
+            parts is empty.
     """
     names = [scene.name for scene in scenes]
     if len(names) < 2:
@@ -108,7 +119,9 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
             "several with ganlane prepare ... scene_s=30."
         )
     if unknown := sorted(set(held_out) - set(names)):
-        raise UserError(f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these.")
+        raise UserError(
+            f"data.held_out={unknown}: not among the recorded scenes {names}; choose from these."
+        )
     others = [scene for scene in scenes if scene.name not in held_out]
     reported = [scene for scene in scenes if scene.name in held_out]
     if not others or not reported:
@@ -118,7 +131,9 @@ def split_for_fit(scenes: list[SceneTracks], held_out: tuple[str, ...]) -> Split
         )
     validation = _validation_names(others)
     fitted = [scene for scene in others if scene.name not in validation]
-    return Split(fitted, [scene for scene in others if scene.name in validation] or fitted, reported)
+    return Split(
+        fitted, [scene for scene in others if scene.name in validation] or fitted, reported
+    )
 
 
 def _validation_names(scenes: list[SceneTracks]) -> set[str]:
@@ -141,10 +156,19 @@ def fit_task(config: Config, split: Split) -> Task:
 
 
 def fit_key(config: Config, split: Split) -> str:
-    """Hash of everything that a fit depends on: its settings, and the recordings of each part of the split."""
-    settings = {"preset": config.preset, "config": json.loads(json.dumps(asdict(config))), **split.names}
+    """Hash of everything that a fit depends on.
+
+    Its settings, and the recordings of each part of the split.
+    """
+    settings = {
+        "preset": config.preset,
+        "config": json.loads(json.dumps(asdict(config))),
+        **split.names,
+    }
     scenes = (*split.fitted, *split.validation, *split.held_out)
-    return content_hash(settings, *(part for scene in scenes for part in (scene.positions, scene.lane)))[:12]
+    return content_hash(
+        settings, *(part for scene in scenes for part in (scene.positions, scene.lane))
+    )[:12]
 
 
 def fit_generator(
@@ -159,12 +183,13 @@ def fit_generator(
 ) -> FitResult:
     """Fit a generator to recorded trajectories in ``ganlane.data``'s schema.
 
-    The weights are those that were best on the validation scenes, a small part of the scenes that are not held out
-    (:func:`split_for_fit`). The metrics are theirs on the held-out scenes, which influence neither the weights nor
-    early stopping. The driving statistics are of all scenes.
+    The weights are those that were best on the validation scenes, a small part of the scenes that
+    are not held out (:func:`split_for_fit`). The metrics are theirs on the held-out scenes, which
+    influence neither the weights nor early stopping. The driving statistics are of all scenes.
 
     Args:
-        preset: ``"paper"`` (positions only, open loop) or ``"calibrated"`` (anchored, closed-loop rollouts).
+        preset: ``"paper"`` (positions only, open loop) or ``"calibrated"`` (anchored, closed-loop
+            rollouts).
         held_out: names of the scenes that are reported.
         source: name of the recordings' file, for the metadata.
         resume_path: file that keeps the state; the fit resumes from it if it exists.
@@ -189,7 +214,12 @@ def fit_generator(
 
 
 def fit_result(
-    loop: FitLoop, split: Split, frame: pl.DataFrame, source: str, metrics: Metrics, others: pl.DataFrame
+    loop: FitLoop,
+    split: Split,
+    frame: pl.DataFrame,
+    source: str,
+    metrics: Metrics,
+    others: pl.DataFrame,
 ) -> FitResult:
     """The result of a finished ``loop``; ``others`` are the recordings of the driving statistics."""
     task, tracks = loop.task, frame.select(TRACK).n_unique()
@@ -213,9 +243,11 @@ class HeldOut(NamedTuple):
 
 
 class ScoredFit(NamedTuple):
-    """A finished fit and forecasts of its held-out scenes: ``short`` as far as the preset predicts, ``long`` for 5 s.
+    """A finished fit and forecasts of its held-out scenes: ``short`` as far as the preset predicts,
+    ``long`` for 5 s.
 
-    Long forecasts are made by the calibrated preset only, and only if a vehicle was recorded for long enough.
+    Long forecasts are made by the calibrated preset only, and only if a vehicle was recorded for
+    long enough.
     """
 
     loop: FitLoop
@@ -223,7 +255,9 @@ class ScoredFit(NamedTuple):
     long: HeldOut | None
 
 
-def fit_and_forecast(config: Config, split: Split, folder: Path, on_progress: OnProgress | None = None) -> ScoredFit:
+def fit_and_forecast(
+    config: Config, split: Split, folder: Path, on_progress: OnProgress | None = None
+) -> ScoredFit:
     """Fit to ``split`` and forecast its held-out scenes; resumes from what ``folder`` holds."""
     task = fit_task(config, split)
     path = folder / f"{config.preset}_{fit_key(config, split)}.pt"
@@ -231,20 +265,29 @@ def fit_and_forecast(config: Config, split: Split, folder: Path, on_progress: On
     loop.run(on_progress)
     short = _forecasts(path, task, split, config.sizes.predicted, STRIDE)
     frames = OBSERVED_POSITIONS + LONG_STEPS
-    far = isinstance(task, CalibratedTask) and any((each.present.sum(0) >= frames).any() for each in split.held_out)
-    return ScoredFit(loop, short, _forecasts(path, task, split, LONG_STEPS, LONG_STRIDE) if far else None)
+    far = isinstance(task, CalibratedTask) and any(
+        (each.present.sum(0) >= frames).any() for each in split.held_out
+    )
+    return ScoredFit(
+        loop, short, _forecasts(path, task, split, LONG_STEPS, LONG_STRIDE) if far else None
+    )
 
 
 def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) -> HeldOut:
-    """Forecasts of the held-out windows by the generator, IDM and all baselines, saved next to the fit's state."""
+    """Forecasts of the held-out windows by the generator, IDM and all baselines, saved next to the
+    fit's state.
+    """
     path = path.with_name(f"{path.stem}_{steps}.npz")
     windows = cut_windows(split.held_out, stride, OBSERVED_POSITIONS + steps)
     kept = load_arrays(path)
     if kept is not None:
         return HeldOut(windows, kept)
     if isinstance(task, CalibratedTask):
-        samples = 1 if steps == LONG_STEPS else SAMPLES  # the best of 20 is for short forecasts only
-        own = calibrated_forecasts(task.generator, split.held_out, steps, stride, task.config, samples)
+        # the best of 20 is for short forecasts only
+        samples = 1 if steps == LONG_STEPS else SAMPLES
+        own = calibrated_forecasts(
+            task.generator, split.held_out, steps, stride, task.config, samples
+        )
     else:
         groups = group_windows(windows, task.config.group_size, task.config.seed)
         own = paper_forecasts(task.generator, windows, groups, task.config.seed)
@@ -257,7 +300,10 @@ def _forecasts(path: Path, task: Task, split: Split, steps: int, stride: int) ->
 
 def pooled(parts: list[HeldOut]) -> tuple[Windows, Forecasts, np.ndarray]:
     """All folds' windows and forecasts, and the fold [W] of each window."""
-    forecasts = {name: np.concatenate([part.forecasts[name] for part in parts]) for name in parts[0].forecasts}
+    forecasts = {
+        name: np.concatenate([part.forecasts[name] for part in parts])
+        for name in parts[0].forecasts
+    }
     fold = np.repeat(np.arange(len(parts)), [len(part.windows) for part in parts])
     return join_windows([part.windows for part in parts]), forecasts, fold
 
@@ -274,12 +320,12 @@ def cross_validate(
 ) -> dict[str, Any]:
     """Fit ``folds`` generators, each without its fold's scenes, and score them on these.
 
-    ``on_fold`` gets each fold's number, from 1, and its generator, with driving statistics of its other scenes only;
-    ``source`` names the recordings in its metadata.
+    ``on_fold`` gets each fold's number, from 1, and its generator, with driving statistics of its
+    other scenes only; ``source`` names the recordings in its metadata.
 
     Returns:
-        ``open_loop`` (:func:`open_loop_scores`), ``splits`` (names of the scenes of each fold's parts), and for the
-        calibrated preset ``rollout`` (:func:`long_rollout_scores`).
+        ``open_loop`` (:func:`open_loop_scores`), ``splits`` (names of the scenes of each fold's
+        parts), and for the calibrated preset ``rollout`` (:func:`long_rollout_scores`).
 
     Raises:
         UserError: too many folds for the recordings.
@@ -304,9 +350,14 @@ def cross_validate(
 
 
 def variants(config: Config) -> dict[str, Config]:
-    """Settings of the ablations by name, with a quarter of the updates; the first is the preset itself."""
+    """Settings of the ablations by name, with a quarter of the updates.
+
+    The first is the preset itself.
+    """
     loop = config.loop
-    quarter = {name: max(1, getattr(loop, name) // 4) for name in ("updates", "evaluate_every", "warmup")}
+    quarter = {
+        name: max(1, getattr(loop, name) // 4) for name in ("updates", "evaluate_every", "warmup")
+    }
     config = replace(config, loop=replace(loop, **quarter))
     if isinstance(config, CalibratedConfig):
         return {
@@ -324,7 +375,9 @@ def variants(config: Config) -> dict[str, Config]:
         "without differences as inputs": replace(config, sizes=replace(sizes, differences=False)),
         "without adversarial term": replace(config, weights=replace(weights, adversarial=0.0)),
         "without single-sample term": replace(config, weights=replace(weights, single=0.0)),
-        "variety term alone": replace(config, weights=replace(weights, single=0.0, mean=0.0, adversarial=0.0)),
+        "variety term alone": replace(
+            config, weights=replace(weights, single=0.0, mean=0.0, adversarial=0.0)
+        ),
         "with history noise of 0.5": replace(config, history_noise=0.5),
     }
 
@@ -337,12 +390,14 @@ def ablate(
     on_fit: OnFit | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Fit the preset with one part changed at a time to one split, and score every variant on ``held_out``.
+    """Fit the preset with one part changed at a time to one split, and score every variant on
+    ``held_out``.
 
     Returns:
-        Per variant ``windows``, the change of ADE to constant velocity's in % (``ade_change_percent``) by kind, over
-        all predicted steps and over the first 0.4 s (``ade_change_percent_0.4_s``), and for the calibrated preset
-        ``rmse_5_s_ratio``, the RMSE after 5 s divided by constant velocity's.
+        Per variant ``windows``, the change of ADE to constant velocity's in %
+        (``ade_change_percent``) by kind, over all predicted steps and over the first 0.4 s
+        (``ade_change_percent_0.4_s``), and for the calibrated preset ``rmse_5_s_ratio``, the RMSE
+        after 5 s divided by constant velocity's.
     """
     split = split_for_fit(scene_tracks(frame), held_out)
     rows = {}
@@ -355,13 +410,17 @@ def ablate(
 
 def _ablation_row(fit: ScoredFit) -> dict[str, Any]:
     kinds = ("mean", "single", f"best_of_{SAMPLES}", BASELINE)
-    errors = errors_of({kind: fit.short.forecasts[kind] for kind in kinds}, fit.short.windows.future)
+    errors = errors_of(
+        {kind: fit.short.forecasts[kind] for kind in kinds}, fit.short.windows.future
+    )
     all_steps = displacement_errors(errors)
     # Predictions of any length can be compared over 0.4 s.
     early = displacement_errors({kind: values[:, :4] for kind, values in errors.items()})
     row = {name: all_steps[name] for name in ("windows", "ade_change_percent")}
     row["ade_change_percent_0.4_s"] = early["ade_change_percent"]
     if fit.long is not None:
-        ratio = long_rollout_scores(fit.long.windows, fit.long.forecasts)["ratio_to_constant_velocity"]
+        ratio = long_rollout_scores(fit.long.windows, fit.long.forecasts)[
+            "ratio_to_constant_velocity"
+        ]
         row["rmse_5_s_ratio"] = {kind: ratio[kind] for kind in ("mean", "single")}
     return row

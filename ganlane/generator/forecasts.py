@@ -1,9 +1,10 @@
-"""Forecasts of recorded windows by both presets, by IDM and by baselines without a network, and their scores.
+"""Forecasts of recorded windows by both presets, by IDM and by baselines without a network, and
+their scores.
 
 Every forecast is positions [W, T, 2] in m relative to the present, for the windows of
-:func:`~ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator: ``mean`` (z = 0),
-``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean error over the predicted steps, FDE the error at the
-last of them, both in m.
+:func:`~ganlane.generator.windows.cut_windows` in the same order. Kinds of forecasts by a generator:
+``mean`` (z = 0), ``single`` (one sample), ``best_of_20`` (by ADE). ADE is the mean error over the
+predicted steps, FDE the error at the last of them, both in m.
 """
 
 from __future__ import annotations
@@ -21,7 +22,13 @@ from sklearn.preprocessing import StandardScaler
 from torch import Tensor
 
 from ganlane.generator.checkpoint import Metrics
-from ganlane.generator.closed_loop import displacement_of, driven_positions, driver_params, moved_by, rollout
+from ganlane.generator.closed_loop import (
+    displacement_of,
+    driven_positions,
+    driver_params,
+    moved_by,
+    rollout,
+)
 from ganlane.generator.networks import Generator
 from ganlane.generator.windows import (
     OBSERVED_POSITIONS,
@@ -70,49 +77,74 @@ def scene_metrics(windows: Windows, forecasts: Forecasts) -> Metrics:
     errors, metrics = errors_of(forecasts, windows.future), {}
     for name, rows in {"all": np.ones(len(windows), dtype=bool), **windows.by_scene}.items():
         row = displacement_errors(errors, rows)
-        metrics[name] = {f"{error}/{kind}": row[error][kind] for error in ("ade_m", "fde_m") for kind in forecasts}
+        metrics[name] = {
+            f"{error}/{kind}": row[error][kind]
+            for error in ("ade_m", "fde_m")
+            for kind in forecasts
+        }
         metrics[name]["windows"] = float(row["windows"])
     return metrics
 
 
 def errors_of(forecasts: Forecasts, recorded: np.ndarray) -> Forecasts:
     """Distances [W, T] in m of every forecast [W, T, 2] to the recording."""
-    return {name: np.linalg.norm(positions - recorded, axis=-1) for name, positions in forecasts.items()}
+    return {
+        name: np.linalg.norm(positions - recorded, axis=-1) for name, positions in forecasts.items()
+    }
 
 
 def displacement_errors(errors: Forecasts, rows: np.ndarray | None = None) -> Row:
-    """ADE and FDE in m of every forecast over the chosen windows, and the ADE's change to the baseline's in %."""
+    """ADE and FDE in m of every forecast over the chosen windows, and the ADE's change to the
+    baseline's in %.
+    """
     chosen = errors if rows is None else {name: values[rows] for name, values in errors.items()}
     ade = {name: float(values.mean()) for name, values in chosen.items()}
     fde = {name: float(values[:, -1].mean()) for name, values in chosen.items()}
     change = {name: 100.0 * (value / ade[BASELINE] - 1.0) for name, value in ade.items()}
-    return {"windows": len(chosen[BASELINE]), "ade_m": ade, "fde_m": fde, "ade_change_percent": change}
+    return {
+        "windows": len(chosen[BASELINE]),
+        "ade_m": ade,
+        "fde_m": fde,
+        "ade_change_percent": change,
+    }
 
 
 def parts_of(windows: Windows, least: int) -> dict[str, np.ndarray]:
-    """Masks [W] of the windows by lane (1 the leftmost) and by class, of parts with at least ``least`` windows."""
+    """Masks [W] of the windows by lane (1 the leftmost) and by class, of parts with at least
+    ``least`` windows.
+    """
     lanes, truck = windows.lane_from_left, windows.length > TRUCK_M
-    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)} | {"car": ~truck, "truck": truck}
+    parts = {f"lane {lane}": lanes == lane for lane in np.unique(lanes)} | {
+        "car": ~truck,
+        "truck": truck,
+    }
     return {name: rows for name, rows in parts.items() if rows.sum() >= least}
 
 
-def direction_scores(forecasts: Forecasts, recorded: np.ndarray, observed: np.ndarray | float = 0.0) -> Row:
+def direction_scores(
+    forecasts: Forecasts, recorded: np.ndarray, observed: np.ndarray | float = 0.0
+) -> Row:
     """Among vehicles that move more than 0.1 m sideways: share predicted to the right side.
 
     ``observed`` are lateral moves [W] in m before the present, to be added to both.
     """
     lateral = observed + recorded[:, -1, 1]
     moving = np.abs(lateral) > SIDEWAYS_M
-    right = {name: ((observed + course[:, -1, 1]) * lateral > 0)[moving] for name, course in forecasts.items()}
+    right = {
+        name: ((observed + course[:, -1, 1]) * lateral > 0)[moving]
+        for name, course in forecasts.items()
+    }
     shares = {name: float(hits.mean()) if len(hits) else None for name, hits in right.items()}
     return {"windows": int(moving.sum()), "share_right": shares}
 
 
 def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
-    """Share of lateral moves after the present whose side a dedicated classifier predicts; None without moves.
+    """Share of lateral moves after the present whose side a dedicated classifier predicts; None
+    without moves.
 
-    Gradient boosting on the observed motion, the lane and the length, fitted to the other folds' moving vehicles: a
-    reference for :func:`direction_scores`, about as much as the history contains.
+    Gradient boosting on the observed motion, the lane and the length, fitted to the other folds'
+    moving vehicles: a reference for :func:`direction_scores`, about as much as the history
+    contains.
     """
     lateral, past = windows.future[:, -1, 1], windows.past
     moving = np.abs(lateral) > SIDEWAYS_M
@@ -133,12 +165,17 @@ def side_classifier_share(windows: Windows, fold: np.ndarray) -> float | None:
 def rmse_by_second(errors: Forecasts) -> dict[str, dict[str, float]]:
     """Root mean square error in m after each whole second (10 steps), of every forecast."""
     return {
-        name: {f"{k} s": float(np.sqrt((each**2).mean())) for k, each in enumerate(values.T[9::10], start=1)}
+        name: {
+            f"{k} s": float(np.sqrt((each**2).mean()))
+            for k, each in enumerate(values.T[9::10], start=1)
+        }
         for name, values in errors.items()
     }
 
 
-def open_loop_scores(windows: Windows, forecasts: Forecasts, fold: np.ndarray, least_part: int = 100) -> Row:
+def open_loop_scores(
+    windows: Windows, forecasts: Forecasts, fold: np.ndarray, least_part: int = 100
+) -> Row:
     """All scores of the forecasts of ``windows``, each of which was held out in its ``fold`` [W].
 
     Parts (lanes, classes) of fewer than ``least_part`` windows are left out.
@@ -146,7 +183,9 @@ def open_loop_scores(windows: Windows, forecasts: Forecasts, fold: np.ndarray, l
     errors = errors_of(forecasts, windows.future)
 
     def by(masks: dict[str, np.ndarray]) -> dict[str, Row]:
-        return {name: displacement_errors(errors, rows) for name, rows in masks.items() if rows.any()}
+        return {
+            name: displacement_errors(errors, rows) for name, rows in masks.items() if rows.any()
+        }
 
     direction = direction_scores(forecasts, windows.future)
     direction["share_right"]["side classifier"] = side_classifier_share(windows, fold)
@@ -156,21 +195,32 @@ def open_loop_scores(windows: Windows, forecasts: Forecasts, fold: np.ndarray, l
         "scenes": by(windows.by_scene),
         "parts": by(parts_of(windows, least_part)),
         "direction": direction,
-        "direction_whole_window": direction_scores(forecasts, windows.future, windows.past[..., 1].sum(1)),
+        "direction_whole_window": direction_scores(
+            forecasts, windows.future, windows.past[..., 1].sum(1)
+        ),
     }
 
 
 def long_rollout_scores(windows: Windows, forecasts: Forecasts) -> Row:
-    """RMSE after each second, number of windows and tracks, and the ratio to constant velocity's at the end."""
+    """RMSE after each second, number of windows and tracks, and the ratio to constant velocity's at
+    the end.
+    """
     rmse = rmse_by_second(errors_of(forecasts, windows.future))
     last = f"{windows.future.shape[1] // 10} s"
     ratio = {name: values[last] / rmse[BASELINE][last] for name, values in rmse.items()}
     tracks = len(np.unique(np.stack([windows.scene, windows.vehicle]), axis=1).T)
-    return {"windows": len(windows), "tracks": tracks, "rmse_m": rmse, "ratio_to_constant_velocity": ratio}
+    return {
+        "windows": len(windows),
+        "tracks": tracks,
+        "rmse_m": rmse,
+        "ratio_to_constant_velocity": ratio,
+    }
 
 
 def by_kind(samples: np.ndarray, recorded: np.ndarray) -> Forecasts:
-    """``mean`` (z = 0), ``single`` and ``best_of_20`` (by ADE) of samples [1 + K, W, T, 2], the first with z = 0."""
+    """``mean`` (z = 0), ``single`` and ``best_of_20`` (by ADE) of samples [1 + K, W, T, 2], the
+    first with z = 0.
+    """
     kinds = dict(zip(("mean", "single"), samples))
     if len(samples) > SAMPLES:
         errors = np.linalg.norm(samples[1:] - recorded, axis=-1).mean(-1)
@@ -190,17 +240,25 @@ def paper_forecasts(
         past = chunk.displacements[..., : generator.sizes.observed, :]
         noise = torch.randn(1 + samples, *chunk.mask.shape, generator.sizes.noise, generator=random)
         noise[0] = 0.0
-        predicted = generator(generator.observe(past, chunk.position, chunk.mask), noise).cumsum(dim=-2)
+        predicted = generator(generator.observe(past, chunk.position, chunk.mask), noise).cumsum(
+            dim=-2
+        )
         positions[:, chunk.window[chunk.mask].numpy()] = predicted[:, chunk.mask].double().numpy()
     return by_kind(positions, windows.future)
 
 
 def driven_windows(
-    driver: Callable[[Segments], Tensor], scenes: list[SceneTracks], horizon: int, stride: int, samples: int = 1
+    driver: Callable[[Segments], Tensor],
+    scenes: list[SceneTracks],
+    horizon: int,
+    stride: int,
+    samples: int = 1,
 ) -> np.ndarray:
-    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames: the vehicles recorded throughout a segment.
+    """Forecasts [K, W, H, 2] of all windows of 9 + ``horizon`` frames: the vehicles recorded
+    throughout a segment.
 
-    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K = ``samples``.
+    ``driver`` drives all vehicles of a batch of segments jointly: positions [K, B, H, V, 2] of K =
+    ``samples``.
     """
     forecasts = []
     for scene in scenes:
@@ -220,7 +278,9 @@ def calibrated_forecasts(
     config: CalibratedConfig,
     samples: int = SAMPLES,
 ) -> Forecasts:
-    """The calibrated preset, rolled out through whole scenes with the target lanes and drivers of the present."""
+    """The calibrated preset, rolled out through whole scenes with the target lanes and drivers of
+    the present.
+    """
     random = torch.Generator().manual_seed(0)
 
     def driver(segments: Segments) -> Tensor:
@@ -238,16 +298,20 @@ def calibrated_forecasts(
 def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forecasts:
     """IDM along the road in whole scenes, with constant lateral positions.
 
-    ``idm``: all drivers with Table V's headway and a desired speed of 22 m/s. ``idm_own_headway``: with the headway
-    at which each driver is in balance at present, the calibrated preset's anchor.
+    ``idm``: all drivers with Table V's headway and a desired speed of 22 m/s. ``idm_own_headway``:
+    with the headway at which each driver is in balance at present, the calibrated preset's anchor.
     """
 
     def driver(segments: Segments, own_headway: bool) -> Tensor:
         headway, desired = driver_params(segments, traits=own_headway)
 
         def move(vehicles: Vehicles, step: int) -> Vehicles:
-            acceleration = following_acceleration(perceive(vehicles, segments.road), TABLE_V, headway)
-            velocity = displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S + acceleration * PHYSICS_STEP_S
+            acceleration = following_acceleration(
+                perceive(vehicles, segments.road), TABLE_V, headway
+            )
+            velocity = (
+                displacement_of(vehicles)[..., 0] / PHYSICS_STEP_S + acceleration * PHYSICS_STEP_S
+            )
             return moved_by(vehicles, velocity, torch.zeros_like(velocity))
 
         return driven_positions(segments, desired, move)[None]
@@ -259,9 +323,11 @@ def idm_forecasts(scenes: list[SceneTracks], horizon: int, stride: int) -> Forec
 
 
 def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int) -> Forecasts:
-    """Forecasts without a network; the ridge regression is fitted to windows of the scenes ``others``.
+    """Forecasts without a network; the ridge regression is fitted to windows of the scenes
+    ``others``.
 
-    ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less than the last one.
+    ``mean_velocity`` repeats the mean observed displacement, which recorded noise disturbs less
+    than the last one.
     """
     past, steps = windows.past, windows.future.shape[1]
     return {
@@ -273,12 +339,16 @@ def baseline_forecasts(windows: Windows, others: list[SceneTracks], stride: int)
 
 
 def repeated(displacement: np.ndarray, steps: int) -> np.ndarray:
-    """Positions [W, T, 2] in m relative to the present when ``displacement`` [W, 2] per 0.1 s is repeated."""
+    """Positions [W, T, 2] in m relative to the present when ``displacement`` [W, 2] per 0.1 s is
+    repeated.
+    """
     return displacement[:, None] * np.arange(1.0, steps + 1.0)[:, None]
 
 
 def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
-    """Positions [W, T, 2] in m when the displacement keeps changing by its mean observed change per step."""
+    """Positions [W, T, 2] in m when the displacement keeps changing by its mean observed change per
+    step.
+    """
     change = ((past[:, -1] - past[:, 0]) / (past.shape[1] - 1))[:, None]
     ahead = np.arange(1.0, steps + 1.0)[:, None]
     return repeated(past[:, -1], steps) + 0.5 * change * ahead * (ahead + 1.0)
@@ -287,14 +357,16 @@ def constant_acceleration(past: np.ndarray, steps: int) -> np.ndarray:
 def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
     """Positions [W, T, 2] in m that follow the displacements ``past`` [W, 8, 2].
 
-    Ridge regression from the last displacement and all observed differences to the error of constant velocity; it is
-    fitted to the windows ``fitted``, as they are and mirrored.
+    Ridge regression from the last displacement and all observed differences to the error of
+    constant velocity; it is fitted to the windows ``fitted``, as they are and mirrored.
     """
 
     def features(past: np.ndarray) -> np.ndarray:
         return np.concatenate([past[:, -1:], np.diff(past, axis=1)], axis=1).reshape(len(past), -1)
 
-    known, future = (np.concatenate([each, each * (1.0, -1.0)]) for each in (fitted.past, fitted.future))
+    known, future = (
+        np.concatenate([each, each * (1.0, -1.0)]) for each in (fitted.past, fitted.future)
+    )
     steps = future.shape[1]
     model = make_pipeline(StandardScaler(), RidgeCV(alphas=_PENALTIES))
     model.fit(features(known), (future - repeated(known[:, -1], steps)).reshape(len(known), -1))
@@ -302,33 +374,41 @@ def ridge_forecast(fitted: Windows, past: np.ndarray) -> np.ndarray:
 
 
 def energy_score(one: Tensor, other: Tensor, recorded: Tensor) -> Tensor:
-    """Energy score of two samples, in the unit of the positions: mean error minus half their distance.
+    """Energy score of two samples, in the unit of the positions: mean error minus half their
+    distance.
 
-    All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from the distribution
-    of the recordings (Gneiting and Raftery 2007).
+    All are positions [..., 2]. A proper score: least in expectation when the samples are drawn from
+    the distribution of the recordings (Gneiting and Raftery 2007).
     """
     mean_error = 0.5 * (distance(one, recorded) + distance(other, recorded))
     return mean_error - 0.5 * distance(one, other)
 
 
 @torch.no_grad()
-def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: CalibratedConfig) -> Metrics:
+def rollout_errors(
+    generator: Generator, scenes: list[SceneTracks], config: CalibratedConfig
+) -> Metrics:
     """Errors of the calibrated preset's rollouts through scenes, for all and for each scene.
 
-    Target lanes and driver parameters are those of the present, so no information of the future is used. Unlike
-    forecasts of windows, these count a vehicle for as long as it is recorded.
+    Target lanes and driver parameters are those of the present, so no information of the future is
+    used. Unlike forecasts of windows, these count a vehicle for as long as it is recorded.
 
     Returns:
-        ``{"all" or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
-        "relative_mean", "relative_energy", "end_s", "windows"}}`` with the kinds ``mean``, ``single``,
-        ``constant_velocity`` and ``energy`` (the energy score of two samples).
+        ``{"all"
+        or scene: {"ade_m/KIND" over 0.8 s, "fde_m/KIND" at 0.8 s, "end_m/KIND" at the last step,
+        "relative_mean", "relative_energy", "end_s",
+        "windows"}}``
+        with the kinds ``mean``, ``single``, ``constant_velocity`` and ``energy`` (the energy score
+        of two samples).
     """
     random, horizon = torch.Generator().manual_seed(0), config.held_out_horizon
     parts: dict[str, list[tuple[dict[str, Tensor], Tensor]]] = {"all": []}
     for scene in scenes:
         for batch in segment_batches(scene, horizon, config.held_out_stride, _SEGMENTS):
             segments = batch.without_intentions()
-            fresh = torch.randn(1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random)
+            fresh = torch.randn(
+                1 + horizon, 2, *segments.length.shape, generator.sizes.noise, generator=random
+            )
             noise = torch.cat([torch.zeros_like(fresh[:, :1]), fresh], dim=1)
             drivers, future = driver_params(segments, config.traits), segments.future
             mean, one, other = rollout(generator, segments, drivers, noise, config)
@@ -345,9 +425,15 @@ def rollout_errors(generator: Generator, scenes: list[SceneTracks], config: Cali
 
 def _step_means(parts: list[tuple[dict[str, Tensor], Tensor]], horizon: int) -> dict[str, float]:
     """Means over the vehicles that are still recorded at the step in question."""
-    means = {kind: mean_by_step([(errors[kind], scored) for errors, scored in parts]) for kind in parts[0][0]}
+    means = {
+        kind: mean_by_step([(errors[kind], scored) for errors, scored in parts])
+        for kind in parts[0][0]
+    }
     short = min(PREDICTED_STEPS, horizon)
-    metrics = {"end_s": 0.1 * horizon, "windows": max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts)))}
+    metrics = {
+        "end_s": 0.1 * horizon,
+        "windows": max(1.0, float(sum(scored[:, 0].sum() for _, scored in parts))),
+    }
     for kind, errors in means.items():
         metrics[f"ade_m/{kind}"] = float(errors[:short].mean())
         metrics[f"fde_m/{kind}"] = float(errors[short - 1])

@@ -1,15 +1,17 @@
 """The Social-GAN's two networks (section III; Gupta et al. 2018) and their layers.
 
-**Linear layer.** ``torch.nn.functional.linear`` multiplies float32 by MKL, which uses little of the vector units of
-processors other than Intel's. On an AMD EPYC, oneDNN takes a third of the time from a few thousand rows on, and more
-below :data:`_MANY_ROWS`; its operator has no gradient. Results are equal.
+**Linear layer.** ``torch.nn.functional.linear`` multiplies float32 by MKL, which uses little of the
+vector units of processors other than Intel's. On an AMD EPYC, oneDNN takes a third of the time from
+a few thousand rows on, and more below :data:`_MANY_ROWS`; its operator has no gradient. Results are
+equal.
 
-**LSTM.** The projection of an input is separate from the recurrence, so that projections can be kept when the window
-of observed motions moves on by one step.
+**LSTM.** The projection of an input is separate from the recurrence, so that projections can be
+kept when the window of observed motions moves on by one step.
 
-**Pooling.** The original loops over scenes and runs a linear layer on relative position and the other's state for
-every pair. That layer is a term of the other vehicle minus a term of one's own: here both are computed once per
-vehicle and subtracted per pair. Groups are padded, and only the nearest vehicles count.
+**Pooling.** The original loops over scenes and runs a linear layer on relative position and the
+other's state for every pair. That layer is a term of the other vehicle minus a term of one's own:
+here both are computed once per vehicle and subtracted per pair. Groups are padded, and only the
+nearest vehicles count.
 """
 
 from __future__ import annotations
@@ -23,11 +25,14 @@ from torch import Tensor, nn
 
 from ganlane.parameters.generator import GeneratorSizes
 
-#: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the networks' units.
+#: Typical displacement per 0.1 s and typical change of it, along and across the road, m: the
+#: networks' units.
 DISPLACEMENT_SCALE_M, DIFFERENCE_SCALE_M = (1.0, 0.05), (0.04, 0.02)
-#: Changes of displacement are clipped here (in units of the scale): recorded positions sometimes jump.
+#: Changes of displacement are clipped here (in units of the scale): recorded positions sometimes
+#: jump.
 LARGEST_DIFFERENCE = 5.0
-#: Units of a pair's relative position (m) and relative displacement (m per 0.1 s), each along and across the road.
+#: Units of a pair's relative position (m) and relative displacement (m per 0.1 s), each along and
+#: across the road.
 _PAIR_SCALE = (20.0, 4.0, 0.4, 0.05)
 #: Vehicles further away than this along the road have no influence, m.
 RANGE_M = 100.0
@@ -37,7 +42,10 @@ _ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_l
 
 
 def dense(x: Tensor, weight: Tensor, bias: Tensor | None = None, relu: bool = False) -> Tensor:
-    """Linear layer: ``x`` [..., I], ``weight`` [O, I], ``bias`` [O] -> [..., O], with a ReLU if ``relu``."""
+    """Linear layer.
+
+    ``x`` [..., I], ``weight`` [O, I], ``bias`` [O] -> [..., O], with a ReLU if ``relu``.
+    """
     many = x.numel() >= _MANY_ROWS * x.shape[-1]
     float32_on_cpu = x.device.type == "cpu" and x.dtype == torch.float32
     if _ONEDNN and float32_on_cpu and many and not torch.is_grad_enabled():
@@ -56,7 +64,8 @@ def _onednn(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tenso
     return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
 
 
-# Compiled graphs accept oneDNN's operator for constant weights only, so they call it through an operator of our own.
+# Compiled graphs accept oneDNN's operator for constant weights only, so they call it through an
+# operator of our own.
 @torch.library.custom_op("ganlane::dense", mutates_args=())
 def _compiled_onednn(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
     return _onednn(x, weight, bias, relu)
@@ -68,17 +77,21 @@ def _shape(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor
 
 
 def motion_features(displacement: Tensor, difference: Tensor) -> Tensor:
-    """Network inputs [..., 4] of displacements [..., 2] per 0.1 s and their differences to the step before, in m."""
+    """Network inputs [..., 4] of displacements [..., 2] per 0.1 s and their differences to the step
+    before, in m.
+    """
     scaled = displacement / displacement.new_tensor(DISPLACEMENT_SCALE_M)
     change = difference / difference.new_tensor(DIFFERENCE_SCALE_M)
     return torch.cat([scaled, change.clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)], dim=-1)
 
 
 class MotionLSTM(nn.Module):
-    """Embedding with ReLU, then an LSTM cell in two parts: the projection of the input, and the recurrence.
+    """Embedding with ReLU, then an LSTM cell in two parts: the projection of the input, and the
+    recurrence.
 
-    The gates are ordered input, forget, output, new: the three with a sigmoid are adjacent. ``hidden`` is the width H
-    of the state; without ``differences`` the displacements' differences are 0 as inputs (an ablation).
+    The gates are ordered input, forget, output, new: the three with a sigmoid are adjacent.
+    ``hidden`` is the width H of the state; without ``differences`` the displacements' differences
+    are 0 as inputs (an ablation).
     """
 
     def __init__(self, embedding: int, hidden: int, differences: bool = True):
@@ -90,7 +103,8 @@ class MotionLSTM(nn.Module):
         bound = 1.0 / math.sqrt(hidden)
         nn.init.uniform_(self.recurrent, -bound, bound)
         with torch.no_grad():
-            self.input.bias[hidden : 2 * hidden].fill_(1.0)  # forget gate open at the start of the fit
+            # forget gate open at the start of the fit
+            self.input.bias[hidden : 2 * hidden].fill_(1.0)
 
     def project(self, displacement: Tensor, difference: Tensor) -> Tensor:
         """Part of the gates [..., 4H] that depends on this motion alone, so it can be kept."""
@@ -98,11 +112,16 @@ class MotionLSTM(nn.Module):
         return apply(self.input, apply(self.embed, motion_features(displacement, used), relu=True))
 
     def step(self, projected: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
-        """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]); returns the new state."""
+        """One recurrence on a projection [..., 4H] and state ([..., H], [..., H]).
+
+        Returns the new state.
+        """
         return self._update(dense(hidden, self.recurrent).add_(projected), cell)
 
     def encode(self, projections: Tensor | Sequence[Tensor]) -> Tensor:
-        """Last hidden state [..., H] after the projections [..., T, 4H], or T of [..., 4H], from a state of zeros."""
+        """Last hidden state [..., H] after the projections [..., T, 4H], or T of [..., 4H], from a
+        state of zeros.
+        """
         steps = projections.unbind(dim=-2) if isinstance(projections, Tensor) else projections
         hidden, cell = self._update(steps[0], torch.zeros_like(steps[0][..., : self.hidden]))
         for projected in steps[1:]:
@@ -123,10 +142,12 @@ def _times_tanh(factor: Tensor, x: Tensor) -> Tensor:
 
 
 def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | None, Tensor]:
-    """Indices [B, G, K] of the ``neighbours`` nearest other vehicles of each, and a mask [B, G, K] of the real ones.
+    """Indices [B, G, K] of the ``neighbours`` nearest other vehicles of each, and a mask [B, G, K]
+    of the real ones.
 
-    ``position`` is [B, G, 2] in m, ``valid`` [B, G]. If there are not more vehicles than that, the indices are None
-    and K is G: all vehicles in order. The mask is false for padding, the vehicle itself and beyond :data:`RANGE_M`.
+    ``position`` is [B, G, 2] in m, ``valid`` [B, G]. If there are not more vehicles than that, the
+    indices are None and K is G: all vehicles in order. The mask is false for padding, the vehicle
+    itself and beyond :data:`RANGE_M`.
     """
     count = position.shape[-2]
     offset = position[..., None, :, :] - position[..., :, None, :]
@@ -140,7 +161,10 @@ def nearest(position: Tensor, valid: Tensor, neighbours: int) -> tuple[Tensor | 
 
 
 def gather_vehicles(values: Tensor, index: Tensor | None) -> Tensor:
-    """Rows [B, G, K, F] of ``values`` [B, G, F] at ``index`` [B, G, K]; all of them, [B, 1, G, F], without one."""
+    """Rows [B, G, K, F] of ``values`` [B, G, F] at ``index`` [B, G, K].
+
+    All of them, [B, 1, G, F], without one.
+    """
     if index is None:
         return values[..., None, :, :]
     batch, count, chosen = index.shape
@@ -151,8 +175,8 @@ def gather_vehicles(values: Tensor, index: Tensor | None) -> Tensor:
 class PairPooling(nn.Module):
     """Max pooling of two layers over each vehicle's nearest neighbours; zeros where there is none.
 
-    ``hidden`` is the width H of the vehicles' states, ``pooled`` the width P of the result; 0 ``neighbours`` is no
-    pooling.
+    ``hidden`` is the width H of the vehicles' states, ``pooled`` the width P of the result; 0
+    ``neighbours`` is no pooling.
     """
 
     def __init__(self, hidden: int, inner: int, pooled: int, neighbours: int):
@@ -162,12 +186,17 @@ class PairPooling(nn.Module):
         self.per_vehicle = nn.Linear(hidden, inner, bias=False)
         self.second = nn.Linear(inner, pooled)
 
-    def forward(self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor) -> Tensor:
-        """Pooled states [B, G, P] of states [B, G, H], positions and displacements [B, G, 2] and mask [B, G]."""
+    def forward(
+        self, hidden: Tensor, position: Tensor, displacement: Tensor, valid: Tensor
+    ) -> Tensor:
+        """Pooled states [B, G, P] of states [B, G, H], positions and displacements [B, G, 2] and
+        mask [B, G].
+        """
         if self.neighbours == 0:
             return hidden.new_zeros(*hidden.shape[:-1], self.second.out_features)
         index, real = nearest(position, valid, self.neighbours)
-        # Relative to the first vehicle: far down the road, differences of float32 positions lose digits.
+        # Relative to the first vehicle: far down the road, differences of float32 positions lose
+        # digits.
         scale = position.new_tensor(_PAIR_SCALE)
         state = torch.cat([position - position[..., :1, :], displacement], dim=-1) / scale
         own = nn.functional.linear(state, self.per_pair.weight)
@@ -182,10 +211,11 @@ class Observation(NamedTuple):
     """The generator's input for [B, G] vehicles.
 
     Attributes:
-        projections: [B, G, observed - 1, 4H] or a sequence of [B, G, 4H], input projections of the observed motions
-            (:meth:`Generator.project`), oldest first. A motion is a displacement and its difference to the one
-            before, so 8 displacements are 7 motions.
-        displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference to the one before.
+        projections: [B, G, observed - 1, 4H] or a sequence of [B, G, 4H], input projections of the
+            observed motions (:meth:`Generator.project`), oldest first. A motion is a displacement
+            and its difference to the one before, so 8 displacements are 7 motions.
+        displacement, difference: [B, G, 2], the last displacement, m per 0.1 s, and its difference
+            to the one before.
         position: [B, G, 2], m, relative to any common point.
         valid, extra: [B, G] bool and [B, G, extra_inputs].
     """
@@ -201,7 +231,8 @@ class Observation(NamedTuple):
 class Generator(nn.Module):
     """Encoder, pooling over pairs, context with noise, decoder.
 
-    The decoder's output changes the last displacement: with an output of 0 it predicts constant velocity.
+    The decoder's output changes the last displacement: with an output of 0 it predicts constant
+    velocity.
     """
 
     def __init__(self, sizes: GeneratorSizes):
@@ -211,13 +242,18 @@ class Generator(nn.Module):
         self.pooling = PairPooling(sizes.hidden, sizes.pooling, sizes.pooled, sizes.neighbours)
         inputs = sizes.hidden + sizes.pooled + sizes.extra_inputs
         self.context = nn.Sequential(
-            nn.Linear(inputs, sizes.context), nn.ReLU(), nn.Linear(sizes.context, sizes.hidden - sizes.noise)
+            nn.Linear(inputs, sizes.context),
+            nn.ReLU(),
+            nn.Linear(sizes.context, sizes.hidden - sizes.noise),
         )
         self.decoder = MotionLSTM(sizes.embedding, sizes.hidden, sizes.differences)
         self.head = nn.Linear(sizes.hidden, 2)
 
     def project(self, displacements: Tensor) -> Tensor:
-        """Projections [..., T - 1, 4H] of T displacements [..., T, 2]: one for every motion in them."""
+        """Projections [..., T - 1, 4H] of T displacements [..., T, 2].
+
+        One for every motion in them.
+        """
         return self.encoder.project(displacements[..., 1:, :], displacements.diff(dim=-2))
 
     def observe(self, displacements: Tensor, position: Tensor, valid: Tensor) -> Observation:
@@ -227,17 +263,24 @@ class Generator(nn.Module):
         return Observation(self.project(displacements), last, last - before, position, valid, extra)
 
     def summarise(self, now: Observation) -> Tensor:
-        """Context [B, G, H - Z] of every vehicle: its own motion, its neighbours, its further inputs."""
+        """Context [B, G, H - Z] of every vehicle.
+
+        Its own motion, its neighbours, its further inputs.
+        """
         hidden = self.encoder.encode(now.projections)
         pooled = self.pooling(hidden, now.position, now.displacement, now.valid)
         first, second = (cast(nn.Linear, self.context[index]) for index in (0, 2))
-        return apply(second, apply(first, torch.cat([hidden, pooled, now.extra], dim=-1), relu=True))
+        return apply(
+            second, apply(first, torch.cat([hidden, pooled, now.extra], dim=-1), relu=True)
+        )
 
     def decode(self, context: Tensor, noise: Tensor, now: Observation, steps: int) -> Tensor:
-        """Output of the decoder's first ``steps`` steps [..., steps, 2], in units of ``DIFFERENCE_SCALE_M``.
+        """Output of the decoder's first ``steps`` steps [..., steps, 2], in units of
+        ``DIFFERENCE_SCALE_M``.
 
-        ``context`` is [..., H - Z] and ``noise`` [..., Z]; leading dimensions broadcast, so that several
-        samples share one context. Each output is the change of the displacement that the next step continues.
+        ``context`` is [..., H - Z] and ``noise`` [..., Z]; leading dimensions broadcast, so that
+        several samples share one context. Each output is the change of the displacement that the
+        next step continues.
         """
         leading = torch.broadcast_shapes(context.shape[:-1], noise.shape[:-1])
         hidden = torch.cat([context.expand(*leading, -1), noise.expand(*leading, -1)], dim=-1)
@@ -245,25 +288,37 @@ class Generator(nn.Module):
         scale = hidden.new_tensor(DIFFERENCE_SCALE_M)
         displacement, difference, outputs = now.displacement, now.difference, []
         for _ in range(steps):
-            hidden, cell = self.decoder.step(self.decoder.project(displacement, difference), hidden, cell)
+            hidden, cell = self.decoder.step(
+                self.decoder.project(displacement, difference), hidden, cell
+            )
             outputs.append(apply(self.head, hidden))
             difference = outputs[-1] * scale
             displacement = displacement + difference
         return torch.stack(outputs, dim=-2)
 
     def forward(self, now: Observation, noise: Tensor, steps: int | None = None) -> Tensor:
-        """Predicted displacements [..., steps, 2], m per 0.1 s, for ``noise`` [..., B, G, Z]; all by default."""
-        outputs = self.decode(self.summarise(now), noise, now, self.sizes.predicted if steps is None else steps)
+        """Predicted displacements [..., steps, 2], m per 0.1 s, for ``noise`` [..., B, G, Z].
+
+        All by default.
+        """
+        outputs = self.decode(
+            self.summarise(now), noise, now, self.sizes.predicted if steps is None else steps
+        )
         return displacements_of(outputs, now.displacement)
 
 
 def displacements_of(outputs: Tensor, last: Tensor) -> Tensor:
-    """Displacements [..., steps, 2] that follow ``last`` [..., 2] when it changes by the decoder's outputs."""
+    """Displacements [..., steps, 2] that follow ``last`` [..., 2] when it changes by the decoder's
+    outputs.
+    """
     return last[..., None, :] + outputs.cumsum(dim=-2) * outputs.new_tensor(DIFFERENCE_SCALE_M)
 
 
 class Discriminator(nn.Module):
-    """Classifies displacements as recorded or generated; outputs a logit (the original's ReLU cannot say 'fake')."""
+    """Classifies displacements as recorded or generated.
+
+    Outputs a logit (the original's ReLU cannot say 'fake').
+    """
 
     def __init__(self, embedding: int = 64, hidden: int = 32):
         super().__init__()

@@ -1,10 +1,11 @@
 """What is fitted: the losses, updates and scores of both presets, and the loop that runs them.
 
-**paper**, open loop: adversarial, variety, single-sample and mean terms on k-means groups of windows. Losses after
-Gupta et al. (2018), with the changes that the fit needs here.
+**paper**, open loop: adversarial, variety, single-sample and mean terms on k-means groups of
+windows. Losses after Gupta et al. (2018), with the changes that the fit needs here.
 
-**calibrated**: joint rollouts of whole scenes. Updates with z = 0, whose loss is the error, alternate with updates of
-two samples, whose loss is the energy score; both are divided, step by step, by the error of constant velocity.
+**calibrated**: joint rollouts of whole scenes. Updates with z = 0, whose loss is the error,
+alternate with updates of two samples, whose loss is the energy score; both are divided, step by
+step, by the error of constant velocity.
 """
 
 from __future__ import annotations
@@ -36,7 +37,12 @@ from ganlane.generator.forecasts import (
     rollout_errors,
     scene_metrics,
 )
-from ganlane.generator.networks import DIFFERENCE_SCALE_M, Discriminator, Generator, displacements_of
+from ganlane.generator.networks import (
+    DIFFERENCE_SCALE_M,
+    Discriminator,
+    Generator,
+    displacements_of,
+)
 from ganlane.generator.windows import (
     Groups,
     SceneTracks,
@@ -64,13 +70,20 @@ def variety_loss(errors: Tensor) -> Tensor:
 
 
 def cross_entropy(logits: Tensor, recorded: float) -> Tensor:
-    """Cross-entropy of classifying trajectories as recorded (1) or generated (0) by their logits; ln 2 is chance."""
-    return binary_cross_entropy_with_logits(logits, torch.full_like(logits, recorded), reduction="none").mean()
+    """Cross-entropy of classifying trajectories as recorded (1) or generated (0) by their logits.
+
+    Ln 2 is chance.
+    """
+    return binary_cross_entropy_with_logits(
+        logits, torch.full_like(logits, recorded), reduction="none"
+    ).mean()
 
 
 def discriminator_accuracy(recorded: Tensor, generated: Tensor) -> Tensor:
     """Share of logits with the right sign, both classes with equal weight; 0.5 is chance."""
-    return 0.5 * ((recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean())
+    return 0.5 * (
+        (recorded > 0).to(recorded.dtype).mean() + (generated <= 0).to(generated.dtype).mean()
+    )
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -96,7 +109,9 @@ class _Networks:
         self.modules[name], self.optimisers[name] = module, torch.optim.Adam(module.parameters())
 
     def descend(self, name: str, loss: Tensor) -> float:
-        """One step of a network down its ``loss``, whose value is returned, with the gradient's norm clipped."""
+        """One step of a network down its ``loss``, whose value is returned, with the gradient's
+        norm clipped.
+        """
         self.optimisers[name].zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.modules[name].parameters(), self.largest_gradient)
@@ -107,7 +122,9 @@ class _Networks:
 class PaperTask(_Networks):
     """The Social-GAN on windows."""
 
-    def __init__(self, fitted: list[SceneTracks], validation: list[SceneTracks], config: PaperConfig):
+    def __init__(
+        self, fitted: list[SceneTracks], validation: list[SceneTracks], config: PaperConfig
+    ):
         super().__init__(config)
         self.config = config
         self.discriminator = Discriminator(config.sizes.embedding, config.sizes.hidden)
@@ -118,7 +135,9 @@ class PaperTask(_Networks):
     def update(self, number: int) -> dict[str, float]:
         """One step of the discriminator, if the adversarial term is on, and one of the generator."""
         config = self.config
-        groups = self.groups.select(torch.randint(len(self.groups), (config.batch,), generator=self.random))
+        groups = self.groups.select(
+            torch.randint(len(self.groups), (config.batch,), generator=self.random)
+        )
         if config.mirror:
             groups = groups.mirrored(torch.rand(len(groups), generator=self.random) < 0.5)
         recorded = groups.displacements[groups.mask]
@@ -130,7 +149,11 @@ class PaperTask(_Networks):
             losses["discriminator"] = self.descend("discriminator", loss)
         observed = config.sizes.observed
         errors = distances(generated[..., observed:, :], recorded[..., observed:, :]).mean(-1)
-        terms = {"variety": variety_loss(errors[:-1]), "single": errors[:-1].mean(), "mean": errors[-1].mean()}
+        terms = {
+            "variety": variety_loss(errors[:-1]),
+            "single": errors[:-1].mean(),
+            "mean": errors[-1].mean(),
+        }
         if config.weights.adversarial > 0:
             terms["adversarial"] = cross_entropy(self.discriminator(generated[0]), 1.0)
         weighted = [getattr(config.weights, name) * term for name, term in terms.items()]
@@ -145,11 +168,16 @@ class PaperTask(_Networks):
 
     @torch.no_grad()
     def metrics(self, scenes: list[SceneTracks]) -> Metrics:
-        """ADE and FDE of the generator on ``scenes``, all and each, and the discriminator's accuracy on them."""
+        """ADE and FDE of the generator on ``scenes``, all and each, and the discriminator's
+        accuracy on them.
+        """
         windows, groups = self._grouped_windows(scenes, self.config.held_out_stride)
         forecasts = paper_forecasts(self.generator, windows, groups, self.config.seed)
         forecasts[BASELINE] = repeated(windows.past[:, -1], self.config.sizes.predicted)
-        logits = self.discriminator(groups.displacements[groups.mask]), self.discriminator(self._samples(groups)[0])
+        logits = (
+            self.discriminator(groups.displacements[groups.mask]),
+            self.discriminator(self._samples(groups)[0]),
+        )
         accuracy = {"held_out_accuracy": float(discriminator_accuracy(*logits))}
         return scene_metrics(windows, forecasts) | {"discriminator": accuracy}
 
@@ -160,7 +188,8 @@ class PaperTask(_Networks):
         return windows, group_windows(windows, self.config.group_size, self.config.seed)
 
     def _samples(self, groups: Groups, history_noise: float = 0.0) -> Tensor:
-        """Recorded past and generated future [K + 1, n, T, 2] of n vehicles: the samples, the mean prediction last.
+        """Recorded past and generated future [K + 1, n, T, 2] of n vehicles: the samples, the mean
+        prediction last.
 
         Only the pooling needs the padded groups; the decoder runs without padding.
         """
@@ -174,7 +203,9 @@ class PaperTask(_Networks):
         vehicles = observation._replace(
             displacement=observation.displacement[mask], difference=observation.difference[mask]
         )
-        noise = torch.randn(self.config.samples + 1, len(context), sizes.noise, generator=self.random)
+        noise = torch.randn(
+            self.config.samples + 1, len(context), sizes.noise, generator=self.random
+        )
         noise[-1] = 0.0
         outputs = self.generator.decode(context, noise, vehicles, sizes.predicted)
         future = displacements_of(outputs, vehicles.displacement)
@@ -184,7 +215,9 @@ class PaperTask(_Networks):
 class CalibratedTask(_Networks):
     """The anchored generator on whole scenes."""
 
-    def __init__(self, fitted: list[SceneTracks], validation: list[SceneTracks], config: CalibratedConfig):
+    def __init__(
+        self, fitted: list[SceneTracks], validation: list[SceneTracks], config: CalibratedConfig
+    ):
         super().__init__(config)
         self.config, self.validation = config, validation
         longest = max(config.horizons)
@@ -193,15 +226,25 @@ class CalibratedTask(_Networks):
         self.cuts = sorted(cuts, key=lambda cut: int(cut[0].present[cut[1]].sum()))
         segments = cut_segments(self.cuts[:: max(1, len(self.cuts) // 64)], longest)
         #: Mean error [H] in m of constant velocity on the fitted scenes.
-        self.scale = mean_by_step([(distance(segments.constant_velocity, segments.future), segments.scored)])
+        self.scale = mean_by_step(
+            [(distance(segments.constant_velocity, segments.future), segments.scored)]
+        )
 
     def update(self, number: int) -> dict[str, float]:
-        """One rollout of a batch of segments and one step: alternately of the mean driver and of two samples."""
+        """One rollout of a batch of segments and one step.
+
+        Alternately of the mean driver and of two samples.
+        """
         config = self.config
         segments = self._batch()
         drivers = driver_params(segments, config.traits, self.random)
         sampled = number % 2 == 1
-        shape = (1 + segments.future.shape[1], 2 if sampled else 1, *segments.length.shape, config.sizes.noise)
+        shape = (
+            1 + segments.future.shape[1],
+            2 if sampled else 1,
+            *segments.length.shape,
+            config.sizes.noise,
+        )
         noise = torch.randn(shape, generator=self.random) if sampled else torch.zeros(shape)
         positions = rollout(self.generator, segments, drivers, noise, config)
         if sampled:
@@ -212,7 +255,9 @@ class CalibratedTask(_Networks):
         return {name: self.descend("generator", loss)}
 
     def evaluate(self) -> float:
-        """Mean of the error for z = 0 and the energy score on validation scenes, relative to constant velocity."""
+        """Mean of the error for z = 0 and the energy score on validation scenes, relative to
+        constant velocity.
+        """
         metrics = self.metrics(self.validation)["all"]
         return 0.5 * (metrics["relative_mean"] + metrics["relative_energy"])
 
@@ -221,7 +266,9 @@ class CalibratedTask(_Networks):
         return rollout_errors(self.generator, scenes, self.config)
 
     def _batch(self) -> Segments:
-        """Segments with similar numbers of vehicles over a random horizon, mirrored in half of the updates."""
+        """Segments with similar numbers of vehicles over a random horizon, mirrored in half of the
+        updates.
+        """
         shares = torch.tensor(self.config.shares, dtype=torch.float32)
         horizon = self.config.horizons[int(torch.multinomial(shares, 1, generator=self.random))]
         span = min(len(self.cuts), 8 * self.config.batch)
@@ -237,9 +284,11 @@ Task = PaperTask | CalibratedTask
 
 @dataclass(frozen=True)
 class Progress:
-    """State of a fit after ``update`` of at most ``updates``, ``seconds`` after the start of this run.
+    """State of a fit after ``update`` of at most ``updates``, ``seconds`` after the start of this
+    run.
 
-    ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best`` the lowest.
+    ``losses`` are the last update's; ``score`` is the last evaluation's (lower is better), ``best``
+    the lowest.
     """
 
     update: int
@@ -254,10 +303,11 @@ OnProgress = Callable[[Progress], None]
 
 
 class FitLoop:
-    """Runs a task until it stops improving: updates, evaluations on validation scenes, early stopping.
+    """Runs a task until it stops improving: updates, evaluations on validation scenes, early
+    stopping.
 
-    ``path`` keeps the state after every evaluation; the fit resumes from it if it exists. ``seconds`` is the time of
-    the updates, those in earlier runs of the same fit too.
+    ``path`` keeps the state after every evaluation; the fit resumes from it if it exists.
+    ``seconds`` is the time of the updates, those in earlier runs of the same fit too.
     """
 
     def __init__(self, task: Task, path: str | Path | None = None):
@@ -280,10 +330,16 @@ class FitLoop:
             seconds = time.monotonic() - begun
             self.seconds = earlier + seconds
             late = self.config.max_seconds is not None and seconds > self.config.max_seconds
-            if self.done % self.config.evaluate_every == 0 or self.done == self.config.updates or late:
+            if (
+                self.done % self.config.evaluate_every == 0
+                or self.done == self.config.updates
+                or late
+            ):
                 score = self._evaluate()
             if on_progress is not None:
-                on_progress(Progress(self.done, self.config.updates, losses, score, self.best, seconds))
+                on_progress(
+                    Progress(self.done, self.config.updates, losses, score, self.best, seconds)
+                )
             if late:
                 break
         for name, weights in self.best_weights.items():
@@ -294,7 +350,9 @@ class FitLoop:
         self.waited += 1
         if score < self.best:
             self.best, self.best_update, self.waited = score, self.done, 0
-            self.best_weights = {name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()}
+            self.best_weights = {
+                name: deepcopy(module.state_dict()) for name, module in self.task.modules.items()
+            }
         if self.path is not None:
             # Tensors and plain data only.
             state = {
@@ -302,8 +360,12 @@ class FitLoop:
                 "best": self.best,
                 "seconds": self.seconds,
                 "best_weights": self.best_weights,
-                "modules": {name: module.state_dict() for name, module in self.task.modules.items()},
-                "optimisers": {name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()},
+                "modules": {
+                    name: module.state_dict() for name, module in self.task.modules.items()
+                },
+                "optimisers": {
+                    name: optimiser.state_dict() for name, optimiser in self.task.optimisers.items()
+                },
                 "random": self.task.random.get_state(),
             }
             file = io.BytesIO()
@@ -333,7 +395,11 @@ class FitLoop:
                 f"{path}: holds another fit than the one asked for; give the same preset and sizes or remove it."
             ) from error
         self.done, self.waited, self.best_update = state["counters"]
-        self.best, self.best_weights, self.seconds = state["best"], state["best_weights"], state["seconds"]
+        self.best, self.best_weights, self.seconds = (
+            state["best"],
+            state["best_weights"],
+            state["seconds"],
+        )
         self.task.random.set_state(state["random"])
         if not whole:
             note_without_checksum(path)

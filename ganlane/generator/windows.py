@@ -1,8 +1,10 @@
-"""Recorded scenes as arrays, and what is cut from them: segments for joint rollouts, windows and groups of windows.
+"""Recorded scenes as arrays, and what is cut from them: segments for joint rollouts, windows and
+groups of windows.
 
-A segment is a stretch of a scene with all its vehicles; a window is 9 observed and 8 future positions of one vehicle.
-Nothing is smoothed: a filter applied before windows are cut would carry the future into the past. Grouping windows
-takes most of the time before a fit, so it is cached under a hash of everything that it follows from.
+A segment is a stretch of a scene with all its vehicles; a window is 9 observed and 8 future
+positions of one vehicle. Nothing is smoothed: a filter applied before windows are cut would carry
+the future into the past. Grouping windows takes most of the time before a fit, so it is cached
+under a hash of everything that it follows from.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ INTENTION_S = 2.0
 
 @dataclass(frozen=True)
 class SceneTracks:
-    """One recorded scene of T frames (0.1 s apart) and V vehicles; entries of absent vehicles are 0.
+    """One recorded scene of T frames (0.1 s apart) and V vehicles; entries of absent vehicles are
+    0.
 
     Attributes:
         vehicles: [V] vehicle numbers.
@@ -63,7 +66,9 @@ class SceneTracks:
 
     @cached_property
     def endless_positions(self) -> np.ndarray:
-        """Positions [T, V, 2], at constant velocity before a vehicle's first and after its last present frame."""
+        """Positions [T, V, 2], at constant velocity before a vehicle's first and after its last
+        present frame.
+        """
         frames, column = np.arange(len(self.present))[:, None], np.arange(self.present.shape[1])
         first, last = self._first_and_last
         begin, end = self.positions[first, column], self.positions[last, column]
@@ -73,11 +78,15 @@ class SceneTracks:
         before = begin + early * (frames - first)[..., None]
         after = end + late * (frames - last)[..., None]
         inside = np.where(self.present[..., None], self.positions, 0.0)
-        return np.where((frames < first)[..., None], before, np.where((frames > last)[..., None], after, inside))
+        return np.where(
+            (frames < first)[..., None], before, np.where((frames > last)[..., None], after, inside)
+        )
 
     @cached_property
     def target_lane(self) -> np.ndarray:
-        """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its track."""
+        """Lane [T, V] that each vehicle will be in after :data:`INTENTION_S`, or at the end of its
+        track.
+        """
         ahead = np.arange(len(self.present))[:, None] + round(INTENTION_S / PHYSICS_STEP_S)
         return np.take_along_axis(self.lane, np.clip(ahead, *self._first_and_last), axis=0)
 
@@ -122,8 +131,8 @@ def scene_tracks(frame: pl.DataFrame) -> list[SceneTracks]:
 class Segments:
     """B segments of recorded scenes: 9 observed frames and H more, padded to V vehicles.
 
-    Positions go on at constant velocity before a track's first and after its last frame, so they are finite
-    everywhere; ``present`` is true where they were recorded.
+    Positions go on at constant velocity before a track's first and after its last frame, so they
+    are finite everywhere; ``present`` is true where they were recorded.
 
     Attributes:
         positions: [B, 9 + H, V, 2] float32, m, x relative to the segment's mean at the present.
@@ -142,7 +151,9 @@ class Segments:
 
     @property
     def scored(self) -> Tensor:
-        """Vehicles [B, H, V] that the model drives (present in the first 9 frames) and that are still recorded."""
+        """Vehicles [B, H, V] that the model drives (present in the first 9 frames) and that are
+        still recorded.
+        """
         observed, after = self.present[:, :OBSERVED_POSITIONS], self.present[:, OBSERVED_POSITIONS:]
         return observed.all(dim=1, keepdim=True) & after
 
@@ -165,7 +176,9 @@ class Segments:
 
     def repeated(self, times: int) -> Segments:
         """The segments repeated ``times`` times along the batch dimension."""
-        return Segments(*(value.repeat(times, *[1] * (value.dim() - 1)) for value in vars(self).values()))
+        return Segments(
+            *(value.repeat(times, *[1] * (value.dim() - 1)) for value in vars(self).values())
+        )
 
     def mirrored(self) -> Segments:
         """The segments with left and right swapped."""
@@ -174,7 +187,9 @@ class Segments:
         return replace(self, positions=positions, target_lane=last[..., None] - self.target_lane)
 
     def without_intentions(self) -> Segments:
-        """Target lanes are the present ones, so that no information of the future is used (for evaluation)."""
+        """Target lanes are the present ones, so that no information of the future is used (for
+        evaluation).
+        """
         y = self.positions[:, PRESENT : PRESENT + 1, :, 1]
         lane = Road(self.lanes[..., None], self.lane_width[..., None]).lane_of(y).long()
         return replace(self, target_lane=lane.expand_as(self.target_lane).contiguous())
@@ -194,7 +209,9 @@ def segment_batches(scene: SceneTracks, horizon: int, stride: int, size: int) ->
 
 
 def cut_segments(cuts: list[tuple[SceneTracks, int]], horizon: int) -> Segments:
-    """The segments that start at (scene, row), ``horizon`` steps beyond the present, padded to one batch."""
+    """The segments that start at (scene, row), ``horizon`` steps beyond the present, padded to one
+    batch.
+    """
     frames = OBSERVED_POSITIONS + horizon
     members = [np.flatnonzero(scene.present[row : row + frames].any(0)) for scene, row in cuts]
     batch, most = len(cuts), max(map(len, members))
@@ -226,8 +243,10 @@ class Windows:
     Attributes:
         positions: [W, frames, 2] float64, m.
         scene: [W] int64, index into ``scene_names``.
-        start, vehicle: [W] int64, row of the scene at which the window starts, and column of its vehicle.
-        lane, lane_from_left: [W] int64, at the last observed position; 0 is the rightmost, 1 from left the leftmost.
+        start, vehicle: [W] int64, row of the scene at which the window starts, and column of its
+            vehicle.
+        lane, lane_from_left: [W] int64, at the last observed position; 0 is the rightmost, 1 from
+            left the leftmost.
         length: [W] float64, m.
     """
 
@@ -268,7 +287,11 @@ def join_windows(parts: list[Windows]) -> Windows:
     }
     before = np.cumsum([0, *(len(part.scene_names) for part in parts[:-1])])
     scene = np.concatenate([part.scene + first for part, first in zip(parts, before)])
-    return Windows(**joined, scene=scene, scene_names=tuple(name for part in parts for name in part.scene_names))
+    return Windows(
+        **joined,
+        scene=scene,
+        scene_names=tuple(name for part in parts for name in part.scene_names),
+    )
 
 
 def _present_throughout(scene: SceneTracks, frames: int) -> np.ndarray:
@@ -284,7 +307,8 @@ def count_windows(scene: SceneTracks) -> int:
 
 
 def cut_windows(scenes: list[SceneTracks], stride: int = 1, frames: int = WINDOW_FRAMES) -> Windows:
-    """All windows of ``scenes``, starting at every ``stride``-th frame; a window never spans two scenes.
+    """All windows of ``scenes``, starting at every ``stride``-th frame; a window never spans two
+    scenes.
 
     Raises:
         UserError: no vehicle is present for a whole window.
@@ -341,11 +365,15 @@ class Groups:
         """The same groups, left and right swapped where ``flip`` [B] is true."""
         sign = torch.ones(len(self), 1, 2)
         sign[..., 1] = torch.where(flip, -1.0, 1.0)[:, None]
-        return replace(self, displacements=self.displacements * sign[:, :, None], position=self.position * sign)
+        return replace(
+            self, displacements=self.displacements * sign[:, :, None], position=self.position * sign
+        )
 
 
 def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
-    """Group number [n] of each of n positions [n, 2], in groups of about ``size``, by k-means on metres."""
+    """Group number [n] of each of n positions [n, 2], in groups of about ``size``, by k-means on
+    metres.
+    """
     groups = max(1, round(len(positions) / size))
     if groups == 1:
         return np.zeros(len(positions), dtype=np.int64)
@@ -353,7 +381,8 @@ def kmeans_labels(positions: np.ndarray, size: int, seed: int) -> np.ndarray:
 
 
 def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
-    """Split the vehicles of every (scene, start) into k-means groups of about ``size`` and pad them.
+    """Split the vehicles of every (scene, start) into k-means groups of about ``size`` and pad
+    them.
 
     Uses the last observed positions only; each scene's groups are cached (:func:`cached`).
     """
@@ -364,7 +393,11 @@ def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
         place, start = now[rows], windows.start[rows]
 
         def compute() -> dict[str, np.ndarray]:
-            return {"labels": _labels_by_run(start, lambda chosen: kmeans_labels(place[chosen], size, seed))}
+            return {
+                "labels": _labels_by_run(
+                    start, lambda chosen: kmeans_labels(place[chosen], size, seed)
+                )
+            }
 
         return cached("groups", content_hash(settings, place, start), compute)["labels"]
 
@@ -389,7 +422,10 @@ def group_windows(windows: Windows, size: int = 9, seed: int = 0) -> Groups:
 
 
 def _labels_by_run(values: np.ndarray, labels_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Labels [W] of each run of equal ``values`` [W], by ``labels_of`` its rows; no label is used in two runs."""
+    """Labels [W] of each run of equal ``values`` [W], by ``labels_of`` its rows.
+
+    No label is used in two runs.
+    """
     labels, used = np.empty(len(values), dtype=np.int64), 0
     for rows in np.split(np.arange(len(values)), np.flatnonzero(np.diff(values)) + 1):
         labels[rows] = used + labels_of(rows)

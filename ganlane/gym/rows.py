@@ -1,7 +1,9 @@
-"""Basis of the single and the vector environment: N highways behind NumPy arrays, and checks of arguments.
+"""Basis of the single and the vector environment: N highways behind NumPy arrays, and checks of
+arguments.
 
-:class:`Rows` is the interface. :class:`NativeRows` implements it for rule-driven traffic, by the native kernel and
-without torch; :class:`ganlane.gym.tensor_rows.TensorRows` for everything else, by the TorchRL environment.
+:class:`Rows` is the interface. :class:`NativeRows` implements it for rule-driven traffic, by the
+native kernel and without torch; :class:`ganlane.gym.tensor_rows.TensorRows` for everything else, by
+the TorchRL environment.
 """
 
 # ruff: noqa: D102 - Rows has the docstrings of the methods
@@ -71,7 +73,10 @@ class Rows(ABC):
 
     @abstractmethod
     def mask(self) -> Flags:
-        """Allowed actions [N, 3]: the mask's, without one those that stay on the road; valid until the next call."""
+        """Allowed actions [N, 3]: the mask's, without one those that stay on the road.
+
+        Valid until the next call.
+        """
 
     @abstractmethod
     def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
@@ -88,17 +93,22 @@ class Rows(ABC):
 
 
 def observation_space(size: int, largest: float) -> Box:
-    """Bounds of an observation [D]: speed over desired speed, then numbers from -1 to the largest of its form."""
+    """Bounds of an observation [D].
+
+    Speed over desired speed, then numbers from -1 to the largest of its form.
+    """
     low, high = np.full(size, -1.0, np.float32), np.full(size, largest, np.float32)
     low[0], high[0] = 0.0, SPEED_RATIO_LIMIT
     return Box(low, high, dtype=np.float32)
 
 
-def make_rows(traffic: Option, count: int, render_mode: str | None, options: Mapping[str, Any]) -> Rows:
+def make_rows(
+    traffic: Option, count: int, render_mode: str | None, options: Mapping[str, Any]
+) -> Rows:
     """N highways with ``traffic`` and the ``options`` of :func:`ganlane.api.make_env`.
 
-    The native kernel drives them where it can, unless the option ``kernel`` is ``torch`` or there is a
-    ``render_mode``, since the kernel shows no physics steps.
+    The native kernel drives them where it can, unless the option ``kernel`` is ``torch`` or there
+    is a ``render_mode``, since the kernel shows no physics steps.
 
     Raises:
         UserError: a wrong value.
@@ -113,13 +123,18 @@ def make_rows(traffic: Option, count: int, render_mode: str | None, options: Map
 
 
 def native_rows(traffic: Option, count: int, options: dict[str, Any]) -> NativeRows | None:
-    """N highways by the kernel; None where it does not implement these options, or one of them is wrong."""
+    """N highways by the kernel.
+
+    None where it does not implement these options, or one of them is wrong.
+    """
     groups = ("env", "observation", "reward", "mask", "stream", "device", "transforms")
     given = {name: options.pop(name) for name in groups if name in options}
     try:
         config: TrafficConfig = option("traffic", traffic)
         env: EnvConfig = option("env", given.get("env"), options)
-        observation, reward, mask = (option(group, given.get(group)) for group in ("observation", "reward", "mask"))
+        observation, reward, mask = (
+            option(group, given.get(group)) for group in ("observation", "reward", "mask")
+        )
         check_reward(env, reward)
         device = RunConfig(device=given.get("device", "cpu")).device
         stream = Stream.named(str(given.get("stream", "train")))
@@ -233,7 +248,10 @@ def row_of(info: Any, row: int) -> Any:
 
 
 def array_of(given: Any) -> npt.NDArray[Any]:
-    """A user's value as an array; an array of None if it cannot be one, such as lists of different lengths."""
+    """A user's value as an array.
+
+    An array of None if it cannot be one, such as lists of different lengths.
+    """
     try:
         return np.asarray(given)
     except (TypeError, ValueError, RuntimeError):
@@ -259,7 +277,9 @@ def actions_of(given: Any, rows: int) -> npt.NDArray[np.int64]:
 def known_options(options: dict[str, Any] | None, names: tuple[str, ...]) -> dict[str, Any]:
     """The options of a reset, checked for unknown names."""
     if not isinstance(options, dict | None):
-        raise UserError(f"options={options!r}: expected a dictionary with {', '.join(names)}, or none.")
+        raise UserError(
+            f"options={options!r}: expected a dictionary with {', '.join(names)}, or none."
+        )
     unknown = sorted(map(str, set(options or {}) - set(names)))
     if unknown:
         raise UserError(f"options: {', '.join(unknown)} unknown; a reset takes {', '.join(names)}.")

@@ -13,7 +13,16 @@ import numpy.typing as npt
 from ganlane.arguments import checked_arguments, seed_number, whole_number
 from ganlane.errors import UserError
 from ganlane.gym import has_display
-from ganlane.gym.rows import SEEDS, Floats, OnRows, actions_of, array_of, known_options, make_rows, row_of
+from ganlane.gym.rows import (
+    SEEDS,
+    Floats,
+    OnRows,
+    actions_of,
+    array_of,
+    known_options,
+    make_rows,
+    row_of,
+)
 from ganlane.keys import ACTIONS, PHYSICS_STEP_S
 from ganlane.options import Option
 
@@ -30,15 +39,18 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
 
     Args:
         traffic: as in :func:`ganlane.api.make_env`, as are ``options``.
-        seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random, as in gymnasium.
-        render_mode: None, ``rgb_array`` (a frame per decision), ``rgb_array_list`` (all frames since the last
-            ``render()``, ten per second of driving) or ``human`` (a window, in real time; needs the extra ``human``).
-        options: further arguments of ``make_env``: ``observation``, ``reward``, ``mask``, ``env``, ``transforms``,
-            ``stream``, ``device``, and keys of the environment.
+        seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random,
+            as in gymnasium.
+        render_mode: None, ``rgb_array`` (a frame per decision), ``rgb_array_list`` (all frames
+            since the last ``render()``, ten per second of driving) or ``human`` (a window, in real
+            time; needs the extra ``human``).
+        options: further arguments of ``make_env``: ``observation``, ``reward``, ``mask``, ``env``,
+            ``transforms``, ``stream``, ``device``, and keys of the environment.
 
     ``reset(seed=s)`` begins episode 0 of seed s, every further ``reset()`` the next one;
     ``reset(options={"episode": k})`` runs episode k. ``action`` is 0 (keep), 1 (left) or 2 (right);
-    docs/gymnasium.md lists observations and infos. ``spec.max_episode_steps`` follows from ``timeout_s``.
+    docs/gymnasium.md lists observations and infos. ``spec.max_episode_steps`` follows from
+    ``timeout_s``.
 
     Raises:
         UserError: a wrong value, or ``human`` without a display.
@@ -64,7 +76,10 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         self.action_space = gymnasium.spaces.Discrete(ACTIONS)
         modes = [mode for mode in RENDER_MODES if mode != "human" or has_display()]
         decisions = max(1, round(1.0 / self._rows.episode.decision_period_s))
-        self.metadata = {"render_modes": modes, "render_fps": decisions if render_mode == "rgb_array" else FPS}
+        self.metadata = {
+            "render_modes": modes,
+            "render_fps": decisions if render_mode == "rgb_array" else FPS,
+        }
         self.render_mode = render_mode
         self._view: Any = None
         #: Pictures since the last ``render()``, with ``rgb_array_list``.
@@ -73,7 +88,9 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         if render_mode is not None:
             from ganlane.gym.tensor_rows import LiveView  # with torch, which takes seconds
 
-            self._view = LiveView(self._rows, traffic, FilmWindow() if render_mode == "human" else None)
+            self._view = LiveView(
+                self._rows, traffic, FilmWindow() if render_mode == "human" else None
+            )
         self._seed = None if seed is None else seed_number(seed)
         self._episode = -1
         self._running = False
@@ -89,7 +106,9 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             self._seed, self._episode = seed, -1
         elif self._seed is None:
             self._seed = int(self.np_random.integers(SEEDS))
-        self._episode = whole_number("options: episode", given.get("episode", self._episode + 1), 0, 2**62)
+        self._episode = whole_number(
+            "options: episode", given.get("episode", self._episode + 1), 0, 2**62
+        )
         self._rows.start(self._seed, self._episode)
         self._running = True
         if self._view is not None:
@@ -112,7 +131,13 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         if self._view is not None:
             self._view.after_step(reward)
             self._collect()
-        return stepped.observation[0].copy(), reward, terminated, truncated, row_of(self._rows.info(), 0)
+        return (
+            stepped.observation[0].copy(),
+            reward,
+            terminated,
+            truncated,
+            row_of(self._rows.info(), 0),
+        )
 
     def _collect(self) -> None:
         """Store the pictures of the last decision for ``render()``, or pass them to the video."""
@@ -123,7 +148,8 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
             self._video.recorded_frames += between
 
     def set_record_video_wrapper(self, wrapper: RecordVideo) -> None:
-        """Let gymnasium's ``RecordVideo`` around this environment write ten frames per second of driving.
+        """Let gymnasium's ``RecordVideo`` around this environment write ten frames per second of
+        driving.
 
         By itself it gets one picture per decision. The name is HighwayEnv's.
         """
@@ -134,9 +160,14 @@ class HighwayGym(OnRows, gymnasium.Env[Floats, Any]):
         return self._rows.mask()[0].copy()
 
     def render(self) -> Any:
-        """The present picture [height, width, 3] uint8, or a list of them; None for ``human``, which draws itself."""
+        """The present picture [height, width, 3] uint8, or a list of them.
+
+        None for ``human``, which draws itself.
+        """
         if self._view is None:
-            raise UserError(f"render(): made without render_mode; give one of {', '.join(RENDER_MODES)} to make().")
+            raise UserError(
+                f"render(): made without render_mode; give one of {', '.join(RENDER_MODES)} to make()."
+            )
         self._rows.check_started()
         if self.render_mode == "rgb_array_list":
             pictures, self._pictures = self._pictures, []

@@ -33,21 +33,28 @@ _KEPT = round(DrawingParameters().trail_s / PHYSICS_STEP_S) + 1
 
 
 class TensorRows(Rows):
-    """N highways by the TorchRL environment, which :func:`ganlane.api.make_env` makes of the arguments."""
+    """N highways by the TorchRL environment, which :func:`ganlane.api.make_env` makes of the
+    arguments.
+    """
 
     env: TransformedEnv
 
     def __init__(self, traffic: Option, count: int, options: Mapping[str, Any]) -> None:
         self.env = env = make_env(traffic, count, **options)
         self.count, self.episode = count, env.base_env.episode
-        form = next((each.form for each in env.transform if isinstance(each, ObservationTransform)), "table3")
+        form = next(
+            (each.form for each in env.transform if isinstance(each, ObservationTransform)),
+            "table3",
+        )
         largest = largest_number(form, env.base_env.scenes.longest_m)
         self.space = observation_space(env.observation_spec[keys.OBSERVATION].shape[-1], largest)
 
     @torch.no_grad()
     def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike) -> None:
         counters = {
-            name: torch.as_tensor(np.broadcast_to(value, self.count).astype(np.int64), device=self.env.device)
+            name: torch.as_tensor(
+                np.broadcast_to(value, self.count).astype(np.int64), device=self.env.device
+            )
             for name, value in ((keys.SEED, seed), (keys.EPISODE, episode))
         }
         self.state = self.env.reset(TensorDict(counters, [self.count], device=self.env.device))
@@ -59,32 +66,49 @@ class TensorRows(Rows):
 
     @torch.no_grad()
     def step(self, actions: npt.NDArray[np.int64]) -> Stepped:
-        stepped = self.env.step(self.now().set(keys.ACTION, torch.as_tensor(actions, device=self.env.device)))
+        stepped = self.env.step(
+            self.now().set(keys.ACTION, torch.as_tensor(actions, device=self.env.device))
+        )
         self.state, after = self.env.step_mdp(stepped), stepped.get("next")
-        reward, *ended = (_array(after.get(name)[:, 0]) for name in ("reward", "terminated", "truncated"))
+        reward, *ended = (
+            _array(after.get(name)[:, 0]) for name in ("reward", "terminated", "truncated")
+        )
         return Stepped(self.observation(), reward.astype(np.float32), *ended)
 
     def now(self) -> TensorDictBase:
         """The state of all rows; raises :class:`UserError` before the first :meth:`start`."""
-        if self.state is None:  # asked first, since check_started copies the numbers from the device
+        # asked first, since check_started copies the numbers from the device
+        if self.state is None:
             self.check_started()
         return self.state
 
     def observation(self) -> Floats:
-        return np.clip(self.now().get(keys.OBSERVATION).cpu().numpy(), self.space.low, self.space.high)
+        return np.clip(
+            self.now().get(keys.OBSERVATION).cpu().numpy(), self.space.low, self.space.high
+        )
 
     def mask(self) -> Flags:
         state = self.now()
         mask: Tensor | None = state.get(keys.ACTION_MASK, None)
-        return _array(legal_actions(state, road_in(state, self.env.base_env.road)) if mask is None else mask)
+        return _array(
+            legal_actions(state, road_in(state, self.env.base_env.road)) if mask is None else mask
+        )
 
     def numbers(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
         state = self.state
-        return None if state is None else (_array(state.get(keys.SEED)), _array(state.get(keys.EPISODE)))
+        return (
+            None
+            if state is None
+            else (_array(state.get(keys.SEED)), _array(state.get(keys.EPISODE)))
+        )
 
     def info(self) -> dict[str, Any]:
         state = self.now()
-        vehicles, ego, events = state.get(keys.VEHICLES), state.get(keys.EGO), state.get(keys.EVENTS)
+        vehicles, ego, events = (
+            state.get(keys.VEHICLES),
+            state.get(keys.EGO),
+            state.get(keys.EVENTS),
+        )
         road = road_in(state, self.env.base_env.road)
         values = {
             "seed": state.get(keys.SEED),
@@ -95,7 +119,10 @@ class TensorRows(Rows):
             "lane": road.lane_of(vehicles.get("y"))[:, EGO_INDEX].long(),
             "decisions": ego.get("decisions"),
             "lane_changes": ego.get("lane_changes"),
-            **{name: events.get(name)[:, 0] for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)},
+            **{
+                name: events.get(name)[:, 0]
+                for name in (*keys.END_EVENTS, keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND)
+            },
         }
         terms = {name: _array(term[:, 0]) for name, term in state.get(keys.REWARD_TERMS).items()}
         arrays = {name: _array(value) for name, value in values.items()}
@@ -112,7 +139,9 @@ def _array(tensor: Tensor) -> npt.NDArray[Any]:
 def _label(rows: Rows, row: int, traffic: str) -> EpisodeLabel:
     """The header's text for a row."""
     seed, episode = (int(rows.state.get(name)[row]) for name in (keys.SEED, keys.EPISODE))
-    return EpisodeLabel("ego", traffic, seed, episode, *road_of_row(rows.state, rows.env.base_env.road, row))
+    return EpisodeLabel(
+        "ego", traffic, seed, episode, *road_of_row(rows.state, rows.env.base_env.road, row)
+    )
 
 
 class LiveView:
@@ -197,6 +226,11 @@ class BatchView:
         return tuple(map(self._picture, range(self.rows.count)))
 
     def _picture(self, row: int) -> Picture:
-        recorder = Recorder(row, current_action=int(self._actions[row]), current_return=float(self._returns[row]))
-        recorder.add(self.rows.state.get(keys.VEHICLES), float(self.rows.state.get(keys.STEP)[row]) * PHYSICS_STEP_S)
+        recorder = Recorder(
+            row, current_action=int(self._actions[row]), current_return=float(self._returns[row])
+        )
+        recorder.add(
+            self.rows.state.get(keys.VEHICLES),
+            float(self.rows.state.get(keys.STEP)[row]) * PHYSICS_STEP_S,
+        )
         return FramePainter(recorder.trajectory(_label(self.rows, row, self.traffic))).draw(0)

@@ -13,7 +13,16 @@ from gymnasium.vector.utils import batch_space
 
 from ganlane.arguments import checked_arguments, seed_number
 from ganlane.errors import UserError
-from ganlane.gym.rows import SEEDS, Flags, Floats, OnRows, actions_of, array_of, known_options, make_rows
+from ganlane.gym.rows import (
+    SEEDS,
+    Flags,
+    Floats,
+    OnRows,
+    actions_of,
+    array_of,
+    known_options,
+    make_rows,
+)
 from ganlane.keys import ACTIONS
 from ganlane.options import Option
 
@@ -27,22 +36,29 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         seed: of the first episodes, until ``reset(seed=...)`` gives another; None: drawn at random.
         render_mode: None or ``rgb_array``.
         autoreset_mode: what happens to a row that has ended, see below.
-        max_episode_steps: passed by ``make_vec`` for a spec of this environment; ``timeout_s`` sets the limit.
+        max_episode_steps: passed by ``make_vec`` for a spec of this environment; ``timeout_s`` sets
+            the limit.
         options: as in :class:`ganlane.gym.single.HighwayGym`.
 
-    ``AutoresetMode.SAME_STEP``: a row that ends is reset in the same step: ``observation`` is the first of its next
-    episode, ``info["final_obs"]`` and ``info["final_info"]`` are the last of the old one. ``NEXT_STEP``: it is reset
-    in the next step, which ignores its action and gives the reward 0. ``DISABLED``: you reset it by
-    ``reset(options={"reset_mask": mask})``, which begins the next episodes in the rows of a boolean array [N].
+    ``AutoresetMode.SAME_STEP``: a row that ends is reset in the same step: ``observation`` is the
+    first of its next episode, ``info["final_obs"]`` and ``info["final_info"]`` are the last of the
+    old one. ``NEXT_STEP``: it is reset in the next step, which ignores its action and gives the
+    reward 0. ``DISABLED``: you reset it by ``reset(options={"reset_mask": mask})``, which begins
+    the next episodes in the rows of a boolean array [N].
 
-    Row i of N runs the episodes i, i + N, i + 2N, ... of the seed. ``reset(options={"episode": k})`` begins with the
-    episodes k + i instead; an array [N] sets the episode of every row.
+    Row i of N runs the episodes i, i + N, i + 2N, ... of the seed.
+    ``reset(options={"episode": k})`` begins with the episodes k + i instead; an array [N] sets the
+    episode of every row.
 
     Raises:
         UserError: a wrong value.
     """
 
-    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012
+    metadata = {
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "render_modes": ["rgb_array"],
+        "render_fps": 1,
+    }  # noqa: RUF012
 
     @checked_arguments
     def __init__(
@@ -71,7 +87,10 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             )
         fps = max(1, round(1.0 / episode.decision_period_s))
         self.metadata = {**self.metadata, "autoreset_mode": self._mode, "render_fps": fps}
-        self.single_observation_space, self.single_action_space = self._rows.space, Discrete(ACTIONS)
+        self.single_observation_space, self.single_action_space = (
+            self._rows.space,
+            Discrete(ACTIONS),
+        )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._seed = None if seed is None else seed_number(seed)
@@ -118,7 +137,10 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
         elif (present := self._rows.numbers()) is not None:
             seeds, first = present[0].copy(), present[1] + self.num_envs
         else:
-            seeds, first = int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed, each
+            seeds, first = (
+                int(self.np_random.integers(SEEDS)) if self._seed is None else self._seed,
+                each,
+            )
         if episode is not None:
             first = array_of(episode)
             first = first.astype(np.int64) if first.dtype.kind in "iu" else np.asarray(-1)
@@ -128,7 +150,9 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
                 )
             first = first + each if first.ndim == 0 else first
         if first.shape != (self.num_envs,) or np.size(seeds) not in (1, self.num_envs):
-            raise UserError(f"reset(): expected one seed and one episode, or {self.num_envs} of each.")
+            raise UserError(
+                f"reset(): expected one seed and one episode, or {self.num_envs} of each."
+            )
         self._rows.start(seeds if np.size(seeds) > 1 else np.ravel(seeds)[0], first)
 
     def step(self, actions: Any) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
@@ -156,7 +180,13 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
             final |= {"final_info": _copied(self._rows.info()), "_final_info": ended}
             self._rows.restart(ended)
             self._begun(ended)
-        return self._rows.observation().copy(), reward, terminated, truncated, _copied(self._rows.info()) | final
+        return (
+            self._rows.observation().copy(),
+            reward,
+            terminated,
+            truncated,
+            _copied(self._rows.info()) | final,
+        )
 
     def action_masks(self) -> Flags:
         """Which actions are allowed now, bool [N, 3]."""
@@ -165,7 +195,9 @@ class HighwayVectorGym(OnRows, VectorEnv[Floats, npt.NDArray[np.int64], npt.NDAr
     def render(self) -> tuple[Any, ...] | None:
         """A picture [height, width, 3] uint8 of every row, without trails."""
         if self._view is None:
-            raise UserError("render(): made without render_mode; give render_mode='rgb_array' to make_vec().")
+            raise UserError(
+                "render(): made without render_mode; give render_mode='rgb_array' to make_vec()."
+            )
         self._rows.check_started()
         return self._view.pictures()
 
@@ -189,4 +221,7 @@ def _where(rows: Flags, observations: Floats) -> npt.NDArray[np.object_]:
 
 def _copied(info: dict[str, Any]) -> dict[str, Any]:
     """A copy of an info, which the caller may keep."""
-    return {name: _copied(value) if isinstance(value, dict) else value.copy() for name, value in info.items()}
+    return {
+        name: _copied(value) if isinstance(value, dict) else value.copy()
+        for name, value in info.items()
+    }

@@ -1,8 +1,9 @@
-"""A batch of highways on NumPy arrays: a whole step (drive, reward, mask, observation) in one call of the kernel.
+"""A batch of highways on NumPy arrays: a whole step (drive, reward, mask, observation) in one call
+of the kernel.
 
-What gymnasium's environments stand on (:mod:`ganlane.gym`). Imports no torch, so it is there in a fraction of a
-second, and costs microseconds where a TensorDict costs milliseconds. Its episodes are, number for number, those of
-the TorchRL environment with ``env.kernel=native``.
+What gymnasium's environments stand on (:mod:`ganlane.gym`). Imports no torch, so it is there in a
+fraction of a second, and costs microseconds where a TensorDict costs milliseconds. Its episodes
+are, number for number, those of the TorchRL environment with ``env.kernel=native``.
 """
 
 from __future__ import annotations
@@ -18,12 +19,30 @@ from ganlane.native import settings
 from ganlane.native.library import addresses, in_threads, load
 from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, Visibility
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
-from ganlane.parameters.observation import MASKS, MaskParameters, ObservationConfig, RewardParameters, largest_number
+from ganlane.parameters.observation import (
+    MASKS,
+    MaskParameters,
+    ObservationConfig,
+    RewardParameters,
+    largest_number,
+)
 
-#: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM stays far below.
+#: Speed over desired speed beyond which the observation is cut off, for a space with bounds; IDM
+#: stays far below.
 SPEED_RATIO_LIMIT = 4.0
 # The structures of observation.cpp and mask.cpp, in their order.
-_VIEW = ("speed", "desired_speed", "length", "y", "x", "y", "speed", "valid", "change_progress", "change_direction")
+_VIEW = (
+    "speed",
+    "desired_speed",
+    "length",
+    "y",
+    "x",
+    "y",
+    "speed",
+    "valid",
+    "change_progress",
+    "change_direction",
+)
 _MASK = (
     "x", "y", "heading", "speed", "length", "width", "desired_speed", "target_lane", "visibility", "valid",
     "change_direction",
@@ -65,7 +84,8 @@ class NativeBatch:
         spawn, ego, episode: the first scene, what is special about the ego, and the episode's end.
         idm: car following of all.
         mobil: lane changes of the others; None: they keep their lanes.
-        recycle_share: share of the episodes in which vehicles left behind return ahead; None: of none.
+        recycle_share: share of the episodes in which vehicles left behind return ahead; None: of
+            none.
         observation: one of :data:`ganlane.native.settings.NATIVE_FORMS`, without sensor errors.
         reward: section V.C.
         mask: of the ego's actions; ``none``: those that stay on the road.
@@ -98,16 +118,31 @@ class NativeBatch:
         variant: str | None = None,
     ) -> None:
         self._arguments = {name: value for name, value in locals().items() if name != "self"}
-        spawn, ego, episode = spawn or SpawnParameters(), ego or EgoParameters(), episode or EpisodeParameters()
+        spawn, ego, episode = (
+            spawn or SpawnParameters(),
+            ego or EgoParameters(),
+            episode or EpisodeParameters(),
+        )
         observation, reward = observation or ObservationConfig(), reward or RewardParameters()
         idm, mask = idm or IdmParameters(), mask or MaskParameters()
         road = (lanes, lane_width_m, vehicles)
-        self.rows, self.lanes, self.lane_width_m, self.terms = rows, lanes, lane_width_m, reward.term_names
+        self.rows, self.lanes, self.lane_width_m, self.terms = (
+            rows,
+            lanes,
+            lane_width_m,
+            reward.term_names,
+        )
         view = settings.view_of(*road, observation.scale(), observation.form)
         self.bounds = (-1.0, largest_number(observation.form, spawn.longest_m))
         self.state: dict[str, npt.NDArray[Any]] = {
-            **{name: np.zeros((rows, vehicles), kind) for name, kind in settings.VEHICLE_ARRAYS.items()},
-            **{name: np.zeros(rows, kind) for name, kind in (settings.ROW_ARRAYS | settings.EVENT_ARRAYS).items()},
+            **{
+                name: np.zeros((rows, vehicles), kind)
+                for name, kind in settings.VEHICLE_ARRAYS.items()
+            },
+            **{
+                name: np.zeros(rows, kind)
+                for name, kind in (settings.ROW_ARRAYS | settings.EVENT_ARRAYS).items()
+            },
         }
         self.observation = np.zeros((rows, view.numbers()), np.float32)
         self.mask = np.ones((rows, 3), np.bool_)
@@ -119,12 +154,16 @@ class NativeBatch:
             "settings": settings.settings_of(*road, episode, ego, idm, mobil=mobil),
             "inputs": self._pointers(settings.INPUTS),
             "outputs": self._pointers(settings.OUTPUTS),
-            "spawn": settings.spawn_of(*road, spawn, stream, visible, Visibility.SIGNALLED, recycle_share),
+            "spawn": settings.spawn_of(
+                *road, spawn, stream, visible, Visibility.SIGNALLED, recycle_share
+            ),
             "scene": self._pointers(settings.SCENE),
             "reward_settings": settings.reward_of(reward, episode.decision_period_s),
             "view": view,
             "view_inputs": self._pointers(_VIEW),
-            "mask_settings": settings.safe_settings(*road, idm, mask.safe_deceleration, ego.abort_lane_change),
+            "mask_settings": settings.safe_settings(
+                *road, idm, mask.safe_deceleration, ego.abort_lane_change
+            ),
             "mask_inputs": self._pointers(_MASK),
             "mask_outputs": addresses([self.mask, self._no_safe_action]),
         }
@@ -150,7 +189,10 @@ class NativeBatch:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """What it was made of, and its numbers: pointers and the library hold in this process alone."""
+        """What it was made of, and its numbers.
+
+        Pointers and the library hold in this process alone.
+        """
         return {"arguments": self._arguments, "arrays": self._arrays()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -159,13 +201,23 @@ class NativeBatch:
             array[:] = kept
 
     def _arrays(self) -> list[npt.NDArray[Any]]:
-        return [*self.state.values(), self.observation, self.mask, self._term_values, self._no_safe_action]
+        return [
+            *self.state.values(),
+            self.observation,
+            self.mask,
+            self._term_values,
+            self._no_safe_action,
+        ]
 
     def _pointers(self, names: Sequence[str]) -> ctypes.Array[ctypes.c_void_p]:
         return addresses([self.state[name] for name in names])
 
-    def start(self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None) -> None:
-        """Begin the episodes [N] of the seeds [N], each perhaps one number for all, in ``rows`` [N] (None: all)."""
+    def start(
+        self, seed: npt.ArrayLike, episode: npt.ArrayLike, rows: npt.NDArray[np.bool_] | None = None
+    ) -> None:
+        """Begin the episodes [N] of the seeds [N], each perhaps one number for all, in ``rows`` [N]
+        (None: all).
+        """
         state = self.state
         fresh = state["fresh"]
         fresh[:] = True if rows is None else rows

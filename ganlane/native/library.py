@@ -1,9 +1,10 @@
-"""Loads the library of the C++ sources and calls its functions, in threads; needs torch off Linux alone.
+"""Loads the library of the C++ sources and calls its functions, in threads; needs torch off Linux
+alone.
 
-The library is the one that came with the wheel, else one built at first use. That one goes into the user's cache
-folder, under a name that follows from the source, the flags and the compiler, so that another version of any of them
-builds anew. Processes that build at once do so each for itself; the last one to finish puts its library in the place
-of the others', which is the same.
+The library is the one that came with the wheel, else one built at first use. That one goes into the
+user's cache folder, under a name that follows from the source, the flags and the compiler, so that
+another version of any of them builds anew. Processes that build at once do so each for itself; the
+last one to finish puts its library in the place of the others', which is the same.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from ganlane.errors import UserError
 SOURCES = tuple(sorted(Path(__file__).parent.glob("*.[ch]pp")))
 #: Libraries that came with the wheel.
 PREBUILT = Path(__file__).with_name("prebuilt")
-#: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives the same bits.
+#: -ffp-contract=off: a product and a sum stay two roundings, so that every instruction set gives
+#: the same bits.
 FLAGS = ("-O3", "-std=c++17", "-ffp-contract=off", "-fno-exceptions", "-fPIC", "-shared", "-s")
 #: The kernel needs no C++ library; zig would compile one first, which takes minutes.
 ZIG_FLAGS = ("-nostdinc++", "-nostdlib++")
@@ -40,7 +42,10 @@ ADVICE = "install g++ or clang++ (Debian: apt install g++), or pip install 'ganl
 
 
 class Variant(NamedTuple):
-    """An instruction set: environments per vector, what GCC and Clang, and zig, call it, and Linux its parts."""
+    """An instruction set.
+
+    Environments per vector, what GCC and Clang, and zig, call it, and Linux its parts.
+    """
 
     lanes: int
     flags: tuple[str, ...]
@@ -76,7 +81,10 @@ def best_variant() -> str:
 
 
 def find_compiler() -> tuple[str, ...] | None:
-    """The command of a C++ compiler: ``CXX``, g++, clang++ or the package ``ziglang``; None if there is none."""
+    """The command of a C++ compiler: ``CXX``, g++, clang++ or the package ``ziglang``.
+
+    None if there is none.
+    """
     for name in (os.environ.get("CXX"), "g++", "clang++"):
         found = name and shutil.which(name)
         if found:
@@ -85,7 +93,8 @@ def find_compiler() -> tuple[str, ...] | None:
 
 
 def cache_folder() -> Path:
-    """Where built libraries are kept: ``native`` in the folder ``GANLANE_CACHE``, by default the user's.
+    """Where built libraries are kept: ``native`` in the folder ``GANLANE_CACHE``, by default the
+    user's.
 
     If that variable is empty, which switches caches off, a folder that goes when the process ends.
     """
@@ -113,7 +122,8 @@ def why_not() -> str | None:
 
 
 def load(variant: str | None = None) -> ctypes.CDLL:
-    """The library for this processor, or for ``variant``: that of the wheel, else built if it is not there yet.
+    """The library for this processor, or for ``variant``: that of the wheel, else built if it is
+    not there yet.
 
     Raises:
         UserError: there is no compiler, it fails, or the cache folder cannot be written.
@@ -164,8 +174,17 @@ def _flags(variant: str) -> tuple[str, ...]:
 
 
 def _command(variant: str, compiler: tuple[str, ...]) -> tuple[str, ...]:
-    own = (*ZIG_FLAGS, *VARIANTS[variant].zig_flags) if "ziglang" in compiler else VARIANTS[variant].flags
-    return (*compiler, *_flags(variant), *own, *(str(source) for source in SOURCES if source.suffix == ".cpp"))
+    own = (
+        (*ZIG_FLAGS, *VARIANTS[variant].zig_flags)
+        if "ziglang" in compiler
+        else VARIANTS[variant].flags
+    )
+    return (
+        *compiler,
+        *_flags(variant),
+        *own,
+        *(str(source) for source in SOURCES if source.suffix == ".cpp"),
+    )
 
 
 def _sources() -> tuple[str, ...]:
@@ -189,7 +208,9 @@ def _build(command: tuple[str, ...], library: Path) -> None:
             done = _run((*command, "-o", str(made)))
             if done.returncode != 0:
                 last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-                raise UserError(f"env.kernel=native: {command[0]} failed ({last}); set env.kernel=torch or {ADVICE}")
+                raise UserError(
+                    f"env.kernel=native: {command[0]} failed ({last}); set env.kernel=torch or {ADVICE}"
+                )
             made.replace(library)
     except OSError as error:
         raise UserError(
@@ -201,7 +222,14 @@ def _build(command: tuple[str, ...], library: Path) -> None:
 def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
     """With the types of its functions; a call through ctypes releases the interpreter's lock."""
     pointer, number = ctypes.c_void_p, ctypes.c_long
-    for name, pointers in (("decide", 3), ("lane_view", 3), ("mask", 3), ("spawn", 3), ("step", 1), ("start", 1)):
+    for name, pointers in (
+        ("decide", 3),
+        ("lane_view", 3),
+        ("mask", 3),
+        ("spawn", 3),
+        ("step", 1),
+        ("start", 1),
+    ):
         function = getattr(library, f"ganlane_{name}")
         function.argtypes = [*[pointer] * pointers, number, number]
         function.restype = ctypes.c_int
@@ -210,8 +238,9 @@ def _declared(library: ctypes.CDLL) -> ctypes.CDLL:
 
 # Calls: arrays as pointers, rows shared between threads
 
-#: Rows per thread from which on a second thread pays: idm_mobil through gymnasium on two cores took 1.3 times as long
-#: with two threads at 128 rows, 1.0 times at 256, 0.8 times at 512, 0.65 times at 1024 and 0.55 times at 4096.
+#: Rows per thread from which on a second thread pays: idm_mobil through gymnasium on two cores took
+#: 1.3 times as long with two threads at 128 rows, 1.0 times at 256, 0.8 times at 512, 0.65 times at
+#: 1024 and 0.55 times at 4096.
 ROWS_PER_THREAD = 192
 #: The largest number of environments in a vector; threads take a multiple of it.
 BLOCK = 16
@@ -221,12 +250,19 @@ def addresses(arrays: Sequence[Any]) -> ctypes.Array[ctypes.c_void_p]:
     """A struct of pointers to tensors or NumPy arrays; None: a null pointer."""
 
     def address(array: Any) -> int | None:
-        return None if array is None else array.ctypes.data if hasattr(array, "ctypes") else array.data_ptr()
+        return (
+            None
+            if array is None
+            else array.ctypes.data
+            if hasattr(array, "ctypes")
+            else array.data_ptr()
+        )
 
     return (ctypes.c_void_p * len(arrays))(*map(address, arrays))
 
 
-#: Threads of the kernel while torch has but one (:func:`torch_on_one_thread`); None: as many as torch.
+#: Threads of the kernel while torch has but one (:func:`torch_on_one_thread`); None: as many as
+#: torch.
 _threads: ContextVar[int | None] = ContextVar("threads of the kernel", default=None)
 
 
@@ -234,9 +270,10 @@ _threads: ContextVar[int | None] = ContextVar("threads of the kernel", default=N
 def torch_on_one_thread() -> Iterator[None]:
     """Inside, torch computes on one thread, and the kernel on as many as torch had.
 
-    Around the kernel torch works on small tensors, which it is slow to share out: a step of 4096 environments through
-    TorchRL took 6.8 ms on one core, 7.3 ms with two threads for torch and the kernel, and 5.2 ms with two for the
-    kernel alone. A thread that calls torch for the first time while another one is inside keeps one thread.
+    Around the kernel torch works on small tensors, which it is slow to share out: a step of 4096
+    environments through TorchRL took 6.8 ms on one core, 7.3 ms with two threads for torch and the
+    kernel, and 5.2 ms with two for the kernel alone. A thread that calls torch for the first time
+    while another one is inside keeps one thread.
     """
     torch = sys.modules["torch"]
     before = int(torch.get_num_threads())
@@ -253,7 +290,10 @@ def torch_on_one_thread() -> Iterator[None]:
 
 
 def threads_allowed() -> int:
-    """As many threads as torch may use; where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores."""
+    """As many threads as torch may use.
+
+    Where torch is not loaded, ``OMP_NUM_THREADS`` or the processor's cores.
+    """
     own, torch = _threads.get(), sys.modules.get("torch")
     if own is not None:
         return own
@@ -276,8 +316,11 @@ def in_threads(rows: int, call: Callable[[int, int], int]) -> None:
     else:
         share = -(-rows // (threads * BLOCK)) * BLOCK
         starts = range(0, rows, share)
-        others = [_pool(threads - 1).submit(call, start, min(start + share, rows)) for start in starts[1:]]
-        codes = [call(0, share), *(other.result() for other in others)]  # this thread does not wait idle
+        others = [
+            _pool(threads - 1).submit(call, start, min(start + share, rows)) for start in starts[1:]
+        ]
+        # this thread does not wait idle
+        codes = [call(0, share), *(other.result() for other in others)]
     if 2 in codes:
         raise ValueError("an action is not 0, 1 or 2")
     if any(codes):

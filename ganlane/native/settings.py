@@ -10,14 +10,21 @@ from collections.abc import Mapping
 from typing import Any, Final, TypeVar
 
 from ganlane.keys import PHYSICS_STEP_S
-from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, SteeringParameters
+from ganlane.parameters.driving import (
+    EgoParameters,
+    IdmParameters,
+    MobilParameters,
+    SteeringParameters,
+)
 from ganlane.parameters.episode import EpisodeParameters, SpawnParameters
 from ganlane.parameters.observation import NEARNESS_M, OVERLAP_M, ObservationScale, RewardParameters
 
 _FLOAT, _INTEGER, _FLAG = "float32", "int64", "bool"
 #: Arrays [rows, vehicles] and their types.
 VEHICLE_ARRAYS: Final = {
-    **dict.fromkeys(("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed"), _FLOAT),
+    **dict.fromkeys(
+        ("x", "y", "heading", "speed", "acceleration", "length", "width", "desired_speed"), _FLOAT
+    ),
     **dict.fromkeys(("target_lane", "visibility"), _INTEGER),
     "valid": _FLAG,
     "steering": _FLOAT,
@@ -30,12 +37,26 @@ EVENT_ARRAYS: Final = {
 }
 #: The other arrays [rows].
 ROW_ARRAYS: Final = {
-    **dict.fromkeys(("seed", "episode", "action", "change_direction", "decisions", "lane_changes", "step"), _INTEGER),
-    **dict.fromkeys(("ego_steering", "mean_acceleration", "change_progress", "distance", "reward"), _FLOAT),
-    **dict.fromkeys(("soft_crash", "soft_crash_behind", "started_change", "recycles", "fresh"), _FLAG),
+    **dict.fromkeys(
+        ("seed", "episode", "action", "change_direction", "decisions", "lane_changes", "step"),
+        _INTEGER,
+    ),
+    **dict.fromkeys(
+        ("ego_steering", "mean_acceleration", "change_progress", "distance", "reward"), _FLOAT
+    ),
+    **dict.fromkeys(
+        ("soft_crash", "soft_crash_behind", "started_change", "recycles", "fresh"), _FLAG
+    ),
 }
 # The structures of arrays.hpp, in their order.
-_EGO = ("ego_steering", "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind")
+_EGO = (
+    "ego_steering",
+    "change_direction",
+    "decisions",
+    "lane_changes",
+    "soft_crash",
+    "soft_crash_behind",
+)
 INPUTS: Final = ("action", *VEHICLE_ARRAYS, *_EGO, "step", "recycles")
 OUTPUTS: Final = (
     "x", "y", "heading", "speed", "acceleration", "target_lane", "steering",
@@ -43,7 +64,17 @@ OUTPUTS: Final = (
     "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind", "started_change",
     "step", *EVENT_ARRAYS,
 )  # fmt: skip
-SCENE: Final = ("seed", "episode", "fresh", "length", "width", "desired_speed", "visibility", "valid", "recycles")
+SCENE: Final = (
+    "seed",
+    "episode",
+    "fresh",
+    "length",
+    "width",
+    "desired_speed",
+    "visibility",
+    "valid",
+    "recycles",
+)
 
 #: The observations that the kernel computes: whether with drift, and with overlap.
 NATIVE_FORMS: Final = {
@@ -73,7 +104,10 @@ class View(ctypes.Structure):
     """``View`` of observation.cpp."""
 
     _fields_ = (
-        *((name, ctypes.c_float) for name in ("range_m", "speed_mps", "lane_width_m", "nearness_m", "overlap_m")),
+        *(
+            (name, ctypes.c_float)
+            for name in ("range_m", "speed_mps", "lane_width_m", "nearness_m", "overlap_m")
+        ),
         *((name, ctypes.c_int32) for name in ("lanes", "vehicles", "drift", "overlap")),
     )
 
@@ -141,7 +175,13 @@ def settings_of(
     episode, ego = episode or EpisodeParameters(), ego or EgoParameters()
     idm, steering = idm or IdmParameters(), steering or SteeringParameters()
     given = {
-        **(vars(episode) | vars(ego) | vars(idm) | vars(steering) | vars(mobil or MobilParameters())),
+        **(
+            vars(episode)
+            | vars(ego)
+            | vars(idm)
+            | vars(steering)
+            | vars(mobil or MobilParameters())
+        ),
         **{"lanes": lanes, "lane_width_m": lane_width_m, "vehicles": vehicles},
         "per_brake_scale": 1.0 / idm.brake_scale(),
         "per_near_s": 1.0 / steering.near_s,
@@ -155,15 +195,24 @@ def settings_of(
 
 
 def safe_settings(
-    lanes: int, lane_width_m: float, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool
+    lanes: int,
+    lane_width_m: float,
+    vehicles: int,
+    idm: IdmParameters,
+    safe_deceleration: float,
+    abort: bool,
 ) -> Settings:
     """The numbers of the mask ``safe``; ``safe_deceleration`` in m/s2."""
-    settings = settings_of(lanes, lane_width_m, vehicles, ego=EgoParameters(abort_lane_change=abort), idm=idm)
+    settings = settings_of(
+        lanes, lane_width_m, vehicles, ego=EgoParameters(abort_lane_change=abort), idm=idm
+    )
     settings.safe_deceleration = safe_deceleration
     return settings
 
 
-def view_of(lanes: int, lane_width_m: float, vehicles: int, scale: ObservationScale, form: str) -> View:
+def view_of(
+    lanes: int, lane_width_m: float, vehicles: int, scale: ObservationScale, form: str
+) -> View:
     """The numbers of an observation in :data:`NATIVE_FORMS`."""
     road = (lane_width_m, NEARNESS_M, OVERLAP_M, lanes, vehicles)
     return View(scale.range_m, scale.speed_mps, *road, *NATIVE_FORMS[form])
@@ -179,7 +228,10 @@ def spawn_of(
     others_visibility: int,
     recycle_share: float | None,
 ) -> Spawn:
-    """The numbers of Table II; ``recycle_share`` of the episodes recycle their vehicles, None: no episode does."""
+    """The numbers of Table II; ``recycle_share`` of the episodes recycle their vehicles, None.
+
+    No episode does.
+    """
 
     def of_struct(value: Any) -> Any:
         return value if isinstance(value, int | float) else Range(value[0], value[1] - value[0])
@@ -198,5 +250,9 @@ def spawn_of(
 
 def reward_of(reward: RewardParameters, decision_period_s: float) -> Reward:
     """The numbers of the reward, and of how many terms it is the sum."""
-    given = {**vars(reward), "decision_period_s": decision_period_s, "terms": len(reward.term_names)}
+    given = {
+        **vars(reward),
+        "decision_period_s": decision_period_s,
+        "terms": len(reward.term_names),
+    }
     return _filled(Reward, given)

@@ -1,4 +1,7 @@
-"""The kernel on tensors, on a CPU in float32: a decision, first scenes, the lane view and the mask ``safe``."""
+"""The kernel on tensors, on a CPU in float32.
+
+A decision, first scenes, the lane view and the mask ``safe``.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +15,43 @@ from torch import Tensor
 from ganlane.errors import UserError
 from ganlane.native import settings
 from ganlane.native.library import addresses, in_threads, load
-from ganlane.parameters.driving import EgoParameters, IdmParameters, MobilParameters, SteeringParameters
+from ganlane.parameters.driving import (
+    EgoParameters,
+    IdmParameters,
+    MobilParameters,
+    SteeringParameters,
+)
 from ganlane.parameters.episode import EpisodeParameters
 from ganlane.parameters.observation import ObservationScale
 from ganlane.sim.dynamics import STEERING
 from ganlane.sim.spawn import RandomScenes
 from ganlane.sim.state import Road, Vehicles
 
-#: What a decision led to, by the names of :data:`~ganlane.native.settings.OUTPUTS`: the vehicles' fields and the
-#: traffic's ``steering`` [N, M], ``step`` and the ego's memory [N], events and done flags [N, 1].
+#: What a decision led to, by the names of :data:`~ganlane.native.settings.OUTPUTS`: the vehicles'
+#: fields and the traffic's ``steering`` [N, M], ``step`` and the ego's memory [N], events and done
+#: flags [N, 1].
 Outcome: TypeAlias = dict[str, Tensor]
-#: What of the ego is remembered from one decision to the next (:mod:`ganlane.env.state`), in the kernel's order.
-EGO_MEMORY = ("steering", "change_direction", "decisions", "lane_changes", "soft_crash", "soft_crash_behind")
-_TABLES = {"vehicle": settings.VEHICLE_ARRAYS, "row": settings.ROW_ARRAYS, "event": settings.EVENT_ARRAYS}
+#: What of the ego is remembered from one decision to the next (:mod:`ganlane.env.state`), in the
+#: kernel's order.
+EGO_MEMORY = (
+    "steering",
+    "change_direction",
+    "decisions",
+    "lane_changes",
+    "soft_crash",
+    "soft_crash_behind",
+)
+_TABLES = {
+    "vehicle": settings.VEHICLE_ARRAYS,
+    "row": settings.ROW_ARRAYS,
+    "event": settings.EVENT_ARRAYS,
+}
 #: Form and dtype of the kernel's arrays.
-_ARRAYS = {name: (form, getattr(torch, dtype)) for form, table in _TABLES.items() for name, dtype in table.items()}
+_ARRAYS = {
+    name: (form, getattr(torch, dtype))
+    for form, table in _TABLES.items()
+    for name, dtype in table.items()
+}
 _INPUT_DTYPES = tuple(_ARRAYS[name][1] for name in settings.INPUTS)
 
 
@@ -44,7 +69,11 @@ def moved(before: Vehicles, out: Outcome) -> Vehicles:
 
 def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
     """Lanes, their width in m, and M."""
-    if road.ring_m is not None or isinstance(road.lanes, Tensor) or isinstance(road.lane_width_m, Tensor):
+    if (
+        road.ring_m is not None
+        or isinstance(road.lanes, Tensor)
+        or isinstance(road.lane_width_m, Tensor)
+    ):
         raise UserError(
             "env.kernel=native: the road must be straight and the same in all rows; set env.kernel=torch."
         )
@@ -54,7 +83,8 @@ def _shape(road: Road, vehicles: int) -> tuple[int, float, int]:
 class _Function:
     """A function of the kernel with its settings.
 
-    ``variant`` is one of :data:`ganlane.native.library.VARIANTS`; None: the best for this processor.
+    ``variant`` is one of :data:`ganlane.native.library.VARIANTS`; None: the best for this
+    processor.
 
     Raises:
         UserError: the road is a ring or differs from row to row, or the kernel cannot be built.
@@ -75,7 +105,12 @@ class _Function:
     def _run(self, rows: int, inputs: Sequence[Tensor | None], outputs: Sequence[Tensor]) -> None:
         # Referred to until the call is over.
         inputs = [each if each is None else each.contiguous() for each in inputs]
-        call, numbers, given, made = self._call, ctypes.byref(self._numbers), addresses(inputs), addresses(outputs)
+        call, numbers, given, made = (
+            self._call,
+            ctypes.byref(self._numbers),
+            addresses(inputs),
+            addresses(outputs),
+        )
         in_threads(rows, lambda first, last: call(numbers, given, made, first, last))
 
 
@@ -125,7 +160,8 @@ class Kernel(_Function):
             steering: of the vehicles, rad, [N, M]; the ego's is its own memory's.
             ego: :data:`EGO_MEMORY` by name, each [N].
             step: physics steps since the start of the episode, [N] int64.
-            recycles: rows that put vehicles left behind ahead of the ego again, [N] bool; None: no row does.
+            recycles: rows that put vehicles left behind ahead of the ego again, [N] bool; None: no
+                row does.
             out: written to; None: new tensors. It must not share memory with what goes in.
 
         Raises:
@@ -136,7 +172,9 @@ class Kernel(_Function):
         given = [action, *vehicles, steering, *(ego[name] for name in EGO_MEMORY), step, recycles]
         for number, wanted in zip(given, _INPUT_DTYPES):
             if number is not None and (number.dtype is not wanted or number.shape[0] != rows):
-                raise TypeError(f"the kernel takes {rows} rows of {wanted} here, not {number.dtype} {number.shape}")
+                raise TypeError(
+                    f"the kernel takes {rows} rows of {wanted} here, not {number.dtype} {number.shape}"
+                )
         self._run(rows, given, tuple(out.values()))
         return out
 
@@ -144,7 +182,8 @@ class Kernel(_Function):
 class NativeScenes(_Function):
     """What :class:`~ganlane.sim.spawn.RandomScenes` draws, bit for bit.
 
-    Drawn by tensor code, the rows that ended took 3 of the 10 ms of a step of 4096 environments through TorchRL.
+    Drawn by tensor code, the rows that ended took 3 of the 10 ms of a step of 4096 environments
+    through TorchRL.
 
     Args:
         scenes: with a straight road, the same in all rows.
@@ -157,7 +196,9 @@ class NativeScenes(_Function):
         numbers = settings.spawn_of(*shape, scenes.parameters, stream, *seen, recycle_share=None)
         super().__init__("ganlane_spawn", numbers)
 
-    def start(self, seed: Tensor, episode: Tensor, rows: Tensor | None = None) -> tuple[Outcome, Vehicles]:
+    def start(
+        self, seed: Tensor, episode: Tensor, rows: Tensor | None = None
+    ) -> tuple[Outcome, Vehicles]:
         """The first states of the episodes (``seed``, ``episode``) [N] int64.
 
         ``rows`` [N] bool are those to be drawn; None: all. The others are zeros, without a vehicle.
@@ -166,16 +207,22 @@ class NativeScenes(_Function):
         rows = torch.ones(count, dtype=torch.bool) if rows is None else rows
         out = empty_outcome(count, self.vehicles, torch.zeros)
         length, width, desired_speed = (torch.zeros_like(out["x"]) for _ in range(3))
-        visibility, valid = torch.zeros_like(out["target_lane"]), torch.zeros_like(out["x"], dtype=torch.bool)
+        visibility, valid = (
+            torch.zeros_like(out["target_lane"]),
+            torch.zeros_like(out["x"], dtype=torch.bool),
+        )
         recycles = torch.zeros(count, dtype=torch.bool)
         scene = [seed, episode, rows, length, width, desired_speed, visibility, valid, recycles]
         self._run(count, scene, tuple(out.values()))
         moving = (out["x"], out["y"], out["heading"], out["speed"], out["acceleration"])
-        return out, Vehicles(*moving, length, width, desired_speed, out["target_lane"], visibility, valid)
+        return out, Vehicles(
+            *moving, length, width, desired_speed, out["target_lane"], visibility, valid
+        )
 
 
 class LaneView(_Function):
-    """Observations of own state, lane view and own lane change (:func:`ganlane.transforms.observation.lane_view`).
+    """Observations of own state, lane view and own lane change
+    (:func:`ganlane.transforms.observation.lane_view`).
 
     Args:
         road: straight, the same in all rows.
@@ -189,10 +236,26 @@ class LaneView(_Function):
         self.size = view.numbers()
         super().__init__("ganlane_lane_view", view)
 
-    def observe(self, vehicles: Vehicles, progress: Tensor, direction: Tensor, seen: Vehicles) -> Tensor:
-        """The observation [N, size]; arguments as :meth:`ganlane.transforms.ObservationTransform.observe`."""
+    def observe(
+        self, vehicles: Vehicles, progress: Tensor, direction: Tensor, seen: Vehicles
+    ) -> Tensor:
+        """The observation [N, size].
+
+        Arguments as :meth:`ganlane.transforms.ObservationTransform.observe`.
+        """
         v = vehicles
-        given = [v.speed, v.desired_speed, v.length, v.y, seen.x, seen.y, seen.speed, seen.valid, progress, direction]
+        given = [
+            v.speed,
+            v.desired_speed,
+            v.length,
+            v.y,
+            seen.x,
+            seen.y,
+            seen.speed,
+            seen.valid,
+            progress,
+            direction,
+        ]
         out = torch.empty((v.x.shape[0], self.size), dtype=torch.float32)
         self._run(len(out), given, [out])
         return out
@@ -211,15 +274,22 @@ class SafeActions(_Function):
         abort: whether the ego may turn back during a lane change.
     """
 
-    def __init__(self, road: Road, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool) -> None:
+    def __init__(
+        self, road: Road, vehicles: int, idm: IdmParameters, safe_deceleration: float, abort: bool
+    ) -> None:
         numbers = settings.safe_settings(*_shape(road, vehicles), idm, safe_deceleration, abort)
         super().__init__("ganlane_mask", numbers)
 
     def allowed(self, seen: Vehicles, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """The mask [N, 3], and whether no action is safe [N], of vehicles as the ego perceives them."""
+        """The mask [N, 3], and whether no action is safe [N], of vehicles as the ego perceives
+        them.
+        """
         v, rows = seen, seen.x.shape[0]
         given = [v.x, v.y, v.heading, v.speed, v.length, v.width, v.desired_speed]
         given += [v.target_lane, v.visibility, v.valid, direction]
-        mask, none = torch.empty((rows, 3), dtype=torch.bool), torch.empty((rows,), dtype=torch.bool)
+        mask, none = (
+            torch.empty((rows, 3), dtype=torch.bool),
+            torch.empty((rows,), dtype=torch.bool),
+        )
         self._run(rows, given, [mask, none])
         return mask, none

@@ -1,6 +1,7 @@
 """Rainbow's hyperparameters and switches, and options that released versions had in addition.
 
-Agents, checkpoints and command lines of released versions hold the latter at their defaults and load as before.
+Agents, checkpoints and command lines of released versions hold the latter at their defaults and
+load as before.
 """
 
 from __future__ import annotations
@@ -10,12 +11,22 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from ganlane.errors import ParameterError, UserError, as_typed
-from ganlane.parameters import Count, CountOrZero, NotNegative, Number, Positive, PositiveShare, Record, Share
+from ganlane.parameters import (
+    Count,
+    CountOrZero,
+    NotNegative,
+    Number,
+    Positive,
+    PositiveShare,
+    Record,
+    Share,
+)
 
 
 @dataclass(frozen=True)
 class RainbowConfig(Record):
-    """Hyperparameters of Rainbow (Hessel et al. 2018); the values are for one update of 256 per 64 decisions.
+    """Hyperparameters of Rainbow (Hessel et al. 2018); the values are for one update of 256 per 64
+    decisions.
 
     Attributes:
         hidden: widths of the hidden layers.
@@ -37,14 +48,16 @@ class RainbowConfig(Record):
         target_period: updates between two copies of the target network.
         learning_rate: of Adam.
         learning_rate_end: it falls to this in a straight line; null: it stays.
-        learning_rate_decisions: within so many decisions; 0: those of the phase (:meth:`for_phase`).
+        learning_rate_decisions: within so many decisions; 0: those of the phase
+            (:meth:`for_phase`).
         adam_eps: of Adam; null: 0.005 / batch_size.
         gradient_clip: norm at which gradients are clipped.
         alpha: strength of the priorities, 0 to 1.
         beta_start: importance weights, rises to 1.
         beta_updates: within so many updates.
         kl_priority: priority by KL divergence, else by the expected error.
-        epsilon_start: share of random legal actions at first; a trained agent (init=...) starts with epsilon.
+        epsilon_start: share of random legal actions at first; a trained agent (init=...) starts
+            with epsilon.
         epsilon: share of random legal actions in the end (docs/agent.md).
         epsilon_decisions: decisions in which the one falls to the other.
     """
@@ -98,7 +111,9 @@ class RainbowConfig(Record):
             )
 
     def for_phase(self, decisions: int) -> RainbowConfig:
-        """The same for a phase of ``decisions``, in which the learning rate falls unless it has a time of its own."""
+        """The same for a phase of ``decisions``, in which the learning rate falls unless it has a
+        time of its own.
+        """
         if self.learning_rate_end is not None and self.learning_rate_decisions == 0:
             return replace(self, learning_rate_decisions=decisions)
         return self
@@ -108,7 +123,8 @@ class RemovedOption(UserError):
     """A stored file or a command line asks for an option that was removed."""
 
 
-#: The last revision that had the options that lost the search of the hyperparameters (docs/search.md).
+#: The last revision that had the options that lost the search of the hyperparameters
+#: (docs/search.md).
 LAST_REVISION: Final = "2f3f5feca555"
 #: Options of the agent and their defaults.
 AGENT_OPTIONS: Final[dict[str, Any]] = {
@@ -123,7 +139,8 @@ _OBSERVATION: Final = "fixed_order"
 
 
 def without_removed(options: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """``options`` of a saved agent or network, without those that are no more; ``where`` names it in the error.
+    """``options`` of a saved agent or network, without those that are no more; ``where`` names it
+    in the error.
 
     Raises:
         RemovedOption: the agent was trained with one of them.

@@ -1,4 +1,5 @@
-"""Who drives and how: car following and lane changes (Tables IV and V), the ego, and the traffics' own drivers.
+"""Who drives and how: car following and lane changes (Tables IV and V), the ego, and the traffics'
+own drivers.
 
 The latter are generated, random, faulty and recorded ones, and those of SUMO.
 """
@@ -44,8 +45,8 @@ class Visibility(IntEnum):
 class IdmParameters(Record):
     """The Intelligent Driver Model (Treiber et al. 2000) with the paper's Table V.
 
-    The acceleration exponent is 4, computed as two squarings: the result of ``torch.pow`` may differ in its last bits
-    between batch sizes.
+    The acceleration exponent is 4, computed as two squarings: the result of ``torch.pow`` may
+    differ in its last bits between batch sizes.
 
     Attributes:
         min_gap_m: gap to a standing leader, m, at least 0.
@@ -72,14 +73,16 @@ class IdmParameters(Record):
 
 @dataclass(frozen=True)
 class MobilParameters(Record):
-    """The lane-changing model MOBIL (Kesting et al. 2007) with the paper's Table IV; all at least 0.
+    """The lane-changing model MOBIL (Kesting et al. 2007) with the paper's Table IV; all at least
+    0.
 
     Attributes:
         threshold: least incentive for a change, m/s2.
         politeness_rear: ``q``, weights the old ('rear') follower.
         politeness_side: ``p``, weights the new ('side') one.
         safe_deceleration: a change may not make any vehicle brake harder, m/s2, above 0.
-        exclusive_m: of several vehicles that want to enter one lane within this distance, only the foremost does, m.
+        exclusive_m: of several vehicles that want to enter one lane within this distance, only the
+            foremost does, m.
     """
 
     threshold: NotNegative = 0.1
@@ -115,7 +118,8 @@ class SteeringParameters:
     gain_far: float = 1.5
     gain_near: float = 3.0
     gain_integral: float = 3.375
-    #: Below this speed the law is one of distance travelled, not of time: a standing car does not turn its wheels.
+    #: Below this speed the law is one of distance travelled, not of time: a standing car does not
+    #: turn its wheels.
     slow_mps: float = 3.0
     max_angle_rad: float = 0.5
 
@@ -145,13 +149,14 @@ class GanParameters(Record):
 class CalibratedGanParameters(Record):
     """The calibrated generated traffic (:func:`ganlane.traffic.presets.gan_calibrated_traffic`).
 
-    The two numbers of the noise were chosen on the scenes that the generator is fitted to: as fitted (1 and 5 s) too
-    few drivers accelerate.
+    The two numbers of the noise were chosen on the scenes that the generator is fitted to: as
+    fitted (1 and 5 s) too few drivers accelerate.
 
     Attributes:
         path: weights of the preset 'calibrated'; null: the ones that ship.
         noise_scale: of the latent vectors; 1 as fitted, 0 drives everybody by the mean prediction.
-        noise_period_s: time in which a driver's latent vector is forgotten, s; 5 in fitting, 0: at once.
+        noise_period_s: time in which a driver's latent vector is forgotten, s; 5 in fitting, 0: at
+            once.
         changes_per_km: wishes for a lane change per vehicle-km; null: from the recordings.
     """
 
@@ -185,8 +190,10 @@ class ReplayParameters(Record):
     """Recorded traffic (:class:`ganlane.traffic.ReplayTraffic`).
 
     Attributes:
-        path: scene CSV, or Parquet from ganlane prepare; null: US-101 in GANLANE_DATA or ../shared/data.
-        least_s: the vehicle that the ego replaces is recorded at least so long from the start on, s.
+        path: scene CSV, or Parquet from ganlane prepare; null: US-101 in GANLANE_DATA or
+            ../shared/data.
+        least_s: the vehicle that the ego replaces is recorded at least so long from the start on,
+            s.
     """
 
     path: str | None = None
@@ -195,23 +202,26 @@ class ReplayParameters(Record):
 
 @dataclass(frozen=True)
 class RandomDrivers(Record):
-    """Ranges (low, high) that every driver's parameters are drawn from, uniformly and independently, per episode.
+    """Ranges (low, high) that every driver's parameters are drawn from, uniformly and
+    independently, per episode.
 
     Attributes:
-        headway_s: IDM's time headway T, s. The recorded followers' middle half on US-101 keeps 0.93 to 1.93 s
-            (median 1.27); Kesting and Treiber (2008) fit 1.2 to 1.5 s, Treiber and Kesting (2013, table 11.2) take
-            1.0 s on highways.
-        max_acceleration: m/s2; 1.0 there, Table V has 0.7, calibrations on trajectories give up to about 1.5.
+        headway_s: IDM's time headway T, s. The recorded followers' middle half on US-101 keeps 0.93
+            to 1.93 s (median 1.27); Kesting and Treiber (2008) fit 1.2 to 1.5 s, Treiber and
+            Kesting (2013, table 11.2) take 1.0 s on highways.
+        max_acceleration: m/s2; 1.0 there, Table V has 0.7, calibrations on trajectories give up to
+            about 1.5.
         comfortable_deceleration: m/s2; 1.5 there, Table V has 1.7.
         strongest_braking: m/s2, more only where the first scene asks for it
-            (:func:`ganlane.traffic.idm_mobil.start_braking`). About 9 is what dry asphalt allows, 4 is a hesitant
-            driver or a wet road.
+            (:func:`ganlane.traffic.idm_mobil.start_braking`). About 9 is what dry asphalt allows, 4
+            is a hesitant driver or a wet road.
         desired_speed: factor on the desired speed that the scene gives (Table II: 18 to 26 m/s).
         politeness: factor on MOBIL's weights of the followers (Table IV), 0 is an egoist.
-        reaction_s: time that passes before an acceleration decided on is driven, s. Drivers' reaction times of about
-            1 s are partly made up for by anticipation (Treiber, Kesting and Helbing 2006), which IDM has none of, so
-            the range lies below them.
-        sway_m: how far the line that a driver aims at wanders from its lane's centre, m; less in narrow lanes.
+        reaction_s: time that passes before an acceleration decided on is driven, s. Drivers'
+            reaction times of about 1 s are partly made up for by anticipation (Treiber, Kesting and
+            Helbing 2006), which IDM has none of, so the range lies below them.
+        sway_m: how far the line that a driver aims at wanders from its lane's centre, m; less in
+            narrow lanes.
         sway_period_s: periods of that wandering, s.
     """
 
@@ -277,7 +287,8 @@ class AbortFaults(Record):
 
     Attributes:
         share: of the lane changes, 0 to 1.
-        at: how far the change has come when the driver turns back, 0 to 1; 0.5 is the line between the lanes.
+        at: how far the change has come when the driver turns back, 0 to 1; 0.5 is the line between
+            the lanes.
     """
 
     share: Share = 0.1

@@ -14,7 +14,10 @@ KERNELS = ("torch", "native", "auto")
 
 
 class Stream(IntEnum):
-    """Disjoint sets of episodes: for training, for selection (validation), and for reported results (test)."""
+    """Disjoint sets of episodes.
+
+    For training, for selection (validation), and for reported results (test).
+    """
 
     TRAIN = 0
     SELECT = 1
@@ -49,7 +52,10 @@ class EpisodeParameters(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.substeps() < 1 or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9:
+        if (
+            self.substeps() < 1
+            or abs(self.substeps() * PHYSICS_STEP_S - self.decision_period_s) > 1e-9
+        ):
             raise ParameterError(
                 f"{{decision_period_s}}={self.decision_period_s:g} is not a multiple of {PHYSICS_STEP_S:g} s; "
                 "choose 0.1, 0.2, ... 1.0 or more."
@@ -66,15 +72,16 @@ class EpisodeParameters(Record):
 
 @dataclass(frozen=True)
 class SpawnParameters(Record):
-    """The first scene: Table II, extended by lorries. Distances in m, speeds in m/s, ranges (low, high).
+    """The first scene: Table II, extended by lorries. Distances in m, speeds in m/s, ranges (low,
+    high).
 
-    Desired speeds are above 0, since IDM divides by them. Whether so many vehicles fit and can brake is
-    checked by :func:`ganlane.sim.spawn.check_start`.
+    Desired speeds are above 0, since IDM divides by them. Whether so many vehicles fit and can
+    brake is checked by :func:`ganlane.sim.spawn.check_start`.
 
     Attributes:
         spread_m: all vehicles start on this stretch.
-        min_spacing_m: centre to centre in a lane, between cars; larger by the extra length of lorries
-            (:attr:`spacing_m`).
+        min_spacing_m: centre to centre in a lane, between cars; larger by the extra length of
+            lorries (:attr:`spacing_m`).
         front_speed_mps: of vehicles ahead of the ego.
         rear_speed_mps: of vehicles behind it.
         ego_speed_mps: of the ego.
@@ -82,11 +89,12 @@ class SpawnParameters(Record):
         ego_desired_speed_mps: of the ego.
         length_m: of a car.
         width_m: of a car.
-        truck_share: each of the others is a lorry with this probability, 0 to 1; the paper has none.
+        truck_share: each of the others is a lorry with this probability, 0 to 1; the paper has
+            none.
         truck_length_m: the longest rigid lorry of Directive 96/53/EC.
         truck_width_m: about its 2.55 m.
-        truck_desired_speed_mps: 80 to 90 km/h, from Germany's limit for lorries to the speed limiter of Directive
-            92/6/EEC.
+        truck_desired_speed_mps: 80 to 90 km/h, from Germany's limit for lorries to the speed
+            limiter of Directive 92/6/EEC.
     """
 
     spread_m: Positive = 200.0
@@ -115,7 +123,10 @@ class SpawnParameters(Record):
 
     @property
     def spacing_m(self) -> float:
-        """Minimum distance between centres in a lane, m: the gap between two lorries is that between two cars."""
+        """Minimum distance between centres in a lane, m.
+
+        The gap between two lorries is that between two cars.
+        """
         return self.min_spacing_m + (self.longest_m - self.length_m)
 
     def lane_capacity(self) -> int:
@@ -123,9 +134,15 @@ class SpawnParameters(Record):
         return int(self.spread_m / self.spacing_m) + 1
 
     def worst_followers(self) -> tuple[tuple[str, float, float, float], ...]:
-        """Fastest followers: key, highest speed, the leader's lowest speed, highest desired speed, m/s."""
+        """Fastest followers.
+
+        Key, highest speed, the leader's lowest speed, highest desired speed, m/s.
+        """
         front, rear, ego = self.front_speed_mps, self.rear_speed_mps, self.ego_speed_mps
-        others = max(self.desired_speed_mps[1], self.truck_desired_speed_mps[1] if self.truck_share > 0 else 0.0)
+        others = max(
+            self.desired_speed_mps[1],
+            self.truck_desired_speed_mps[1] if self.truck_share > 0 else 0.0,
+        )
         return (
             ("rear_speed_mps", rear[1], min(rear[0], ego[0], front[0]), others),
             ("ego_speed_mps", ego[1], front[0], self.ego_desired_speed_mps),

@@ -1,4 +1,7 @@
-"""Recordings and the fit of the generator to them: files and held-out scenes, sizes, schedule, both presets."""
+"""Recordings and the fit of the generator to them.
+
+Files and held-out scenes, sizes, schedule, both presets.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ from ganlane.parameters import (
 )
 
 Preset = Literal["paper", "calibrated"]
-#: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing speed, lane offset.
+#: Inputs of the calibrated preset in addition to the motion: IDM's acceleration, gap, closing
+#: speed, lane offset.
 EXTRA_INPUTS = 4
 _WASHOUT = Rule(lambda value: value > 0 and not math.isnan(value), "a number above 0, or inf")
 
@@ -42,10 +46,12 @@ class GeneratorSizes(Record):
         context: width of the layer between encoder and decoder.
         noise: width Z of the latent vector; below ``hidden``.
         neighbours: how many of the nearest vehicles are pooled; 0 is no pooling (an ablation).
-        extra_inputs: inputs per vehicle in addition to its motion (0 for the paper's preset, positions only).
+        extra_inputs: inputs per vehicle in addition to its motion (0 for the paper's preset,
+            positions only).
         observed: displacements that are observed (the paper's ``o_l``).
         predicted: displacements that are predicted (the paper's ``p_l``).
-        differences: whether the displacements' differences are inputs too; false is for an ablation.
+        differences: whether the displacements' differences are inputs too; false is for an
+            ablation.
     """
 
     embedding: int = field(default=64, metadata=NO_KEY)
@@ -66,7 +72,8 @@ class LossWeights(Record):
     """Weights of the generator's loss terms; a weight of 0 switches a term off.
 
     Attributes:
-        variety: the best of the samples (variety alone makes a single sample worse than constant velocity).
+        variety: the best of the samples (variety alone makes a single sample worse than constant
+            velocity).
         single: the mean over the samples.
         mean: the prediction for z = 0.
         adversarial: cross-entropy of the discriminator's logits.
@@ -80,7 +87,9 @@ class LossWeights(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.variety == self.single == self.mean == 0:
-            raise ParameterError("{variety}=0: {single} and {mean} are 0, too; give one of them a weight.")
+            raise ParameterError(
+                "{variety}=0: {single} and {mean} are 0, too; give one of them a weight."
+            )
 
 
 @dataclass(frozen=True)
@@ -129,8 +138,8 @@ class PaperConfig(FitConfig):
         group_size: approximate number of vehicles per k-means group.
         stride: frames between the starts of two windows, in fitting.
         held_out_stride: the same on validation and held-out scenes.
-        history_noise: in fitting, standard deviation of noise on the observed displacements, in units of a typical
-            difference (0.04 m along and 0.02 m across the road); 0 is no noise.
+        history_noise: in fitting, standard deviation of noise on the observed displacements, in
+            units of a typical difference (0.04 m along and 0.02 m across the road); 0 is no noise.
         samples: samples per update; the best counts in the variety term.
         batch: groups per update.
         mirror: swap left and right in half of the groups.
@@ -163,15 +172,20 @@ class CalibratedConfig(FitConfig):
         held_out_stride: frames between the starts of the segments in evaluation.
         noise_period_s: time constant of each driver's latent vector, s.
         mirror: swap left and right in half of the updates.
-        washout_s: time constant of the residual's mean, which is subtracted, s; inf: without washout. The simulation
-            uses the value stored with the weights.
-        further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane offset.
+        washout_s: time constant of the residual's mean, which is subtracted, s; inf: without
+            washout. The simulation uses the value stored with the weights.
+        further_inputs: whether the network gets gap, closing speed, IDM's acceleration and lane
+            offset.
         traits: whether every driver has its own headway and desired speed.
     """
 
     preset: ClassVar[Preset] = "calibrated"
-    sizes: GeneratorSizes = field(default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS), metadata=NO_KEY)
-    loop: LoopConfig = field(default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40))
+    sizes: GeneratorSizes = field(
+        default_factory=lambda: GeneratorSizes(extra_inputs=EXTRA_INPUTS), metadata=NO_KEY
+    )
+    loop: LoopConfig = field(
+        default_factory=lambda: LoopConfig(updates=800, evaluate_every=80, warmup=40)
+    )
     horizons: tuple[Count, ...] = (8, 16, 29)
     shares: tuple[NotNegative, ...] = (3.0, 1.0, 1.0)
     held_out_horizon: Annotated[int, at_least(8)] = 29
@@ -194,12 +208,17 @@ class CalibratedConfig(FitConfig):
 
 #: The NGSIM trajectories (doi:10.21949/1504477), as the portal of the US DOT exports them.
 NGSIM_URL = "https://data.transportation.gov/api/views/8ect-6jqj/rows.csv?accessType=DOWNLOAD"
-#: Bytes of a file that are read at once: about 300,000 rows of NGSIM, which take a few times as much memory.
+#: Bytes of a file that are read at once: about 300,000 rows of NGSIM, which take a few times as
+#: much memory.
 BLOCK_BYTES = 32 * 2**20
 #: NGSIM's locations without crossings.
 MOTORWAYS = ("us-101", "i-80")
-_SHA256 = Rule(lambda value: re.fullmatch(r"[0-9a-fA-F]{64}", value) is not None, "64 hexadecimal digits")
-_ADDRESS = Rule(lambda value: value.startswith(("http://", "https://")), "an address that begins with https://")
+_SHA256 = Rule(
+    lambda value: re.fullmatch(r"[0-9a-fA-F]{64}", value) is not None, "64 hexadecimal digits"
+)
+_ADDRESS = Rule(
+    lambda value: value.startswith(("http://", "https://")), "an address that begins with https://"
+)
 
 
 @dataclass(frozen=True)
@@ -207,9 +226,10 @@ class NgsimParameters(Record):
     """Which rows of an NGSIM file are read.
 
     Attributes:
-        locations: places to keep, where the file names them; lankershim and peachtree have crossings.
-        lanes: number of lanes kept, counted from the left; on US-101 and I-80 lanes 1 to 6 are the main lanes (and
-            US-101's auxiliary lane), higher numbers are ramps.
+        locations: places to keep, where the file names them; lankershim and peachtree have
+            crossings.
+        lanes: number of lanes kept, counted from the left; on US-101 and I-80 lanes 1 to 6 are the
+            main lanes (and US-101's auxiliary lane), higher numbers are ramps.
         block_bytes: bytes read at once.
     """
 
@@ -224,12 +244,14 @@ class NgsimParameters(Record):
 
 @dataclass(frozen=True)
 class DataConfig(Record):
-    """``data=scenes``: scene CSV, or what ``ganlane prepare`` wrote (:func:`ganlane.data.read_scenes`).
+    """``data=scenes``: scene CSV, or what ``ganlane prepare`` wrote
+    (:func:`ganlane.data.read_scenes`).
 
     Attributes:
         format: chosen with the option: ``data=ngsim``.
         path: file or folder; null: US-101 below GANLANE_DATA or ../shared/data.
-        held_out: names of scenes not to fit to; null: those of the shipped weights, else every third scene.
+        held_out: names of scenes not to fit to; null: those of the shipped weights, else every
+            third scene.
     """
 
     format: str = "scenes"
@@ -239,14 +261,19 @@ class DataConfig(Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.format != type(self).format:
-            raise ParameterError(f"{{format}}={self.format}: expected {type(self).format}; choose data=NAME.")
+            raise ParameterError(
+                f"{{format}}={self.format}: expected {type(self).format}; choose data=NAME."
+            )
 
     def parameters(self) -> NgsimParameters | None:
         """Further inputs of the reader; None where it takes nothing."""
         return None
 
     def held_out_scenes(self, scenes: Sequence[str], preferred: Sequence[str]) -> tuple[str, ...]:
-        """The scenes not to fit to, of ``scenes`` in the recordings; ``preferred`` where they are all there."""
+        """The scenes not to fit to, of ``scenes`` in the recordings.
+
+        ``preferred`` where they are all there.
+        """
         if self.held_out is not None:
             return self.held_out
         return tuple(preferred) if set(preferred) <= set(scenes) else tuple(sorted(scenes)[1::3])
@@ -272,7 +299,9 @@ class NgsimDataConfig(NgsimParameters, DataConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.download and self.path is None:
-            raise ParameterError("{download}=true: where to is missing; give {path}=FILE, for instance ngsim.csv.")
+            raise ParameterError(
+                "{download}=true: where to is missing; give {path}=FILE, for instance ngsim.csv."
+            )
 
     def parameters(self) -> NgsimParameters:
         """As the reader takes it."""
@@ -281,7 +310,8 @@ class NgsimDataConfig(NgsimParameters, DataConfig):
 
 @dataclass(frozen=True)
 class HighdDataConfig(DataConfig):
-    """``data=highd``: a folder of highD recordings, or one ``XX_tracks.csv`` (:func:`ganlane.data.highd_scenes`).
+    """``data=highd``: a folder of highD recordings, or one ``XX_tracks.csv``
+    (:func:`ganlane.data.highd_scenes`).
 
     Attributes:
         path: the folder, or one XX_tracks.csv.

@@ -22,10 +22,18 @@ from ganlane.parameters import (
 from ganlane.parameters.agent import refuse_removed_observation
 
 #: What the agent can see, see :data:`ganlane.transforms.OBSERVATIONS`.
-FORMS = ("table3", "table3_progress", "lane_view", "lane_view_drift", "lane_view_overlap", "table3_lane_view")
+FORMS = (
+    "table3",
+    "table3_progress",
+    "lane_view",
+    "lane_view_drift",
+    "lane_view_overlap",
+    "table3_lane_view",
+)
 #: Scale of the nearness in the lane view, m.
 NEARNESS_M = 15.0
-#: Overlap along the road that adds 1 to the nearness, m: drivers at the side brake so hard that one metre decides.
+#: Overlap along the road that adds 1 to the nearness, m: drivers at the side brake so hard that one
+#: metre decides.
 OVERLAP_M = 1.0
 #: The masks, see :class:`ganlane.transforms.ActionMaskTransform`.
 MASKS = ("none", "legal", "safe")
@@ -49,8 +57,8 @@ class SensorParameters(Record):
     """Errors in what the ego perceives of the other vehicles; all at least 0, all 0: none.
 
     Attributes:
-        position_noise_m: standard deviation of a Gaussian error along the road, m, drawn anew for every vehicle and
-            decision.
+        position_noise_m: standard deviation of a Gaussian error along the road, m, drawn anew for
+            every vehicle and decision.
         lateral_noise_m: the same across the road, m.
         speed_noise_mps: the same of the speed, m/s.
         dropout: probability that a vehicle is not seen in a decision.
@@ -76,7 +84,8 @@ class SensorParameters(Record):
 
 @dataclass(frozen=True)
 class ObservationConfig(ObservationScale):
-    """``observation=lane_view_overlap`` and the other forms (:class:`ganlane.transforms.ObservationTransform`).
+    """``observation=lane_view_overlap`` and the other forms
+    (:class:`ganlane.transforms.ObservationTransform`).
 
     Attributes:
         form: one of :data:`FORMS`.
@@ -98,14 +107,19 @@ class ObservationConfig(ObservationScale):
         return part_of(self, ObservationScale)
 
     def read_by(self, agent: ObservationConfig | None) -> ObservationConfig:
-        """What a driver reads here: the form and scale that ``agent`` names, if it does, through these sensors."""
+        """What a driver reads here.
+
+        The form and scale that ``agent`` names, if it does, through these sensors.
+        """
         return self if agent is None else replace(agent, sensors=self.sensors)
 
 
 def largest_number(form: str, longest_m: float = 4.5) -> float:
-    """Upper bound of all numbers of observation ``form`` but the first (speed over desired speed, unbounded).
+    """Upper bound of all numbers of observation ``form`` but the first (speed over desired speed,
+    unbounded).
 
-    ``longest_m`` is the length of the longest vehicle, m: ``lane_view_overlap`` counts metres of overlap.
+    ``longest_m`` is the length of the longest vehicle, m: ``lane_view_overlap`` counts metres of
+    overlap.
     """
     return 1.0 + longest_m / OVERLAP_M if form == "lane_view_overlap" else 1.0
 
@@ -128,16 +142,19 @@ class RewardParameters(Record):
     """Section V.C. Speeds in m/s, deceleration in m/s2; the other numbers are rewards.
 
     Attributes:
-        base_speed_mps: the speed reward is 0 at this speed and 1 at the ego's desired speed, which is higher.
-        low_acceleration: a mean acceleration below this, itself below 0, turns the speed reward against the agent.
-        literal_low_acceleration: whether the speed reward is then negated, as the paper's text has it, which below
-            15 m/s pays for crawling; by default its absolute value is.
+        base_speed_mps: the speed reward is 0 at this speed and 1 at the ego's desired speed, which
+            is higher.
+        low_acceleration: a mean acceleration below this, itself below 0, turns the speed reward
+            against the agent.
+        literal_low_acceleration: whether the speed reward is then negated, as the paper's text has
+            it, which below 15 m/s pays for crawling; by default its absolute value is.
         lane_change: when one starts.
         out_of_road: a command that would leave the road.
         hard_crash: a collision.
         soft_crash: per onset of somebody dangerously close ahead.
         goal: the goal reached.
-        soft_crash_behind: per onset of a soft crash *behind* (:func:`ganlane.sim.dynamics.ego_surroundings`), at most
+        soft_crash_behind: per onset of a soft crash *behind*
+            (:func:`ganlane.sim.dynamics.ego_surroundings`), at most
             0. The paper has no such term; at 0 it is not there.
     """
 
@@ -154,4 +171,6 @@ class RewardParameters(Record):
     @property
     def term_names(self) -> tuple[str, ...]:
         """The terms in the order in which they are added up."""
-        return keys.REWARD_TERM_NAMES + ((keys.SOFT_CRASH_BEHIND,) if self.soft_crash_behind else ())
+        return keys.REWARD_TERM_NAMES + (
+            (keys.SOFT_CRASH_BEHIND,) if self.soft_crash_behind else ()
+        )

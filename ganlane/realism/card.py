@@ -44,7 +44,13 @@ from ganlane.view.figures import (
 )
 
 #: Quantities in which generated traffic should come closer to recordings than rules do.
-CLOSER_IN = ("speed_spread", "acceleration", "time_headway", "time_to_collision", "lane_change_duration")
+CLOSER_IN = (
+    "speed_spread",
+    "acceleration",
+    "time_headway",
+    "time_to_collision",
+    "lane_change_duration",
+)
 
 
 @dataclass(frozen=True)
@@ -73,11 +79,24 @@ class Card:
     def numbers(self) -> dict[str, Any]:
         """The content of ``results.json``."""
         starts, held_out = self.starts, self.starts.separately_held_out
-        apart = card_rows(starts.restricted_to(held_out), self.traffic, self.resamples) if held_out else None
-        driving = {name: each.summary() for name, each in {"recorded": starts.recorded, **starts.driven}.items()}
+        apart = (
+            card_rows(starts.restricted_to(held_out), self.traffic, self.resamples)
+            if held_out
+            else None
+        )
+        driving = {
+            name: each.summary()
+            for name, each in {"recorded": starts.recorded, **starts.driven}.items()
+        }
         own, recorded = (driving[name]["quantiles"] for name in (self.traffic, "recorded"))
-        runs, rate, spread = self.long_runs[self.traffic], starts.reference.rate(), starts.reference.spread_mps
-        checks = card_checks(self.quantities, own, recorded, rate["per_vehicle_km_ci"], spread, runs)
+        runs, rate, spread = (
+            self.long_runs[self.traffic],
+            starts.reference.rate(),
+            starts.reference.spread_mps,
+        )
+        checks = card_checks(
+            self.quantities, own, recorded, rate["per_vehicle_km_ci"], spread, runs
+        )
         return {
             "traffic": self.traffic,
             **starts.description(),
@@ -87,7 +106,9 @@ class Card:
             "i80": self.site,
             **totals(runs),
             "long_runs": runs,
-            "long_runs_against": {name: runs for name, runs in self.long_runs.items() if name != self.traffic},
+            "long_runs_against": {
+                name: runs for name, runs in self.long_runs.items() if name != self.traffic
+            },
             "checks": checks,
         }
 
@@ -95,7 +116,9 @@ class Card:
 def card_rows(starts: Starts, traffic: str, resamples: int) -> dict[str, Any]:
     """The rows of a traffic's card, compared with every other traffic from the same starts."""
     floors = starts.reference.floors
-    return quantity_rows(traffic, starts.driven, starts.recorded.counts, floors, starts.paired, resamples)
+    return quantity_rows(
+        traffic, starts.driven, starts.recorded.counts, floors, starts.paired, resamples
+    )
 
 
 def quantity_rows(
@@ -111,7 +134,8 @@ def quantity_rows(
     Args:
         traffic: whose rows.
         driven: it and others from the same starts; all but :data:`FLOORS` are rivals.
-        recorded: by quantity, [units, bins]; its quantities are the rows. Their halves give the ceilings.
+        recorded: by quantity, [units, bins]; its quantities are the rows. Their halves give the
+            ceilings.
         floors: by driver and quantity, where ``driven`` does not hold the driver.
         paired: whether the recorded units are those that were driven.
     """
@@ -141,17 +165,26 @@ def quantity_rows(
     return rows
 
 
-def floors_of(driven: Mapping[str, Measured], recorded: Mapping[str, Array]) -> dict[str, dict[str, float]]:
-    """Finite distances of the reference drivers in ``driven`` to the recordings, by driver and quantity."""
+def floors_of(
+    driven: Mapping[str, Measured], recorded: Mapping[str, Array]
+) -> dict[str, dict[str, float]]:
+    """Finite distances of the reference drivers in ``driven`` to the recordings, by driver and
+    quantity.
+    """
     found: dict[str, dict[str, float]] = {}
     for floor in (name for name in FLOORS if name in driven):
-        values = {name: pooled_distance(driven[floor].counts[name], counts) for name, counts in recorded.items()}
+        values = {
+            name: pooled_distance(driven[floor].counts[name], counts)
+            for name, counts in recorded.items()
+        }
         found[floor] = {name: value for name, value in values.items() if math.isfinite(value)}
     return found
 
 
 def verdict(difference: Estimate) -> str:
-    """``closer`` or ``farther`` where the interval of the difference leaves out 0, else ``undecided``."""
+    """``closer`` or ``farther`` where the interval of the difference leaves out 0, else
+    ``undecided``.
+    """
     if not difference.excludes_zero():
         return "undecided"
     return "closer" if difference.value < 0.0 else "farther"
@@ -178,7 +211,9 @@ def card_checks(
     for name in CLOSER_IN:
         for other, row in quantities[name]["against"].items():
             rivals.setdefault(other, {})[name] = row["verdict"]
-    pairs = [(own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")]
+    pairs = [
+        (own["acceleration"][level], recorded["acceleration"][level]) for level in ("0.05", "0.95")
+    ]
     near = None
     if all(None not in pair for pair in pairs):
         near = all(abs(mine - theirs) <= 0.3 * abs(theirs) for mine, theirs in pairs)
@@ -189,7 +224,9 @@ def card_checks(
     }
 
 
-def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float) -> dict[str, Any]:
+def _run_checks(
+    run: Mapping[str, Any], recorded_rate: Sequence[float] | None, spread_mps: float
+) -> dict[str, Any]:
     changes, overlaps = run["lane_changes_per_vehicle_km"], run["overlaps_per_1000_vehicle_km"]
     inside = None
     if changes is not None and recorded_rate:
@@ -207,22 +244,37 @@ def _run_checks(run: Mapping[str, Any], recorded_rate: Sequence[float] | None, s
     }
 
 
-def card_text(numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
-    """The card's tables: of the ``numbers`` in ``results.json``, and of the long runs of all traffics."""
+def card_text(
+    numbers: Mapping[str, Any], long_runs: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> list[str]:
+    """The card's tables.
+
+    Of the ``numbers`` in ``results.json``, and of the long runs of all traffics.
+    """
     traffic = numbers["traffic"]
     tables = [quantities_table(numbers["quantities"], traffic)]
     if numbers["quantities_held_out"] is not None:
-        tables.append(f"held-out scenes alone\n{quantities_table(numbers['quantities_held_out'], traffic)}")
+        tables.append(
+            f"held-out scenes alone\n{quantities_table(numbers['quantities_held_out'], traffic)}"
+        )
     tables.append(starts_table(numbers["driving"]))
-    tables += [f"I-80, {name}\n{quantities_table(rows, traffic)}" for name, rows in numbers["i80"].items()]
+    tables += [
+        f"I-80, {name}\n{quantities_table(rows, traffic)}" for name, rows in numbers["i80"].items()
+    ]
     tables += [long_table(runs, name) for name, runs in long_runs.items() if runs]
     return [*tables, checks_text(numbers["checks"])]
 
 
-def document_text(tables: Sequence[str], numbers: Mapping[str, Any], command: str, written: str) -> str:
+def document_text(
+    tables: Sequence[str], numbers: Mapping[str, Any], command: str, written: str
+) -> str:
     """A card's section of a document: command, machine, starts, tables."""
     here, code = machine(), code_version()
-    revision = f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})" if code["revision"] else ""
+    revision = (
+        f" ({code['revision'][:12]}{', modified' if code['modified'] else ''})"
+        if code["revision"]
+        else ""
+    )
     excess = ", ".join(f"{name} {value:g}" for name, value in numbers["desired_above_mps"].items())
     paragraphs = [
         f"Written by the command on {written}:\n\n    {command}",
@@ -234,9 +286,18 @@ def document_text(tables: Sequence[str], numbers: Mapping[str, Any], command: st
 
 
 def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
-    """Distances, one quantity per line: the traffic, the scale, and each rival with the difference to it."""
+    """Distances, one quantity per line.
+
+    The traffic, the scale, and each rival with the difference to it.
+    """
     others = list(next(iter(quantities.values()))["against"])
-    heading = ["distance to recorded", f"{short_name(traffic)} [95 %]", "ceiling", "constant v", "random"]
+    heading = [
+        "distance to recorded",
+        f"{short_name(traffic)} [95 %]",
+        "ceiling",
+        "constant v",
+        "random",
+    ]
     for other in others:
         heading += [short_name(other), f"minus {short_name(other)} [95 %]", ""]
     lines = [heading]
@@ -245,16 +306,29 @@ def quantities_table(quantities: Mapping[str, Any], traffic: str) -> str:
         line = [f"{name}, {row['unit']}", with_interval(row, "distance"), *scale]
         for other in others:
             rival = row["against"][other]
-            line += [number(rival["distance"]), with_interval(rival, "difference"), rival["verdict"]]
+            line += [
+                number(rival["distance"]),
+                with_interval(rival, "difference"),
+                rival["verdict"],
+            ]
         lines.append(line)
     return aligned(lines)
 
 
 def starts_table(driving: Mapping[str, Any]) -> str:
     """Lane changes and accelerations, one traffic per line, the recordings among them."""
-    lines = [["from the same starts", "changes per vehicle-km [95 %]", "vehicle-km", "acceleration 5 %, 95 %"]]
+    lines = [
+        [
+            "from the same starts",
+            "changes per vehicle-km [95 %]",
+            "vehicle-km",
+            "acceleration 5 %, 95 %",
+        ]
+    ]
     for name, row in driving.items():
-        tails = ", ".join(number(row["quantiles"]["acceleration"][level], 2) for level in ("0.05", "0.95"))
+        tails = ", ".join(
+            number(row["quantiles"]["acceleration"][level], 2) for level in ("0.05", "0.95")
+        )
         rate, km = with_interval(row, "per_vehicle_km", 2), number(row["vehicle_km"], 1)
         lines.append([short_name(name), rate, km, tails])
     return aligned(lines)
@@ -265,20 +339,28 @@ def long_table(runs: Sequence[Mapping[str, Any]], traffic: str) -> str:
     cells = {
         f"{short_name(traffic)}, long runs": [f"{run['vehicles']} vehicles" for run in runs],
         "vehicle-km": [number(run["vehicle_km"], 0) for run in runs],
-        "changes per vehicle-km": [with_interval(run, "lane_changes_per_vehicle_km", 2) for run in runs],
-        "overlaps per 1000 vehicle-km": [with_interval(run, "overlaps_per_1000_vehicle_km", 2) for run in runs],
+        "changes per vehicle-km": [
+            with_interval(run, "lane_changes_per_vehicle_km", 2) for run in runs
+        ],
+        "overlaps per 1000 vehicle-km": [
+            with_interval(run, "overlaps_per_1000_vehicle_km", 2) for run in runs
+        ],
         "off road": [str(run["off_road"]) for run in runs],
         "standstills in free flow": [str(run["standstills_in_free_flow"]) for run in runs],
     }
     for time in runs[0]["speeds"]:
         at = [run["speeds"][time] for run in runs]
-        speeds = [f"{number(each['mean_speed_mps'], 1)}, {number(each['spread_mps'], 2)}" for each in at]
+        speeds = [
+            f"{number(each['mean_speed_mps'], 1)}, {number(each['spread_mps'], 2)}" for each in at
+        ]
         cells[f"mean speed, spread after {time}, m/s"] = speeds
     for level in runs[0]["acceleration_quantiles"]:
         quantiles = [number(run["acceleration_quantiles"][level], 2) for run in runs]
         cells[f"acceleration, {100 * float(level):g} % quantile"] = quantiles
     shares = [run["guard_share"] for run in runs]
-    cells["the guard's share"] = ["none" if share is None else percent(share, 1) for share in shares]
+    cells["the guard's share"] = [
+        "none" if share is None else percent(share, 1) for share in shares
+    ]
     return aligned([[name, *row] for name, row in cells.items()])
 
 
@@ -308,7 +390,10 @@ def short_name(traffic: str) -> str:
 def draw_distributions(
     recorded: Mapping[str, FloatArray], simulated: Mapping[str, Mapping[str, FloatArray]]
 ) -> Figure:
-    """A panel per quantity: the recorded density, and each traffic's, from counts [bins] (none where all are 0)."""
+    """A panel per quantity.
+
+    The recorded density, and each traffic's, from counts [bins] (none where all are 0).
+    """
     figure, grid = panel_grid(len(recorded))
     colours = {**palette(list(simulated)), "recorded": INK}
     for axes, name in zip(grid, recorded):
@@ -323,7 +408,9 @@ def draw_distributions(
                 # The bins at both ends hold all values beyond, too.
                 for end, mark in ((0, "<"), (-1, ">")):
                     if counts[name][end]:
-                        axes.plot(middle[end], density[end], mark, color=colours[driver], clip_on=False)
+                        axes.plot(
+                            middle[end], density[end], mark, color=colours[driver], clip_on=False
+                        )
     beyond = Line2D([], [], color=FAINT, label="and all values beyond", marker=">", ls="")
     add_legend(figure, {"recorded": INK, **colours}, [beyond])
     return figure
@@ -331,7 +418,8 @@ def draw_distributions(
 
 @rc_context(STYLE)
 def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
-    """The rows of :func:`ganlane.realism.card.quantity_rows`: a block per quantity, a line per traffic.
+    """The rows of :func:`ganlane.realism.card.quantity_rows`: a block per quantity, a line per
+    traffic.
 
     Vertical lines are the ends of the scale: recordings against each other, and random driving.
     """
@@ -340,7 +428,11 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
     block = len(colours) + 1
     figure = Figure(figsize=(7.5, 0.8 + 0.125 * block * len(quantities)))
     axes = figure.subplots()
-    axes.set(xlim=(0, 1), ylim=(block * len(quantities), 0), xlabel="Jensen-Shannon distance to recorded driving")
+    axes.set(
+        xlim=(0, 1),
+        ylim=(block * len(quantities), 0),
+        xlabel="Jensen-Shannon distance to recorded driving",
+    )
     axes.set_yticks([block * (index + 0.5) for index in range(len(quantities))])
     axes.set_yticklabels([name.replace("_", " ") for name in quantities], color=INK, size=9)
     axes.tick_params("y", length=0)
@@ -358,21 +450,34 @@ def draw_distances(quantities: Mapping[str, Any], traffic: str) -> Figure:
                 axes.plot([low, high], [top + line + 1] * 2, color=colour)
                 axes.plot(shown["distance"], top + line + 1, "o", color=colour, ms=5)
     ends = {"half against half": INK, "random": FAINT}
-    marks = [Line2D([], [], color=colour, label=name, marker="|", ls="", ms=10) for name, colour in ends.items()]
+    marks = [
+        Line2D([], [], color=colour, label=name, marker="|", ls="", ms=10)
+        for name, colour in ends.items()
+    ]
     add_legend(figure, {short_name(name): colour for name, colour in colours.items()}, marks)
     return figure
 
 
 @rc_context(STYLE)
 def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) -> Figure:
-    """Mean and spread of the speeds of long runs over time; the recorded mean spread within a frame as a level."""
+    """Mean and spread of the speeds of long runs over time.
+
+    The recorded mean spread within a frame as a level.
+    """
     figure, grid = panel_grid(2)
     colours = palette([f"{run['vehicles']} vehicles" for run in runs])
-    for axes, (key, title) in zip(grid, {"mean_speed_mps": "mean speed", "spread_mps": "spread of speeds"}.items()):
+    for axes, (key, title) in zip(
+        grid, {"mean_speed_mps": "mean speed", "spread_mps": "spread of speeds"}.items()
+    ):
         axes.set(title=title, xlabel="time, s", ylabel="m/s")
         for run, colour in zip(runs, colours.values()):
-            timed = [(float(time.split()[0]), at[key]) for time, at in run["speeds"].items() if time.endswith(" s")]
-            x, y = np.array(timed, dtype=np.float64).T  # None, where nobody was left to measure, becomes NaN
+            timed = [
+                (float(time.split()[0]), at[key])
+                for time, at in run["speeds"].items()
+                if time.endswith(" s")
+            ]
+            # None, where nobody was left to measure, becomes NaN
+            x, y = np.array(timed, dtype=np.float64).T
             plot_line(axes, x, y, color=colour)
     grid[1].axhline(spread_mps, color=INK)
     add_legend(figure, {"recorded": INK, **colours})
@@ -380,7 +485,10 @@ def draw_speeds_over_time(runs: Sequence[Mapping[str, Any]], spread_mps: float) 
 
 
 def draw(card: Card, to: Path) -> list[Path]:
-    """The figures of a card, into the folder ``to``: distributions, distances, and drift if there are long runs."""
+    """The figures of a card, into the folder ``to``.
+
+    Distributions, distances, and drift if there are long runs.
+    """
     starts = card.starts
     simulated = {
         short_name(name): {quantity: counts.sum(0) for quantity, counts in driven.counts.items()}

@@ -1,19 +1,24 @@
-"""Recorded scenes driven by a traffic: the same vehicles and road, for as long as recorded; and reference drivers.
+"""Recorded scenes driven by a traffic: the same vehicles and road, for as long as recorded; and
+reference drivers.
 
-A vehicle is driven from the frame at which it was first recorded to the one at which it was last recorded, or until
-it passes the end of the recorded road. One that appears later waits while another occupies its place, and enters in
-its recorded state at the first frame in which there is room. So simulation and recording hold the same drivers at the
-same times, whatever the model does. Index 0, the ego's, is not valid.
+A vehicle is driven from the frame at which it was first recorded to the one at which it was last
+recorded, or until it passes the end of the recorded road. One that appears later waits while
+another occupies its place, and enters in its recorded state at the first frame in which there is
+room. So simulation and recording hold the same drivers at the same times, whatever the model does.
+Index 0, the ego's, is not valid.
 
-Others perceive a vehicle in the lane of its centre (and in its target lane, if it signals): recorded lanes are narrow
-and straightened to some decimetres, so by their bodies one vehicle in ten would occupy two lanes.
+Others perceive a vehicle in the lane of its centre (and in its target lane, if it signals):
+recorded lanes are narrow and straightened to some decimetres, so by their bodies one vehicle in ten
+would occupy two lanes.
 
-Headways: a driver recorded behind a leader has shown how closely it follows. With a headway drawn at random half of
-the drivers would begin with hard braking, and the first seconds would measure nothing else. So a traffic with a
-headway per driver (a memory ``headway`` [N, M] in s) starts with those that balance the recorded gaps. Traffic with
-one headway for everybody (IDM, Table V) keeps it.
+Headways: a driver recorded behind a leader has shown how closely it follows. With a headway drawn
+at random half of the drivers would begin with hard braking, and the first seconds would measure
+nothing else. So a traffic with a headway per driver (a memory ``headway`` [N, M] in s) starts with
+those that balance the recorded gaps. Traffic with one headway for everybody (IDM, Table V) keeps
+it.
 
-Two drivers mark the ends of the scale (random driving, constant velocity); :class:`HeadwayIdm` is a control.
+Two drivers mark the ends of the scale (random driving, constant velocity); :class:`HeadwayIdm` is a
+control.
 """
 
 from __future__ import annotations
@@ -56,7 +61,8 @@ class StartOptions:
     """How recorded scenes are driven.
 
     Attributes:
-        desired_above_mps: desired speeds are the speed at entry and a uniform number from 0 on with this mean.
+        desired_above_mps: desired speeds are the speed at entry and a uniform number from 0 on with
+            this mean.
         repeats: times that every scene is driven, with different random numbers.
     """
 
@@ -65,8 +71,13 @@ class StartOptions:
     seed: int = 0
 
 
-def drive_recordings(make: Factory, recordings: Sequence[Recording], options: StartOptions) -> pl.DataFrame:
-    """Drive every recording ``options.repeats`` times, those on equal roads side by side; see :func:`frame_of`."""
+def drive_recordings(
+    make: Factory, recordings: Sequence[Recording], options: StartOptions
+) -> pl.DataFrame:
+    """Drive every recording ``options.repeats`` times, those on equal roads side by side.
+
+    See :func:`frame_of`.
+    """
     roads: dict[tuple[int, float], list[Recording]] = {}
     for each in recordings:
         roads.setdefault((each.lanes, each.lane_width_m), []).append(each)
@@ -90,7 +101,9 @@ def _batches(rows: list[Recording]) -> list[list[Recording]]:
     return batches
 
 
-def _drive(traffic: TrafficModule, rows: list[Recording], options: StartOptions, first: int) -> list[pl.DataFrame]:
+def _drive(
+    traffic: TrafficModule, rows: list[Recording], options: StartOptions, first: int
+) -> list[pl.DataFrame]:
     """Drives a batch of recordings on one road; one frame per row."""
     batch, n = RecordingBatch.of(rows), len(rows)
     counters = {keys.SEED: torch.full((n,), options.seed), keys.EPISODE: first + torch.arange(n)}
@@ -120,9 +133,16 @@ def _drive(traffic: TrafficModule, rows: list[Recording], options: StartOptions,
 
 
 def step_traffic(
-    traffic: TrafficModule, state: Vehicles, memory: TensorDictBase, counters: dict[str, Tensor], step: int
+    traffic: TrafficModule,
+    state: Vehicles,
+    memory: TensorDictBase,
+    counters: dict[str, Tensor],
+    step: int,
 ) -> tuple[Vehicles, TensorDictBase]:
-    """State and memory at t + 0.1 s when the traffic drives without an ego; invalid vehicles stay as they are."""
+    """State and memory at t + 0.1 s when the traffic drives without an ego.
+
+    Invalid vehicles stay as they are.
+    """
     size = torch.Size([state.x.shape[0]])
     view = TensorDict._new_unsafe(
         {
@@ -138,7 +158,11 @@ def step_traffic(
 
 
 def _updated_memory(
-    traffic: TrafficModule, state: Vehicles, memory: TensorDictBase | None, enters: Tensor, key: Tensor
+    traffic: TrafficModule,
+    state: Vehicles,
+    memory: TensorDictBase | None,
+    enters: Tensor,
+    key: Tensor,
 ) -> TensorDictBase:
     """The traffic's memory, initialised for the vehicles that enter, with their recorded headways."""
     if memory is not None and not bool(enters.any()):
@@ -155,8 +179,8 @@ def _updated_memory(
 class RecordingBatch:
     """Recordings side by side, padded with absent vehicles; index 0 is the ego's and absent.
 
-    ``x``, ``y``, ``speed`` and ``present`` are [T, N, M], ``length`` and ``driven`` [N, M]; ``end_m`` [N, 1] is where
-    each road ends, m.
+    ``x``, ``y``, ``speed`` and ``present`` are [T, N, M], ``length`` and ``driven`` [N, M];
+    ``end_m`` [N, 1] is where each road ends, m.
     """
 
     x: Tensor
@@ -174,7 +198,10 @@ class RecordingBatch:
 
         def padded(name: str) -> Tensor:
             values = [getattr(row, name) for row in rows]
-            whole = np.zeros((*([steps] if values[0].ndim == 2 else []), len(rows), most + 1), dtype=values[0].dtype)
+            whole = np.zeros(
+                (*([steps] if values[0].ndim == 2 else []), len(rows), most + 1),
+                dtype=values[0].dtype,
+            )
             for index, value in enumerate(values):
                 where = (slice(len(value)), index) if value.ndim == 2 else (index,)
                 whole[(*where, slice(1, value.shape[-1] + 1))] = value
@@ -205,17 +232,27 @@ def no_vehicles(batch: RecordingBatch, traffic: TrafficModule) -> Vehicles:
 
 
 def remove_finished(batch: RecordingBatch, state: Vehicles, step: int) -> Vehicles:
-    """Removes vehicles whose recording is over or that passed the end of the road; moves replayed ones on."""
+    """Removes vehicles whose recording is over or that passed the end of the road.
+
+    Moves replayed ones on.
+    """
     on_road = (state.x <= batch.end_m + _ROUNDING_M) | ~batch.driven
     stays = state.valid & batch.present[step] & on_road
     state = state.with_(valid=stays, x=torch.where(stays, state.x, _ABSENT_M))
     replayed = stays & ~batch.driven
     fields = ("x", "y", "speed")
-    return state.with_(**{f: torch.where(replayed, getattr(batch, f)[step], getattr(state, f)) for f in fields})
+    return state.with_(
+        **{f: torch.where(replayed, getattr(batch, f)[step], getattr(state, f)) for f in fields}
+    )
 
 
-def may_enter(batch: RecordingBatch, state: Vehicles, waiting: Tensor, road: Road, step: int) -> Tensor:
-    """Vehicles that enter now, bool [N, M]: recorded in this frame, still waiting, and with room in their lane."""
+def may_enter(
+    batch: RecordingBatch, state: Vehicles, waiting: Tensor, road: Road, step: int
+) -> Tensor:
+    """Vehicles that enter now, bool [N, M].
+
+    Recorded in this frame, still waiting, and with room in their lane.
+    """
     wants = batch.present[step] & waiting
     # Mostly no vehicle waits, and on a CPU the test costs nothing.
     if step == 0 or not bool(wants.any()):
@@ -227,9 +264,17 @@ def may_enter(batch: RecordingBatch, state: Vehicles, waiting: Tensor, road: Roa
 
 
 def insert_entering(
-    batch: RecordingBatch, state: Vehicles, enters: Tensor, excess: Tensor, traffic: TrafficModule, step: int
+    batch: RecordingBatch,
+    state: Vehicles,
+    enters: Tensor,
+    excess: Tensor,
+    traffic: TrafficModule,
+    step: int,
 ) -> Vehicles:
-    """Puts the vehicles that enter into their recorded state, heading along the road; the others are unchanged."""
+    """Puts the vehicles that enter into their recorded state, heading along the road.
+
+    The others are unchanged.
+    """
     x, y, speed = batch.x[step], batch.y[step], batch.speed[step].clamp_min(0.0)
     entered = state.with_(
         x=x,
@@ -244,15 +289,22 @@ def insert_entering(
     return entered.where(enters, state)
 
 
-def with_recorded_headways(memory: TensorDictBase, vehicles: Vehicles, road: Road, who: Tensor) -> TensorDictBase:
-    """A traffic's ``memory`` with the headways that the entering drivers ``who`` [N, M] show in their recorded state.
+def with_recorded_headways(
+    memory: TensorDictBase, vehicles: Vehicles, road: Road, who: Tensor
+) -> TensorDictBase:
+    """A traffic's ``memory`` with the headways that the entering drivers ``who`` [N, M] show in
+    their recorded state.
 
     The memory, nested or not, is not modified; one without headways comes back equal.
     """
 
     def shown(name: str | tuple[str, ...], value: Tensor) -> Tensor:
         last = name if isinstance(name, str) else name[-1]
-        return torch.where(who, balanced_headway(vehicles, road, value), value) if last == "headway" else value
+        return (
+            torch.where(who, balanced_headway(vehicles, road, value), value)
+            if last == "headway"
+            else value
+        )
 
     return memory.named_apply(shown, nested_keys=True)
 
@@ -260,7 +312,9 @@ def with_recorded_headways(memory: TensorDictBase, vehicles: Vehicles, road: Roa
 class ConstantVelocity(TrafficModule):
     """Every vehicle keeps its lane and the speed at which it entered."""
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+    def move(
+        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+    ) -> tuple[Vehicles, dict]:
         """One step along the road."""
         v = vehicles
         return v.with_(x=v.x + v.speed * self.dt, acceleration=torch.zeros_like(v.speed)), memory
@@ -269,16 +323,21 @@ class ConstantVelocity(TrafficModule):
 class RandomDriving(TrafficModule):
     """Drivers that ignore all others: the far end of the scale.
 
-    An acceleration is drawn every second, uniform up to 3 m/s2 either way; a lane change to a random side starts at a
-    constant hazard, every 20 s on average, and takes 4 s. Speeds are never negative.
+    An acceleration is drawn every second, uniform up to 3 m/s2 either way; a lane change to a
+    random side starts at a constant hazard, every 20 s on average, and takes 4 s. Speeds are never
+    negative.
     """
 
     hardest, every_s, change_s = 3.0, 20.0, 4.0
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+    def move(
+        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+    ) -> tuple[Vehicles, dict]:
         """One step: the second's acceleration, and towards the target lane."""
         v, m, dtype = vehicles, vehicles.x.shape[1], vehicles.x.dtype
-        pace = uniform(key, torch.div(step, 10, rounding_mode="floor"), m, [Purpose.ACCELERATION], dtype)[..., 0]
+        pace = uniform(
+            key, torch.div(step, 10, rounding_mode="floor"), m, [Purpose.ACCELERATION], dtype
+        )[..., 0]
         drawn = uniform(key, step, m, [Purpose.LANE_CHANGE_HAZARD, Purpose.LANE_CHANGE_SIDE], dtype)
         remaining = self.road.centre_of(v.target_lane, dtype) - v.y
         starts = (drawn[..., 0] < self.dt / self.every_s) & (remaining.abs() < 0.3)
@@ -298,10 +357,11 @@ class RandomDriving(TrafficModule):
 
 
 class HeadwayIdm(TrafficModule):
-    """IDM without lane changes, each driver with its own headway: generated traffic without its network.
+    """IDM without lane changes, each driver with its own headway: generated traffic without its
+    network.
 
-    A control, none of the shipped traffics: Table V gives everybody the same headway. Here they are drawn from the
-    recorded distribution, or taken from a recorded start.
+    A control, none of the shipped traffics: Table V gives everybody the same headway. Here they are
+    drawn from the recorded distribution, or taken from a recorded start.
     """
 
     memory_fields = {"headway": ((), None)}  # noqa: RUF012
@@ -311,7 +371,9 @@ class HeadwayIdm(TrafficModule):
         u = uniform(key, -1, vehicles.x.shape[1], [Purpose.TRAIT_HEADWAY], vehicles.x.dtype)[..., 0]
         return {"headway": headway_from_uniform(u)}
 
-    def move(self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor) -> tuple[Vehicles, dict]:
+    def move(
+        self, vehicles: Vehicles, memory: dict[str, Tensor], key: Tensor, step: Tensor
+    ) -> tuple[Vehicles, dict]:
         """One step along the road."""
         v = vehicles
         wanted = following_acceleration(perceive(v, self.road), headway_s=memory["headway"])

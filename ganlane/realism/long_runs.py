@@ -1,8 +1,8 @@
 """Long runs without an ego: what a traffic does over minutes and 5000 m.
 
-Vehicles start as the simulator's own episodes do (Table II), on the paper's road, and drive until everybody is
-expected to have covered 5000 m. Index 0, the ego's, is not valid. Results are rates with exact intervals, speeds over
-time, and quantiles.
+Vehicles start as the simulator's own episodes do (Table II), on the paper's road, and drive until
+everybody is expected to have covered 5000 m. Index 0, the ego's, is not valid. Results are rates
+with exact intervals, speeds over time, and quantiles.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _MOST_SAMPLES = 12_000_000
 _MOST_ROWS = 64
 #: A body further beyond the edge than this is off the road, m; less is rounding.
 EDGE_M: Final = 0.01
-#: A vehicle slower than this with a leader no nearer than that has stopped without reason, m/s and m.
+#: A vehicle slower than this with a leader no nearer than that has stopped without reason, m/s and
+#: m.
 STANDING_MPS: Final = 1.0
 FREE_M: Final = 50.0
 #: A guard intervenes where it alters more than this, m/s2 and m.
@@ -52,8 +53,8 @@ class LongRunParameters:
     Attributes:
         vehicles: of an episode, none of them an ego.
         vehicle_km: at least so many are driven.
-        most_s: no episode lasts longer, s; it ends when its vehicles have covered 5000 m on average and 5 minutes
-            have passed.
+        most_s: no episode lasts longer, s; it ends when its vehicles have covered 5000 m on average
+            and 5 minutes have passed.
         spawn: Table II; the spread grows with the vehicles at the paper's density.
     """
 
@@ -65,7 +66,10 @@ class LongRunParameters:
 
 
 class Trajectories(NamedTuple):
-    """Vehicles of a batch without ego: positions [T, N, M] in m, speeds [T, N, M] in m/s, sizes [N, M] in m."""
+    """Vehicles of a batch without ego.
+
+    Positions [T, N, M] in m, speeds [T, N, M] in m/s, sizes [N, M] in m.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -115,7 +119,9 @@ class EventCounter:
 
 
 class GuardMeter:
-    """Counts, on the device, the vehicle-steps in which a guard alters acceleration or lateral position."""
+    """Counts, on the device, the vehicle-steps in which a guard alters acceleration or lateral
+    position.
+    """
 
     def __init__(self) -> None:
         self._altered, self._steps = torch.zeros(2, dtype=torch.int64)
@@ -128,7 +134,9 @@ class GuardMeter:
 
     def __call__(self, before: Vehicles, moved: Vehicles, guarded: Vehicles) -> None:
         """Called by the guard at every step; index 0 is the ego's and does not count."""
-        wanted, given = ((after.speed - before.speed) / PHYSICS_STEP_S for after in (moved, guarded))
+        wanted, given = (
+            (after.speed - before.speed) / PHYSICS_STEP_S for after in (moved, guarded)
+        )
         along = (given - wanted).abs() > ALTERED_ACCELERATION
         across = (guarded.y - moved.y).abs() > ALTERED_POSITION_M
         counts = before.valid.clone()
@@ -148,7 +156,11 @@ class LongRun:
 
     def __init__(self, road: Road, parameters: LongRunParameters) -> None:
         self.road, self.parameters, self.episodes = road, parameters, 0
-        self._events, self._meter, self._parts = EventCounter(road), GuardMeter(), list[dict[str, Any]]()
+        self._events, self._meter, self._parts = (
+            EventCounter(road),
+            GuardMeter(),
+            list[dict[str, Any]](),
+        )
 
     @property
     def vehicle_km(self) -> float:
@@ -170,7 +182,9 @@ class LongRun:
         return trajectories
 
     def numbers(self) -> dict[str, Any]:
-        """Counts, rates per vehicle-km with exact 95 % intervals (None where no vehicle moved), speeds, quantiles."""
+        """Counts, rates per vehicle-km with exact 95 % intervals (None where no vehicle moved),
+        speeds, quantiles.
+        """
         parts, events, km = self._parts, self._events, self.vehicle_km
         changes = sum(part["lane_changes"] for part in parts)
         durations = np.concatenate([part["durations"] for part in parts])
@@ -189,7 +203,9 @@ class LongRun:
                 f"{level:g}": float(np.quantile(acceleration, level)) for level in (0.05, 0.95)
             },
             "speeds": {
-                name: _mean_speeds([row for part in parts for row in part["speeds"][name]], name.endswith(" m"))
+                name: _mean_speeds(
+                    [row for part in parts for row in part["speeds"][name]], name.endswith(" m")
+                )
                 for name in parts[0]["speeds"]
             },
             "guard_share": self._meter.share,
@@ -197,7 +213,10 @@ class LongRun:
 
 
 def long_run(
-    make: Factory, road: Road, parameters: LongRunParameters, report: Callable[[float], None] | None = None
+    make: Factory,
+    road: Road,
+    parameters: LongRunParameters,
+    report: Callable[[float], None] | None = None,
 ) -> dict[str, Any]:
     """Drive ``parameters.vehicle_km``; ``report`` is called with the vehicle-km driven so far."""
     traffic, run = make(road), LongRun(road, parameters)
@@ -209,31 +228,50 @@ def long_run(
 
 
 def _rows(parameters: LongRunParameters, km: float) -> int:
-    """Number of parallel episodes for ``km`` vehicle-km, if each vehicle covers a little less than 5000 m."""
+    """Number of parallel episodes for ``km`` vehicle-km, if each vehicle covers a little less than
+    5000 m.
+    """
     expected = parameters.vehicles * min(4.8, 0.014 * parameters.most_s)
     steps = round(parameters.most_s / PHYSICS_STEP_S)
     most = max(1, min(_MOST_ROWS, _MOST_SAMPLES // (steps * parameters.vehicles)))
     return int(np.clip(np.ceil(km / expected), 1, most))
 
 
-def spawned_vehicles(traffic: TrafficModule, parameters: LongRunParameters, key: Tensor) -> Vehicles:
-    """The vehicles [N, M + 1] at the start of the episodes ``key`` [N]; index 0, an ego's, is not valid."""
+def spawned_vehicles(
+    traffic: TrafficModule, parameters: LongRunParameters, key: Tensor
+) -> Vehicles:
+    """The vehicles [N, M + 1] at the start of the episodes ``key`` [N].
+
+    Index 0, an ego's, is not valid.
+    """
     lanes, width, seen = traffic.road.lanes, traffic.road.lane_width_m, int(traffic.visibility)
     assert not isinstance(lanes, Tensor)
     assert not isinstance(width, Tensor)
     # Table II's density, for the vehicles and an empty place for the ego.
     spread = parameters.spawn.spread_m * (parameters.vehicles + 1) / 9.0
     start = replace(parameters.spawn, spread_m=max(parameters.spawn.spread_m, spread))
-    vehicles = spawn(key, parameters.vehicles + 1, lanes, float(width), start, others_visibility=seen)
+    vehicles = spawn(
+        key, parameters.vehicles + 1, lanes, float(width), start, others_visibility=seen
+    )
     index = torch.arange(parameters.vehicles + 1)
     return vehicles.with_(valid=vehicles.valid & (index > 0))
 
 
 def drive_spawned(
-    traffic: TrafficModule, parameters: LongRunParameters, first: int, rows: int, events: EventCounter
+    traffic: TrafficModule,
+    parameters: LongRunParameters,
+    first: int,
+    rows: int,
+    events: EventCounter,
 ) -> Trajectories:
-    """One batch of ``rows`` episodes from number ``first`` on, from spawned starts; ``events`` counts."""
-    counters = {keys.SEED: torch.full((rows,), parameters.seed), keys.EPISODE: first + torch.arange(rows)}
+    """One batch of ``rows`` episodes from number ``first`` on, from spawned starts.
+
+    ``events`` counts.
+    """
+    counters = {
+        keys.SEED: torch.full((rows,), parameters.seed),
+        keys.EPISODE: first + torch.arange(rows),
+    }
     key = episode_key(traffic.stream, *counters.values())
     state = spawned_vehicles(traffic, parameters, key)
     memory = traffic.init_memory(state, absorb(key, 0))
@@ -271,8 +309,13 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
         for name, time in times.items()
     }
     # The first time at which the episode's vehicles have covered 5000 m on average.
-    reached = [(row, np.flatnonzero(trajectories.driven_m[:, row].mean(-1) >= GOAL_M)) for row in range(rows)]
-    speeds[f"{GOAL_M:g} m"] = [_speeds(trajectories, row, int(there[0])) for row, there in reached if len(there)]
+    reached = [
+        (row, np.flatnonzero(trajectories.driven_m[:, row].mean(-1) >= GOAL_M))
+        for row in range(rows)
+    ]
+    speeds[f"{GOAL_M:g} m"] = [
+        _speeds(trajectories, row, int(there[0])) for row, there in reached if len(there)
+    ]
     return {
         "vehicle_km": float(trajectories.driven_m[-1].sum(dtype=np.float64)) / 1000.0,
         "lane_changes": len(changes),
@@ -285,27 +328,47 @@ def batch_statistics(trajectories: Trajectories, road: Road) -> dict[str, Any]:
 def _speeds(trajectories: Trajectories, row: int, time: int) -> tuple[float, float, float]:
     """Mean and standard deviation of an episode's speeds, m/s, and the time, s."""
     speed = trajectories.speed[time, row].astype(np.float64)
-    return float(speed.mean()), float(speed.std(ddof=1)) if len(speed) > 1 else 0.0, time * PHYSICS_STEP_S
+    return (
+        float(speed.mean()),
+        float(speed.std(ddof=1)) if len(speed) > 1 else 0.0,
+        time * PHYSICS_STEP_S,
+    )
 
 
 def rates(lane_changes: int, overlaps: int, km: float) -> dict[str, Any]:
-    """Both counts per vehicle-km and per 1000 of them, with exact 95 % intervals; None where no vehicle moved."""
+    """Both counts per vehicle-km and per 1000 of them, with exact 95 % intervals.
+
+    None where no vehicle moved.
+    """
     changes, pairs = poisson_interval(lane_changes), poisson_interval(overlaps)
     return {
         **entries("lane_changes_per_vehicle_km", changes.scaled(per=km) if km > 0.0 else None),
-        **entries("overlaps_per_1000_vehicle_km", pairs.scaled(1000.0, per=km) if km > 0.0 else None),
+        **entries(
+            "overlaps_per_1000_vehicle_km", pairs.scaled(1000.0, per=km) if km > 0.0 else None
+        ),
     }
 
 
-def _mean_speeds(rows: Sequence[tuple[float, float, float]], with_time: bool) -> dict[str, float | int | None]:
+def _mean_speeds(
+    rows: Sequence[tuple[float, float, float]], with_time: bool
+) -> dict[str, float | int | None]:
     """Means over the episodes that lasted so long, and their number."""
-    names = ("mean_speed_mps", "spread_mps", "after_s") if with_time else ("mean_speed_mps", "spread_mps")
-    means = {name: float(np.mean(values)) for name, values in zip(names, zip(*rows))} if rows else {}
+    names = (
+        ("mean_speed_mps", "spread_mps", "after_s")
+        if with_time
+        else ("mean_speed_mps", "spread_mps")
+    )
+    means = (
+        {name: float(np.mean(values)) for name, values in zip(names, zip(*rows))} if rows else {}
+    )
     return {"mean_speed_mps": None, "spread_mps": None, **means, "episodes": len(rows)}
 
 
 def totals(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Event counts and rates over all long runs, with exact 95 % intervals; None without any."""
-    sums = {key: sum(run[key] for run in runs) for key in ("lane_changes", "overlaps", "vehicle_km", *_EVENTS)}
+    sums = {
+        key: sum(run[key] for run in runs)
+        for key in ("lane_changes", "overlaps", "vehicle_km", *_EVENTS)
+    }
     events = {name: sums[name] if runs else None for name in _EVENTS}
     return {**events, **rates(sums["lane_changes"], sums["overlaps"], sums["vehicle_km"])}

@@ -1,8 +1,9 @@
-"""What is measured of driving, recorded or simulated, and how far two distributions are apart, with intervals.
+"""What is measured of driving, recorded or simulated, and how far two distributions are apart, with
+intervals.
 
-Everything is taken from positions, over one second and centred, so that recordings and simulations go through the
-same filter: raw recorded speeds and accelerations are mostly noise. A vehicle counts from 3 s after it appears: at
-the start everything looks real.
+Everything is taken from positions, over one second and centred, so that recordings and simulations
+go through the same filter: raw recorded speeds and accelerations are mostly noise. A vehicle counts
+from 3 s after it appears: at the start everything looks real.
 """
 
 from __future__ import annotations
@@ -19,11 +20,19 @@ from scipy.special import stdtrit
 
 from ganlane.data import FRAME_S, TRACK, Bins, find_lane_changes, leader_gaps, tracks_of_frame
 from ganlane.errors import UserError
-from ganlane.evaluation.statistics import TAIL_LEVELS, Array, Estimate, entries, poisson_interval, resample_counts
+from ganlane.evaluation.statistics import (
+    TAIL_LEVELS,
+    Array,
+    Estimate,
+    entries,
+    poisson_interval,
+    resample_counts,
+)
 from ganlane.files import CHECKPOINTS, PLACE, has_checksum, note_without_checksum, write_json
 from ganlane.realism.recordings import Recording, recorded_frame, units_of
 
-#: Recorded driving as histograms, which ships; it holds derived numbers, never an excerpt of a recording.
+#: Recorded driving as histograms, which ships; it holds derived numbers, never an excerpt of a
+#: recording.
 SHIPPED_REFERENCE = CHECKPOINTS / "realism_us101.json"
 _KIND = "ganlane realism reference"
 RESAMPLES = 2_000
@@ -60,17 +69,21 @@ QUANTITIES: Final = {name: bins for name, (_, bins) in _QUANTITIES.items()}
 
 
 def jensen_shannon(first: Array, second: Array) -> Array:
-    """Jensen-Shannon distance of histograms [..., bins]: 0 for equal ones, 1 for disjoint ones (Lin 1991).
+    """Jensen-Shannon distance of histograms [..., bins]: 0 for equal ones, 1 for disjoint ones (Lin
+    1991).
 
-    The square root of the divergence to base 2, which is a metric (Endres and Schindelin 2003). NaN where either
-    histogram is empty.
+    The square root of the divergence to base 2, which is a metric (Endres and Schindelin 2003). NaN
+    where either histogram is empty.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         p, q = first / first.sum(-1, keepdims=True), second / second.sum(-1, keepdims=True)
     middle = 0.5 * (p + q)
 
     def information(share: Array) -> Array:
-        return np.sum(share * (np.log2(np.maximum(share, _TINY)) - np.log2(np.maximum(middle, _TINY))), axis=-1)
+        return np.sum(
+            share * (np.log2(np.maximum(share, _TINY)) - np.log2(np.maximum(middle, _TINY))),
+            axis=-1,
+        )
 
     return np.sqrt(np.clip(0.5 * (information(p) + information(q)), 0.0, 1.0))
 
@@ -80,13 +93,17 @@ def pooled_distance(simulated: Array, recorded: Array) -> float:
     return float(jensen_shannon(simulated.sum(0), recorded.sum(0)))
 
 
-def distance(simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES) -> Estimate:
-    """Distance with its 95 % bootstrap interval over units; both are [units, bins]. One unit gives no interval.
+def distance(
+    simulated: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
+) -> Estimate:
+    """Distance with its 95 % bootstrap interval over units; both are [units, bins]. One unit gives
+    no interval.
 
-    A resample holds some units twice and others not at all, so its distance is biased upwards; near 0 all of them lie
-    above the estimate. Hence the basic (reverse percentile) interval, taken of the squared distance, in which that
-    bias adds up, cut off at 0 and widened to hold the estimate. Percentile and BCa intervals consist of resamples,
-    none of which is 0, so they miss a perfect model's distance (``benchmarks/realism_coverage.py``).
+    A resample holds some units twice and others not at all, so its distance is biased upwards; near
+    0 all of them lie above the estimate. Hence the basic (reverse percentile) interval, taken of
+    the squared distance, in which that bias adds up, cut off at 0 and widened to hold the estimate.
+    Percentile and BCa intervals consist of resamples, none of which is 0, so they miss a perfect
+    model's distance (``benchmarks/realism_coverage.py``).
 
     ``paired`` units are the same and are resampled together; else ``simulated`` alone is.
     """
@@ -103,12 +120,14 @@ def distance(simulated: Array, recorded: Array, paired: bool = True, resamples: 
 def distance_difference(
     first: Array, second: Array, recorded: Array, paired: bool = True, resamples: int = RESAMPLES
 ) -> Estimate:
-    """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval; see :func:`distance`.
+    """Distance of ``first`` less that of ``second`` to ``recorded``, with its 95 % interval; see
+    :func:`distance`.
 
-    Both are of the same units and resampled together. The interval is Student's, from the bootstrap's standard error
-    of the difference in squared distance, in which the bias of both mostly cancels, divided by the sum of the
-    distances: (a^2 - b^2) / (a + b) = a - b. With four units the basic and the percentile interval find one of two
-    equally good models closer too often.
+    Both are of the same units and resampled together. The interval is Student's, from the
+    bootstrap's standard error of the difference in squared distance, in which the bias of both
+    mostly cancels, divided by the sum of the distances: (a^2 - b^2) / (a + b) = a - b. With four
+    units the basic and the percentile interval find one of two equally good models closer too
+    often.
     """
     one, other = pooled_distance(first, recorded), pooled_distance(second, recorded)
     ours, theirs = _resampled((first, second), recorded, paired, resamples)
@@ -121,8 +140,13 @@ def distance_difference(
     return Estimate(value, max(-1.0, value - reach), min(1.0, value + reach))
 
 
-def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples: int) -> list[Array]:
-    """Distances [R] of each of ``models`` from resampled units, the same ones for all; none of a single unit."""
+def _resampled(
+    models: Sequence[Array], recorded: Array, paired: bool, resamples: int
+) -> list[Array]:
+    """Distances [R] of each of ``models`` from resampled units, the same ones for all.
+
+    None of a single unit.
+    """
     units = len(recorded) if paired else len(models[0])
     if units < 2:
         return [np.empty(0) for _ in models]
@@ -135,9 +159,11 @@ def _resampled(models: Sequence[Array], recorded: Array, paired: bool, resamples
 
 
 def ceiling(recorded: Array) -> float | None:
-    """Mean distance of one half of the units [units, bins] to the other, over random halves; None for one unit.
+    """Mean distance of one half of the units [units, bins] to the other, over random halves; None
+    for one unit.
 
-    What no model can be expected to beat: halves hold half of the driving, so it errs on the high side.
+    What no model can be expected to beat: halves hold half of the driving, so it errs on the high
+    side.
     """
     units = len(recorded)
     if units < 2:
@@ -167,8 +193,13 @@ class Measured:
     vehicle_km: float
 
     def summary(self) -> dict[str, Any]:
-        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles`` of every quantity."""
-        return {**lane_change_rate(self.lane_changes, self.vehicle_km), "quantiles": self.quantiles()}
+        """Lane changes per vehicle-km (:func:`lane_change_rate`) and the ``quantiles`` of every
+        quantity.
+        """
+        return {
+            **lane_change_rate(self.lane_changes, self.vehicle_km),
+            "quantiles": self.quantiles(),
+        }
 
     def quantile(self, quantity: str, level: float) -> float | None:
         """Quantile of a quantity over all units; None without samples."""
@@ -176,7 +207,10 @@ class Measured:
 
     def quantiles(self) -> dict[str, dict[str, float | None]]:
         """By quantity, the quantiles at :data:`LEVELS`."""
-        return {name: {f"{level:g}": self.quantile(name, level) for level in LEVELS} for name in QUANTITIES}
+        return {
+            name: {f"{level:g}": self.quantile(name, level) for level in LEVELS}
+            for name in QUANTITIES
+        }
 
     def restricted_to(self, rows: Sequence[int]) -> Measured:
         """The same with the counts of some units only; samples and totals remain those of all."""
@@ -186,8 +220,12 @@ class Measured:
     def joined(parts: Sequence[Measured]) -> Measured:
         """Driving of different units, one below the other."""
         samples = {name: pl.concat([part.samples[name] for part in parts]) for name in QUANTITIES}
-        counts = {name: np.concatenate([part.counts[name] for part in parts]) for name in QUANTITIES}
-        return Measured(samples, counts, sum(p.lane_changes for p in parts), sum(p.vehicle_km for p in parts))
+        counts = {
+            name: np.concatenate([part.counts[name] for part in parts]) for name in QUANTITIES
+        }
+        return Measured(
+            samples, counts, sum(p.lane_changes for p in parts), sum(p.vehicle_km for p in parts)
+        )
 
 
 def lane_change_rate(changes: int, km: float) -> dict[str, Any]:
@@ -202,13 +240,20 @@ def measure_recordings(recordings: Sequence[Recording]) -> Measured:
 
 
 def measure(frame: pl.DataFrame, units: Sequence[str]) -> Measured:
-    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them; ``units`` are the rows."""
+    """Measure trajectories, as :func:`ganlane.realism.recordings.frame_of` gives them.
+
+    ``units`` are the rows.
+    """
     motion = _motion(frame)
     own = motion.filter(pl.col("counts"))
     near = pl.col("counts") & pl.col("gap").is_between(0.0, FOLLOWING_M)
     followers = leader_gaps(motion).filter(near).drop_nulls(["speed", "leader_speed"])
     closing = pl.col("speed") - pl.col("leader_speed")
-    crowded = own.drop_nulls("speed").group_by("unit", "scene", "frame").agg(pl.col("speed").std(), pl.len())
+    crowded = (
+        own.drop_nulls("speed")
+        .group_by("unit", "scene", "frame")
+        .agg(pl.col("speed").std(), pl.len())
+    )
     fast_enough = followers.filter(pl.col("speed") >= SLOWEST_FOLLOWER_MPS)
     changes = _lane_changes(motion)
     values = {
@@ -247,7 +292,9 @@ def _at(column: str, frames: int) -> pl.Expr:
 
 
 def _motion(frame: pl.DataFrame) -> pl.DataFrame:
-    """``frame`` with speed, acceleration and jerk over 1 s, the step driven, and whether the row counts."""
+    """``frame`` with speed, acceleration and jerk over 1 s, the step driven, and whether the row
+    counts.
+    """
     speed = (_at("x", _HALF) - _at("x", -_HALF)) / (_WHOLE * FRAME_S)
     bend = _at("x", _WHOLE) - 2.0 * pl.col("x") + _at("x", -_WHOLE)
     late, later = _HALF, _HALF + _WHOLE
@@ -263,13 +310,18 @@ def _motion(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _lane_changes(motion: pl.DataFrame) -> pl.DataFrame:
-    """Unit and duration of the changes that cross in a row that counts, censored ones as far as seen.
+    """Unit and duration of the changes that cross in a row that counts, censored ones as far as
+    seen.
 
     Simulations run where and as long as the recordings do, so both are cut off alike.
     """
     widths = dict(motion.select("scene", "lane_width").unique().iter_rows())
     changes = find_lane_changes(tracks_of_frame(motion, widths))
-    rows = motion[changes.sample].select("unit", "counts").with_columns(value=pl.Series(changes.duration_s))
+    rows = (
+        motion[changes.sample]
+        .select("unit", "counts")
+        .with_columns(value=pl.Series(changes.duration_s))
+    )
     return rows.filter(pl.col("counts")).select("unit", "value")
 
 
@@ -283,7 +335,8 @@ class Reference:
         counts: by quantity, [units, bins].
         quantiles: by quantity, by level as text.
         lane_changes, vehicle_km: from 3 s after each vehicle's first frame.
-        whole: lane changes and vehicle-km of all frames, and ``speed_spread_mps``; long runs are compared with these.
+        whole: lane changes and vehicle-km of all frames, and ``speed_spread_mps``; long runs are
+            compared with these.
         floors: by driver (``random``, ``constant_velocity``), by quantity: its distance from here.
     """
 
@@ -297,10 +350,21 @@ class Reference:
     floors: Mapping[str, Mapping[str, float]]
 
     @classmethod
-    def of(cls, measured: Measured, units: Sequence[str], whole: Mapping[str, float], source: str) -> Reference:
+    def of(
+        cls, measured: Measured, units: Sequence[str], whole: Mapping[str, float], source: str
+    ) -> Reference:
         """The reference that measured recordings give, without floors."""
         changes, km = measured.lane_changes, measured.vehicle_km
-        return cls(source, list(units), measured.counts, measured.quantiles(), changes, km, whole, floors={})
+        return cls(
+            source,
+            list(units),
+            measured.counts,
+            measured.quantiles(),
+            changes,
+            km,
+            whole,
+            floors={},
+        )
 
     def summary(self) -> dict[str, Any]:
         """As :meth:`Measured.summary`."""
@@ -318,8 +382,13 @@ class Reference:
     def save(self, path: Path) -> None:
         """Write as JSON, atomically."""
         ceilings = {quantity: ceiling(counts) for quantity, counts in self.counts.items()}
-        plain = {**vars(self), "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()}}
-        write_json(path, {"kind": _KIND, "checksum": PLACE, "bins": _bins(), "ceilings": ceilings, **plain})
+        plain = {
+            **vars(self),
+            "counts": {name: value.astype(int).tolist() for name, value in self.counts.items()},
+        }
+        write_json(
+            path, {"kind": _KIND, "checksum": PLACE, "bins": _bins(), "ceilings": ceilings, **plain}
+        )
 
     @classmethod
     def load(cls, path: Path) -> Reference:
@@ -338,7 +407,10 @@ class Reference:
                 raise ValueError("its histograms have other bins")
             for derived in ("ceilings", "checksum"):
                 numbers.pop(derived, None)
-            counts = {name: np.asarray(value, dtype=np.float64) for name, value in numbers.pop("counts").items()}
+            counts = {
+                name: np.asarray(value, dtype=np.float64)
+                for name, value in numbers.pop("counts").items()
+            }
             reference = cls(counts=counts, **numbers)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise UserError(

@@ -1,10 +1,10 @@
 """Recorded scenes as dense arrays: the starts of simulations, and what those are measured against.
 
-Two sources: scenes in the project's schema, and three files of I-80, a site that no generator was fitted to.
-``i80_1600_lane1.csv`` holds every car of one lane, all of which are driven (no lengths are given: 4.5 m). The two
-others hold pairs, in which the follower is driven behind its recorded leader. All three are cut into segments of
-15 s, each of which starts as recorded, on a road of one lane. Positions in the files are of the front bumper; here
-they are of the centre, as everywhere.
+Two sources: scenes in the project's schema, and three files of I-80, a site that no generator was
+fitted to. ``i80_1600_lane1.csv`` holds every car of one lane, all of which are driven (no lengths
+are given: 4.5 m). The two others hold pairs, in which the follower is driven behind its recorded
+leader. All three are cut into segments of 15 s, each of which starts as recorded, on a road of one
+lane. Positions in the files are of the front bumper; here they are of the centre, as everywhere.
 """
 
 from __future__ import annotations
@@ -25,7 +25,11 @@ from ganlane.errors import UserError
 #: A scene must last longer than the seconds that every measure leaves out, s.
 SHORTEST_S = 4.0
 #: Name to file.
-I80_FILES: Final = {"lane_1": "i80_1600_lane1.csv", "pairs": "i80_1600_pairs.csv", "following": "i80_following.csv"}
+I80_FILES: Final = {
+    "lane_1": "i80_1600_lane1.csv",
+    "pairs": "i80_1600_pairs.csv",
+    "following": "i80_following.csv",
+}
 SEGMENT_S: Final = 15.0
 #: The first seconds of a pair, in which the published smoothing bends the follower's speed, s.
 EDGE_S: Final = 3.0
@@ -36,7 +40,8 @@ _NUMBERS = {"frame": pl.Int64, "x": pl.Float64}
 
 @dataclass(frozen=True)
 class Recording:
-    """A recorded scene of T frames (0.1 s apart) and V tracks; entries that are not ``present`` are 0.
+    """A recorded scene of T frames (0.1 s apart) and V tracks; entries that are not ``present`` are
+    0.
 
     Attributes:
         name: the scene's; no other recording has it.
@@ -67,21 +72,32 @@ class Recording:
 
 
 def recordings_of(frame: pl.DataFrame, lane_widths: Mapping[str, float]) -> list[Recording]:
-    """The scenes of a frame in the schema, whose tracks have no gaps, by name; ``lane_widths`` are in m."""
+    """The scenes of a frame in the schema, whose tracks have no gaps, by name.
+
+    ``lane_widths`` are in m.
+    """
     made = []
     for name in sorted(frame["scene"].unique().to_list()):
         rows = frame.filter(pl.col("scene") == name).with_columns(driven=pl.lit(True))
         track = np.unique(rows["vehicle"].to_numpy(), return_inverse=True)[1]
-        made.append(_recording(name, rows, track, int(rows["lane"].to_numpy().max()) + 1, lane_widths[name]))
+        made.append(
+            _recording(name, rows, track, int(rows["lane"].to_numpy().max()) + 1, lane_widths[name])
+        )
     return made
 
 
-def _recording(name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lane_width_m: float) -> Recording:
+def _recording(
+    name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lane_width_m: float
+) -> Recording:
     """The recording of ``rows`` [R], of which ``track`` [R] gives the index of each one's track."""
     time = rows["frame"].to_numpy() - rows["frame"].to_numpy().min()
     shape = (int(time.max()) + 1, int(track.max()) + 1)
     made: dict[str, Any] = {field: np.zeros(shape) for field in ("x", "y", "speed")}
-    made |= {"length": np.zeros(shape[1]), "width": np.zeros(shape[1]), "driven": np.zeros(shape[1], dtype=bool)}
+    made |= {
+        "length": np.zeros(shape[1]),
+        "width": np.zeros(shape[1]),
+        "driven": np.zeros(shape[1], dtype=bool),
+    }
     for field, values in made.items():
         values[(time, track) if values.ndim == 2 else track] = rows[field].to_numpy()
     present = np.zeros(shape, dtype=bool)
@@ -90,10 +106,11 @@ def _recording(name: str, rows: pl.DataFrame, track: np.ndarray, lanes: int, lan
 
 
 def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: str) -> pl.DataFrame:
-    """Trajectories [T, V] of the vehicles of ``recording`` as a frame in the schema, sorted by track.
+    """Trajectories [T, V] of the vehicles of ``recording`` as a frame in the schema, sorted by
+    track.
 
-    The lane is the one whose centre is nearest, and the speed is 0: everything is measured from positions. Further
-    columns are the recording's ``unit``, ``driven`` and ``lane_width``.
+    The lane is the one whose centre is nearest, and the speed is 0: everything is measured from
+    positions. Further columns are the recording's ``unit``, ``driven`` and ``lane_width``.
     """
     vehicle, time = np.nonzero(present.T)
     width = recording.lane_width_m
@@ -109,13 +126,17 @@ def frame_of(recording: Recording, x: Floats, y: Floats, present: Flags, name: s
         "width": recording.width[vehicle],
     }
     return pl.DataFrame(columns, schema=SCHEMA).with_columns(
-        unit=pl.lit(recording.unit), driven=pl.Series(recording.driven[vehicle]), lane_width=pl.lit(width)
+        unit=pl.lit(recording.unit),
+        driven=pl.Series(recording.driven[vehicle]),
+        lane_width=pl.lit(width),
     )
 
 
 def recorded_frame(recordings: Sequence[Recording]) -> pl.DataFrame:
     """The recordings in the form in which simulations are measured."""
-    return pl.concat([frame_of(each, each.x, each.y, each.present, each.name) for each in recordings])
+    return pl.concat(
+        [frame_of(each, each.x, each.y, each.present, each.name) for each in recordings]
+    )
 
 
 def units_of(recordings: Sequence[Recording]) -> list[str]:
@@ -124,20 +145,26 @@ def units_of(recordings: Sequence[Recording]) -> list[str]:
 
 
 def segments(recording: Recording, seconds: float, skip_s: float = 0.0) -> list[Recording]:
-    """Cuts ``recording`` from ``skip_s`` on into pieces of ``seconds``, each with the vehicles present in it."""
+    """Cuts ``recording`` from ``skip_s`` on into pieces of ``seconds``, each with the vehicles
+    present in it.
+    """
     length, first = round(seconds / FRAME_S), round(skip_s / FRAME_S)
     pieces = []
     for start in range(first, len(recording.x) - length + 1, length):
         rows = slice(start, start + length)
         who = recording.present[rows].any(0)
-        dense = {field: getattr(recording, field)[rows][:, who] for field in ("x", "y", "speed", "present")}
+        dense = {
+            field: getattr(recording, field)[rows][:, who]
+            for field in ("x", "y", "speed", "present")
+        }
         flat = {field: getattr(recording, field)[who] for field in ("length", "width", "driven")}
         pieces.append(replace(recording, name=f"{recording.name}@{start}", **dense, **flat))
     return pieces
 
 
 def read_i80(name: str, path: Path) -> list[Recording]:
-    """Segments of 15 s from the file ``path``, which is the one of :data:`I80_FILES` called ``name``.
+    """Segments of 15 s from the file ``path``, which is the one of :data:`I80_FILES` called
+    ``name``.
 
     Raises:
         UserError: it is damaged, or no track in it lasts 15 s.
@@ -152,12 +179,21 @@ def _lane(path: Path) -> list[Recording]:
     rows = read_table(path, {"vehicle": pl.Int64, **_NUMBERS}).with_columns(
         length=pl.lit(_LENGTH_M), x=pl.col("x") - 0.5 * _LENGTH_M, driven=pl.lit(True)
     )
-    # Each segment is a unit of its own: the whole lane would be a single unit, and gives no interval.
-    return [replace(piece, unit=piece.name) for piece in segments(_one_lane("lane_1", rows), SEGMENT_S)]
+    # Each segment is a unit of its own: the whole lane would be a single unit, and gives no
+    # interval.
+    return [
+        replace(piece, unit=piece.name) for piece in segments(_one_lane("lane_1", rows), SEGMENT_S)
+    ]
 
 
 def _pairs(path: Path) -> list[Recording]:
-    columns = {"pair": pl.String, "role": pl.String, "vehicle": pl.Int64, "length": pl.Float64, **_NUMBERS}
+    columns = {
+        "pair": pl.String,
+        "role": pl.String,
+        "vehicle": pl.Int64,
+        "length": pl.Float64,
+        **_NUMBERS,
+    }
     rows = read_table(path, columns).with_columns(
         x=pl.col("x") - 0.5 * pl.col("length"), driven=pl.col("role") == "follower"
     )
@@ -167,11 +203,15 @@ def _pairs(path: Path) -> list[Recording]:
 def _following(path: Path) -> list[Recording]:
     whose = ["period", "follower", "leader"]
     kinds = {"period": pl.String, "follower": pl.Int64, "leader": pl.Int64, "frame": pl.Int64}
-    table = read_table(path, kinds | dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64))
+    table = read_table(
+        path, kinds | dict.fromkeys(("x_follower", "x_leader", "leader_length"), pl.Float64)
+    )
 
     def car(role: str, length: pl.Expr) -> pl.DataFrame:
         x, driven = pl.col(f"x_{role}") - 0.5 * length, pl.lit(role == "follower")
-        return table.select(*whose, "frame", vehicle=pl.col(role), x=x, length=length, driven=driven)
+        return table.select(
+            *whose, "frame", vehicle=pl.col(role), x=x, length=length, driven=driven
+        )
 
     cars = pl.concat([car("follower", pl.lit(_LENGTH_M)), car("leader", pl.col("leader_length"))])
     return _pair_segments("", cars.group_by(whose, maintain_order=True))
@@ -180,18 +220,27 @@ def _following(path: Path) -> list[Recording]:
 _I80_READERS = {"lane_1": _lane, "pairs": _pairs, "following": _following}
 
 
-def _pair_segments(prefix: str, pairs: Iterable[tuple[tuple[object, ...], pl.DataFrame]]) -> list[Recording]:
+def _pair_segments(
+    prefix: str, pairs: Iterable[tuple[tuple[object, ...], pl.DataFrame]]
+) -> list[Recording]:
     """The segments of all pairs of cars, by the names of the pairs."""
     recordings = (_one_lane(prefix + "-".join(map(str, name)), rows) for name, rows in pairs)
     return [piece for each in recordings for piece in segments(each, SEGMENT_S, EDGE_S)]
 
 
 def _one_lane(name: str, rows: pl.DataFrame) -> Recording:
-    """Cars of one lane; a speed is the mean over the second around its frame, cut off at the ends of the track."""
+    """Cars of one lane.
+
+    A speed is the mean over the second around its frame, cut off at the ends of the track.
+    """
     rows = rows.sort("vehicle", "frame").with_columns(y=0.0, speed=0.0, width=_WIDTH_M)
     # A gap splits a track, since a recording's tracks have none.
-    part = ((pl.col("frame").diff() != 1) | (pl.col("vehicle").diff() != 0)).fill_null(False).cum_sum()
-    made = _recording(name, rows, rows.select(part).to_series().to_numpy(), 1, STANDARD_LANE_WIDTH_M)
+    part = (
+        ((pl.col("frame").diff() != 1) | (pl.col("vehicle").diff() != 0)).fill_null(False).cum_sum()
+    )
+    made = _recording(
+        name, rows, rows.select(part).to_series().to_numpy(), 1, STANDARD_LANE_WIDTH_M
+    )
     return replace(made, speed=_speeds(made.x, made.present))
 
 

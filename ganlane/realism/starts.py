@@ -1,8 +1,9 @@
-"""Every traffic from the same starts: recorded scenes, or spawned ones where there are no recordings.
+"""Every traffic from the same starts: recorded scenes, or spawned ones where there are no
+recordings.
 
-Recordings do not show how fast drivers would like to go, so the mean desired speed is fitted for every traffic.
-Generators may be split into folds, so that no scene is driven by weights that were fitted to it. Without recordings
-everything is compared with the histograms that ship.
+Recordings do not show how fast drivers would like to go, so the mean desired speed is fitted for
+every traffic. Generators may be split into folds, so that no scene is driven by weights that were
+fitted to it. Without recordings everything is compared with the histograms that ship.
 """
 
 from __future__ import annotations
@@ -29,7 +30,13 @@ from ganlane.realism.measures import (
     measure_recordings,
     pooled_distance,
 )
-from ganlane.realism.recordings import SHORTEST_S, Recording, recorded_frame, recordings_of, units_of
+from ganlane.realism.recordings import (
+    SHORTEST_S,
+    Recording,
+    recorded_frame,
+    recordings_of,
+    units_of,
+)
 from ganlane.sim.spawn import SpawnParameters
 from ganlane.sim.state import Road
 from ganlane.weights import load_weights
@@ -51,7 +58,9 @@ def simulate(make: Factory, recordings: Sequence[Recording], options: StartOptio
 
 
 def simulate_all(
-    factories: Mapping[str, Factory], recordings: Sequence[Recording], options: Mapping[str, StartOptions]
+    factories: Mapping[str, Factory],
+    recordings: Sequence[Recording],
+    options: Mapping[str, StartOptions],
 ) -> dict[str, Measured]:
     """Drive every traffic and both reference drivers from the same starts."""
     driven = {}
@@ -62,12 +71,16 @@ def simulate_all(
 
 
 def fit_excess(
-    make: Factory, recordings: Sequence[Recording], options: StartOptions, grid: Sequence[float] = EXCESS_GRID
+    make: Factory,
+    recordings: Sequence[Recording],
+    options: StartOptions,
+    grid: Sequence[float] = EXCESS_GRID,
 ) -> float:
-    """The mean excess of desired speeds, of ``grid``, at which a traffic is nearest to ``recordings``, m/s.
+    """The mean excess of desired speeds, of ``grid``, at which a traffic is nearest to
+    ``recordings``, m/s.
 
-    Nearest by the mean distance over all quantities that need no lane change. Every traffic is fitted, so that none
-    suffers from desired speeds chosen for another.
+    Nearest by the mean distance over all quantities that need no lane change. Every traffic is
+    fitted, so that none suffers from desired speeds chosen for another.
     """
     recorded = measure_recordings(recordings)
 
@@ -83,7 +96,10 @@ def fit_excess(
 def desired_speeds(
     factories: Mapping[str, Factory], fitted: Sequence[Recording], common: StartOptions
 ) -> dict[str, StartOptions]:
-    """Options by traffic: desired speeds fitted to ``fitted``, if there are any; reference drivers as ``common``."""
+    """Options by traffic: desired speeds fitted to ``fitted``, if there are any.
+
+    Reference drivers as ``common``.
+    """
     chosen = {name: common for name in FLOORS}
     for name, make in factories.items():
         chosen[name] = common
@@ -102,7 +118,8 @@ class Starts:
         scenes: started from.
         held_out: by fold, the scenes that desired speeds were not fitted on.
         options: by traffic, how it was driven; over several folds the mean of what was fitted.
-        driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded starts only).
+        driven: by name, the card's traffic first, then its rivals, then :data:`FLOORS` (recorded
+            starts only).
         recorded: the same scenes (spawned starts: all recordings).
         reference: all recordings.
     """
@@ -133,11 +150,17 @@ class Starts:
         assert isinstance(self.recorded, Measured)  # spawned starts are of no scenes
         rows = [self.scenes.index(name) for name in scenes]
         driven = {name: each.restricted_to(rows) for name, each in self.driven.items()}
-        return replace(self, scenes=list(scenes), driven=driven, recorded=self.recorded.restricted_to(rows))
+        return replace(
+            self, scenes=list(scenes), driven=driven, recorded=self.recorded.restricted_to(rows)
+        )
 
     def description(self) -> dict[str, Any]:
         """The entries of ``results.json`` about starts and recordings."""
-        excess = {name: each.desired_above_mps for name, each in self.options.items() if name not in FLOORS}
+        excess = {
+            name: each.desired_above_mps
+            for name, each in self.options.items()
+            if name not in FLOORS
+        }
         return {
             "starts": self.kind,
             "scenes": self.scenes,
@@ -150,7 +173,8 @@ class Starts:
 
 @dataclass(frozen=True)
 class Fold:
-    """Traffics by name, the card's own first and the same in every fold, and the scenes that they start from.
+    """Traffics by name, the card's own first and the same in every fold, and the scenes that they
+    start from.
 
     Desired speeds are not fitted on the ``held_out`` scenes.
     """
@@ -164,7 +188,8 @@ def fold_weights(paths: Sequence[Path]) -> dict[tuple[str, ...], dict[str, Path]
     """Weights of k folds: by held-out scenes, then by preset (``paper``, ``calibrated``).
 
     Raises:
-        UserError: a file is not a generator's, names no held-out scenes, or two files are of one fold and preset.
+        UserError: a file is not a generator's, names no held-out scenes, or two files are of one
+            fold and preset.
     """
     folds: dict[tuple[str, ...], dict[str, Path]] = {}
     for path in paths:
@@ -194,9 +219,11 @@ def check_folds_cover(folds: Sequence[Sequence[str]], scenes: Sequence[str]) -> 
 def recorded_starts(
     folds: Sequence[Fold], frame: pl.DataFrame, options: StartOptions, fit: bool, source: str
 ) -> Starts:
-    """Drive every traffic from recorded scenes (``frame``, in the schema); those that are too short are skipped.
+    """Drive every traffic from recorded scenes (``frame``, in the schema); those that are too short
+    are skipped.
 
-    ``fit``: every traffic's desired speeds, on a fold's other scenes; else they are those of ``options``.
+    ``fit``: every traffic's desired speeds, on a fold's other scenes; else they are those of
+    ``options``.
 
     Raises:
         UserError: a fold names an unknown scene, or no scene is long enough.
@@ -206,7 +233,9 @@ def recorded_starts(
     names = [each.name for each in every]
     for name in (name for fold in folds for name in fold.held_out):
         if name not in names:
-            raise UserError(f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}.")
+            raise UserError(
+                f"data.held_out={name}: no such scene in {source}; choose among {', '.join(names)}."
+            )
     long = [each for each in every if len(each.x) * FRAME_S >= SHORTEST_S]
     chosen: list[Recording] = []
     fitted: list[dict[str, StartOptions]] = []
@@ -219,7 +248,9 @@ def recorded_starts(
             driven.append(simulate_all(fold.factories, scenes, fitted[-1]))
             chosen += scenes
     if not chosen:
-        raise UserError(f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all.")
+        raise UserError(
+            f"{source}: no scene to start from lasts {SHORTEST_S:g} s; give longer ones or scenes=all."
+        )
     statistics = driving_statistics(frame, widths)
     whole = {
         "lane_changes": statistics.lane_changes.count,
@@ -227,12 +258,17 @@ def recorded_starts(
         "speed_spread_mps": statistics.speed_sd_in_frame or 0.0,
     }
     # Sites that belong to no fold get the mean over folds of the fitted desired speeds.
-    means = {name: float(np.mean([part[name].desired_above_mps for part in fitted])) for name in fitted[0]}
+    means = {
+        name: float(np.mean([part[name].desired_above_mps for part in fitted]))
+        for name in fitted[0]
+    }
     return Starts(
         kind="recorded",
         scenes=[each.name for each in chosen],
         held_out=[list(fold.held_out) for fold in folds],
-        options={name: replace(options, desired_above_mps=excess) for name, excess in means.items()},
+        options={
+            name: replace(options, desired_above_mps=excess) for name, excess in means.items()
+        },
         driven={name: Measured.joined([part[name] for part in driven]) for name in driven[0]},
         recorded=measure_recordings(chosen),
         reference=Reference.of(measure_recordings(every), names, whole, source),
@@ -242,10 +278,11 @@ def recorded_starts(
 def spawned_starts(
     factories: Mapping[str, Factory], road: Road, spawn: SpawnParameters, repeats: int, seed: int
 ) -> Starts:
-    """Drive every traffic from the same spawned scenes: ``repeats`` times 8 episodes of 30 vehicles and 30 s each.
+    """Drive every traffic from the same spawned scenes: ``repeats`` times 8 episodes of 30 vehicles
+    and 30 s each.
 
-    ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density). They are compared with
-    the histograms that ship.
+    ``road`` and ``spawn`` say where and how vehicles start (Table II at the paper's density). They
+    are compared with the histograms that ship.
     """
     reference, rows = Reference.load(SHIPPED_REFERENCE), _SPAWNED_ROWS * repeats
     print_progress(
@@ -260,8 +297,12 @@ def spawned_starts(
     return Starts("spawned", [], [], {}, driven, reference, reference)
 
 
-def spawned_frame(make: Factory, road: Road, parameters: LongRunParameters, rows: int) -> pl.DataFrame:
-    """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` s, in the form of measured recordings."""
+def spawned_frame(
+    make: Factory, road: Road, parameters: LongRunParameters, rows: int
+) -> pl.DataFrame:
+    """Trajectories of ``rows`` spawned episodes of ``parameters.most_s`` s, in the form of measured
+    recordings.
+    """
     paths = drive_spawned(make(road), parameters, 0, rows, EventCounter(road))
     everywhere = np.ones(paths.x[:, 0].shape, dtype=bool)
     lanes, width = int(road.lanes), float(road.lane_width_m)

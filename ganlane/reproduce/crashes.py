@@ -1,8 +1,9 @@
-"""Crashes and departures from the road as a list that can be driven again: episode numbers and actions, as JSON.
+"""Crashes and departures from the road as a list that can be driven again: episode numbers and
+actions, as JSON.
 
-``ganlane reproduce`` writes such a list, ``ganlane render crashes=FILE`` plays it. Everything is driven by the tensor
-code in batches of :data:`ROWS` rows: generated traffic repeats bit by bit in batches of one size only, and a film
-shows what the tensor code drives.
+``ganlane reproduce`` writes such a list, ``ganlane render crashes=FILE`` plays it. Everything is
+driven by the tensor code in batches of :data:`ROWS` rows: generated traffic repeats bit by bit in
+batches of one size only, and a film shows what the tensor code drives.
 """
 
 from __future__ import annotations
@@ -39,12 +40,24 @@ ROWS = 8
 #: Events that end a listed episode.
 ENDS = ("hard_crash", "out_of_road")
 _KIND = "ganlane crashes"
-_ACTIONS = Rule(lambda text: re.fullmatch("[012]{1,100000}", text) is not None, "a text of the digits 0, 1 and 2")
-#: Keys of a traffic that name code. A list holds none, so traffics that need code of a user's own are not listed.
+_ACTIONS = Rule(
+    lambda text: re.fullmatch("[012]{1,100000}", text) is not None,
+    "a text of the digits 0, 1 and 2",
+)
+#: Keys of a traffic that name code. A list holds none, so traffics that need code of a user's own
+#: are not listed.
 _CODE = {"_target_", "parameters"}
 _LISTED = {name: kind for name, kind in TRAFFICS.items() if name != "mixed"}
 #: Errors raised by reading a broken list.
-_BROKEN = (ValueError, KeyError, TypeError, AttributeError, RecursionError, OmegaConfBaseException, UserError)
+_BROKEN = (
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OmegaConfBaseException,
+    UserError,
+)
 
 
 @dataclass(frozen=True)
@@ -76,7 +89,10 @@ class Crash(Record):
 
 @dataclass(frozen=True)
 class CrashList:
-    """Crashes, and what their episodes depend on: environment, traffics and stream of random numbers."""
+    """Crashes, and what their episodes depend on.
+
+    Environment, traffics and stream of random numbers.
+    """
 
     env: EnvConfig
     traffics: Mapping[str, TrafficConfig]
@@ -98,14 +114,20 @@ class CrashList:
     def drive_again(self) -> list[Rollout]:
         """The rollouts of the listed actions, in the order of the list."""
         rollouts: dict[tuple[str, str, int, int], Rollout] = {}
-        for (driver, traffic, seed), group in groupby(self.crashes, attrgetter("driver", "traffic", "seed")):
+        for (driver, traffic, seed), group in groupby(
+            self.crashes, attrgetter("driver", "traffic", "seed")
+        ):
             actions = {number: steps for each in group for number, steps in each.steps().items()}
             for rollout in replay(self.make_env(traffic), actions, seed):
                 rollouts[driver, traffic, seed, rollout.episode] = rollout
-        return [rollouts[each.driver, each.traffic, each.seed, each.episode] for each in self.crashes]
+        return [
+            rollouts[each.driver, each.traffic, each.seed, each.episode] for each in self.crashes
+        ]
 
 
-def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> tuple[CrashList, int]:
+def find_crashes(
+    episodes: pl.DataFrame, config: EvaluateConfig, most: int
+) -> tuple[CrashList, int]:
     """Drive failed episodes again and list those that end in the same way.
 
     Args:
@@ -113,8 +135,8 @@ def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> t
         most: episodes per driver and traffic, those with the fewest decisions first.
 
     Returns:
-        The list, and how many of the episodes ended otherwise: generated traffic rounds differently in batches of
-        another size.
+        The list, and how many of the episodes ended otherwise: generated traffic rounds differently
+        in batches of another size.
     """
     traffics = {
         name: option
@@ -123,16 +145,29 @@ def find_crashes(episodes: pl.DataFrame, config: EvaluateConfig, most: int) -> t
     }
     listed = CrashList(config.env, traffics, config.stream, [])
     failed = episodes.filter(pl.col("reason").is_in(ENDS), pl.col("traffic").is_in(list(traffics)))
-    chosen = failed.sort("decisions", "episode").group_by("agent", "traffic", maintain_order=True).head(most)
+    chosen = (
+        failed.sort("decisions", "episode")
+        .group_by("agent", "traffic", maintain_order=True)
+        .head(most)
+    )
     crashes: list[Crash] = []
-    for (name, traffic), frame in chosen.sort("traffic", "agent").group_by("agent", "traffic", maintain_order=True):
+    for (name, traffic), frame in chosen.sort("traffic", "agent").group_by(
+        "agent", "traffic", maintain_order=True
+    ):
         driver = make_driver(name, config.env)
         mask, policy = driver.behind(config.mask)
-        env = listed.make_env(traffic, config.observation.read_by(driver.observation), config.reward, mask)
+        env = listed.make_env(
+            traffic, config.observation.read_by(driver.observation), config.reward, mask
+        )
         ends = dict(zip(frame["episode"].to_list(), frame["reason"].to_list()))
         for each in roll_out(env, policy, sorted(ends), config.seed):
             if each.end == ends[each.episode]:
-                outcome = (each.end, round(max(each.distance_m, 0.0), 1), each.contact, each.changing)
+                outcome = (
+                    each.end,
+                    round(max(each.distance_m, 0.0), 1),
+                    each.contact,
+                    each.changing,
+                )
                 actions = "".join(map(str, each.actions))
                 crashes.append(Crash(name, traffic, config.seed, each.episode, *outcome, actions))
     return replace(listed, crashes=crashes), len(chosen) - len(crashes)
@@ -148,7 +183,13 @@ def write_crashes(path: str | Path, listed: CrashList) -> None:
         if name in used
     }
     env = {"option": option, **asdict(listed.env)}
-    content = {"kind": _KIND, "stream": listed.stream, "env": env, "traffics": traffics, "crashes": listed.crashes}
+    content = {
+        "kind": _KIND,
+        "stream": listed.stream,
+        "env": env,
+        "traffics": traffics,
+        "crashes": listed.crashes,
+    }
     write_json(path, plain(content))
 
 
@@ -164,17 +205,24 @@ def read_crashes(path: str | Path) -> CrashList:
             raise ValueError("another kind of file")
         env, traffics = dict(content["env"]), dict(content["traffics"])
         # OmegaConf would replace ${...}.
-        if "${" in json.dumps(content) or any(_CODE & options.keys() for options in traffics.values()):
+        if "${" in json.dumps(content) or any(
+            _CODE & options.keys() for options in traffics.values()
+        ):
             raise ValueError("it names what is not plain data")
         crashes = [_typed(Crash, each) for each in content["crashes"]]
         return CrashList(
             _typed(SCHEMAS["env"][env.pop("option")], env),
-            {name: _typed(_LISTED[name], traffics[name]) for name in {each.traffic for each in crashes}},
+            {
+                name: _typed(_LISTED[name], traffics[name])
+                for name in {each.traffic for each in crashes}
+            },
             {stream: stream for stream in ("report", "select")}[content["stream"]],
             crashes,
         )
     except OSError as error:
-        raise UserError(f"{path}: cannot be read; give the crashes.json of ganlane reproduce.") from error
+        raise UserError(
+            f"{path}: cannot be read; give the crashes.json of ganlane reproduce."
+        ) from error
     except _BROKEN as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(

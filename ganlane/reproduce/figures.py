@@ -1,4 +1,7 @@
-"""The matrix drawn, and the paper's figures: forecasts (2), an episode among generated drivers (3), transfer (4)."""
+"""The matrix drawn, and the paper's figures.
+
+Forecasts (2), an episode among generated drivers (3), transfer (4).
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,14 @@ from ganlane.data import FRAME_S, default_scenes, read_scenes
 from ganlane.errors import UserError
 from ganlane.generator import load_generator, shipped_generator
 from ganlane.generator.forecasts import paper_forecasts
-from ganlane.generator.windows import OBSERVED_POSITIONS, PRESENT, Windows, cut_windows, group_windows, scene_tracks
+from ganlane.generator.windows import (
+    OBSERVED_POSITIONS,
+    PRESENT,
+    Windows,
+    cut_windows,
+    group_windows,
+    scene_tracks,
+)
 from ganlane.reproduce.report import Row, rows_of
 from ganlane.sim.random import Stream
 from ganlane.view.figures import COLOURS, FAINT, INK, STYLE, add_legend, panel_grid, read_metrics
@@ -39,7 +49,8 @@ SAMPLES = 8
 _STRIDE = 5
 #: Shortest distance that a vehicle drives in the 1.6 s of a window, m.
 LEAST_M = 8.0
-#: Figure 3: frames over each other, s from the first to the last, s of the episode to choose from, m around the ego.
+#: Figure 3: frames over each other, s from the first to the last, s of the episode to choose from,
+#: m around the ego.
 FRAMES, SHOWN_S, LONGEST_S, AROUND_M = 4, 3.0, 30.0, (-70.0, 130.0)
 EGO, OTHER = COLOURS[1], COLOURS[0]
 Positions = npt.NDArray[np.float64]
@@ -54,7 +65,9 @@ class Drawn(NamedTuple):
 
 
 def draw_all(config: ReproduceConfig, traffics: Mapping[str, TrafficConfig]) -> Drawn:
-    """``figure_2``, where the recordings are at hand, and ``figure_3``, where ``gan`` is among the traffics."""
+    """``figure_2``, where the recordings are at hand, and ``figure_3``, where ``gan`` is among the
+    traffics.
+    """
     drawn = Drawn({}, {}, {})
     try:
         drawn.numbers["figure_2"] = forecasts_to_draw()
@@ -74,10 +87,11 @@ def draw_all(config: ReproduceConfig, traffics: Mapping[str, TrafficConfig]) -> 
 
 
 def interesting(windows: Windows) -> list[tuple[str, int]]:
-    """Kind and row of the windows to draw, :data:`PANELS`, no vehicle twice, none that hardly moves.
+    """Kind and row of the windows to draw, :data:`PANELS`, no vehicle twice, none that hardly
+    moves.
 
-    A vehicle starts a lane change where it moves across in the future and has not before, completes one the other way
-    round, and goes steady where it moves across least of all.
+    A vehicle starts a lane change where it moves across in the future and has not before, completes
+    one the other way round, and goes steady where it moves across least of all.
     """
     along, across = windows.positions[:, :, 0], windows.positions[:, :, 1]
     before = np.abs(across[:, PRESENT] - across[:, 0])
@@ -101,20 +115,26 @@ def interesting(windows: Windows) -> list[tuple[str, int]]:
 
 
 def forecasts_to_draw() -> pl.DataFrame:
-    """Vehicles of the recordings that the shipped generator was not fitted to, observed, recorded and predicted.
+    """Vehicles of the recordings that the shipped generator was not fitted to, observed, recorded
+    and predicted.
 
     Returns:
-        Columns ``panel``, ``kind`` (of :data:`PANELS`), ``path`` (``observed``, ``recorded``, ``mean`` with z = 0,
-        ``sample 1`` to :data:`SAMPLES`), ``time_s``, ``ahead_m`` and ``left_m``, all relative to the present.
+        Columns ``panel``, ``kind`` (of :data:`PANELS`), ``path`` (``observed``, ``recorded``,
+        ``mean`` with z = 0, ``sample 1`` to :data:`SAMPLES`), ``time_s``, ``ahead_m`` and
+        ``left_m``, all relative to the present.
 
     Raises:
         UserError: the recordings are not at hand.
     """
     generator, metadata = load_generator(shipped_generator("paper"), "paper")
     held_out = set(metadata["data"]["held_out"])
-    scenes = [scene for scene in scene_tracks(read_scenes(default_scenes())) if scene.name in held_out]
+    scenes = [
+        scene for scene in scene_tracks(read_scenes(default_scenes())) if scene.name in held_out
+    ]
     if not scenes:
-        raise UserError(f"the recordings have none of the scenes {', '.join(sorted(held_out))}, kept from the fit.")
+        raise UserError(
+            f"the recordings have none of the scenes {', '.join(sorted(held_out))}, kept from the fit."
+        )
     windows = cut_windows(scenes, _STRIDE)
     groups = group_windows(windows)
     predicted: dict[str, Positions] = {}
@@ -125,25 +145,48 @@ def forecasts_to_draw() -> pl.DataFrame:
     for panel, (kind, row) in enumerate(interesting(windows)):
         observed = windows.positions[row, :OBSERVED_POSITIONS] - windows.positions[row, PRESENT]
         later = {"recorded": windows.future, **predicted}
-        paths = {name: np.concatenate([np.zeros((1, 2)), each[row]]) for name, each in later.items()}
+        paths = {
+            name: np.concatenate([np.zeros((1, 2)), each[row]]) for name, each in later.items()
+        }
         for name, path in {**paths, "observed": observed}.items():
             time_s = (np.arange(len(path)) - (PRESENT if name == "observed" else 0)) * FRAME_S
             columns = {"time_s": time_s, "ahead_m": path[:, 0], "left_m": path[:, 1]}
-            parts.append(pl.DataFrame(columns).select(pl.lit(panel).alias("panel"), pl.lit(kind).alias("kind"),
-                                                      pl.lit(name).alias("path"), pl.all()))  # fmt: skip
+            parts.append(
+                pl.DataFrame(columns).select(
+                    pl.lit(panel).alias("panel"),
+                    pl.lit(kind).alias("kind"),
+                    # fmt: skip
+                    pl.lit(name).alias("path"),
+                    pl.all(),
+                )
+            )
     return pl.concat(parts)
 
 
 @rc_context(STYLE)
 def draw_forecasts(paths: pl.DataFrame) -> Figure:
-    """Figure 2: the vehicles of :func:`forecasts_to_draw`, 0.8 s observed, then 0.8 s recorded and predicted."""
+    """Figure 2.
+
+    The vehicles of :func:`forecasts_to_draw`, 0.8 s observed, then 0.8 s recorded and predicted.
+    """
     panels = paths.partition_by("panel", maintain_order=True)
     figure, grid = panel_grid(len(panels), 2.5, 1.7)
-    colours = {"observed": FAINT, "recorded": INK, "predicted, z = 0": COLOURS[1], "predicted": COLOURS[4]}
+    colours = {
+        "observed": FAINT,
+        "recorded": INK,
+        "predicted, z = 0": COLOURS[1],
+        "predicted": COLOURS[4],
+    }
     styles: dict[str, dict[str, Any]] = {
-        **{f"sample {number + 1}": {"color": colours["predicted"], "lw": 0.8} for number in range(SAMPLES)},
+        **{
+            f"sample {number + 1}": {"color": colours["predicted"], "lw": 0.8}
+            for number in range(SAMPLES)
+        },
         "mean": {"color": colours["predicted, z = 0"], "lw": 1.6},
-        **{name: {"color": colours[name], "marker": ".", "ms": 3} for name in ("observed", "recorded")},
+        **{
+            name: {"color": colours[name], "marker": ".", "ms": 3}
+            for name in ("observed", "recorded")
+        },
     }
     for axes, panel in zip(grid, panels):
         axes.set(title=panel["kind"][0], xlabel="m ahead", ylabel="m to the left")
@@ -170,8 +213,9 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
     """The :data:`SHOWN_S` seconds of an episode in which the others near the ego move across most.
 
     Returns:
-        Columns ``time_s``, ``vehicle`` (0: the ego), ``x_m`` (from where the ego is at first), ``y_m``,
-        ``heading_rad``, ``length_m`` and ``width_m``; a vehicle that is placed elsewhere meanwhile is left out.
+        Columns ``time_s``, ``vehicle`` (0: the ego), ``x_m`` (from where the ego is at first),
+        ``y_m``, ``heading_rad``, ``length_m`` and ``width_m``; a vehicle that is placed elsewhere
+        meanwhile is left out.
     """
     shown = min(round(SHOWN_S / episode.frame_s), len(episode) - 1)
     ahead = episode.x - episode.x[:, :1]
@@ -180,14 +224,19 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
     across = np.abs(episode.y[shown:] - episode.y[: len(episode) - shown])
     first = int(np.argmax((across * near[: len(across)]).sum(axis=1)))
     part, origin = slice(first, first + shown + 1), episode.x[first, 0]
-    stays = episode.valid[part].all(axis=0) & ~episode.jumped()[first + 1 : first + shown + 1].any(axis=0)
+    stays = episode.valid[part].all(axis=0) & ~episode.jumped()[first + 1 : first + shown + 1].any(
+        axis=0
+    )
     numbers = {
         "x_m": episode.x - origin, "y_m": episode.y, "heading_rad": episode.heading,
         "length_m": episode.length, "width_m": episode.width,
     }  # fmt: skip
     return pl.concat(
         pl.DataFrame(
-            {"time_s": episode.time_s[part], **{name: each[part, vehicle] for name, each in numbers.items()}}
+            {
+                "time_s": episode.time_s[part],
+                **{name: each[part, vehicle] for name, each in numbers.items()},
+            }
         ).insert_column(1, pl.lit(int(vehicle)).alias("vehicle"))
         for vehicle in np.flatnonzero(stays)
     )
@@ -195,7 +244,10 @@ def busiest(episode: Trajectory) -> pl.DataFrame:
 
 @rc_context(STYLE)
 def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
-    """Figure 3: :data:`FRAMES` frames of :func:`busiest` over each other, older ones fainter, and the paths."""
+    """Figure 3.
+
+    :data:`FRAMES` frames of :func:`busiest` over each other, older ones fainter, and the paths.
+    """
     figure = Figure(figsize=(9.0, 1.9))
     axes = figure.subplots()
     width_m, times = label.lane_width_m, tracks["time_s"].unique().sort().to_numpy()
@@ -204,13 +256,17 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
     axes.set_title(f"{label.agent} on {label.traffic}, {times[0]:.1f} to {times[-1]:.1f} s")
     for line in range(label.lanes + 1):
         edge = line in (0, label.lanes)
-        axes.axhline((line - 0.5) * width_m, color=INK if edge else FAINT, ls="-" if edge else (0, (8, 8)))
+        axes.axhline(
+            (line - 0.5) * width_m, color=INK if edge else FAINT, ls="-" if edge else (0, (8, 8))
+        )
     frames = np.linspace(0, len(times) - 1, FRAMES).round().astype(int)
     for track in tracks.partition_by("vehicle", maintain_order=True):
         colour = EGO if track["vehicle"][0] == 0 else OTHER
         axes.plot(track["x_m"], track["y_m"], color=colour, lw=0.8)
         for place, frame in enumerate(frames):
-            _draw_body(axes, track.row(int(frame), named=True), color=colour, alpha=(place + 1.0) / FRAMES)
+            _draw_body(
+                axes, track.row(int(frame), named=True), color=colour, alpha=(place + 1.0) / FRAMES
+            )
     add_legend(figure, {"ego": EGO, "others": OTHER})
     return figure
 
@@ -218,7 +274,9 @@ def draw_episode(label: EpisodeLabel, tracks: pl.DataFrame) -> Figure:
 def _draw_body(axes: Axes, at: dict[str, float], **style: Any) -> None:
     length, width = at["length_m"], at["width_m"]
     turned = Affine2D().rotate(at["heading_rad"]).translate(at["x_m"], at["y_m"]) + axes.transData
-    axes.add_patch(Rectangle((-length / 2.0, -width / 2.0), length, width, lw=0, transform=turned, **style))
+    axes.add_patch(
+        Rectangle((-length / 2.0, -width / 2.0), length, width, lw=0, transform=turned, **style)
+    )
 
 
 #: Ticks of the leads: linear up to 20, logarithmic beyond.
@@ -227,7 +285,10 @@ _LEADS = (-300, -100, -20, -10, 0, 10, 20, 100)
 
 @rc_context(STYLE)
 def draw_matrix(rows: Sequence[Row]) -> Figure:
-    """Lead over MOBIL, one panel per traffic: the interval over trainings and episodes, a dot for each training."""
+    """Lead over MOBIL, one panel per traffic.
+
+    The interval over trainings and episodes, a dot for each training.
+    """
     drawn = [row for row in rows if row["minus_mobil"] is not None]
     drivers = list(dict.fromkeys(row["driver"] for row in drawn))
     traffics = list(dict.fromkeys(row["traffic"] for row in drawn))
@@ -262,7 +323,10 @@ def draw_matrix(rows: Sequence[Row]) -> Figure:
 
 @dataclass(frozen=True)
 class Transfer:
-    """Learning curves over the decisions: both phases, one line per run, and what the agent earned at the switch."""
+    """Learning curves over the decisions.
+
+    Both phases, one line per run, and what the agent earned at the switch.
+    """
 
     runs: Mapping[str, pl.DataFrame]
     switch: float
@@ -284,15 +348,25 @@ def read_transfers(folders: Sequence[str], rows: Sequence[Row]) -> Transfer | No
         )
         switch = max(switch, float(first["decisions"][-1]))
         later = second.with_columns(pl.col("decisions") + first["decisions"][-1])
-        phases = [first.with_columns(phase=pl.lit("first")), later.with_columns(phase=pl.lit("second"))]
+        phases = [
+            first.with_columns(phase=pl.lit("first")),
+            later.with_columns(phase=pl.lit("second")),
+        ]
         runs[folder.name] = pl.concat(phases, how="vertical_relaxed")
     ours = rows_of(rows, ["gan"], ["agent_idm"])
-    return Transfer(runs, switch, [each["mean_reward"] for row in ours for each in row["each"]]) if runs else None
+    return (
+        Transfer(runs, switch, [each["mean_reward"] for row in ours for each in row["each"]])
+        if runs
+        else None
+    )
 
 
 @rc_context(STYLE)
 def draw_transfer(transfer: Transfer) -> Figure:
-    """Figure 4: every run, their median, and the range between them; the switch of the traffic is marked."""
+    """Figure 4: every run, their median, and the range between them.
+
+    The switch of the traffic is marked.
+    """
     figure = Figure(figsize=(7.0, 3.4))
     axes = figure.subplots()
     axes.set(title="evaluations during training", xlabel="decisions", ylabel="mean reward")
@@ -300,13 +374,22 @@ def draw_transfer(transfer: Transfer) -> Figure:
     for phase, colour in zip(("first", "second"), COLOURS):
         lines = [frame.filter(pl.col("phase") == phase) for frame in transfer.runs.values()]
         x = lines[0]["decisions"].cast(pl.Float64).to_numpy()
-        y = np.stack([np.interp(x, line["decisions"].to_numpy(), line["mean_reward"].to_numpy()) for line in lines])
+        y = np.stack(
+            [
+                np.interp(x, line["decisions"].to_numpy(), line["mean_reward"].to_numpy())
+                for line in lines
+            ]
+        )
         axes.fill_between(x, y.min(axis=0), y.max(axis=0), color=colour, alpha=0.2, lw=0)
         axes.plot(x, np.median(y, axis=0), color=colour)
         for line in lines if len(lines) > 1 else []:
             axes.plot(line["decisions"], line["mean_reward"], color=colour, lw=0.5, alpha=0.6)
     axes.axvline(transfer.switch, color=FAINT, ls=":")
     if transfer.at_switch:
-        axes.plot([transfer.switch] * len(transfer.at_switch), transfer.at_switch, "x", color=COLOURS[1])
-    add_legend(figure, {"on idm_mobil": COLOURS[0], "on gan (x: before any training there)": COLOURS[1]})
+        axes.plot(
+            [transfer.switch] * len(transfer.at_switch), transfer.at_switch, "x", color=COLOURS[1]
+        )
+    add_legend(
+        figure, {"on idm_mobil": COLOURS[0], "on gan (x: before any training there)": COLOURS[1]}
+    )
     return figure

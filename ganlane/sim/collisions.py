@@ -1,4 +1,6 @@
-"""Overlap of oriented boxes by the separating-axis theorem, and soft crashes (dangerously small gaps)."""
+"""Overlap of oriented boxes by the separating-axis theorem, and soft crashes (dangerously small
+gaps).
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def boxes_overlap(
     cos, sin = (c * oc + s * os).abs(), (c * os - s * oc).abs()
     boxes = [(0.5 * length, 0.5 * width), (0.5 * other_length, 0.5 * other_width)]
 
-    def separated(along: Tensor, across: Tensor, own: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> Tensor:
+    def separated(
+        along: Tensor, across: Tensor, own: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]
+    ) -> Tensor:
         """Whether an axis of a box separates it from the other; half lengths and widths."""
         reach_along = own[0] + other[0] * cos + other[1] * sin
         reach_across = own[1] + other[0] * sin + other[1] * cos
@@ -50,13 +54,17 @@ def ego_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
     dx = road.distance_ahead(v.x[:, :1], v.x[:, 1:])
     both = v.valid[:, 1:] & v.valid[:, :1]
     if reads_are_cheap(dx):
-        # Boxes overlap only within the sum of their half diagonals, each at most half of length plus width.
+        # Boxes overlap only within the sum of their half diagonals, each at most half of length
+        # plus width.
         row, column = (dx.abs() < v.length.amax() + v.width.amax()).nonzero().unbind(1)
         if len(row) == 0:
             return torch.zeros_like(both)
         if dx.numel() >= FEW:
             ego, near = (Vehicles(*(field[row, which] for field in v)) for which in (0, column + 1))
-            return torch.zeros_like(both).index_put((row, column), _hits(dx[row, column], ego, near)) & both
+            return (
+                torch.zeros_like(both).index_put((row, column), _hits(dx[row, column], ego, near))
+                & both
+            )
     return _hits(dx, v.columns(slice(0, 1)), v.columns(slice(1, None))) & both
 
 
@@ -70,10 +78,22 @@ def pair_overlaps(vehicles: Vehicles, road: Road = STRAIGHT) -> Tensor:
 def _hits(dx: Tensor, one: Vehicles, other: Vehicles) -> Tensor:
     """Whether the boxes of ``other``, ``dx`` m ahead of ``one``, overlap its box."""
     return boxes_overlap(
-        dx, other.y - one.y, one.heading, one.length, one.width, other.heading, other.length, other.width
+        dx,
+        other.y - one.y,
+        one.heading,
+        one.length,
+        one.width,
+        other.heading,
+        other.length,
+        other.width,
     )
 
 
-def dangerously_close(gap: Tensor, closing_speed: Tensor, ttc_s: float = 1.5, gap_m: float = 2.0) -> Tensor:
-    """Soft crash: gap under ``gap_m`` or time to collision under ``ttc_s``; gap in m, closing speed in m/s."""
+def dangerously_close(
+    gap: Tensor, closing_speed: Tensor, ttc_s: float = 1.5, gap_m: float = 2.0
+) -> Tensor:
+    """Soft crash: gap under ``gap_m`` or time to collision under ``ttc_s``.
+
+    Gap in m, closing speed in m/s.
+    """
     return (gap < gap_m) | (gap < ttc_s * closing_speed)

@@ -1,13 +1,14 @@
-"""Motion of a vehicle, by the kinematic bicycle model and steering towards a lane's centre; and what the ego does.
+"""Motion of a vehicle, by the kinematic bicycle model and steering towards a lane's centre; and
+what the ego does.
 
-The bicycle has a slip angle and its centre of gravity in the middle (section IV.C). Steering is two-point visual
-control (Salvucci and Gray 2004): the driver looks at a near and a far point on the centre of the lane it wants to be
-in, and turns the wheel at
+The bicycle has a slip angle and its centre of gravity in the middle (section IV.C). Steering is
+two-point visual control (Salvucci and Gray 2004): the driver looks at a near and a far point on the
+centre of the lane it wants to be in, and turns the wheel at
 
     d(delta)/dt = k_f d(theta_far)/dt + k_n d(theta_near)/dt + k_I theta_near .
 
-Fixed gains from the literature are unstable at a step of 0.1 s and highway speeds. With gains inversely
-proportional to speed a lane change takes about 4 s at every speed, without overshoot.
+Fixed gains from the literature are unstable at a step of 0.1 s and highway speeds. With gains
+inversely proportional to speed a lane change takes about 4 s at every speed, without overshoot.
 """
 
 from __future__ import annotations
@@ -45,13 +46,20 @@ def slip_angle(steering: Tensor) -> Tensor:
 
 
 def advance(
-    x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, acceleration: Tensor, steering: Tensor, dt: float
+    x: Tensor,
+    y: Tensor,
+    heading: Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    steering: Tensor,
+    dt: float,
 ) -> Pose:
     """One step of ``dt`` seconds.
 
-    The distance is the mean of old and new speed times ``dt`` (exact for constant acceleration), so it never
-    exceeds ``max(v_old, v_new) dt``; a vehicle that brakes to a stop does not roll back. The direction is the mean
-    heading of the step, so a constant steering angle gives a circle, accurate to second order.
+    The distance is the mean of old and new speed times ``dt`` (exact for constant acceleration), so
+    it never exceeds ``max(v_old, v_new) dt``; a vehicle that brakes to a stop does not roll back.
+    The direction is the mean heading of the step, so a constant steering angle gives a circle,
+    accurate to second order.
     """
     new_speed = (speed + acceleration * dt).clamp_min(0.0)
     distance = 0.5 * (speed + new_speed) * dt
@@ -76,7 +84,10 @@ def steer(
     dt: float,
     parameters: SteeringParameters = STEERING,
 ) -> Tensor:
-    """Steering angle (rad) after ``dt`` seconds of aiming at the lane centre ``centre_y`` (m); all [N] or [N, M]."""
+    """Steering angle (rad) after ``dt`` seconds of aiming at the lane centre ``centre_y`` (m).
+
+    All [N] or [N, M].
+    """
 
     def angle_rate(distance: Tensor) -> Tensor:
         """Of the angle, rad/s, to a point ``distance`` m ahead that moves along with the vehicle."""
@@ -103,8 +114,8 @@ def steer(
 class Command(NamedTuple):
     """Effect of an action, each [N].
 
-    Target lane; direction of the current lane change (-1 right, 0 none, +1 left); whether a change starts; whether
-    the action would leave the road.
+    Target lane; direction of the current lane change (-1 right, 0 none, +1 left); whether a change
+    starts; whether the action would leave the road.
     """
 
     target_lane: Tensor
@@ -113,11 +124,14 @@ class Command(NamedTuple):
     off_road: Tensor
 
 
-def apply_action(action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool) -> Command:
-    """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose current lane change has ``direction``; [N] int64.
+def apply_action(
+    action: Tensor, target_lane: Tensor, direction: Tensor, lanes: int | Tensor, abort: bool
+) -> Command:
+    """Apply ``action`` (0 keep, 1 left, 2 right) to an ego whose current lane change has
+    ``direction``; [N] int64.
 
-    During a lane change actions are ignored without penalty; with ``abort`` the opposite action turns back. An action
-    that would leave the road has no effect except ``off_road``.
+    During a lane change actions are ignored without penalty; with ``abort`` the opposite action
+    turns back. An action that would leave the road has no effect except ``off_road``.
     """
     wish = torch.where(action == LEFT, 1, torch.where(action == RIGHT, -1, 0))
     accepted = (direction == 0) | (wish == -direction) if abort else direction == 0
@@ -135,7 +149,12 @@ def ego_scene(vehicles: Vehicles, road: Road) -> Scene:
 
 
 def move_ego(
-    vehicles: Vehicles, acceleration: Tensor, steering: Tensor, road: Road, wheel: SteeringParameters, dt: float
+    vehicles: Vehicles,
+    acceleration: Tensor,
+    steering: Tensor,
+    road: Road,
+    wheel: SteeringParameters,
+    dt: float,
 ) -> tuple[Vehicles, Tensor]:
     """The ego after ``dt`` seconds (fields [N]) and its steering angle (rad, [N]).
 
@@ -148,13 +167,20 @@ def move_ego(
     return ego.with_(**pose._asdict()), steering
 
 
-def ego_surroundings(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> tuple[Tensor, Tensor, Tensor]:
-    """The ego's IDM acceleration, m/s2, and whether it has a soft crash ahead, and behind; each [N].
+def ego_surroundings(
+    scene: Scene, idm: IdmParameters, ego: EgoParameters
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The ego's IDM acceleration, m/s2, and whether it has a soft crash ahead, and behind; each
+    [N].
 
-    IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that its body is in.
+    IDM considers the leaders in all lanes that the ego attends to, soft crashes only the lanes that
+    its body is in.
     """
     attention, body = spanned(scene.attention), spanned(scene.body)
-    ahead, lanes = leader(scene, torch.cat((attention, body), dim=-1)), (attention.shape[-1], body.shape[-1])
+    ahead, lanes = (
+        leader(scene, torch.cat((attention, body), dim=-1)),
+        (attention.shape[-1], body.shape[-1]),
+    )
     followed, near = map(Neighbour, *(number.split(lanes, dim=-1) for number in ahead))
     behind, speed = follower(scene, body), scene.observers.speed[..., None]
     closing = torch.where(behind.exists, behind.speed - speed, 0.0)
@@ -167,7 +193,12 @@ def ego_surroundings(scene: Scene, idm: IdmParameters, ego: EgoParameters) -> tu
 
 
 def change_progress(ego: Vehicles, direction: Tensor, road: Road) -> Tensor:
-    """Progress [N] of the current lane change, 0 at its start to 1 at the target lane's centre; 0 without one."""
-    width = road.lane_width_m if not isinstance(road.lane_width_m, Tensor) else road.lane_width_m[:, 0]
+    """Progress [N] of the current lane change, 0 at its start to 1 at the target lane's centre.
+
+    0 without one.
+    """
+    width = (
+        road.lane_width_m if not isinstance(road.lane_width_m, Tensor) else road.lane_width_m[:, 0]
+    )
     remaining = (ego.y - ego.target_lane.to(ego.y.dtype) * width).abs() / width
     return torch.where(direction != 0, (1.0 - remaining).clamp(0.0, 1.0), 0.0)

@@ -41,16 +41,22 @@ class DriverIdm(NamedTuple):
 
 AnyIdm: TypeAlias = IdmParameters | DriverIdm
 TABLE_V = IdmParameters()
-#: Lower bound of the gap in the interaction term, m, which stays finite and gives the hardest braking.
+#: Lower bound of the gap in the interaction term, m, which stays finite and gives the hardest
+#: braking.
 SMALLEST_GAP_M = 0.1
 
 
 def desired_gap(
-    speed: Tensor, closing_speed: Tensor, parameters: AnyIdm = TABLE_V, headway_s: Tensor | float | None = None
+    speed: Tensor,
+    closing_speed: Tensor,
+    parameters: AnyIdm = TABLE_V,
+    headway_s: Tensor | float | None = None,
 ) -> Tensor:
-    """Desired gap in metres at ``speed`` behind a leader that is approached at ``closing_speed`` (m/s).
+    """Desired gap in metres at ``speed`` behind a leader that is approached at ``closing_speed``
+    (m/s).
 
-    The dynamic part is never negative, so a faster leader does not reduce the desired gap below the minimum.
+    The dynamic part is never negative, so a faster leader does not reduce the desired gap below the
+    minimum.
     """
     headway = parameters.headway_s if headway_s is None else headway_s
     dynamic = speed * headway + speed * closing_speed / parameters.brake_scale()
@@ -69,8 +75,8 @@ def idm_acceleration(
 
     Args:
         speed, desired_speed: own ones, m/s, at least 0 and above 0.
-        gap: to the leader, bumper to bumper, m; Table V's 10 000 m without a leader. A gap of 0 or less (an overlap)
-            gives the hardest braking.
+        gap: to the leader, bumper to bumper, m; Table V's 10 000 m without a leader. A gap of 0 or
+            less (an overlap) gives the hardest braking.
         leader_speed: m/s; without a leader it only enters the (negligible) approach term.
         parameters: common to all drivers, or per driver (:class:`DriverIdm`).
         headway_s: time headway per vehicle, s, instead of Table V's.
@@ -83,20 +89,29 @@ def idm_acceleration(
     return acceleration.clamp(parameters.min_acceleration, parameters.max_acceleration)  # type: ignore[arg-type]
 
 
-def equilibrium_gap(speed: Tensor, desired_speed: Tensor | float, parameters: IdmParameters = TABLE_V) -> Tensor:
-    """Gap in metres at which the IDM acceleration behind a leader of equal ``speed`` is 0 (below desired speed)."""
+def equilibrium_gap(
+    speed: Tensor, desired_speed: Tensor | float, parameters: IdmParameters = TABLE_V
+) -> Tensor:
+    """Gap in metres at which the IDM acceleration behind a leader of equal ``speed`` is 0 (below
+    desired speed).
+    """
     ratio = speed / desired_speed
     square = ratio * ratio
     return (parameters.min_gap_m + speed * parameters.headway_s) / torch.sqrt(1.0 - square * square)
 
 
 def acceleration_behind(
-    scene: Scene, ahead: Neighbour, parameters: AnyIdm = TABLE_V, headway_s: Tensor | float | None = None
+    scene: Scene,
+    ahead: Neighbour,
+    parameters: AnyIdm = TABLE_V,
+    headway_s: Tensor | float | None = None,
 ) -> Tensor:
     """IDM acceleration of each observer behind ``ahead`` [N, K, L] in L lanes, m/s2, of that shape."""
     speed, desired = scene.observers.speed[..., None], scene.observers.desired_speed[..., None]
     headway_s = headway_s[..., None] if isinstance(headway_s, Tensor) else headway_s
-    return idm_acceleration(speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s)
+    return idm_acceleration(
+        speed, desired, ahead.gap, ahead.speed, parameters.per_lane(), headway_s
+    )
 
 
 def following_acceleration(
@@ -104,7 +119,8 @@ def following_acceleration(
 ) -> Tensor:
     """IDM acceleration of every observer, m/s2, [N, K].
 
-    During a lane change a vehicle is in two lanes, or three; the smallest acceleration over the lanes is used.
+    During a lane change a vehicle is in two lanes, or three; the smallest acceleration over the
+    lanes is used.
     """
     ahead = leader(scene, spanned(scene.attention))
     return acceleration_behind(scene, ahead, parameters, headway_s).amin(-1)
@@ -117,18 +133,24 @@ HORIZON_S = 60.0
 
 
 def needed_deceleration(speed: Tensor, leader_speed: Tensor, gap: Tensor) -> Tensor:
-    """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead; infinite at 0 m."""
+    """Constant deceleration, m/s2, that avoids a leader of constant speed ``gap`` m ahead.
+
+    Infinite at 0 m.
+    """
     closing = (speed - leader_speed).clamp_min(0.0)
     needed = closing * closing / (2.0 * gap.clamp_min(1e-9))
     return torch.where((gap <= 0) & (closing > 0), torch.inf, needed)
 
 
-def _survives(gap: Tensor, speed: Tensor, leader_speed: float, desired_speed: float, idm: IdmParameters) -> Tensor:
-    """Whether followers at ``speed`` (m/s) avoid a leader that from now on brakes at ``idm.min_acceleration``.
+def _survives(
+    gap: Tensor, speed: Tensor, leader_speed: float, desired_speed: float, idm: IdmParameters
+) -> Tensor:
+    """Whether followers at ``speed`` (m/s) avoid a leader that from now on brakes at
+    ``idm.min_acceleration``.
 
     Two vehicles, IDM, steps of 0.1 s. This leader is the worst of all that brake no harder than
-    ``idm.min_acceleration``: any other is always ahead of it and no slower. So a driver that avoids this one also
-    avoids crashes in a queue, where each leader may have to brake for its own.
+    ``idm.min_acceleration``: any other is always ahead of it and no slower. So a driver that avoids
+    this one also avoids crashes in a queue, where each leader may have to brake for its own.
     """
     leader_now = torch.tensor(leader_speed, dtype=torch.float64)
     gap, speed, leader_now = torch.broadcast_tensors(gap, speed, leader_now)
@@ -145,17 +167,28 @@ def _survives(gap: Tensor, speed: Tensor, leader_speed: float, desired_speed: fl
 
 @lru_cache(maxsize=1024)
 def can_brake(
-    gap_m: float, speed_mps: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
+    gap_m: float,
+    speed_mps: float,
+    leader_speed_mps: float,
+    desired_speed_mps: float,
+    idm: IdmParameters = TABLE_V,
 ) -> bool:
-    """Whether a follower at ``speed_mps`` avoids a leader that brakes at the limit, with 0.1 m for rounding."""
+    """Whether a follower at ``speed_mps`` avoids a leader that brakes at the limit, with 0.1 m for
+    rounding.
+    """
     gap, speed = (torch.tensor([value], dtype=torch.float64) for value in (gap_m, speed_mps))
     return bool(_survives(gap, speed, leader_speed_mps, desired_speed_mps, idm)[0])
 
 
 def least_gap(
-    speed_mps: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
+    speed_mps: float,
+    leader_speed_mps: float,
+    desired_speed_mps: float,
+    idm: IdmParameters = TABLE_V,
 ) -> float:
-    """Smallest gap (m, in steps of 0.1 m) for which :func:`can_brake` is true at this and every larger gap."""
+    """Smallest gap (m, in steps of 0.1 m) for which :func:`can_brake` is true at this and every
+    larger gap.
+    """
     stopping_m = speed_mps * speed_mps / (-2.0 * idm.min_acceleration)
     gaps = torch.arange(1, int(10.0 * (1.2 * stopping_m + 10.0))).double() * 0.1
     speed = torch.full_like(gaps, speed_mps)
@@ -166,7 +199,13 @@ def least_gap(
 def highest_speed(
     gap_m: float, leader_speed_mps: float, desired_speed_mps: float, idm: IdmParameters = TABLE_V
 ) -> float:
-    """Highest speed (m/s, in steps of 0.1 m/s) for which :func:`can_brake` is true at this and every lower speed."""
+    """Highest speed (m/s, in steps of 0.1 m/s) for which :func:`can_brake` is true at this and
+    every lower speed.
+    """
     speeds = torch.arange(0, 1000).double() * 0.1
-    crashes = ~_survives(torch.full_like(speeds, gap_m), speeds, leader_speed_mps, desired_speed_mps, idm)
-    return 0.1 * max(0, int(crashes.nonzero().min()) - 1) if bool(crashes.any()) else float(speeds[-1])
+    crashes = ~_survives(
+        torch.full_like(speeds, gap_m), speeds, leader_speed_mps, desired_speed_mps, idm
+    )
+    return (
+        0.1 * max(0, int(crashes.nonzero().min()) - 1) if bool(crashes.any()) else float(speeds[-1])
+    )

@@ -31,8 +31,8 @@ TABLE_IV = MobilParameters()
 class LaneAccelerations(NamedTuple):
     """Accelerations in the observer's lane and its neighbours, m/s2, [N, K, L].
 
-    ``own`` is the observer's; ``with_it`` and ``without`` are its follower's in that lane with and without the
-    observer in front of it, both 0 where there is no follower.
+    ``own`` is the observer's; ``with_it`` and ``without`` are its follower's in that lane with and
+    without the observer in front of it, both 0 where there is no follower.
     """
 
     own: Tensor
@@ -50,24 +50,40 @@ def lane_accelerations(scene: Scene, lanes: Tensor, idm: AnyIdm) -> LaneAccelera
     With per-driver parameters, each driver predicts the others with its own parameters.
     """
     ahead, behind = leader(scene, lanes), follower(scene, lanes)
-    speed, length = (number[..., None] for number in (scene.observers.speed, scene.observers.length))
-    with_it = idm_acceleration(behind.speed, behind.desired_speed, behind.gap, speed, idm.per_lane())
+    speed, length = (
+        number[..., None] for number in (scene.observers.speed, scene.observers.length)
+    )
+    with_it = idm_acceleration(
+        behind.speed, behind.desired_speed, behind.gap, speed, idm.per_lane()
+    )
     leader_speed = torch.where(ahead.gap >= FREE_GAP_M, behind.speed, ahead.speed)
     gap = torch.where(ahead.gap < FREE_GAP_M, behind.gap + length + ahead.gap, FREE_GAP_M)
-    without = idm_acceleration(behind.speed, behind.desired_speed, gap, leader_speed, idm.per_lane())
+    without = idm_acceleration(
+        behind.speed, behind.desired_speed, gap, leader_speed, idm.per_lane()
+    )
     nobody = ~behind.exists
     own = acceleration_behind(scene, ahead, idm)
-    return LaneAccelerations(own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0))
+    return LaneAccelerations(
+        own, with_it.masked_fill(nobody, 0.0), without.masked_fill(nobody, 0.0)
+    )
 
 
-def mobil_criterion(there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil) -> tuple[Tensor, Tensor]:
-    """MOBIL's incentive, m/s2, of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], and whether it is safe."""
+def mobil_criterion(
+    there: LaneAccelerations, here: LaneAccelerations, mobil: AnyMobil
+) -> tuple[Tensor, Tensor]:
+    """MOBIL's incentive, m/s2, of a change from ``here`` [N, K, 1] to ``there`` [N, K, L], and
+    whether it is safe.
+    """
     burden, relief = there.with_it - there.without, here.without - here.with_it
-    incentive = there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
+    incentive = (
+        there.own - here.own + mobil.politeness_side * burden + mobil.politeness_rear * relief
+    )
     return incentive, torch.minimum(there.with_it, there.own) >= -mobil.safe_deceleration
 
 
-def safe_change(scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
+def safe_change(
+    scene: Scene, lane: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+) -> Tensor:
     """MOBIL's safety criterion for a change into ``lane`` [N, K] (float), bool."""
     there = lane_accelerations(scene, lane[..., None], idm)
     _, safe = mobil_criterion(there, there, mobil)
@@ -79,11 +95,14 @@ def without_ego(wish: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(wish[:, : EGO_INDEX + 1]), wish[:, EGO_INDEX + 1 :]), dim=1)
 
 
-def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
-    """``wish`` (-1, 0, +1 lanes, [N, M]), 0 where a vehicle ahead that wants the same lane is too close.
+def one_at_a_time(
+    scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+) -> Tensor:
+    """``wish`` (-1, 0, +1 lanes, [N, M]), 0 where a vehicle ahead that wants the same lane is too
+    close.
 
-    Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking. MOBIL's criteria
-    do not cover this case, since neither vehicle is in that lane yet.
+    Too close means nearer than ``exclusive_m`` (centre to centre), or requiring unsafe braking.
+    MOBIL's criteria do not cover this case, since neither vehicle is in that lane yet.
     """
     wants, vehicles = wish != 0, scene.vehicles
     if not reads_are_cheap(wish):
@@ -102,34 +121,47 @@ def one_at_a_time(scene: Scene, wish: Tensor, idm: AnyIdm = TABLE_V, mobil: AnyM
     return wish.index_copy(0, rows, wishes.scatter(1, columns, kept))
 
 
-def _gives_way(vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: AnyMobil) -> Tensor:
+def _gives_way(
+    vehicles: Vehicles, road: Road, wish: Tensor, idm: AnyIdm, mobil: AnyMobil
+) -> Tensor:
     """Whether a vehicle ahead that wants the same lane is too close, bool [N, M]."""
     pairs, wants, target = compare(vehicles, road), wish != 0, vehicles.target_lane + wish
     same = wants[:, None, :] & wants[:, :, None] & (target[:, None, :] == target[:, :, None])
     speed, desired = vehicles.speed[:, :, None], vehicles.desired_speed[:, :, None]
-    demand = idm_acceleration(speed, desired, pairs.ahead, vehicles.speed[:, None, :], idm.per_lane())
+    demand = idm_acceleration(
+        speed, desired, pairs.ahead, vehicles.speed[:, None, :], idm.per_lane()
+    )
     near = (pairs.distance < mobil.exclusive_m) | (demand < -mobil.safe_deceleration)
     return (same & near & (pairs.order > 0)).any(-1)
 
 
-def mobil_wishes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
+def mobil_wishes(
+    scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+) -> Tensor:
     """Lane change that MOBIL proposes to each driver: -1 right, 0 none, +1 left, int64 [N, K].
 
-    None during a lane change. If both sides qualify, the one with the larger incentive, left if equal.
+    None during a lane change. If both sides qualify, the one with the larger incentive, left if
+    equal.
     """
     vehicles = scene.observers
     lane = vehicles.target_lane.to(vehicles.x.dtype)
     lanes = torch.stack((lane, lane + 1.0, lane - 1.0), dim=-1)
     accelerations = lane_accelerations(scene, lanes, idm)
-    incentive, safe = mobil_criterion(accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil)
+    incentive, safe = mobil_criterion(
+        accelerations.of(slice(1, None)), accelerations.of(slice(0, 1)), mobil
+    )
     exists = torch.stack((lane + 1.0 <= road.lanes - 1, lane - 1.0 >= 0), dim=-1)
-    left, right = torch.where(exists & safe & (incentive > mobil.threshold), incentive, -torch.inf).unbind(-1)
+    left, right = torch.where(
+        exists & safe & (incentive > mobil.threshold), incentive, -torch.inf
+    ).unbind(-1)
     free = lane_change_done(vehicles, road) & vehicles.valid
     wish = torch.where(left >= right, 1, -1)
     return torch.where(free & torch.isfinite(torch.maximum(left, right)), wish, 0)
 
 
-def mobil_changes(scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV) -> Tensor:
+def mobil_changes(
+    scene: Scene, road: Road, idm: AnyIdm = TABLE_V, mobil: AnyMobil = TABLE_IV
+) -> Tensor:
     """Lane change that each driver starts: :func:`mobil_wishes` filtered by :func:`one_at_a_time`.
 
     The ego (vehicle 0) is controlled by the agent: its column is 0, and it blocks no other change.

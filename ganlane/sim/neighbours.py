@@ -1,13 +1,14 @@
 """Leaders and followers, for all vehicles of all environments at once.
 
-The observers are all vehicles (K = M) or a slice of them (the ego alone: K = 1). Several lanes are evaluated at once:
-[N, K, L].
+The observers are all vehicles (K = M) or a slice of them (the ego alone: K = 1). Several lanes are
+evaluated at once: [N, K, L].
 
-The leader is the vehicle ahead whose rear is nearest, of two level ones the slower; the follower is the vehicle
-behind whose front is nearest, of two level ones that with the lower index. Two ways lead to them, bit for bit the
-same. *Pairs* [N, K, L, M] compare each observer with every vehicle: for graphs, for gradients, and for few vehicles.
-*Sorting* puts each row in the order of the road once; a running minimum from the front then gives everybody's leader
-in every lane, one from the rear the followers.
+The leader is the vehicle ahead whose rear is nearest, of two level ones the slower; the follower is
+the vehicle behind whose front is nearest, of two level ones that with the lower index. Two ways
+lead to them, bit for bit the same. *Pairs* [N, K, L, M] compare each observer with every vehicle:
+for graphs, for gradients, and for few vehicles. *Sorting* puts each row in the order of the road
+once; a running minimum from the front then gives everybody's leader in every lane, one from the
+rear the followers.
 """
 
 from __future__ import annotations
@@ -18,13 +19,22 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ganlane.sim.state import LaneRange, Road, Vehicles, body_lanes, presence, reads_are_cheap, with_target
+from ganlane.sim.state import (
+    LaneRange,
+    Road,
+    Vehicles,
+    body_lanes,
+    presence,
+    reads_are_cheap,
+    with_target,
+)
 
 #: Gap in an empty lane, m (Table V's 'maximum gap for empty lane').
 FREE_GAP_M = 10_000.0
-#: Rows times pairs of vehicles from which on sorting is faster. Microseconds of :func:`perceive` and
-#: :func:`~ganlane.sim.idm.following_acceleration` on 3 lanes, one core, sorting and pairs, rows x vehicles:
-#: 1 x 9 265, 186; 64 x 9 310, 298; 128 x 9 413, 579; 16 x 30 427, 501; 64 x 100 926, 16917.
+#: Rows times pairs of vehicles from which on sorting is faster. Microseconds of :func:`perceive`
+#: and :func:`~ganlane.sim.idm.following_acceleration` on 3 lanes, one core, sorting and pairs, rows
+#: x vehicles: 1 x 9 265, 186; 64 x 9 310, 298; 128 x 9 413, 579; 16 x 30 427, 501; 64 x 100 926,
+#: 16917.
 SORTS_FROM = 8000
 #: Added to masked values, so that a minimum ignores them; also where nobody is, m.
 _BEYOND = 1e9
@@ -38,8 +48,8 @@ _NOBODY = 0x7F800000 << 32
 class Neighbour(NamedTuple):
     """The nearest vehicle of a kind, per observer and lane.
 
-    ``gap`` is bumper to bumper, m, :data:`FREE_GAP_M` without a neighbour, negative for an overlap along the road;
-    ``speed`` in m/s, the observer's own without a neighbour.
+    ``gap`` is bumper to bumper, m, :data:`FREE_GAP_M` without a neighbour, negative for an overlap
+    along the road; ``speed`` in m/s, the observer's own without a neighbour.
     """
 
     gap: Tensor
@@ -47,7 +57,10 @@ class Neighbour(NamedTuple):
 
 
 class Follower(NamedTuple):
-    """The nearest vehicle behind, per observer and lane: gap, m, speeds, m/s, and whether it exists."""
+    """The nearest vehicle behind, per observer and lane.
+
+    Gap, m, speeds, m/s, and whether it exists.
+    """
 
     gap: Tensor
     speed: Tensor
@@ -58,8 +71,9 @@ class Follower(NamedTuple):
 class Pairs(NamedTuple):
     """Every vehicle relative to every observer, [N, K, M].
 
-    ``distance`` is the signed distance between the centres, m, and ``bumpers`` the sum of the two half lengths.
-    ``order`` is the distance with ties broken: of two vehicles at the same x the one with the lower index is ahead.
+    ``distance`` is the signed distance between the centres, m, and ``bumpers`` the sum of the two
+    half lengths. ``order`` is the distance with ties broken: of two vehicles at the same x the one
+    with the lower index is ahead.
     """
 
     distance: Tensor
@@ -80,9 +94,10 @@ class Pairs(NamedTuple):
 class Scene(NamedTuple):
     """M vehicles as K observers see them, computed once per step.
 
-    ``observers`` and their lane ranges ``body`` and ``attention`` are [N, K]; ``presence`` [N, M] holds the lanes in
-    which others see each vehicle. With a ``queue`` neighbours are found by sorting: int64 [N, M], the vehicles in the
-    order of the road, the foremost first, and everybody's place in that order.
+    ``observers`` and their lane ranges ``body`` and ``attention`` are [N, K]; ``presence`` [N, M]
+    holds the lanes in which others see each vehicle. With a ``queue`` neighbours are found by
+    sorting: int64 [N, M], the vehicles in the order of the road, the foremost first, and
+    everybody's place in that order.
     """
 
     which: slice
@@ -104,8 +119,8 @@ class Scene(NamedTuple):
 def _beyond(number: Tensor, where: Tensor) -> Tensor:
     """Adds 1e9 where masked, so that ``min`` ignores it (branch-free ``where``).
 
-    On a CPU ``torch.where`` branches at every element and takes five times as long. Adding 0 leaves a number
-    unchanged to the last bit; NaN would stay NaN, so padding has to be finite.
+    On a CPU ``torch.where`` branches at every element and takes five times as long. Adding 0 leaves
+    a number unchanged to the last bit; NaN would stay NaN, so padding has to be finite.
     """
     return torch.add(number, where, alpha=_BEYOND)
 
@@ -128,7 +143,8 @@ def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scen
     """The :class:`Scene` of ``vehicles`` on ``road``, as seen by all of them or by a slice of them."""
     body = body_lanes(vehicles, road)
     attention, x = with_target(body, vehicles), vehicles.x
-    # Where sorting is faster, and possible: a ring has no first vehicle, a key holds two numbers of 32 bits.
+    # Where sorting is faster, and possible: a ring has no first vehicle, a key holds two numbers of
+    # 32 bits.
     sorts = (
         which == slice(None)
         and x.shape[0] * x.shape[1] ** 2 >= SORTS_FROM
@@ -151,14 +167,22 @@ def perceive(vehicles: Vehicles, road: Road, which: slice = slice(None)) -> Scen
 
 
 def in_lane(scene: Scene, lane: Tensor) -> Tensor:
-    """Whether vehicle j is in ``lane`` of observer i; bool [N, K, M], or [N, K, L, M] for L lanes [N, K, L]."""
-    low, high = (each[:, None, None, :] if lane.ndim == 3 else each[:, None, :] for each in scene.presence)
+    """Whether vehicle j is in ``lane`` of observer i.
+
+    Bool [N, K, M], or [N, K, L, M] for L lanes [N, K, L].
+    """
+    low, high = (
+        each[:, None, None, :] if lane.ndim == 3 else each[:, None, :] for each in scene.presence
+    )
     asked = lane[..., None]
     return (low <= asked) & (asked <= high)
 
 
 def leader(scene: Scene, lane: Tensor) -> Neighbour:
-    """The nearest vehicle ahead of each observer in its lane (float; [N, K], or [N, K, L] for L of them)."""
+    """The nearest vehicle ahead of each observer in its lane (float.
+
+    [N, K], or [N, K, L] for L of them).
+    """
     if lane.ndim == 2:
         return Neighbour(*(found[..., 0] for found in leader(scene, lane[..., None])))
     speed = scene.vehicles.speed
@@ -174,32 +198,41 @@ def leader(scene: Scene, lane: Tensor) -> Neighbour:
 
 
 def follower(scene: Scene, lane: Tensor) -> Follower:
-    """The nearest vehicle behind each observer in its lane (float; [N, K], or [N, K, L] for L of them)."""
+    """The nearest vehicle behind each observer in its lane (float.
+
+    [N, K], or [N, K, L] for L of them).
+    """
     if lane.ndim == 2:
         return Follower(*(found[..., 0] for found in follower(scene, lane[..., None])))
     vehicles = scene.vehicles
     if scene.queue is not None:
-        key = _nearest_key(scene, scene.queue, lane, -1, torch.arange(vehicles.x.shape[1], device=lane.device))
+        key = _nearest_key(
+            scene, scene.queue, lane, -1, torch.arange(vehicles.x.shape[1], device=lane.device)
+        )
         front, index = _unordered(key >> 32), key & 0xFFFFFFFF
     else:
         front, index = _candidates(scene, lane, -1).min(-1)
     gap, flat = _gap(scene, front, -1), index.flatten(1)
-    speed, desired = (number.gather(1, flat).view_as(gap) for number in (vehicles.speed, vehicles.desired_speed))
+    speed, desired = (
+        number.gather(1, flat).view_as(gap) for number in (vehicles.speed, vehicles.desired_speed)
+    )
     return Follower(gap, speed, desired, gap < FREE_GAP_M)
 
 
 def _candidates(scene: Scene, lane: Tensor, side: int) -> Tensor:
-    """Where the near end of each vehicle ahead (``side`` 1) or behind (-1) in each lane is, m, [N, K, L, M].
+    """Where the near end of each vehicle ahead (``side`` 1) or behind (-1) in each lane is, m, [N,
+    K, L, M].
 
-    Along ``side``: of vehicles ahead the rear, of vehicles behind the front with its sign changed. On a ring from the
-    observer on; else on the road, so that it is one number per vehicle, whoever looks.
+    Along ``side``: of vehicles ahead the rear, of vehicles behind the front with its sign changed.
+    On a ring from the observer on; else on the road, so that it is one number per vehicle, whoever
+    looks.
     """
     v, pairs = scene.vehicles, scene.pairs
     x = v.x[:, None, :] if scene.road.ring_m is None else pairs.distance
     half = (0.5 * v.length)[:, None, :]
     end, on_side = (x - half, pairs.order > 0) if side > 0 else (-x - half, pairs.order < 0)
-    # In two steps: leader and follower in several lanes then share the first, [N, K, M], which a compiler keeps.
-    # In one step compiled idm_mobil took twice as long.
+    # In two steps: leader and follower in several lanes then share the first, [N, K, M], which a
+    # compiler keeps. In one step compiled idm_mobil took twice as long.
     return _beyond(_beyond(end, ~on_side)[:, :, None, :], ~in_lane(scene, lane))
 
 
@@ -217,14 +250,20 @@ def _queue(x: Tensor) -> tuple[Tensor, Tensor]:
     return (turn, torch.empty_like(turn).scatter_(1, turn, numbers))
 
 
-def _nearest_key(scene: Scene, queue: tuple[Tensor, Tensor], lane: Tensor, side: int, second: Tensor) -> Tensor:
-    """The key of the vehicle with the nearest end in each lane [N, K, L], ahead (``side`` 1) or behind (-1).
+def _nearest_key(
+    scene: Scene, queue: tuple[Tensor, Tensor], lane: Tensor, side: int, second: Tensor
+) -> Tensor:
+    """The key of the vehicle with the nearest end in each lane [N, K, L], ahead (``side`` 1) or
+    behind (-1).
 
-    A key is 64 bits long: first the end as in :func:`_candidates`, then ``second``, which decides between level
-    ends. So a minimum of keys finds the neighbour and holds what is to be known of it.
+    A key is 64 bits long: first the end as in :func:`_candidates`, then ``second``, which decides
+    between level ends. So a minimum of keys finds the neighbour and holds what is to be known of
+    it.
     """
     v, m = scene.vehicles, lane.shape[1]
-    lanes = int(scene.road.lanes.max()) if isinstance(scene.road.lanes, Tensor) else scene.road.lanes
+    lanes = (
+        int(scene.road.lanes.max()) if isinstance(scene.road.lanes, Tensor) else scene.road.lanes
+    )
     key = (_ordered(side * v.x - 0.5 * v.length) << 32) | second
     turn, passed = queue if side > 0 else (queue[0].flip(1), m - 1 - queue[1])
     low, high, key = (each.gather(1, turn) for each in (*scene.presence, key))
@@ -238,7 +277,10 @@ def _nearest_key(scene: Scene, queue: tuple[Tensor, Tensor], lane: Tensor, side:
 
 
 def _ordered(number: Tensor) -> Tensor:
-    """A whole number of 32 bits (as int64) that orders as ``number`` (float32) does; :func:`_unordered` undoes it."""
+    """A whole number of 32 bits (as int64) that orders as ``number`` (float32) does.
+
+    :func:`_unordered` undoes it.
+    """
     bits = (number + 0.0).view(torch.int32)  # -0 becomes 0
     return (bits ^ ((bits >> 31) & 0x7FFFFFFF)).long()
 

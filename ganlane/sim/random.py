@@ -1,8 +1,8 @@
 """Counter-based randomness: every number is a pure function of its place of use.
 
-A draw depends on (stream, seed, episode, vehicle, step, purpose) and on nothing else: not on the batch, the
-row, the device or what was drawn before. Each field is mixed into a 64-bit key on its own with the finaliser
-of splitmix64 (Steele et al. 2014), so no two fields can alias each other.
+A draw depends on (stream, seed, episode, vehicle, step, purpose) and on nothing else: not on the
+batch, the row, the device or what was drawn before. Each field is mixed into a 64-bit key on its
+own with the finaliser of splitmix64 (Steele et al. 2014), so no two fields can alias each other.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ _MIX_B = -7723592293110705685  # 0x94D049BB133111EB
 
 
 class Purpose(IntEnum):
-    """Use of a random number; members are appended, never renumbered, since the number enters the hash."""
+    """Use of a random number.
+
+    Members are appended, never renumbered, since the number enters the hash.
+    """
 
     SPAWN_LANE = 0
     SPAWN_POSITION = 1
@@ -49,7 +52,8 @@ class Purpose(IntEnum):
     DRIVER = 70  # and the 15 purposes after it: per-driver parameters (traffic=idm_random)
     SPAWN_TRUCK = 90
     RECYCLED_EPISODE = 91
-    FOREIGN_DRIVER = 128  # and the 15 purposes after it: drivers of a foreign simulator, one per parameter
+    # and the 15 purposes after it: drivers of a foreign simulator, one per parameter
+    FOREIGN_DRIVER = 128
 
 
 def _shift(h: Tensor, bits: int) -> Tensor:
@@ -58,7 +62,10 @@ def _shift(h: Tensor, bits: int) -> Tensor:
 
 
 def _mix(h: Tensor) -> Tensor:
-    """The finaliser of splitmix64: a bijection of 64 bits in which every input bit flips half the output."""
+    """The finaliser of splitmix64.
+
+    A bijection of 64 bits in which every input bit flips half the output.
+    """
     h = (h ^ _shift(h, 30)) * _MIX_A
     h = (h ^ _shift(h, 27)) * _MIX_B
     return h ^ _shift(h, 31)
@@ -70,7 +77,9 @@ def absorb(key: Tensor, field: Tensor | int) -> Tensor:
 
 
 def episode_key(stream: int, seed: Tensor, episode: Tensor) -> Tensor:
-    """Key of an episode, [N] int64, from the stream and the [N] int64 counters ``seed`` and ``episode``."""
+    """Key of an episode, [N] int64, from the stream and the [N] int64 counters ``seed`` and
+    ``episode``.
+    """
     start = torch.full_like(seed, int(stream))
     return absorb(absorb(absorb(start, 0), seed), episode)
 
@@ -90,14 +99,22 @@ def to_uniform(keys: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 def uniform(
-    key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int], dtype: torch.dtype = torch.float32
+    key: Tensor,
+    step: Tensor | int,
+    vehicles: int,
+    purposes: list[int],
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Uniform numbers in [0, 1), [N, vehicles, len(purposes)]: all purposes of a step in one call."""
     return to_uniform(draw_keys(key, step, vehicles, purposes), dtype)
 
 
 def normal(
-    key: Tensor, step: Tensor | int, vehicles: int, purposes: list[int], dtype: torch.dtype = torch.float32
+    key: Tensor,
+    step: Tensor | int,
+    vehicles: int,
+    purposes: list[int],
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Standard normal numbers, [N, vehicles, len(purposes)], by Box and Muller's transform.
 

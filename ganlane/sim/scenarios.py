@@ -1,13 +1,14 @@
 """Hand-made scenes by name and from files; m, m/s, and the ego comes first.
 
-The test scenarios cut-in, stalled car, stop-and-go wave and blocked lane are functions of a few numbers that return
-the rows of a :class:`~ganlane.sim.scenes.FixedScene`. A file is CSV (one line per vehicle) or JSON. CSV has a header
-and these columns, of which ``x_m`` and ``lane`` (or ``y_m``) are required; lines that start with ``#`` are skipped,
-and an empty cell means the default::
+The test scenarios cut-in, stalled car, stop-and-go wave and blocked lane are functions of a few
+numbers that return the rows of a :class:`~ganlane.sim.scenes.FixedScene`. A file is CSV (one line
+per vehicle) or JSON. CSV has a header and these columns, of which ``x_m`` and ``lane`` (or ``y_m``)
+are required; lines that start with ``#`` are skipped, and an empty cell means the default::
 
     x_m, lane, y_m, speed_mps, desired_speed_mps, length_m, width_m, target_lane, visibility
 
-JSON is a list of objects with the same names, or ``{"lanes": 3, "lane_width_m": 4.0, "vehicles": [...]}``.
+JSON is a list of objects with the same names, or
+``{"lanes": 3, "lane_width_m": 4.0, "vehicles": [...]}``.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from ganlane.sim.state import Road
 LENGTH_M = 4.5
 #: Desired speed of a broken-down vehicle; IDM requires more than 0.
 STALLED_MPS = 0.001
-#: A broken-down car is this far right of its lane's centre. Off-centre vehicles start no lane change, so MOBIL's
-#: politeness does not make it change lanes to let others pass.
+#: A broken-down car is this far right of its lane's centre. Off-centre vehicles start no lane
+#: change, so MOBIL's politeness does not make it change lanes to let others pass.
 ASKEW_M = 0.6
 
 
@@ -46,17 +47,21 @@ def cut_in(
     lanes: int = 3,
     desired_speed_mps: float = 25.0,
 ) -> tuple[SceneVehicle, ...]:
-    """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its lane at once.
+    """A slower vehicle one lane to the left, ``gap_m`` ahead of the ego's bumper, moves into its
+    lane at once.
 
-    There are a leader 80 m ahead of the ego, a follower 35 m behind it, a vehicle behind the one that cuts in, and
-    (on three lanes) one on the ego's right, so that braking is the obvious reaction.
+    There are a leader 80 m ahead of the ego, a follower 35 m behind it, a vehicle behind the one
+    that cuts in, and (on three lanes) one on the ego's right, so that braking is the obvious
+    reaction.
     """
     _at_least(lanes, 2, "cut_in")
     own = lanes - 2
     right = (SceneVehicle(-8.0, own - 1, speed_mps, speed_mps),) if own > 0 else ()
     return (
         SceneVehicle(0.0, own, speed_mps, desired_speed_mps),
-        SceneVehicle(gap_m + LENGTH_M, own + 1, cutter_speed_mps, cutter_speed_mps, target_lane=own),
+        SceneVehicle(
+            gap_m + LENGTH_M, own + 1, cutter_speed_mps, cutter_speed_mps, target_lane=own
+        ),
         SceneVehicle(80.0, own, speed_mps, 22.0),
         SceneVehicle(-35.0, own, speed_mps, 22.0),
         SceneVehicle(-40.0, own + 1, speed_mps, 24.0),
@@ -74,7 +79,8 @@ def stalled_car(
 ) -> tuple[SceneVehicle, ...]:
     """A broken-down vehicle ``distance_m`` ahead in the ego's lane, the rightmost.
 
-    A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there is one.
+    A vehicle follows the ego, and five vehicles ``spacing_m`` apart pass in the next lane, if there
+    is one.
     """
     beside = () if lanes == 1 else _column(1, 5, 0.5 * spacing_m, spacing_m, speed_mps, 22.0)
     return (
@@ -94,7 +100,8 @@ def blocked_lane(
     desired_speed_mps: float = 25.0,
     lane_width_m: float = 4.0,
 ) -> tuple[SceneVehicle, ...]:
-    """The rightmost lane is closed by ``standing`` vehicles in a row, from ``distance_m`` on; the others are open.
+    """The rightmost lane is closed by ``standing`` vehicles in a row, from ``distance_m`` on; the
+    others are open.
 
     In each open lane drive six vehicles, ``spacing_m`` apart: the ego has to find a gap.
     """
@@ -104,15 +111,27 @@ def blocked_lane(
         SceneVehicle(0.0, 0, speed_mps, desired_speed_mps),
         *closed,
         SceneVehicle(-50.0, 0, speed_mps, 20.0),
-        *(car for lane in range(1, lanes) for car in _column(lane, 6, 1.3 * spacing_m, spacing_m, speed_mps, 20.0)),
+        *(
+            car
+            for lane in range(1, lanes)
+            for car in _column(lane, 6, 1.3 * spacing_m, spacing_m, speed_mps, 20.0)
+        ),
     )
 
 
 def _column(
-    lane: int, vehicles: int, first_m: float, spacing_m: float, speed_mps: float, desired_speed_mps: float
+    lane: int,
+    vehicles: int,
+    first_m: float,
+    spacing_m: float,
+    speed_mps: float,
+    desired_speed_mps: float,
 ) -> tuple[SceneVehicle, ...]:
     """Vehicles in one lane, from ``first_m`` backwards."""
-    return tuple(SceneVehicle(first_m - spacing_m * k, lane, speed_mps, desired_speed_mps) for k in range(vehicles))
+    return tuple(
+        SceneVehicle(first_m - spacing_m * k, lane, speed_mps, desired_speed_mps)
+        for k in range(vehicles)
+    )
 
 
 def stop_and_go(
@@ -125,9 +144,9 @@ def stop_and_go(
 ) -> tuple[SceneVehicle, ...]:
     """Columns in every lane, of alternately ``per_wave`` stopped and ``per_wave`` moving vehicles.
 
-    From the head: two moving vehicles, then ``waves`` times a stopped queue at IDM's minimum gap and a group that
-    approaches it at ``speed_mps`` in steady following. The ego is the last but one of the rightmost lane. The
-    desired speed of the others is 15 m/s.
+    From the head: two moving vehicles, then ``waves`` times a stopped queue at IDM's minimum gap
+    and a group that approaches it at ``speed_mps`` in steady following. The ego is the last but one
+    of the rightmost lane. The desired speed of the others is 15 m/s.
     """
     steady = LENGTH_M + 1.1 * (idm.min_gap_m + idm.headway_s * speed_mps)
     queue = LENGTH_M + idm.min_gap_m
@@ -149,7 +168,9 @@ def stop_and_go(
 
 def _at_least(lanes: int, needed: int, name: str) -> None:
     if lanes < needed:
-        raise UserError(f"env.lanes={lanes}: env={name} needs {needed} lanes or more; give env.lanes={needed}.")
+        raise UserError(
+            f"env.lanes={lanes}: env={name} needs {needed} lanes or more; give env.lanes={needed}."
+        )
 
 
 # Files
@@ -163,7 +184,9 @@ _MOST_BYTES = 2**24
 _QUOTED = 60
 
 
-def read_scene(path: str | Path, lanes: int | None = None, lane_width_m: float | None = None) -> FixedScene:
+def read_scene(
+    path: str | Path, lanes: int | None = None, lane_width_m: float | None = None
+) -> FixedScene:
     """The scene in a CSV or JSON file; ``replace`` sets its jitter and visibility.
 
     Args:
@@ -172,8 +195,8 @@ def read_scene(path: str | Path, lanes: int | None = None, lane_width_m: float |
         lane_width_m: m; None: as in the file, or 4.
 
     Raises:
-        UserError: no such file, not CSV or JSON, a wrong column or value (named by file, line and column), a road
-            other than the file's, or an impossible scene.
+        UserError: no such file, not CSV or JSON, a wrong column or value (named by file, line and
+            column), a road other than the file's, or an impossible scene.
     """
     path = Path(path)
     if not path.is_file():
@@ -182,11 +205,15 @@ def read_scene(path: str | Path, lanes: int | None = None, lane_width_m: float |
     if path.suffix.lower() not in readers:
         raise UserError(f"{path}: expected a scene as .csv or .json; rename or convert the file.")
     if path.stat().st_size > _MOST_BYTES:
-        raise UserError(f"{path}: more than {_MOST_BYTES} bytes, which no scene has; give a smaller file.")
+        raise UserError(
+            f"{path}: more than {_MOST_BYTES} bytes, which no scene has; give a smaller file."
+        )
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not a text file in UTF-8 ({error.reason}); save the scene as one.") from error
+        raise UserError(
+            f"{path}: not a text file in UTF-8 ({error.reason}); save the scene as one."
+        ) from error
     rows, road = readers[path.suffix.lower()](path, text)
     width = _agreed(path, "lane_width_m", road.get("lane_width_m"), lane_width_m) or LANE_WIDTH_M
     count = _agreed(path, "lanes", road.get("lanes"), lanes) or _lanes_in(rows, width)
@@ -195,7 +222,9 @@ def read_scene(path: str | Path, lanes: int | None = None, lane_width_m: float |
 
 def with_ego_speed(scene: FixedScene, desired_speed_mps: float) -> FixedScene:
     """The scene with another desired speed of the ego, m/s."""
-    return replace(scene, rows=(replace(scene.rows[0], desired_speed_mps=desired_speed_mps), *scene.rows[1:]))
+    return replace(
+        scene, rows=(replace(scene.rows[0], desired_speed_mps=desired_speed_mps), *scene.rows[1:])
+    )
 
 
 def _agreed(path: Path, name: str, in_file: Any, given: float | None) -> Any:
@@ -209,7 +238,9 @@ def _agreed(path: Path, name: str, in_file: Any, given: float | None) -> Any:
 
 def _lanes_in(rows: list[SceneVehicle], lane_width_m: float) -> int:
     """Just enough lanes for all vehicles and their target lanes."""
-    lanes = [row.lane if row.lane is not None else round((row.y_m or 0.0) / lane_width_m) for row in rows]
+    lanes = [
+        row.lane if row.lane is not None else round((row.y_m or 0.0) / lane_width_m) for row in rows
+    ]
     return 1 + max((*lanes, *(row.target_lane or 0 for row in rows), 0))
 
 
@@ -217,14 +248,18 @@ def _read_csv(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any]
     lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     lines = [(number, line) for number, line in lines if line.lstrip()[0] != "#"]
     if not lines:
-        raise UserError(f"{path}: empty; expected a header with {', '.join(COLUMNS)}, and a line per vehicle.")
+        raise UserError(
+            f"{path}: empty; expected a header with {', '.join(COLUMNS)}, and a line per vehicle."
+        )
     check_count(str(path), len(lines) - 1)
     header, *body = (_cells(line, f"{path}: line {number}") for number, line in lines)
     _check_names(header, f"{path}: line {lines[0][0]}")
     rows = []
     for (number, _), cells in zip(lines[1:], body, strict=True):
         if len(cells) != len(header):
-            raise UserError(f"{path}: line {number}: {len(cells)} cells, the header has {len(header)}; fix the line.")
+            raise UserError(
+                f"{path}: line {number}: {len(cells)} cells, the header has {len(header)}; fix the line."
+            )
         given = {name: cell for name, cell in zip(header, cells, strict=True) if cell}
         rows.append(_row(given, f"{path}: line {number}", f"line {number}"))
     return rows, {}
@@ -245,7 +280,9 @@ def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any
         raise UserError(f"{path}: not JSON ({error}); fix the file.") from error
     content = {"vehicles": content} if isinstance(content, list) else content
     if not isinstance(content, dict) or not isinstance(content.get("vehicles"), list):
-        raise UserError(f"{path}: expected a list of vehicles, or an object with 'vehicles'; see docs/scenarios.md.")
+        raise UserError(
+            f"{path}: expected a list of vehicles, or an object with 'vehicles'; see docs/scenarios.md."
+        )
     vehicles = content.pop("vehicles")
     check_count(str(path), len(vehicles))
     rows = []
@@ -262,8 +299,12 @@ def _read_json(path: Path, text: str) -> tuple[list[SceneVehicle], dict[str, Any
 def _json_road(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
     unknown = set(content) - {"lanes", "lane_width_m"}
     if unknown:
-        raise UserError(f"{path}: unknown key {_quoted(min(unknown))}; expected lanes, lane_width_m and vehicles.")
-    given = {name: content[name] for name in ("lanes", "lane_width_m") if content.get(name) is not None}
+        raise UserError(
+            f"{path}: unknown key {_quoted(min(unknown))}; expected lanes, lane_width_m and vehicles."
+        )
+    given = {
+        name: content[name] for name in ("lanes", "lane_width_m") if content.get(name) is not None
+    }
     road = {name: _value(name, value, f"{path}: {name}") for name, value in given.items()}
     for name, value in road.items():
         if not 0 < value < float("inf"):
@@ -276,11 +317,15 @@ def _check_names(names: list[str], where: str, need_place: bool = True) -> None:
     for name in names:
         if name not in COLUMNS:
             unknown = _quoted(name) if name else "(empty)"
-            raise UserError(f"{where}: unknown column {unknown}; expected some of {', '.join(COLUMNS)}.")
+            raise UserError(
+                f"{where}: unknown column {unknown}; expected some of {', '.join(COLUMNS)}."
+            )
         if names.count(name) > 1:
             raise UserError(f"{where}: column {name} is given twice; remove one.")
     if need_place and ("x_m" not in names or not {"lane", "y_m"} & set(names)):
-        raise UserError(f"{where}: columns x_m and lane (or y_m) are needed; the header has {', '.join(names)}.")
+        raise UserError(
+            f"{where}: columns x_m and lane (or y_m) are needed; the header has {', '.join(names)}."
+        )
 
 
 def _row(given: Mapping[str, Any], where: str, origin: str) -> SceneVehicle:

@@ -1,7 +1,9 @@
-"""Hand-made initial scenes: the same vehicles in every episode, optionally with small random variations.
+"""Hand-made initial scenes: the same vehicles in every episode, optionally with small random
+variations.
 
-:class:`Scenes` is the contract; :class:`~ganlane.sim.spawn.RandomScenes` draws scenes by Table II. Scenes set by hand
-are checked for impossible numbers, overlaps and unavoidable crashes; errors name the vehicles.
+:class:`Scenes` is the contract; :class:`~ganlane.sim.spawn.RandomScenes` draws scenes by Table II.
+Scenes set by hand are checked for impossible numbers, overlaps and unavoidable crashes; errors name
+the vehicles.
 """
 
 from __future__ import annotations
@@ -24,11 +26,12 @@ from ganlane.sim.neighbours import in_lane, perceive
 from ganlane.sim.random import Purpose, Stream, episode_key, uniform
 from ganlane.sim.state import STRAIGHT, Road, Vehicles
 
-#: Duration of the test drive of :func:`check_drive`, s, and number of episodes with jitter that it simulates.
+#: Duration of the test drive of :func:`check_drive`, s, and number of episodes with jitter that it
+#: simulates.
 DRIVE_S = 15.0
 DRIVES = 32
-#: The most vehicles and lanes of a scene, the largest number in it (m, m/s), and the smallest of those above 0:
-#: beyond them float32 is too coarse.
+#: The most vehicles and lanes of a scene, the largest number in it (m, m/s), and the smallest of
+#: those above 0: beyond them float32 is too coarse.
 MOST_VEHICLES = 1000
 MOST_LANES = 100
 LARGEST = 1e6
@@ -53,7 +56,10 @@ class Scenes(Protocol):
         ...
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
-        """The vehicles of the episodes with these keys [N] int64, fields [N, M]; the ego at index 0 and x = 0."""
+        """The vehicles of the episodes with these keys [N] int64, fields [N, M].
+
+        The ego at index 0 and x = 0.
+        """
         ...
 
 
@@ -62,12 +68,15 @@ class SceneVehicle:
     """One vehicle of a hand-made scene. m, m/s.
 
     Args:
-        x_m: centre of the body along the road; only distances matter, since the scene is shifted to ego x = 0.
-        lane: the vehicle is at the centre of this lane, 0 the rightmost; may be left out if ``y_m`` is given.
+        x_m: centre of the body along the road; only distances matter, since the scene is shifted to
+            ego x = 0.
+        lane: the vehicle is at the centre of this lane, 0 the rightmost; may be left out if ``y_m``
+            is given.
         y_m: centre of the body across the road, if it is not a lane's centre.
         desired_speed_mps: above 0; 0.001 for a vehicle that stays stopped.
         target_lane: the lane it keeps or is moving to; None: the lane it is in.
-        visibility: when others see its lane changes; None: the scene's ``ego_visibility`` or ``others_visibility``.
+        visibility: when others see its lane changes; None: the scene's ``ego_visibility`` or
+            ``others_visibility``.
         origin: place in its file, for messages ("line 3").
     """
 
@@ -95,20 +104,21 @@ class SceneVehicle:
 
 @dataclass(frozen=True)
 class FixedScene:
-    """The same initial scene in every episode, or with small random variations; the first vehicle is the ego.
+    """The same initial scene in every episode, or with small random variations; the first vehicle
+    is the ego.
 
     Args:
         rows: the vehicles; the ego's x becomes 0, and the others keep their distance to it.
         road: straight, the same in all episodes.
         jitter_m: largest random shift of the others' x, forwards or backwards, m.
-        jitter_mps: largest random change of each speed, m/s, never below 0; stopped vehicles stay stopped. Both
-            depend on (stream, seed, episode) only.
+        jitter_mps: largest random change of each speed, m/s, never below 0; stopped vehicles stay
+            stopped. Both depend on (stream, seed, episode) only.
         ego_visibility, others_visibility: for vehicles without a visibility of their own.
         name: of the scene, for messages.
 
     Raises:
-        UserError: a vehicle is off the road, has an impossible number, or overlaps another; :meth:`check` also raises
-            it for scenes in which crashes are unavoidable.
+        UserError: a vehicle is off the road, has an impossible number, or overlaps another;
+            :meth:`check` also raises it for scenes in which crashes are unavoidable.
     """
 
     rows: tuple[SceneVehicle, ...]
@@ -134,7 +144,9 @@ class FixedScene:
         return max(row.length_m for row in self.rows)
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """Raise :class:`UserError` if ``road`` differs from the scene's, or a vehicle cannot brake in time."""
+        """Raise :class:`UserError` if ``road`` differs from the scene's, or a vehicle cannot brake
+        in time.
+        """
         mine, other = ((r.lanes, r.lane_width_m) for r in (self.road, road))
         if mine != other or road.ring_m is not None:
             raise UserError(
@@ -156,16 +168,22 @@ class FixedScene:
         varied = (whole.speed + self.jitter_mps * u[..., 1]).clamp_min(0.0)
         return whole.with_(x=x, speed=torch.where(whole.speed > 0, varied, whole.speed))
 
-    def base(self, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Vehicles:
+    def base(
+        self, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    ) -> Vehicles:
         """The scene without jitter, fields [1, M]."""
         rows, road = self.rows, self.road
 
         def column(values: Sequence[float], kind: torch.dtype = dtype) -> Tensor:
             return torch.tensor([values], dtype=kind, device=device)
 
-        targets = [row.lane_on(road) if row.target_lane is None else row.target_lane for row in rows]
+        targets = [
+            row.lane_on(road) if row.target_lane is None else row.target_lane for row in rows
+        ]
         usual = [self.ego_visibility] + [self.others_visibility] * (len(rows) - 1)
-        seen = [kind if row.visibility is None else row.visibility for row, kind in zip(rows, usual)]
+        seen = [
+            kind if row.visibility is None else row.visibility for row, kind in zip(rows, usual)
+        ]
         zero = column([0.0] * len(rows))
         return Vehicles(
             x=column([row.x_m - rows[0].x_m for row in rows]),
@@ -189,18 +207,29 @@ class FixedScene:
 
 
 def check_count(name: str, vehicles: int) -> None:
-    """Raise :class:`UserError` for more vehicles than a scene may have: every pair of them is looked at."""
+    """Raise :class:`UserError` for more vehicles than a scene may have.
+
+    Every pair of them is looked at.
+    """
     if vehicles > MOST_VEHICLES:
-        raise UserError(f"{name}: {vehicles} vehicles; a scene has at most {MOST_VEHICLES}, remove some.")
+        raise UserError(
+            f"{name}: {vehicles} vehicles; a scene has at most {MOST_VEHICLES}, remove some."
+        )
 
 
 def check_rows(scene: FixedScene) -> None:
-    """Raise :class:`UserError` for a scene of fewer than two vehicles, or a vehicle with an impossible number."""
+    """Raise :class:`UserError` for a scene of fewer than two vehicles, or a vehicle with an
+    impossible number.
+    """
     check_count(scene.name, len(scene.rows))
     if len(scene.rows) < 2:
-        raise UserError(f"{scene.name}: {len(scene.rows)} vehicles; a scene needs the ego and at least one other.")
+        raise UserError(
+            f"{scene.name}: {len(scene.rows)} vehicles; a scene needs the ego and at least one other."
+        )
     if not isinstance(scene.road.lanes, int) or isinstance(scene.road.lane_width_m, Tensor):
-        raise UserError(f"{scene.name}: a scene set by hand needs one road for all episodes, not one per row.")
+        raise UserError(
+            f"{scene.name}: a scene set by hand needs one road for all episodes, not one per row."
+        )
     if not (1 <= scene.road.lanes <= MOST_LANES and SMALLEST <= scene.road.lane_width_m <= LARGEST):
         raise UserError(
             f"{scene.name}: a road of {scene.road.lanes:g} lanes of {scene.road.lane_width_m:g} m; expected 1 to "
@@ -218,7 +247,12 @@ def check_rows(scene: FixedScene) -> None:
 
 def _fault(row: SceneVehicle, road: Road) -> str:
     """What is wrong with one vehicle; empty if nothing is."""
-    given = {"x_m": row.x_m, "y_m": row.y_m, "speed_mps": row.speed_mps, "desired_speed_mps": row.desired_speed_mps}
+    given = {
+        "x_m": row.x_m,
+        "y_m": row.y_m,
+        "speed_mps": row.speed_mps,
+        "desired_speed_mps": row.desired_speed_mps,
+    }
     for name, value in (given | {"length_m": row.length_m, "width_m": row.width_m}).items():
         if value is not None and not -LARGEST <= value <= LARGEST:
             return f"{name}={value:g}: expected a number from {-LARGEST:g} to {LARGEST:g}"
@@ -239,7 +273,9 @@ def _fault(row: SceneVehicle, road: Road) -> str:
     if row.lane is not None and row.lane != row.lane_on(road):
         return f"lane={row.lane} and y_m={y:g} contradict each other (that is lane {row.lane_on(road)}); give one"
     if row.target_lane is not None and abs(row.target_lane - row.lane_on(road)) > 1:
-        return f"target_lane={row.target_lane}: expected a lane next to its own, {row.lane_on(road)}"
+        return (
+            f"target_lane={row.target_lane}: expected a lane next to its own, {row.lane_on(road)}"
+        )
     return ""
 
 
@@ -248,7 +284,11 @@ def check_overlaps(scene: FixedScene) -> None:
     vehicles = scene.base()
     longer = torch.full_like(vehicles.x, 2.0 * scene.jitter_m)
     longer[:, 0] = 0.0
-    hits = pair_overlaps(vehicles.with_(length=vehicles.length + longer), scene.road)[0].nonzero().tolist()
+    hits = (
+        pair_overlaps(vehicles.with_(length=vehicles.length + longer), scene.road)[0]
+        .nonzero()
+        .tolist()
+    )
     if hits:
         one, other = hits[0]
         worst = f" (with jitter_m={scene.jitter_m:g} at its worst)" if scene.jitter_m else ""
@@ -258,10 +298,11 @@ def check_overlaps(scene: FixedScene) -> None:
 
 
 def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
-    """Raise :class:`UserError` if any follower would need to brake harder than ``idm.min_acceleration``.
+    """Raise :class:`UserError` if any follower would need to brake harder than
+    ``idm.min_acceleration``.
 
-    Leaders are all vehicles ahead in a lane that the follower is in or moving to; they are taken to keep their speed.
-    Jitter is taken at its worst.
+    Leaders are all vehicles ahead in a lane that the follower is in or moving to; they are taken to
+    keep their speed. Jitter is taken at its worst.
     """
     vehicles = scene.base()
     seen = perceive(vehicles, scene.road)
@@ -271,7 +312,9 @@ def check_braking(scene: FixedScene, idm: IdmParameters) -> None:
     slack = scene.jitter_m * (2.0 - (torch.arange(scene.vehicles) == 0).double())
     gap = seen.pairs.ahead - torch.minimum(slack[:, None], slack[None, :])
     fastest, slowest = vehicles.speed + varied, (vehicles.speed - varied).clamp_min(0.0)
-    needed = torch.where(ahead, needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap), 0.0)[0]
+    needed = torch.where(
+        ahead, needed_deceleration(fastest[:, :, None], slowest[:, None, :], gap), 0.0
+    )[0]
     if bool((needed > -idm.min_acceleration).any()):
         one, other = divmod(int(needed.argmax()), scene.vehicles)
         raise UserError(

@@ -1,9 +1,10 @@
 """Who is on the road: random initial scenes (section IV.A, Table II), and vehicles that return.
 
-A scene is built without a rejection loop. Recycling moves vehicles far behind the ego to far ahead of it, and the
-reverse, so that the road never empties: one more than ``range_m`` from the ego is moved by twice the range to the
-other side, as if the road were a ring around the ego; lane, speed, driver and internal state are kept. It is moved
-only when there is room, that is, when no vehicle would have to brake harder than is safe because of it.
+A scene is built without a rejection loop. Recycling moves vehicles far behind the ego to far ahead
+of it, and the reverse, so that the road never empties: one more than ``range_m`` from the ego is
+moved by twice the range to the other side, as if the road were a ring around the ego; lane, speed,
+driver and internal state are kept. It is moved only when there is room, that is, when no vehicle
+would have to brake harder than is safe because of it.
 """
 
 from __future__ import annotations
@@ -25,15 +26,20 @@ from ganlane.sim.state import STRAIGHT, Road, Vehicles, reads_are_cheap
 TABLE_II = SpawnParameters()
 #: Range of the positions in Table III, m.
 RANGE_M = 200.0
-#: Largest deceleration that a moved vehicle may require of any vehicle: MOBIL's safe deceleration, m/s2.
+#: Largest deceleration that a moved vehicle may require of any vehicle: MOBIL's safe deceleration,
+#: m/s2.
 SAFE_DECELERATION = 4.0
-#: Vehicles with less room than this between their sides count as being in one lane, m: who changes lanes drives at an
-#: angle, and its corners reach further than its lanes say.
+#: Vehicles with less room than this between their sides count as being in one lane, m: who changes
+#: lanes drives at an angle, and its corners reach further than its lanes say.
 SIDE_M = 0.4
 
 
-def check_start(parameters: SpawnParameters, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V) -> None:
-    """Raise :class:`ParameterError` if ``vehicles`` do not fit on ``lanes``, overlap, or cannot brake."""
+def check_start(
+    parameters: SpawnParameters, vehicles: int, lanes: int, idm: IdmParameters = TABLE_V
+) -> None:
+    """Raise :class:`ParameterError` if ``vehicles`` do not fit on ``lanes``, overlap, or cannot
+    brake.
+    """
     p = parameters
     if p.min_spacing_m <= p.length_m:
         raise ParameterError(
@@ -48,8 +54,8 @@ def check_start(parameters: SpawnParameters, vehicles: int, lanes: int, idm: Idm
             f"({{spread_m}}={p.spread_m:g}, {{min_spacing_m}}={p.min_spacing_m:g}{lorries}) "
             f"hold {lanes * capacity}; use fewer vehicles, more lanes or a larger {{spread_m}}."
         )
-    # The fastest vehicle must avoid the slowest leader, at the smallest gap, when it brakes at the limit. That gap is
-    # the same whichever vehicles are lorries (SpawnParameters.spacing_m).
+    # The fastest vehicle must avoid the slowest leader, at the smallest gap, when it brakes at the
+    # limit. That gap is the same whichever vehicles are lorries (SpawnParameters.spacing_m).
     gap = p.min_spacing_m - p.length_m
     for field, speed, leader, desired in p.worst_followers() if vehicles > 1 else ():
         if not can_brake(gap, speed, leader, desired, idm):
@@ -64,7 +70,9 @@ def check_start(parameters: SpawnParameters, vehicles: int, lanes: int, idm: Idm
 
 
 def _rank(value: Tensor, same: Tensor | None = None) -> Tensor:
-    """Rank of each by ``value`` [N, M] and then index, among those where ``same`` [N, M, M] is true."""
+    """Rank of each by ``value`` [N, M] and then index, among those where ``same`` [N, M, M] is
+    true.
+    """
     index = torch.arange(value.shape[1], device=value.device)
     mine, other = value[:, :, None], value[:, None, :]
     before = (other < mine) | ((other == mine) & (index[None, :] < index[:, None]))
@@ -81,7 +89,10 @@ def draw_lanes(key: Tensor, vehicles: int, lanes: int, capacity: int) -> Tensor:
 
 
 def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -> Tensor:
-    """Positions in m, [N, M]: in a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank."""
+    """Positions in m, [N, M].
+
+    In a lane of k sorted uniforms on [0, spread - spacing (k - 1)] plus spacing * rank.
+    """
     same = lane[:, :, None] == lane[:, None, :]
     count = same.sum(-1)
     room = spread_m - spacing_m * (count - 1)
@@ -89,7 +100,10 @@ def place_in_lanes(lane: Tensor, u: Tensor, spread_m: float, spacing_m: float) -
 
 
 def ego_first(x: Tensor, lane: Tensor) -> tuple[Tensor, Tensor]:
-    """Order by position, but with the vehicle of rank (M - 1) // 2, the ego, first; shift the ego to x = 0."""
+    """Order by position, but with the vehicle of rank (M - 1) // 2, the ego, first.
+
+    Shift the ego to x = 0.
+    """
     rank = _rank(x)
     order = torch.where(rank == (x.shape[1] - 1) // 2, -1, rank).argsort(dim=1)
     x, lane = x.gather(1, order), lane.gather(1, order)
@@ -112,7 +126,12 @@ def spawn(
         return bounds[0] + u[..., column] * (bounds[1] - bounds[0])
 
     p = parameters
-    drawn = [Purpose.SPAWN_POSITION, Purpose.SPAWN_SPEED, Purpose.SPAWN_DESIRED_SPEED, Purpose.SPAWN_TRUCK]
+    drawn = [
+        Purpose.SPAWN_POSITION,
+        Purpose.SPAWN_SPEED,
+        Purpose.SPAWN_DESIRED_SPEED,
+        Purpose.SPAWN_TRUCK,
+    ]
     u = uniform(key, 0, vehicles, [int(purpose) for purpose in drawn], dtype)
     lane = draw_lanes(key, vehicles, lanes, p.lane_capacity())
     x, lane = ego_first(place_in_lanes(lane, u[..., 0], p.spread_m, p.spacing_m), lane)
@@ -150,7 +169,10 @@ class RandomScenes:
     others_visibility: int = Visibility.SIGNALLED
 
     def check(self, road: Road, idm: IdmParameters) -> None:
-        """See :func:`check_start`; the road must be the scene's, wide enough, and as a ring long enough."""
+        """See :func:`check_start`.
+
+        The road must be the scene's, wide enough, and as a ring long enough.
+        """
         p, lane_width_m, ring_m = self.parameters, road.lane_width_m, road.ring_m
         if isinstance(road.lanes, Tensor) or isinstance(lane_width_m, Tensor):
             return  # a road for each row: its vehicles come from recordings
@@ -202,13 +224,16 @@ def out_of_range(vehicles: Vehicles, road: Road, range_m: float = RANGE_M) -> Te
 
 
 def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
-    """Whether each of the first M vehicles requires no deceleration above ``safe`` in any pair, bool [N, M].
+    """Whether each of the first M vehicles requires no deceleration above ``safe`` in any pair,
+    bool [N, M].
 
-    ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the result holds
-    whichever of the others move too.
+    ``there`` holds 2 M vehicles: all at their new positions, then all at their current ones. So the
+    result holds whichever of the others move too.
     """
     own, other, (low, high) = there.observers, there.vehicles, there.attention
-    shares = (low[..., None] <= high.repeat(1, 2)[:, None, :]) & (low.repeat(1, 2)[:, None, :] <= high[..., None])
+    shares = (low[..., None] <= high.repeat(1, 2)[:, None, :]) & (
+        low.repeat(1, 2)[:, None, :] <= high[..., None]
+    )
     sides = 0.5 * own.width[..., None] + 0.5 * other.width[:, None, :] + SIDE_M
     shares |= (own.y[..., None] - other.y[:, None, :]).abs() < sides
     pairs = there.pairs
@@ -216,7 +241,9 @@ def _room(there: Scene, idm: IdmParameters, safe: float) -> Tensor:
     counts = shares & other.valid[:, None, :] & ~itself
     speed, desired = own.speed[..., None], own.desired_speed[..., None]
     behind = idm_acceleration(speed, desired, pairs.ahead, other.speed[:, None, :], idm)
-    before = idm_acceleration(other.speed[:, None, :], other.desired_speed[:, None, :], pairs.behind, speed, idm)
+    before = idm_acceleration(
+        other.speed[:, None, :], other.desired_speed[:, None, :], pairs.behind, speed, idm
+    )
     asked = torch.where(pairs.order > 0, behind, before)
     return (~counts | (asked >= -safe)).all(-1)
 
@@ -236,7 +263,9 @@ def recycle(
     if reads_are_cheap(away) and not bool(away.any()):
         return vehicles
     distance = road.distance_ahead(vehicles.x[:, EGO_INDEX, None], vehicles.x)
-    moved = vehicles.with_(x=torch.where(away, vehicles.x - 2.0 * range_m * torch.sign(distance), vehicles.x))
+    moved = vehicles.with_(
+        x=torch.where(away, vehicles.x - 2.0 * range_m * torch.sign(distance), vehicles.x)
+    )
     both = Vehicles(*(torch.cat(pair, dim=1) for pair in zip(moved, vehicles)))
     room = _room(perceive(both, road, slice(0, vehicles.x.shape[1])), idm, safe_deceleration)
     return vehicles.with_(x=torch.where(away & room, moved.x, vehicles.x))

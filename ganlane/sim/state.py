@@ -1,6 +1,8 @@
-"""The state of the simulation: the vehicles as tensors, the road they drive on, and the lanes that they occupy.
+"""The state of the simulation: the vehicles as tensors, the road they drive on, and the lanes that
+they occupy.
 
-When others see a lane change strongly affects the number of crashes, so it is a property of each vehicle:
+When others see a lane change strongly affects the number of crashes, so it is a property of each
+vehicle:
 
 - ``CENTRE``: only in the lane of its centre;
 - ``BODY``: in every lane that its body enters by more than :data:`ENTRY_M`;
@@ -23,17 +25,22 @@ from ganlane.parameters.driving import Visibility
 ENTRY_M = 0.1
 #: In an initial scene: the traffic sets a :class:`Visibility` per episode.
 VISIBILITY_OF_EPISODE = -1
-#: A lane change is complete, and the next one possible, within this distance of the target lane's centre.
+#: A lane change is complete, and the next one possible, within this distance of the target lane's
+#: centre.
 ARRIVED_M = 0.3
 
 
 def reads_are_cheap(tensor: Tensor) -> bool:
-    """Whether a value can be read without breaking a graph that is being compiled, or stalling a GPU's queue."""
+    """Whether a value can be read without breaking a graph that is being compiled, or stalling a
+    GPU's queue.
+    """
     return tensor.device.type == "cpu" and not torch.compiler.is_compiling()
 
 
 class Vehicles(NamedTuple):
-    """Fields of ``vehicles`` (:mod:`ganlane.keys`), each of shape [N, M] (or [N] for one vehicle per row)."""
+    """Fields of ``vehicles`` (:mod:`ganlane.keys`), each of shape [N, M] (or [N] for one vehicle
+    per row).
+    """
 
     x: Tensor
     y: Tensor
@@ -72,10 +79,14 @@ class Vehicles(NamedTuple):
     def with_first(self, first: Vehicles) -> Vehicles:
         """The same rows with vehicle 0 replaced by ``first`` (fields [N])."""
         is_first = torch.arange(self.x.shape[1], device=self.x.device) == 0
-        return Vehicles(*(torch.where(is_first, one[:, None], all_) for one, all_ in zip(first, self)))
+        return Vehicles(
+            *(torch.where(is_first, one[:, None], all_) for one, all_ in zip(first, self))
+        )
 
     def with_finite_padding(self) -> Vehicles:
-        """The same vehicles with finite numbers in invalid entries, so that NaN does not spread through sums."""
+        """The same vehicles with finite numbers in invalid entries, so that NaN does not spread
+        through sums.
+        """
 
         def finite(field: Tensor) -> Tensor:
             return torch.where(self.valid, field, torch.nan_to_num(field, 1.0, 1.0, 1.0))
@@ -92,9 +103,9 @@ class Vehicles(NamedTuple):
 class Road:
     """Lane 0 is the rightmost; the centre of lane k lies at ``y = k * lane_width_m``.
 
-    ``lanes`` and ``lane_width_m`` may be tensors [N, 1] if every environment has its own road (recorded scenes).
-    ``ring_m`` closes the road to a ring of that length: positions stay unwrapped, only distances between vehicles are
-    taken modulo the ring.
+    ``lanes`` and ``lane_width_m`` may be tensors [N, 1] if every environment has its own road
+    (recorded scenes). ``ring_m`` closes the road to a ring of that length: positions stay
+    unwrapped, only distances between vehicles are taken modulo the ring.
     """
 
     lanes: int | Tensor = 3
@@ -108,7 +119,9 @@ class Road:
         return lane.clamp(0, self.lanes - 1)
 
     def lane_of(self, y: Tensor) -> Tensor:
-        """Lane whose centre is nearest to lateral position ``y`` (m), as a float tensor, on the road."""
+        """Lane whose centre is nearest to lateral position ``y`` (m), as a float tensor, on the
+        road.
+        """
         return self.clamp_lane(torch.round(y / self.lane_width_m))
 
     def centre_of(self, lane: Tensor, dtype: torch.dtype | None = None) -> Tensor:
@@ -158,9 +171,11 @@ class LaneRange(NamedTuple):
 
 
 def spanned(lanes: LaneRange) -> Tensor:
-    """The lanes of a range, [..., 3]: lowest, middle and highest; [..., 2] or [..., 1] where that is seen to suffice.
+    """The lanes of a range, [..., 3]: lowest, middle and highest; [..., 2] or [..., 1] where that
+    is seen to suffice.
 
-    A vehicle at an angle can be in three lanes, if lanes are narrow, vehicles long or changes consecutive.
+    A vehicle at an angle can be in three lanes, if lanes are narrow, vehicles long or changes
+    consecutive.
     """
     if reads_are_cheap(lanes.low) and (most := int((lanes.high - lanes.low).amax())) < 2:
         return torch.stack(lanes[: most + 1], dim=-1)
@@ -169,7 +184,10 @@ def spanned(lanes: LaneRange) -> Tensor:
 
 def lateral_half_extent(vehicles: Vehicles) -> Tensor:
     """Half of the lateral space that each body takes at its heading, m."""
-    return 0.5 * (vehicles.width * torch.cos(vehicles.heading) + vehicles.length * torch.sin(vehicles.heading).abs())
+    return 0.5 * (
+        vehicles.width * torch.cos(vehicles.heading)
+        + vehicles.length * torch.sin(vehicles.heading).abs()
+    )
 
 
 def body_lanes(vehicles: Vehicles, road: Road) -> LaneRange:
@@ -186,17 +204,25 @@ def with_target(lanes: LaneRange, vehicles: Vehicles) -> LaneRange:
 
 
 def presence(vehicles: Vehicles, road: Road, body: LaneRange, attention: LaneRange) -> LaneRange:
-    """Lanes in which others see each vehicle, by its visibility; an empty range for invalid vehicles."""
+    """Lanes in which others see each vehicle, by its visibility.
+
+    An empty range for invalid vehicles.
+    """
     centre = road.lane_of(vehicles.y)
     signalled = vehicles.visibility == int(Visibility.SIGNALLED)
     by_body = vehicles.visibility == int(Visibility.BODY)
     low = torch.where(signalled, attention.low, torch.where(by_body, body.low, centre))
     high = torch.where(signalled, attention.high, torch.where(by_body, body.high, centre))
     nowhere = torch.inf
-    return LaneRange(torch.where(vehicles.valid, low, nowhere), torch.where(vehicles.valid, high, -nowhere))
+    return LaneRange(
+        torch.where(vehicles.valid, low, nowhere), torch.where(vehicles.valid, high, -nowhere)
+    )
 
 
 def lane_change_done(vehicles: Vehicles, road: Road) -> Tensor:
-    """Whether the lane change is done: centre within :data:`ARRIVED_M` of the target lane's centre, bool."""
+    """Whether the lane change is done.
+
+    Centre within :data:`ARRIVED_M` of the target lane's centre, bool.
+    """
     centre = road.centre_of(vehicles.target_lane, vehicles.y.dtype)
     return (vehicles.y - centre).abs() < ARRIVED_M

@@ -1,20 +1,31 @@
 """Traffic models: TensorDictModules that move the other vehicles, swappable by ``traffic=NAME``.
 
-All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by rules,
-:mod:`~ganlane.traffic.social_gan` by a generator; :mod:`~ganlane.traffic.replay` plays recordings.
-:mod:`~ganlane.traffic.mixed` chooses a model per episode, or hides the ego. Overlays
+All follow one contract (:class:`TrafficModule`). :mod:`~ganlane.traffic.idm_mobil` is driven by
+rules, :mod:`~ganlane.traffic.social_gan` by a generator; :mod:`~ganlane.traffic.replay` plays
+recordings. :mod:`~ganlane.traffic.mixed` chooses a model per episode, or hides the ego. Overlays
 (:mod:`~ganlane.traffic.overlays`, :mod:`~ganlane.traffic.faults`) follow a base model in a
 :class:`TrafficSequential`; :mod:`~ganlane.traffic.presets` builds the chains that ship.
 
-In :mod:`~ganlane.traffic.sumo` (Krauss and LC2013; its roads in :mod:`~ganlane.traffic.sumo_roads`) and
-:mod:`~ganlane.traffic.highway_env` foreign simulators drive, for tests with drivers that are not ours: the ego is
-moved by the environment as always, and there a stand-in drives in its place. Their packages are imported when a model
-is made, not before.
+In :mod:`~ganlane.traffic.sumo` (Krauss and LC2013; its roads in :mod:`~ganlane.traffic.sumo_roads`)
+and :mod:`~ganlane.traffic.highway_env` foreign simulators drive, for tests with drivers that are
+not ours: the ego is moved by the environment as always, and there a stand-in drives in its place.
+Their packages are imported when a model is made, not before.
 """
 
-from ganlane.parameters.driving import AbortFaults, BrakingFaults, HesitationFaults, RandomDrivers, ReactionFaults
+from ganlane.parameters.driving import (
+    AbortFaults,
+    BrakingFaults,
+    HesitationFaults,
+    RandomDrivers,
+    ReactionFaults,
+)
 from ganlane.traffic.base import Overlay, TrafficModule, TrafficSequential
-from ganlane.traffic.faults import AbortedLaneChange, HesitantLaneChange, LateReaction, PhantomBraking
+from ganlane.traffic.faults import (
+    AbortedLaneChange,
+    HesitantLaneChange,
+    LateReaction,
+    PhantomBraking,
+)
 from ganlane.traffic.highway_env import HighwayEnvTraffic
 from ganlane.traffic.idm_mobil import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic
 from ganlane.traffic.mixed import BlindTraffic, MixedTraffic

@@ -1,4 +1,6 @@
-"""The contract of traffic models, TensorDictModules that move the other vehicles by 0.1 s, and chains of them."""
+"""The contract of traffic models, TensorDictModules that move the other vehicles by 0.1 s, and
+chains of them.
+"""
 
 from __future__ import annotations
 
@@ -36,38 +38,50 @@ def memory_of(tensordict: TensorDictBase, key: str = keys.TRAFFIC) -> TensorDict
 
 
 def key_of(tensordict: TensorDictBase, stream: int) -> Tensor:
-    """The episodes' keys [N]: ``episode_key`` if the caller has computed it, else from ``seed`` and ``episode``."""
+    """The episodes' keys [N].
+
+    ``episode_key`` if the caller has computed it, else from ``seed`` and ``episode``.
+    """
     key = tensordict.get(keys.EPISODE_KEY, None)
-    return episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE)) if key is None else key
+    return (
+        episode_key(stream, tensordict.get(keys.SEED), tensordict.get(keys.EPISODE))
+        if key is None
+        else key
+    )
 
 
 def _put(tensordict: TensorDictBase, key: str, fields: Memory) -> None:
-    """``tensordict[key] = fields`` without the checks, which cost as much as a step of a small batch."""
+    """``tensordict[key] = fields`` without the checks, which cost as much as a step of a small
+    batch.
+    """
     nested = TensorDict._new_unsafe(fields, batch_size=tensordict.batch_size)
     tensordict._set_str(key, nested, validated=True, inplace=False, non_blocking=False)
 
 
 def require(module: str, traffic: str, package: str, extra: str) -> Any:
-    """The ``module`` of a foreign simulator, imported only now; :class:`UserError` if its ``package`` is missing.
+    """The ``module`` of a foreign simulator, imported only now; :class:`UserError` if its
+    ``package`` is missing.
 
     ``traffic`` is the option that needs it, ``extra`` the one of ours that brings it.
     """
     if find_spec(module.partition(".")[0]) is None:
-        raise UserError(f"traffic {traffic}: {package} is not installed; pip install 'ganlane[{extra}]' brings it.")
+        raise UserError(
+            f"traffic {traffic}: {package} is not installed; pip install 'ganlane[{extra}]' brings it."
+        )
     return import_module(module)
 
 
 class TrafficModule(TensorDictModuleBase):
     """Base of all traffic models.
 
-    In keys: ``vehicles`` (the state at t, never written), ``traffic`` (the module's memory), ``seed``,
-    ``episode``, ``step`` ([N] int64); optional: ``episode_key``. Out keys: ``moved`` (the same fields as
-    ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: the environment overwrites it. Fields
-    of invalid vehicles may be any finite numbers. Random numbers come from :mod:`ganlane.sim.random` and the counters
-    only.
+    In keys: ``vehicles`` (the state at t, never written), ``traffic`` (the module's memory),
+    ``seed``, ``episode``, ``step`` ([N] int64); optional: ``episode_key``. Out keys: ``moved`` (the
+    same fields as ``vehicles``, the others at t + 0.1 s) and ``traffic``. Index 0 is the ego: the
+    environment overwrites it. Fields of invalid vehicles may be any finite numbers. Random numbers
+    come from :mod:`ganlane.sim.random` and the counters only.
 
-    A model of your own needs one method, :meth:`move`; one with a memory also names :attr:`memory_fields`, and fills
-    them in :meth:`fresh_memory` unless they begin with zeros::
+    A model of your own needs one method, :meth:`move`; one with a memory also names
+    :attr:`memory_fields`, and fills them in :meth:`fresh_memory` unless they begin with zeros::
 
         class Cruise(TrafficModule):
             def move(self, vehicles, memory, key, step):
@@ -81,13 +95,14 @@ class TrafficModule(TensorDictModuleBase):
     in_keys = [keys.VEHICLES, keys.TRAFFIC, keys.SEED, keys.EPISODE, keys.STEP]  # noqa: RUF012
     out_keys = [keys.MOVED, keys.TRAFFIC]  # noqa: RUF012
 
-    #: When others see the lane changes of this model's vehicles; ``VISIBILITY_OF_EPISODE`` if :meth:`enter` sets it
-    #: per episode.
+    #: When others see the lane changes of this model's vehicles; ``VISIBILITY_OF_EPISODE`` if
+    #: :meth:`enter` sets it per episode.
     visibility: int = Visibility.SIGNALLED
     #: Whether lanes and lane width differ between rows (:meth:`road_of`).
     own_roads: bool = False
-    #: Whether a running episode has to keep its row of the batch, since the module holds state per row outside
-    #: ``traffic`` (a foreign simulator). New episodes are recognised by step 0 of their (seed, episode).
+    #: Whether a running episode has to keep its row of the batch, since the module holds state per
+    #: row outside ``traffic`` (a foreign simulator). New episodes are recognised by step 0 of their
+    #: (seed, episode).
     rows_must_stay: bool = False
     #: Per-vehicle memory; empty for a model without any.
     memory_fields: MemoryFields = {}  # noqa: RUF012
@@ -110,9 +125,15 @@ class TrafficModule(TensorDictModuleBase):
         raise NotImplementedError
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
-        """Memory as if every vehicle had just entered, here zeros; ``key`` [N] is for random parameters."""
+        """Memory as if every vehicle had just entered, here zeros.
+
+        ``key`` [N] is for random parameters.
+        """
         (n, m), x = vehicles.x.shape, vehicles.x
-        return {name: x.new_zeros((n, m, *shape), dtype=kind) for name, (shape, kind) in self.memory_fields.items()}
+        return {
+            name: x.new_zeros((n, m, *shape), dtype=kind)
+            for name, (shape, kind) in self.memory_fields.items()
+        }
 
     def road_of(self, key: Tensor, dtype: torch.dtype) -> Road:
         """The road of the episodes with ``key`` [N]."""
@@ -122,14 +143,17 @@ class TrafficModule(TensorDictModuleBase):
         """Physics steps [N] int64 after which an episode ends (``scene_end``); None: never."""
         return None
 
-    def scenes(self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float) -> Scenes | None:
+    def scenes(
+        self, vehicles: int, ego_visibility: int, ego_desired_speed_mps: float
+    ) -> Scenes | None:
         """The initial scenes of this traffic; None: those of the environment."""
         return None
 
     def compile_graphs(self) -> None:
         """Compile the pure functions on tensors (``env.compile=true``); here :meth:`move`.
 
-        A model whose :meth:`move` reads the value of a tensor overrides this and compiles the parts between.
+        A model whose :meth:`move` reads the value of a tensor overrides this and compiles the parts
+        between.
         """
         self.move = compiled(self.move)  # type: ignore[method-assign]
 
@@ -137,18 +161,26 @@ class TrafficModule(TensorDictModuleBase):
 
     @outside_autocast
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """:meth:`forward` in the run's float type: episodes are the same whatever a caller's autocast does."""
+        """:meth:`forward` in the run's float type.
+
+        Episodes are the same whatever a caller's autocast does.
+        """
         return super().__call__(*arguments, **named)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``moved`` and ``traffic``."""
-        vehicles, memory = Vehicles.of(tensordict.get(keys.VEHICLES)), dict(memory_of(tensordict).items())
+        vehicles, memory = (
+            Vehicles.of(tensordict.get(keys.VEHICLES)),
+            dict(memory_of(tensordict).items()),
+        )
         moved, memory = self._call(tensordict, vehicles, memory, key_of(tensordict, self.stream))
         _put(tensordict, keys.MOVED, moved.as_dict())
         _put(tensordict, keys.TRAFFIC, memory)
         return tensordict
 
-    def _call(self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor) -> Moved:
+    def _call(
+        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor
+    ) -> Moved:
         return self.move(vehicles, memory, key, tensordict.get(keys.STEP))
 
     @outside_autocast
@@ -156,8 +188,11 @@ class TrafficModule(TensorDictModuleBase):
         """:meth:`fresh_memory` as a TensorDict [N]."""
         return TensorDict(self.fresh_memory(vehicles, key), batch_size=[vehicles.x.shape[0]])
 
-    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
-        """The start of the episodes of these keys and numbers [N] int64: the initial scene, and the memory.
+    def enter(
+        self, vehicles: Vehicles, key: Tensor, episode: Tensor
+    ) -> tuple[Vehicles, TensorDictBase]:
+        """The start of the episodes of these keys and numbers [N] int64: the initial scene, and the
+        memory.
 
         A traffic that sets visibilities or desired speeds itself overrides this method.
         """
@@ -165,7 +200,10 @@ class TrafficModule(TensorDictModuleBase):
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:
         """Nested name -> (shape, dtype) of the memory of ``n`` rows of ``m`` vehicles."""
-        return {name: ((n, m, *shape), kind or dtype) for name, (shape, kind) in self.memory_fields.items()}
+        return {
+            name: ((n, m, *shape), kind or dtype)
+            for name, (shape, kind) in self.memory_fields.items()
+        }
 
 
 class Overlay(TrafficModule):
@@ -174,11 +212,15 @@ class Overlay(TrafficModule):
     Subclasses implement :meth:`rewrite` instead of :meth:`TrafficModule.move`.
     """
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """The new ``moved``, and the memory to keep; arguments as in :meth:`TrafficModule.move`."""
         raise NotImplementedError
 
-    def _call(self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor) -> Moved:
+    def _call(
+        self, tensordict: TensorDictBase, vehicles: Vehicles, memory: Memory, key: Tensor
+    ) -> Moved:
         moved = Vehicles.of(tensordict.get(keys.MOVED))
         return self.rewrite(vehicles, moved, memory, key, tensordict.get(keys.STEP))
 
@@ -188,7 +230,10 @@ class Overlay(TrafficModule):
 
 
 class TrafficParts(TrafficModule):
-    """Base of traffics made of several, each with its own memory under its name; road and stream are the first's."""
+    """Base of traffics made of several, each with its own memory under its name.
+
+    Road and stream are the first's.
+    """
 
     def __init__(self, parts: Mapping[str, TrafficModule]) -> None:
         first = next(iter(parts.values()))
@@ -214,7 +259,8 @@ class TrafficSequential(TrafficParts):
     """A base model followed by overlays.
 
     Args:
-        parts: name to module, the base model first. Road, stream and visibility are the first one's.
+        parts: name to module, the base model first. Road, stream and visibility are the first
+            one's.
 
     Raises:
         UserError: the base model plays recordings.
@@ -223,7 +269,9 @@ class TrafficSequential(TrafficParts):
     def __init__(self, parts: dict[str, TrafficModule]) -> None:
         base = next(iter(parts.values()))
         if base.own_roads:
-            raise UserError("overlays behind replayed traffic: they go where they went; lay faults over a model.")
+            raise UserError(
+                "overlays behind replayed traffic: they go where they went; lay faults over a model."
+            )
         super().__init__(parts)
         self.visibility = base.visibility
 
@@ -242,8 +290,12 @@ class TrafficSequential(TrafficParts):
         memories = {name: part.init_memory(vehicles, key) for name, part in self.named_parts()}
         return TensorDict(memories, batch_size=[vehicles.x.shape[0]])
 
-    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
-        """The vehicles after the parts' :meth:`TrafficModule.enter` in order, and the memories by name."""
+    def enter(
+        self, vehicles: Vehicles, key: Tensor, episode: Tensor
+    ) -> tuple[Vehicles, TensorDictBase]:
+        """The vehicles after the parts' :meth:`TrafficModule.enter` in order, and the memories by
+        name.
+        """
         memories = {}
         for name, part in self.named_parts():
             vehicles, memories[name] = part.enter(vehicles, key, episode)

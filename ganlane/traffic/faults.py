@@ -1,8 +1,9 @@
-"""Faults of drivers, as overlays on any traffic model: phantom braking, late reactions, faulty lane changes.
+"""Faults of drivers, as overlays on any traffic model: phantom braking, late reactions, faulty lane
+changes.
 
-Each fault is a module of its own, comes at random to single drivers (never to the ego), and leaves the others bitwise
-as they were moved. The faults of lane changes need a model below that moves towards ``vehicles.target_lane``, as
-every model that ships does.
+Each fault is a module of its own, comes at random to single drivers (never to the ego), and leaves
+the others bitwise as they were moved. The faults of lane changes need a model below that moves
+towards ``vehicles.target_lane``, as every model that ships does.
 """
 
 from __future__ import annotations
@@ -14,12 +15,19 @@ import torch
 from torch import Tensor
 
 from ganlane.keys import EGO_INDEX
-from ganlane.parameters.driving import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
+from ganlane.parameters.driving import (
+    AbortFaults,
+    BrakingFaults,
+    DriverFaults,
+    HesitationFaults,
+    ReactionFaults,
+)
 from ganlane.sim.random import Purpose, Stream, uniform
 from ganlane.sim.state import Road, Vehicles, lane_change_done
 from ganlane.traffic.base import Memory, Moved, Overlay, TrafficModule, TrafficSequential
 
-#: A step shorter than this has no direction of its own, m: the vehicle then moves along its heading.
+#: A step shorter than this has no direction of its own, m: the vehicle then moves along its
+#: heading.
 _SHORTEST_M = 1e-3
 #: No lane to turn back to.
 _NO_LANE = -1
@@ -38,9 +46,11 @@ def starting(vehicles: Vehicles, moved: Vehicles) -> Tensor:
 
 
 def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: float) -> Vehicles:
-    """``moved`` with another ``acceleration`` (m/s2, [N, M]): the same path, driven more slowly or faster.
+    """``moved`` with another ``acceleration`` (m/s2, [N, M]): the same path, driven more slowly or
+    faster.
 
-    Position and heading follow the path from ``vehicles`` to ``moved`` in proportion to the distance driven.
+    Position and heading follow the path from ``vehicles`` to ``moved`` in proportion to the
+    distance driven.
     """
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     usual = 0.5 * (vehicles.speed + moved.speed) * dt
@@ -60,12 +70,17 @@ def driven_at(vehicles: Vehicles, moved: Vehicles, acceleration: Tensor, dt: flo
 
 
 class Fault(Overlay, Generic[Faults]):
-    """A fault that comes at random, as often as its ``faults`` say; ``purpose`` of its random numbers."""
+    """A fault that comes at random, as often as its ``faults`` say.
+
+    ``purpose`` of its random numbers.
+    """
 
     kind: type[Faults]
     purpose: Purpose
 
-    def __init__(self, road: Road | None = None, stream: int = Stream.TRAIN, faults: Faults | None = None) -> None:
+    def __init__(
+        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: Faults | None = None
+    ) -> None:
         super().__init__(road, stream)
         self.faults: Faults = faults or self.kind()
 
@@ -81,7 +96,9 @@ def steps_left(
 
     A fault begins where there is none, at a constant hazard, by the uniform numbers ``u`` [N, M].
     """
-    begins = (left == 0) & other_drivers(vehicles) & (u < -math.expm1(-faults.per_hour * dt / 3600.0))
+    begins = (
+        (left == 0) & other_drivers(vehicles) & (u < -math.expm1(-faults.per_hour * dt / 3600.0))
+    )
     return torch.where(begins, round(faults.lasts_s / dt), left)
 
 
@@ -91,30 +108,38 @@ class PhantomBraking(Fault[BrakingFaults]):
     memory_fields = {"left": ((), torch.int64)}  # noqa: RUF012
     kind, purpose = BrakingFaults, Purpose.FAULT
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Brake during a fault."""
         f = self.faults
         left = steps_left(memory["left"], self.draw(vehicles, key, step), vehicles, f, self.dt)
         brakes = (left > 0) & (moved.acceleration > -f.deceleration)
-        braking = driven_at(vehicles, moved, torch.full_like(moved.acceleration, -f.deceleration), self.dt)
+        braking = driven_at(
+            vehicles, moved, torch.full_like(moved.acceleration, -f.deceleration), self.dt
+        )
         return braking.where(brakes, moved), {"left": (left - 1).clamp_min(0)}
 
 
 class LateReaction(Fault[ReactionFaults]):
     """During a lapse a driver accelerates and brakes as it should have done ``delay_s`` before.
 
-    What is delayed is the acceleration that the model below decides on, ``a(t) = f(state(t - delay))``: the
-    reaction time of car-following models (Treiber, Kesting and Helbing 2006). A delayed perception would be the
-    same for a model of the present state only; delaying the output fits every model. Steering is not delayed.
+    What is delayed is the acceleration that the model below decides on,
+    ``a(t) = f(state(t - delay))``: the reaction time of car-following models (Treiber, Kesting and
+    Helbing 2006). A delayed perception would be the same for a model of the present state only;
+    delaying the output fits every model. Steering is not delayed.
 
-    Memory: ``past`` [N, M, D], the accelerations decided in the last ``delay_s``, m/s2, oldest first (at the start
-    the present one), and ``left``, the remaining steps of the lapse.
+    Memory: ``past`` [N, M, D], the accelerations decided in the last ``delay_s``, m/s2, oldest
+    first (at the start the present one), and ``left``, the remaining steps of the lapse.
     """
 
     kind, purpose = ReactionFaults, Purpose.LATE_REACTION
 
     def __init__(
-        self, road: Road | None = None, stream: int = Stream.TRAIN, faults: ReactionFaults | None = None
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        faults: ReactionFaults | None = None,
     ) -> None:
         super().__init__(road, stream, faults)
         self.delay_steps = round(self.faults.delay_s / self.dt)
@@ -125,16 +150,21 @@ class LateReaction(Fault[ReactionFaults]):
         past = vehicles.acceleration[..., None].repeat(1, 1, self.delay_steps)
         return {"past": past, "left": torch.zeros_like(vehicles.target_lane)}
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Drive at the acceleration of ``delay_s`` ago during a lapse."""
-        left = steps_left(memory["left"], self.draw(vehicles, key, step), vehicles, self.faults, self.dt)
+        left = steps_left(
+            memory["left"], self.draw(vehicles, key, step), vehicles, self.faults, self.dt
+        )
         late = driven_at(vehicles, moved, memory["past"][..., 0], self.dt)
         past = torch.cat((memory["past"][..., 1:], moved.acceleration[..., None]), dim=-1)
         return late.where(left > 0, moved), {"past": past, "left": (left - 1).clamp_min(0)}
 
 
 class HesitantLaneChange(Fault[HesitationFaults]):
-    """Some changes take longer: lateral motion is multiplied by ``pace`` until the change is complete.
+    """Some changes take longer: lateral motion is multiplied by ``pace`` until the change is
+    complete.
 
     Memory: whether the current change is ``hesitant``.
     """
@@ -142,7 +172,9 @@ class HesitantLaneChange(Fault[HesitationFaults]):
     memory_fields = {"hesitant": ((), torch.bool)}  # noqa: RUF012
     kind, purpose = HesitationFaults, Purpose.HESITANT_CHANGE
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Reduce the lateral motion of hesitant changes."""
         begins, u = starting(vehicles, moved), self.draw(vehicles, key, step)
         hesitant = torch.where(begins, u < self.faults.share, memory["hesitant"])
@@ -154,8 +186,8 @@ class HesitantLaneChange(Fault[HesitationFaults]):
 class AbortedLaneChange(Fault[AbortFaults]):
     """Some changes are aborted: the driver turns back to its old lane.
 
-    At the default of half way the body is still in the old lane, where the others have seen it all the time, so its
-    place there is free. Memory: the lane to turn back to (-1: none).
+    At the default of half way the body is still in the old lane, where the others have seen it all
+    the time, so its place there is free. Memory: the lane to turn back to (-1: none).
     """
 
     memory_fields = {"origin": ((), torch.int64)}  # noqa: RUF012
@@ -165,12 +197,16 @@ class AbortedLaneChange(Fault[AbortFaults]):
         """No lane to turn back to."""
         return {"origin": torch.full_like(vehicles.target_lane, _NO_LANE)}
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Set the old lane as the target where the change has come far enough."""
         begins, u = starting(vehicles, moved), self.draw(vehicles, key, step)
         chosen = torch.where(u < self.faults.share, vehicles.target_lane, _NO_LANE)
         origin = torch.where(begins, chosen, memory["origin"])
-        start, end = (self.road.centre_of(lane, moved.y.dtype) for lane in (origin, moved.target_lane))
+        start, end = (
+            self.road.centre_of(lane, moved.y.dtype) for lane in (origin, moved.target_lane)
+        )
         far_enough = (moved.y - start).abs() >= self.faults.at * (end - start).abs()
         turns = (origin != _NO_LANE) & far_enough
         moved = moved.with_(target_lane=torch.where(turns, origin, moved.target_lane))

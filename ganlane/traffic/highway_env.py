@@ -19,7 +19,8 @@ from ganlane.traffic.base import Memory, Moved, TrafficModule, require
 _MOVING = ("x", "y", "heading", "speed")
 #: Column of :attr:`ganlane.sim.random.Purpose.FOREIGN_DRIVER`, after those of SUMO's drivers.
 _EXPONENT = 8
-#: HighwayEnv's own bounds for the exponent of a driver's free acceleration (``IDMVehicle.DELTA_RANGE``).
+#: HighwayEnv's own bounds for the exponent of a driver's free acceleration
+#: (``IDMVehicle.DELTA_RANGE``).
 _EXPONENTS = (3.5, 4.5)
 #: Start and end of HighwayEnv's lanes, m, and their speed limit, m/s, above all desired speeds.
 _FROM_M, _TO_M, _LIMIT_MPS = -10_000.0, 200_000.0, 70.0
@@ -30,16 +31,18 @@ def _module(name: str) -> Any:
 
 
 class HighwayEnvTraffic(TrafficModule):
-    """The others driven by HighwayEnv's ``IDMVehicle``: its IDM, MOBIL and steering, its explicit Euler step.
+    """The others driven by HighwayEnv's ``IDMVehicle``: its IDM, MOBIL and steering, its explicit
+    Euler step.
 
-    The parameters are HighwayEnv's own (1.5 s, 3 and -5 m/s2, distances from centre to centre, an egoistic MOBIL
-    once a second); desired speeds are Table II's, and the exponent differs from driver to driver as HighwayEnv draws
-    it. Its vehicles do not react to crashes here. One whose speed would fall below 0 stops.
+    The parameters are HighwayEnv's own (1.5 s, 3 and -5 m/s2, distances from centre to centre, an
+    egoistic MOBIL once a second); desired speeds are Table II's, and the exponent differs from
+    driver to driver as HighwayEnv draws it. Its vehicles do not react to crashes here. One whose
+    speed would fall below 0 stops.
 
-    HighwayEnv's state of a vehicle is in ``vehicles`` and in this module's memory (the time since the driver's last
-    lane change decision, s), and is written into HighwayEnv's objects in every step. So this traffic is a function of
-    the state like the others: an episode is the same in any batch and can be saved and branched. It is slow: a Python
-    loop over rows and vehicles.
+    HighwayEnv's state of a vehicle is in ``vehicles`` and in this module's memory (the time since
+    the driver's last lane change decision, s), and is written into HighwayEnv's objects in every
+    step. So this traffic is a function of the state like the others: an episode is the same in any
+    batch and can be saved and branched. It is slow: a Python loop over rows and vehicles.
 
     Raises:
         UserError: highway-env is not installed, or the road is a ring.
@@ -76,10 +79,24 @@ class HighwayEnvTraffic(TrafficModule):
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """Row by row: write HighwayEnv's objects, let it act and step, read them."""
         m, like = vehicles.x.shape[1], vehicles.x
-        fields = torch.stack([getattr(vehicles, name) for name in _MOVING], dim=-1).double().cpu().numpy()
+        fields = (
+            torch.stack([getattr(vehicles, name) for name in _MOVING], dim=-1)
+            .double()
+            .cpu()
+            .numpy()
+        )
         low, high = _EXPONENTS
-        exponent = low + (high - low) * uniform(key, 0, m, [Purpose.FOREIGN_DRIVER + _EXPONENT], like.dtype)[..., 0]
-        driver = torch.stack((vehicles.desired_speed, exponent, memory["timer"]), dim=-1).double().cpu().numpy()
+        exponent = (
+            low
+            + (high - low)
+            * uniform(key, 0, m, [Purpose.FOREIGN_DRIVER + _EXPONENT], like.dtype)[..., 0]
+        )
+        driver = (
+            torch.stack((vehicles.desired_speed, exponent, memory["timer"]), dim=-1)
+            .double()
+            .cpu()
+            .numpy()
+        )
         size = torch.stack((vehicles.length, vehicles.width), dim=-1).double().cpu().numpy()
         target, valid = vehicles.target_lane.cpu().numpy().copy(), vehicles.valid.cpu().numpy()
         signals = (vehicles.visibility[:, EGO_INDEX] == int(Visibility.SIGNALLED)).tolist()
@@ -91,8 +108,12 @@ class HighwayEnvTraffic(TrafficModule):
         moving = torch.as_tensor(fields).to(like.device, like.dtype)
         moved = vehicles.with_(**dict(zip(_MOVING, moving.unbind(-1))))
         acceleration = (moved.speed - vehicles.speed) / self.dt
-        moved = moved.with_(acceleration=acceleration, target_lane=torch.as_tensor(target).to(like.device))
-        return moved.with_first(vehicles.at(EGO_INDEX)), {"timer": torch.as_tensor(timer).to(like.device, like.dtype)}
+        moved = moved.with_(
+            acceleration=acceleration, target_lane=torch.as_tensor(target).to(like.device)
+        )
+        return moved.with_first(vehicles.at(EGO_INDEX)), {
+            "timer": torch.as_tensor(timer).to(like.device, like.dtype)
+        }
 
 
 class _Highway:
@@ -116,12 +137,20 @@ class _Highway:
             network.add_lane("a", "b", lane)
         self.road = road.Road(network, np_random=np.random.RandomState(0))
         self._driver = _module("vehicle.behavior").IDMVehicle
-        # A ControlledVehicle as in HighwayEnv's own environments: the others' MOBIL asks for its target speed.
+        # A ControlledVehicle as in HighwayEnv's own environments: the others' MOBIL asks for its
+        # target speed.
         ego = _module("vehicle.controller").ControlledVehicle
         self._cars = [ego(self.road, [0.0, 0.0])]
 
     def drive(
-        self, present: Any, fields: Any, size: Any, driver: Any, target: Any, ego_signals: bool, dt: float
+        self,
+        present: Any,
+        fields: Any,
+        size: Any,
+        driver: Any,
+        target: Any,
+        ego_signals: bool,
+        dt: float,
     ) -> None:
         """Move the vehicles with the indices ``present`` of one row by ``dt`` seconds, in place.
 

@@ -1,4 +1,7 @@
-"""Rule-driven traffic: IDM, MOBIL or no lane changes, steered like the ego; drivers who are alike or random."""
+"""Rule-driven traffic: IDM, MOBIL or no lane changes, steered like the ego.
+
+Drivers who are alike or random.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,8 @@ from ganlane.traffic.base import Memory, MemoryFields, Moved, TrafficModule
 MOBIL_PERIOD_STEPS = 10
 #: Minimum distance of a swaying body from its lane's markings, m.
 _LANE_MARGIN_M = 0.1
-#: A random driver's strongest braking is at least this many times what the initial scene requires of it.
+#: A random driver's strongest braking is at least this many times what the initial scene requires
+#: of it.
 _START_MARGIN = 1.5
 #: Number of uniform numbers per random driver, and the column of the factor on the desired speed.
 _DRAWS, _DESIRED_SPEED = 12, 11
@@ -62,9 +66,13 @@ class IdmTraffic(TrafficModule):
     def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
         """The vehicles at t + 0.1 s, steered to the lanes ``target`` [N, M] int64."""
         centre = self.road.centre_of(target, scene.vehicles.y.dtype)
-        return self._advanced(scene.vehicles, following_acceleration(scene, self.idm), target, centre, memory)
+        return self._advanced(
+            scene.vehicles, following_acceleration(scene, self.idm), target, centre, memory
+        )
 
-    def _advanced(self, v: Vehicles, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory) -> Moved:
+    def _advanced(
+        self, v: Vehicles, acceleration: Tensor, target: Tensor, line: Tensor, memory: Memory
+    ) -> Moved:
         """Steered to the lines at ``line`` (m, [N, M])."""
         steering = steer(memory["steering"], v.y, v.heading, v.speed, line, self.dt, self.steering)
         pose = advance(v.x, v.y, v.heading, v.speed, acceleration, steering, self.dt)
@@ -88,7 +96,8 @@ class IdmMobilTraffic(IdmTraffic):
     def move(self, vehicles: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
         """As IDM; rows at a full second decide first."""
         due = step % MOBIL_PERIOD_STEPS == 0
-        # Reading a flag is cheap on a CPU and saves nine evaluations of ten; on a GPU it would stall the queue.
+        # Reading a flag is cheap on a CPU and saves nine evaluations of ten; on a GPU it would
+        # stall the queue.
         if due.device.type == "cpu" and not bool(due.any()):
             return self.keep_lanes(vehicles, memory)
         return self.decide(vehicles, memory, due)
@@ -112,8 +121,8 @@ class IdmMobilTraffic(IdmTraffic):
 class DriverParams(NamedTuple):
     """Per-driver parameters, tensors [N, M]; names and units as in :class:`RandomDrivers`.
 
-    ``delay`` is the reaction time in physics steps; the last four are angular frequencies (rad/s) and phases (rad) of
-    the two waves that make up a driver's sway.
+    ``delay`` is the reaction time in physics steps; the last four are angular frequencies (rad/s)
+    and phases (rad) of the two waves that make up a driver's sway.
     """
 
     headway: Tensor
@@ -134,20 +143,30 @@ class DriverParams(NamedTuple):
         return cls(*memory[_PARAMETERS].unbind(-1))
 
     def idm(self, min_gap_m: float, braking: Tensor) -> DriverIdm:
-        """IDM with each driver's parameters; no driver brakes harder than ``braking`` (m/s2, [N, M])."""
-        return DriverIdm(min_gap_m, self.headway, self.comfortable_deceleration, -braking, self.max_acceleration)
+        """IDM with each driver's parameters.
+
+        No driver brakes harder than ``braking`` (m/s2, [N, M]).
+        """
+        return DriverIdm(
+            min_gap_m, self.headway, self.comfortable_deceleration, -braking, self.max_acceleration
+        )
 
     def sway_m(self, time_s: Tensor) -> Tensor:
-        """Offset of each driver's line from its lane's centre at ``time_s`` [N, 1], m, to the left, [N, M]."""
+        """Offset of each driver's line from its lane's centre at ``time_s`` [N, 1], m, to the left,
+        [N, M].
+        """
         one = torch.sin(self.frequency_one * time_s + self.phase_one)
         return 0.5 * self.sway * (one + torch.sin(self.frequency_two * time_s + self.phase_two))
 
 
-def start_braking(vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m) -> Tensor:
-    """Deceleration (m/s2, [N, M]) with which each driver stays behind all vehicles ahead in its lane.
+def start_braking(
+    vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m: float = TABLE_V.min_gap_m
+) -> Tensor:
+    """Deceleration (m/s2, [N, M]) with which each driver stays behind all vehicles ahead in its
+    lane.
 
-    These keep their speeds; each vehicle in between takes the longest length and ``min_gap_m``. Braking begins after
-    ``reaction_s`` [N, M].
+    These keep their speeds; each vehicle in between takes the longest length and ``min_gap_m``.
+    Braking begins after ``reaction_s`` [N, M].
     """
     scene = perceive(vehicles, road)
     pairs = scene.pairs
@@ -157,7 +176,11 @@ def start_braking(vehicles: Vehicles, road: Road, reaction_s: Tensor, min_gap_m:
     between = distance.argsort(-1).argsort(-1).to(vehicles.x.dtype)
     space = vehicles.length.amax(-1)[:, None, None] + min_gap_m
     speed, leader_speed = vehicles.speed[:, :, None], vehicles.speed[:, None, :]
-    gap = pairs.ahead - between * space - (speed - leader_speed).clamp_min(0.0) * reaction_s[..., None]
+    gap = (
+        pairs.ahead
+        - between * space
+        - (speed - leader_speed).clamp_min(0.0) * reaction_s[..., None]
+    )
     needed = needed_deceleration(speed, leader_speed, gap.clamp_min(1.0))
     return torch.where(ahead, needed, 0.0).amax(-1)
 
@@ -168,11 +191,13 @@ def in_range(u: Tensor, bounds: Range) -> Tensor:
 
 
 class IdmRandomTraffic(IdmMobilTraffic):
-    """``traffic=idm_random``: IDM and MOBIL, each driver with its own parameters for the whole episode.
+    """``traffic=idm_random``: IDM and MOBIL, each driver with its own parameters for the whole
+    episode.
 
-    In MOBIL a driver predicts the others with its own parameters, since it does not know theirs, and without a limit
-    of braking. Memory: the steering angle, ``traits`` [N, M, 11] (:class:`DriverParams`) and, with reaction times,
-    ``past`` [N, M, D], the accelerations decided in the last D steps, m/s2, oldest first.
+    In MOBIL a driver predicts the others with its own parameters, since it does not know theirs,
+    and without a limit of braking. Memory: the steering angle, ``traits`` [N, M, 11]
+    (:class:`DriverParams`) and, with reaction times, ``past`` [N, M, D], the accelerations decided
+    in the last D steps, m/s2, oldest first.
 
     Args:
         road, stream, steering: as for every rule-driven traffic.
@@ -194,7 +219,11 @@ class IdmRandomTraffic(IdmMobilTraffic):
         self.drivers = drivers or RandomDrivers()
         self.delay_steps = round(self.drivers.reaction_s[1] / self.dt)
         past: MemoryFields = {"past": ((self.delay_steps,), None)} if self.delay_steps else {}
-        self.memory_fields = {"steering": ((), None), _PARAMETERS: ((len(DriverParams._fields),), None), **past}
+        self.memory_fields = {
+            "steering": ((), None),
+            _PARAMETERS: ((len(DriverParams._fields),), None),
+            **past,
+        }
 
     def _drawn(self, vehicles: Vehicles, key: Tensor) -> list[Tensor]:
         """Uniform numbers [N, M] of every purpose."""
@@ -205,7 +234,9 @@ class IdmRandomTraffic(IdmMobilTraffic):
         """The drivers at the start of the episodes with ``key`` [N]."""
         d, u = self.drivers, self._drawn(vehicles, key)
         reaction_s = in_range(u[5], d.reaction_s)
-        required = _START_MARGIN * start_braking(vehicles, self.road, reaction_s, self.idm.min_gap_m)
+        required = _START_MARGIN * start_braking(
+            vehicles, self.road, reaction_s, self.idm.min_gap_m
+        )
         room = 0.5 * (self.road.lane_width_m - vehicles.width) - _LANE_MARGIN_M
         return DriverParams(
             headway=in_range(u[0], d.headway_s),
@@ -221,9 +252,13 @@ class IdmRandomTraffic(IdmMobilTraffic):
             phase_two=2.0 * math.pi * u[10],
         )
 
-    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+    def enter(
+        self, vehicles: Vehicles, key: Tensor, episode: Tensor
+    ) -> tuple[Vehicles, TensorDictBase]:
         """Gives every driver but the ego its own desired speed."""
-        factor = in_range(self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED], self.drivers.desired_speed)
+        factor = in_range(
+            self._drawn(vehicles, absorb(key, 0))[_DESIRED_SPEED], self.drivers.desired_speed
+        )
         others = torch.arange(vehicles.x.shape[1], device=key.device) != EGO_INDEX
         desired = torch.where(others, factor * vehicles.desired_speed, vehicles.desired_speed)
         return super().enter(vehicles.with_(desired_speed=desired), key, episode)
@@ -252,7 +287,9 @@ class IdmRandomTraffic(IdmMobilTraffic):
     def drive(self, scene: Scene, target: Tensor, memory: Memory) -> Moved:
         """The vehicles at t + 0.1 s, with each driver's delay and sway."""
         v, own = scene.vehicles, DriverParams.of(memory)
-        acceleration = following_acceleration(scene, own.idm(self.idm.min_gap_m, own.strongest_braking))
+        acceleration = following_acceleration(
+            scene, own.idm(self.idm.min_gap_m, own.strongest_braking)
+        )
         kept = {_PARAMETERS: memory[_PARAMETERS]}
         if self.delay_steps:
             recent = torch.cat((memory["past"], acceleration[..., None]), dim=-1)

@@ -1,4 +1,5 @@
-"""Traffic that differs from episode to episode: several models in shares, or a model that does not see the ego.
+"""Traffic that differs from episode to episode: several models in shares, or a model that does not
+see the ego.
 
 Which one an episode gets follows from its number or key, so it is the same in every batch.
 """
@@ -26,8 +27,8 @@ _SIZES = 16
 def interleaved(shares: Mapping[str, int]) -> list[str]:
     """The part of each of ``sum(shares)`` successive episodes, spread as evenly as possible.
 
-    ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the most (the first of
-    several) is chosen and pays the sum.
+    ``{a: 2, b: 1}`` gives a, b, a: in every episode each part gains its share, the one with the
+    most (the first of several) is chosen and pays the sum.
     """
     credit, turns = dict.fromkeys(shares, 0), []
     for _ in range(sum(shares.values())):
@@ -40,9 +41,11 @@ def interleaved(shares: Mapping[str, int]) -> list[str]:
 
 
 class Rows(NamedTuple):
-    """The rows of a batch that belong to a part: the first ``number`` of ``picked``, then repetitions as padding.
+    """The rows of a batch that belong to a part: the first ``number`` of ``picked``, then
+    repetitions as padding.
 
-    ``source`` [N] is the index of every row of the batch among the part's; ``number`` for rows of other parts.
+    ``source`` [N] is the index of every row of the batch among the part's; ``number`` for rows of
+    other parts.
     """
 
     picked: Tensor
@@ -51,7 +54,9 @@ class Rows(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Part of every row [N], rows by part, and the order that restores the batch from the parts' rows."""
+    """Part of every row [N], rows by part, and the order that restores the batch from the parts'
+    rows.
+    """
 
     part: Tensor
     rows: tuple[Rows, ...]
@@ -59,7 +64,9 @@ class Layout(NamedTuple):
 
 
 class Compact(NamedTuple):
-    """A memory tensor of a part's rows, and the one of the whole batch that it was scattered to (at ``version``)."""
+    """A memory tensor of a part's rows, and the one of the whole batch that it was scattered to (at
+    ``version``).
+    """
 
     whole: Tensor
     version: int | None
@@ -75,16 +82,16 @@ def _version(tensor: Tensor) -> int | None:
 class MixedTraffic(TrafficParts):
     """``traffic=mixed``: parts and their shares of the episodes.
 
-    Episode ``e`` belongs to the part at ``e`` modulo the sum of the shares (:func:`interleaved`). If the batch size
-    is a multiple of that sum, every row keeps its part. Memory: the parts' memories by name; zero in rows of other
-    parts.
+    Episode ``e`` belongs to the part at ``e`` modulo the sum of the shares (:func:`interleaved`).
+    If the batch size is a multiple of that sum, every row keeps its part. Memory: the parts'
+    memories by name; zero in rows of other parts.
 
-    A part gets its rows of vehicles, memory and counters, and computes what it would compute alone: bit for bit where
-    the model is the same at every batch size, as rule-driven ones are.
+    A part gets its rows of vehicles, memory and counters, and computes what it would compute alone:
+    bit for bit where the model is the same at every batch size, as rule-driven ones are.
 
-    Generated traffic has a large memory and renews little of it in a step, so only what is new is copied: a tensor
-    that a part returns unchanged keeps its tensor of the whole batch, and what was scattered to the whole batch in
-    one step is not gathered again in the next.
+    Generated traffic has a large memory and renews little of it in a step, so only what is new is
+    copied: a tensor that a part returns unchanged keeps its tensor of the whole batch, and what was
+    scattered to the whole batch in one step is not gathered again in the next.
 
     Args:
         parts: models by name, of one road and stream.
@@ -109,7 +116,9 @@ class MixedTraffic(TrafficParts):
         # An import path as a name has dots, which separate nested names in a module.
         super().__init__({name.replace(".", "_"): part for name, part in parts.items()})
         if any(part.stream != self.stream or part.road != self.road for part in parts.values()):
-            raise UserError("traffic.shares: the parts have different roads or streams; build all with the same.")
+            raise UserError(
+                "traffic.shares: the parts have different roads or streams; build all with the same."
+            )
         self.shares = {name.replace(".", "_"): shares[name] for name in parts}
         kinds = {int(part.visibility) for part in parts.values()}
         self.visibility = kinds.pop() if len(kinds) == 1 else VISIBILITY_OF_EPISODE
@@ -140,7 +149,9 @@ class MixedTraffic(TrafficParts):
         own = (part == index).nonzero()[:, 0]
         count, batch = len(own), len(part)
         usual = batch * list(self.shares.values())[index] / sum(self.shares.values())
-        source = torch.full_like(part, count).index_copy_(0, own, torch.arange(count, device=part.device))
+        source = torch.full_like(part, count).index_copy_(
+            0, own, torch.arange(count, device=part.device)
+        )
         if not self.compiled or count in (0, usual):
             return Rows(own, count, source)
         # A graph is compiled for every number of rows, which takes a minute.
@@ -163,18 +174,25 @@ class MixedTraffic(TrafficParts):
             fields = _pick(vehicles, rows)
             exchange = MemoryExchange(rows, self._compact)
             inputs = {each: value.index_select(0, rows.picked) for each, value in counters.items()}
-            nested = {keys.VEHICLES: _nested(fields.as_dict(), rows), keys.TRAFFIC: exchange.gather(memory)}
+            nested = {
+                keys.VEHICLES: _nested(fields.as_dict(), rows),
+                keys.TRAFFIC: exchange.gather(memory),
+            }
             outputs = part(_nested({**inputs, **nested}, rows))
             before.append(fields)
             after.append(Vehicles.of(outputs.get(keys.MOVED)))
             kept[name] = exchange.scatter(memory_of(outputs), compact)
         self._compact = compact
         moved = _together(vehicles, before, after, layout)
-        tensordict.set(keys.MOVED, TensorDict._new_unsafe(moved.as_dict(), batch_size=tensordict.batch_size))
+        tensordict.set(
+            keys.MOVED, TensorDict._new_unsafe(moved.as_dict(), batch_size=tensordict.batch_size)
+        )
         tensordict.set(keys.TRAFFIC, TensorDict._new_unsafe(kept, batch_size=tensordict.batch_size))
         return tensordict
 
-    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+    def enter(
+        self, vehicles: Vehicles, key: Tensor, episode: Tensor
+    ) -> tuple[Vehicles, TensorDictBase]:
         """Every row by its part; the memory of the other parts is zero there."""
         (n, m), dtype = vehicles.x.shape, vehicles.x.dtype
         layout, before, after, memories = self.layout(episode), [], [], {}
@@ -185,7 +203,9 @@ class MixedTraffic(TrafficParts):
             fields = _pick(vehicles, rows)
             of_episode = fields.visibility == VISIBILITY_OF_EPISODE
             shown = torch.where(of_episode, int(part.visibility), fields.visibility)
-            own, memory = part.enter(fields.with_(visibility=shown), key[rows.picked], episode[rows.picked])
+            own, memory = part.enter(
+                fields.with_(visibility=shown), key[rows.picked], episode[rows.picked]
+            )
             before.append(fields)
             after.append(own)
             memories[name] = MemoryExchange(rows, {}).scatter(memory, {})
@@ -194,7 +214,9 @@ class MixedTraffic(TrafficParts):
 
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """Not available: the part follows from the episode's number (:meth:`enter`)."""
-        raise UserError("traffic=mixed: its memory begins with an episode's number; call enter() in place of this.")
+        raise UserError(
+            "traffic=mixed: its memory begins with an episode's number; call enter() in place of this."
+        )
 
     def compile_graphs(self) -> None:
         """Compile every part; from now on the rows of a part come in few different numbers."""
@@ -227,13 +249,17 @@ class MemoryExchange:
         return found.part
 
     def scatter(self, part: Any, compact: dict[int, Compact]) -> Any:
-        """The ``part``'s memory (or a tensor of it) in the whole batch, else zero; ``compact`` collects pairs."""
+        """The ``part``'s memory (or a tensor of it) in the whole batch, else zero.
+
+        ``compact`` collects pairs.
+        """
         if not isinstance(part, Tensor):
             named = {name: self.scatter(value, compact) for name, value in part.items()}
             return TensorDict._new_unsafe(named, batch_size=self.rows.source.shape)
         found = self.given.get(id(part))
         if found is None or found.part is not part:
-            # All other rows select one row of zeros at the end: a third faster than zeros and then copies.
+            # All other rows select one row of zeros at the end: a third faster than zeros and then
+            # copies.
             zeros = part.new_zeros((1, *part.shape[1:]))
             whole = torch.cat((part[: self.rows.number], zeros)).index_select(0, self.rows.source)
             found = Compact(whole, _version(whole), self.rows.picked, part)
@@ -249,7 +275,9 @@ def _pick(vehicles: Vehicles, rows: Rows) -> Vehicles:
     return Vehicles(*(value.index_select(0, rows.picked) for value in vehicles))
 
 
-def _together(vehicles: Vehicles, before: list[Vehicles], after: list[Vehicles], layout: Layout) -> Vehicles:
+def _together(
+    vehicles: Vehicles, before: list[Vehicles], after: list[Vehicles], layout: Layout
+) -> Vehicles:
     """The parts' rows as one batch; a field that no part has changed is that of ``vehicles``."""
     counts = [rows.number for rows in layout.rows if rows.number]
 
@@ -276,10 +304,10 @@ def _zeros(spec: Mapping[str, Any], n: int, device: torch.device) -> TensorDict:
 class BlindTraffic(TrafficModule):
     """Any traffic model, blind to the ego in a share of the episodes, as replayed recordings are.
 
-    In these episodes the model gets a state in which the ego is invalid: no vehicle brakes or waits for it. The
-    environment is as ever: the ego hits others, is hit, and observes. Whether an episode is blind follows from
-    (stream, seed, episode) alone. Memory: the model's as ``model``, and ``unseen`` [N, M] bool, true for the ego of a
-    blind episode.
+    In these episodes the model gets a state in which the ego is invalid: no vehicle brakes or waits
+    for it. The environment is as ever: the ego hits others, is hit, and observes. Whether an
+    episode is blind follows from (stream, seed, episode) alone. Memory: the model's as ``model``,
+    and ``unseen`` [N, M] bool, true for the ego of a blind episode.
 
     Args:
         model: the traffic.
@@ -291,7 +319,9 @@ class BlindTraffic(TrafficModule):
 
     def __init__(self, model: TrafficModule, blind_share: float) -> None:
         if not 0.0 <= blind_share <= 1.0:
-            raise UserError(f"traffic.blind_share={blind_share:g}: expected a number from 0 to 1; give such a share.")
+            raise UserError(
+                f"traffic.blind_share={blind_share:g}: expected a number from 0 to 1; give such a share."
+            )
         if model.own_roads:
             raise UserError(
                 f"traffic.blind_share={blind_share:g} with replayed traffic: recorded vehicles see no ego anyway; "
@@ -302,10 +332,15 @@ class BlindTraffic(TrafficModule):
         self.visibility, self.rows_must_stay = model.visibility, model.rows_must_stay
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``moved`` and ``traffic`` of the model, which does not see the ego of blind episodes."""
+        """Write ``moved`` and ``traffic`` of the model, which does not see the ego of blind
+        episodes.
+        """
         memory, vehicles = memory_of(tensordict), tensordict.get(keys.VEHICLES)
         inputs = tensordict.copy()
-        inputs.set(keys.VEHICLES, vehicles.copy().set("valid", vehicles.get("valid") & ~memory.get("unseen")))
+        inputs.set(
+            keys.VEHICLES,
+            vehicles.copy().set("valid", vehicles.get("valid") & ~memory.get("unseen")),
+        )
         inputs.set(keys.TRAFFIC, memory_of(memory, "model"))
         self.model(inputs)
         kept = {"model": memory_of(inputs), "unseen": memory.get("unseen")}
@@ -314,11 +349,18 @@ class BlindTraffic(TrafficModule):
         return tensordict
 
     def unseen(self, vehicles: Vehicles, key: Tensor) -> Tensor:
-        """The egos of blind episodes, bool [N, M]; ``key`` as for :meth:`TrafficModule.fresh_memory`."""
-        blind = uniform(key, -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0] < self.blind_share
+        """The egos of blind episodes, bool [N, M].
+
+        ``key`` as for :meth:`TrafficModule.fresh_memory`.
+        """
+        blind = (
+            uniform(key, -1, 1, [Purpose.BLIND_EPISODE], torch.float64)[..., 0] < self.blind_share
+        )
         return blind & (torch.arange(vehicles.x.shape[1], device=key.device) == EGO_INDEX)
 
-    def enter(self, vehicles: Vehicles, key: Tensor, episode: Tensor) -> tuple[Vehicles, TensorDictBase]:
+    def enter(
+        self, vehicles: Vehicles, key: Tensor, episode: Tensor
+    ) -> tuple[Vehicles, TensorDictBase]:
         """As the model, with ``unseen``."""
         vehicles, memory = self.model.enter(vehicles, key, episode)
         named = {"model": memory, "unseen": self.unseen(vehicles, absorb(key, 0))}
@@ -326,7 +368,10 @@ class BlindTraffic(TrafficModule):
 
     def init_memory(self, vehicles: Vehicles, key: Tensor) -> TensorDict:
         """As the model's, with ``unseen``."""
-        named = {"model": self.model.init_memory(vehicles, key), "unseen": self.unseen(vehicles, key)}
+        named = {
+            "model": self.model.init_memory(vehicles, key),
+            "unseen": self.unseen(vehicles, key),
+        }
         return TensorDict(named, batch_size=[vehicles.x.shape[0]])
 
     def memory_spec(self, n: int, m: int, dtype: torch.dtype = torch.float32) -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""Laid over a traffic model: lane changes (literal and calibrated), sudden accelerations, and the guard.
+"""Laid over a traffic model: lane changes (literal and calibrated), sudden accelerations, and the
+guard.
 
-The first are what the paper adds to its generated traffic, and a calibrated form of it. The guard keeps generated
-vehicles on the road, in their lanes and off their leaders' bumpers: a network with relative positions as its only
-input drifts off the road within a minute, and to any speed.
+The first are what the paper adds to its generated traffic, and a calibrated form of it. The guard
+keeps generated vehicles on the road, in their lanes and off their leaders' bumpers: a network with
+relative positions as its only input drifts off the road within a minute, and to any speed.
 """
 
 from __future__ import annotations
@@ -23,21 +24,27 @@ from ganlane.traffic.base import Memory, Moved, Overlay
 
 
 def literal_hazard(clock: Tensor, mean_steps: float) -> Tensor:
-    """Equation 10: probability ``t / t_m`` per step of a change, ``clock`` steps after the last one ended.
+    """Equation 10: probability ``t / t_m`` per step of a change, ``clock`` steps after the last one
+    ended.
 
-    Read literally the probability grows until a change is certain at ``t = t_m``, so the mean waiting time is about
-    ``sqrt(pi t_m / 2)`` steps, not ``t_m``.
+    Read literally the probability grows until a change is certain at ``t = t_m``, so the mean
+    waiting time is about ``sqrt(pi t_m / 2)`` steps, not ``t_m``.
     """
     return (clock / mean_steps).clamp(0.0, 1.0)
 
 
 def distance_hazard(speed: Tensor, changes_per_km: float, dt: float) -> Tensor:
-    """Probability per step of ``dt`` s of starting a change, at a constant rate per kilometre driven."""
+    """Probability per step of ``dt`` s of starting a change, at a constant rate per kilometre
+    driven.
+    """
     return 1.0 - torch.exp(-speed * (dt * changes_per_km / 1000.0))
 
 
 def random_side(u: Tensor, lane: Tensor, lanes: int | Tensor) -> Tensor:
-    """A random side with a lane: -1 right, +1 left, 0 on a single-lane road; ``u`` uniform, ``lane`` int64."""
+    """A random side with a lane: -1 right, +1 left, 0 on a single-lane road.
+
+    ``u`` uniform, ``lane`` int64.
+    """
     left, right = lane < lanes - 1, lane > 0
     both = torch.where(u < 0.5, 1, -1)
     return torch.where(left & right, both, torch.where(left, 1, torch.where(right, -1, 0)))
@@ -55,7 +62,8 @@ class LiteralChanges:
 
     Attributes:
         mean_steps: ``t_m``, in steps of 0.1 s.
-        lateral_speed_mps, lateral_speed_sd_mps: mean and standard deviation of the Gaussian of lateral speeds, m/s.
+        lateral_speed_mps, lateral_speed_sd_mps: mean and standard deviation of the Gaussian of
+            lateral speeds, m/s.
         slowest_mps: lower bound of a drawn speed, so that every change ends, m/s.
     """
 
@@ -66,30 +74,39 @@ class LiteralChanges:
 
 
 class LiteralLaneChange(Overlay):
-    """The paper's lane changes: hazard ``t / t_m`` per step, blind, at a lateral speed drawn per change.
+    """The paper's lane changes: hazard ``t / t_m`` per step, blind, at a lateral speed drawn per
+    change.
 
-    Memory: ``clock``, steps since the last change ended (0 at the start, too), and ``lateral_speed`` of the current
-    change (m/s, positive to the left, 0 without one).
+    Memory: ``clock``, steps since the last change ended (0 at the start, too), and
+    ``lateral_speed`` of the current change (m/s, positive to the left, 0 without one).
     """
 
     memory_fields = {"clock": ((), torch.int64), "lateral_speed": ((), None)}  # noqa: RUF012
 
     def __init__(
-        self, road: Road | None = None, stream: int = Stream.TRAIN, changes: LiteralChanges | None = None
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        changes: LiteralChanges | None = None,
     ) -> None:
         super().__init__(road, stream)
         self.changes = changes or LiteralChanges()
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Start changes, and move current ones sideways at their own speed until they arrive.
 
-        A vehicle whose target lane was set back (:class:`ganlane.traffic.AbortedLaneChange`) returns at that speed.
+        A vehicle whose target lane was set back (:class:`ganlane.traffic.AbortedLaneChange`)
+        returns at that speed.
         """
         c, dtype = self.changes, vehicles.x.dtype
         u, u_side = _hazard_and_side(vehicles, key, step)
         gauss = normal(key, step, vehicles.x.shape[1], [Purpose.LANE_CHANGE_SPEED], dtype)[..., 0]
         idle = memory["lateral_speed"] == 0
-        starts = idle & vehicles.valid & (u < literal_hazard(memory["clock"].to(dtype), c.mean_steps))
+        starts = (
+            idle & vehicles.valid & (u < literal_hazard(memory["clock"].to(dtype), c.mean_steps))
+        )
         side = torch.where(starts, random_side(u_side, vehicles.target_lane, self.road.lanes), 0)
         drawn = (c.lateral_speed_mps + c.lateral_speed_sd_mps * gauss).clamp_min(c.slowest_mps)
         target = vehicles.target_lane + side
@@ -101,7 +118,10 @@ class LiteralLaneChange(Overlay):
         arrives = changing & (remaining.abs() <= stride.abs())
         y = vehicles.y + torch.where(arrives, remaining, stride)
         heading = torch.atan(lateral / vehicles.speed.clamp_min(1.0))
-        y, heading = torch.where(changing, y, moved.y), torch.where(changing, heading, moved.heading)
+        y, heading = (
+            torch.where(changing, y, moved.y),
+            torch.where(changing, heading, moved.heading),
+        )
         moved = moved.with_(target_lane=target, y=y, heading=heading)
         clock = torch.where(changing, 0, memory["clock"] + 1)
         return moved, {"clock": clock, "lateral_speed": torch.where(arrives, 0.0, lateral)}
@@ -112,12 +132,12 @@ class CalibratedChanges:
     """A rate per kilometre driven, and what makes a gap good enough.
 
     Attributes:
-        per_km: hazard of *wishing* for a change, set so that the rate *measured in the simulation* is that of the
-            data; waiting for a gap makes the two differ.
+        per_km: hazard of *wishing* for a change, set so that the rate *measured in the simulation*
+            is that of the data; waiting for a gap makes the two differ.
         patience_s: a wish that finds no gap for this long is given up, s.
         safe_deceleration: no vehicle has to brake harder, by IDM, m/s2.
-        exclusive_m: a change does not start while another vehicle is moving into the same lane within this distance;
-            of several that would start at once only the foremost does, m.
+        exclusive_m: a change does not start while another vehicle is moving into the same lane
+            within this distance; of several that would start at once only the foremost does, m.
     """
 
     per_km: float = 0.92
@@ -129,8 +149,8 @@ class CalibratedChanges:
 class CalibratedLaneChange(Overlay):
     """Lane changes at the recorded rate, after a gap check that considers closing speeds.
 
-    Only the target lane is set: the model below drives there. Memory: ``wish``, the desired side (-1, 0, 1), and
-    ``waited``, the number of steps since it began.
+    Only the target lane is set: the model below drives there. Memory: ``wish``, the desired side
+    (-1, 0, 1), and ``waited``, the number of steps since it began.
     """
 
     memory_fields = {"wish": ((), torch.int64), "waited": ((), torch.int64)}  # noqa: RUF012
@@ -154,7 +174,9 @@ class CalibratedLaneChange(Overlay):
         comes = u < distance_hazard(vehicles.speed, self.changes.per_km, self.dt)
         side = random_side(u_side, vehicles.target_lane, self.road.lanes)
         free = lane_change_done(vehicles, self.road) & vehicles.valid
-        return without_ego(torch.where(memory["wish"] != 0, memory["wish"], torch.where(comes & free, side, 0)))
+        return without_ego(
+            torch.where(memory["wish"] != 0, memory["wish"], torch.where(comes & free, side, 0))
+        )
 
     def _contested(self, scene: Scene, lane: Tensor) -> Tensor:
         """Whether a near vehicle other than the ego is already moving into ``lane`` [N, M]."""
@@ -164,7 +186,9 @@ class CalibratedLaneChange(Overlay):
         near = torch.minimum(pairs.ahead, pairs.behind) < self.changes.exclusive_m
         return (near & changing[:, None, :] & (target[:, None, :] == lane[:, :, None])).any(-1)
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Set the target lane of those whose wish finds a gap."""
         wish = self._wishes(vehicles, memory, key, step)
         scene = perceive(vehicles, self.road)
@@ -179,8 +203,13 @@ class CalibratedLaneChange(Overlay):
         return moved, {"wish": rest, "waited": torch.where(rest == 0, 0, waited)}
 
 
-def _accelerated(vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float) -> Vehicles:
-    """``moved`` with another speed and position along the road for ``who`` [N, M]: at ``acceleration``, m/s2."""
+def _accelerated(
+    vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration: Tensor, dt: float
+) -> Vehicles:
+    """``moved`` with another speed and position along the road for ``who`` [N, M].
+
+    At ``acceleration``, m/s2.
+    """
     speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
     return moved.with_(
         speed=torch.where(who, speed, moved.speed),
@@ -191,7 +220,9 @@ def _accelerated(vehicles: Vehicles, moved: Vehicles, who: Tensor, acceleration:
 
 @dataclass(frozen=True)
 class SuddenAccelerations:
-    """Mean time between two (s), duration (s), mean and standard deviation of their Gaussian (m/s2)."""
+    """Mean time between two (s), duration (s), mean and standard deviation of their Gaussian
+    (m/s2).
+    """
 
     every_s: float = 10.0
     lasts_s: float = 1.0
@@ -202,19 +233,25 @@ class SuddenAccelerations:
 class AccelerationOverlay(Overlay):
     """The paper's 'instant-acceleration or instant-slowing', drawn from the recorded accelerations.
 
-    The paper says that accelerations 'were added manually' and no more. Here they come at a constant hazard and
-    replace the base model's acceleration for a second. Memory: the acceleration (m/s2) and its remaining steps.
+    The paper says that accelerations 'were added manually' and no more. Here they come at a
+    constant hazard and replace the base model's acceleration for a second. Memory: the acceleration
+    (m/s2) and its remaining steps.
     """
 
     memory_fields = {"acceleration": ((), None), "left": ((), torch.int64)}  # noqa: RUF012
 
     def __init__(
-        self, road: Road | None = None, stream: int = Stream.TRAIN, sudden: SuddenAccelerations | None = None
+        self,
+        road: Road | None = None,
+        stream: int = Stream.TRAIN,
+        sudden: SuddenAccelerations | None = None,
     ) -> None:
         super().__init__(road, stream)
         self.sudden = sudden or SuddenAccelerations()
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Replace speed and position along the road during a sudden acceleration."""
         s, m, dtype = self.sudden, vehicles.x.shape[1], vehicles.x.dtype
         u = uniform(key, step, m, [Purpose.ACCELERATION], dtype)[..., 0]
@@ -232,10 +269,12 @@ class GuardParameters:
 
     Attributes:
         headway_s: time headway of the IDM acceleration that is the upper bound.
-        slack: the lower bound is IDM's acceleration minus this, m/s2, times speed over desired speed, so that a
-            network that always slows ends at a crawl instead of standing still on a free road.
+        slack: the lower bound is IDM's acceleration minus this, m/s2, times speed over desired
+            speed, so that a network that always slows ends at a crawl instead of standing still on
+            a free road.
         hardest_braking: lowest acceleration, m/s2.
-        centring_per_s: rate at which the offset from the target lane's centre is reduced (the P of the PD).
+        centring_per_s: rate at which the offset from the target lane's centre is reduced (the P of
+            the PD).
         damping: share of the network's lateral motion that is kept (the D).
         edge_margin_m: minimum distance of the turned body from the edge of the road.
         steepest_rad: largest angle to the road.
@@ -278,19 +317,28 @@ class Guard(Overlay):
         close = acceleration_behind(scene, ahead, self.idm, g.headway_s).amin(-1)
         usual = acceleration_behind(scene, ahead, self.idm).amin(-1)
         highest = close.clamp_min(g.hardest_braking)
-        lowest = (usual - g.slack * vehicles.speed / vehicles.desired_speed).clamp_min(g.hardest_braking)
+        lowest = (usual - g.slack * vehicles.speed / vehicles.desired_speed).clamp_min(
+            g.hardest_braking
+        )
         wanted = (moved.speed - vehicles.speed) / self.dt
         acceleration = torch.minimum(torch.maximum(wanted, torch.minimum(lowest, highest)), highest)
         return _accelerated(vehicles, moved, acceleration != wanted, acceleration, self.dt)
 
     def across(self, vehicles: Vehicles, moved: Vehicles) -> Vehicles:
-        """``moved`` pulled towards its lane's centre where it keeps a lane, and inside the edges everywhere."""
+        """``moved`` pulled towards its lane's centre where it keeps a lane, and inside the edges
+        everywhere.
+        """
         g = self.guard
         offset = self.road.centre_of(moved.target_lane, moved.y.dtype) - vehicles.y
-        pulled = vehicles.y + g.damping * (moved.y - vehicles.y) + g.centring_per_s * self.dt * offset
+        pulled = (
+            vehicles.y + g.damping * (moved.y - vehicles.y) + g.centring_per_s * self.dt * offset
+        )
         y = torch.where(offset.abs() < 0.5 * self.road.lane_width_m, pulled, moved.y)
         half = 0.5 * moved.width
-        left, right = self.road.left_edge_m() - g.edge_margin_m, self.road.right_edge_m() + g.edge_margin_m
+        left, right = (
+            self.road.left_edge_m() - g.edge_margin_m,
+            self.road.right_edge_m() + g.edge_margin_m,
+        )
         y = torch.minimum(torch.maximum(y, right + half), left - half)
         heading = torch.atan((y - vehicles.y) / ((moved.x - vehicles.x).clamp_min(0.1)))
         heading = torch.where(y == moved.y, moved.heading, heading)
@@ -299,7 +347,9 @@ class Guard(Overlay):
         steepest = (room / (0.5 * moved.length)).clamp(0.0, g.steepest_rad)
         return moved.with_(y=y, heading=torch.minimum(torch.maximum(heading, -steepest), steepest))
 
-    def rewrite(self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor) -> Moved:
+    def rewrite(
+        self, vehicles: Vehicles, moved: Vehicles, memory: Memory, key: Tensor, step: Tensor
+    ) -> Moved:
         """Along the road, then across it."""
         guarded = self.across(vehicles, self.along(vehicles, moved))
         if self.observer is not None:

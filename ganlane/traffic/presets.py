@@ -1,4 +1,7 @@
-"""The chains that ship: the paper's generated traffic, the calibrated one, and rule-driven drivers with faults."""
+"""The chains that ship.
+
+The paper's generated traffic, the calibrated one, and rule-driven drivers with faults.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,13 @@ from typing import Any
 
 from ganlane.data import DrivingStatistics
 from ganlane.errors import UserError
-from ganlane.generator import ANCHOR, AnchorParameters, headway_quantiles, load_generator, shipped_generator
+from ganlane.generator import (
+    ANCHOR,
+    AnchorParameters,
+    headway_quantiles,
+    load_generator,
+    shipped_generator,
+)
 from ganlane.parameters.driving import (
     CalibratedGanParameters,
     DriverFaults,
@@ -37,13 +46,14 @@ from ganlane.traffic.overlays import (
 )
 from ganlane.traffic.social_gan import AnchoredGanTraffic, SocialGanTraffic
 
-#: Anchor of the calibrated traffic: the fitted one, with brisker acceleration and lane changes as fast as recorded
-#: ones.
+#: Anchor of the calibrated traffic: the fitted one, with brisker acceleration and lane changes as
+#: fast as recorded ones.
 SIMULATED_ANCHOR: AnchorParameters = replace(
     ANCHOR, idm=replace(ANCHOR.idm, max_acceleration=1.0), lane_stiffness=0.6, lane_damping=1.55
 )
-#: Wishes per executed lane change, measured in the simulation with 9 vehicles: a wish comes only while the driver is
-#: near its lane's centre, and waiting for a gap costs distance. A slow test holds the resulting rate.
+#: Wishes per executed lane change, measured in the simulation with 9 vehicles: a wish comes only
+#: while the driver is near its lane's centre, and waiting for a gap costs distance. A slow test
+#: holds the resulting rate.
 WISH_PER_CHANGE = 1.8
 
 
@@ -62,18 +72,25 @@ def literal_changes(statistics: DrivingStatistics, source: object) -> LiteralCha
 def sudden_accelerations(statistics: DrivingStatistics) -> SuddenAccelerations:
     """Gaussian of the recorded accelerations over one second, of all scenes."""
     recorded = statistics.acceleration_smoothed
-    known = {name: getattr(recorded, name) for name in ("mean", "sd") if getattr(recorded, name) is not None}
+    known = {
+        name: getattr(recorded, name)
+        for name in ("mean", "sd")
+        if getattr(recorded, name) is not None
+    }
     return SuddenAccelerations(**known)
 
 
 def fitted_anchor(metadata: Mapping[str, Any], source: object) -> AnchorParameters:
-    """:data:`SIMULATED_ANCHOR` with the washout and the further inputs of the fit (by default those of ``ANCHOR``).
+    """:data:`SIMULATED_ANCHOR` with the washout and the further inputs of the fit (by default those
+    of ``ANCHOR``).
 
     Args:
-        metadata, source: of the weights (:func:`ganlane.generator.load_generator`), and their file for messages.
+        metadata, source: of the weights (:func:`ganlane.generator.load_generator`), and their file
+            for messages.
 
     Raises:
-        UserError: fitted without per-driver parameters, which this traffic always draws; or impossible values.
+        UserError: fitted without per-driver parameters, which this traffic always draws; or
+            impossible values.
     """
     config = metadata["config"] if isinstance(metadata.get("config"), Mapping) else {}
     washout_s = config.get("washout_s", ANCHOR.washout_s)
@@ -101,7 +118,8 @@ def gan_traffic(
     execute_k: int = GanParameters.execute_k,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
-    """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden accelerations.
+    """``traffic=gan``, the paper's: positions only, literal blind lane changes, sudden
+    accelerations.
 
     Args:
         road, stream: as for every traffic module.
@@ -115,7 +133,9 @@ def gan_traffic(
     generator, metadata = load_generator(source, "paper")
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     parts: dict[str, TrafficModule] = {
-        "generator": SocialGanTraffic(generator, road, stream, noise_scale=noise_scale, execute_k=execute_k),
+        "generator": SocialGanTraffic(
+            generator, road, stream, noise_scale=noise_scale, execute_k=execute_k
+        ),
         "acceleration": AccelerationOverlay(road, stream, sudden_accelerations(statistics)),
         "lane_change": LiteralLaneChange(road, stream, literal_changes(statistics, source)),
     }
@@ -133,27 +153,35 @@ def gan_calibrated_traffic(
     noise_period_s: float = CalibratedGanParameters.noise_period_s,
     idm: IdmParameters = TABLE_V,
 ) -> TrafficSequential:
-    """``traffic=gan_calibrated``: anchored residual, per-driver headways, checked lane changes at the recorded rate.
+    """``traffic=gan_calibrated``: anchored residual, per-driver headways, checked lane changes at
+    the recorded rate.
 
     Args:
         road, stream: as for every traffic module.
-        path, noise_scale, noise_period_s: see :class:`~ganlane.parameters.driving.CalibratedGanParameters`.
-        changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE` times the recorded
-            rate, which gives that rate in the simulation.
+        path, noise_scale, noise_period_s: see
+            :class:`~ganlane.parameters.driving.CalibratedGanParameters`.
+        changes_per_km: hazard of wishing for a lane change; by default :data:`WISH_PER_CHANGE`
+            times the recorded rate, which gives that rate in the simulation.
         idm: of the gap check; the anchor keeps its own (:data:`SIMULATED_ANCHOR`).
 
     Raises:
-        UserError: the weights are missing, foreign, of the other preset, or fitted without per-driver parameters.
+        UserError: the weights are missing, foreign, of the other preset, or fitted without
+            per-driver parameters.
     """
     source = path or shipped_generator("calibrated")
     generator, metadata = load_generator(source, "calibrated")
     statistics = DrivingStatistics.from_dict(metadata["driving_statistics"])
     recorded = statistics.lane_changes.per_vehicle_km or 0.0
     wishes = WISH_PER_CHANGE * recorded if changes_per_km is None else changes_per_km
-    headways_s, anchor = headway_quantiles(metadata["driving_statistics"]), fitted_anchor(metadata, source)
+    headways_s, anchor = (
+        headway_quantiles(metadata["driving_statistics"]),
+        fitted_anchor(metadata, source),
+    )
     return TrafficSequential(
         {
-            "generator": AnchoredGanTraffic(generator, road, stream, noise_period_s, noise_scale, headways_s, anchor),
+            "generator": AnchoredGanTraffic(
+                generator, road, stream, noise_period_s, noise_scale, headways_s, anchor
+            ),
             "lane_change": CalibratedLaneChange(road, stream, CalibratedChanges(wishes), idm),
         }
     )

@@ -1,7 +1,8 @@
 """``traffic=replay``: recorded scenes, played around the ego.
 
-All samples are in one table. A sample is one vehicle in one frame; the samples of a track follow each other, 0.1 s
-apart, so ``k`` steps after sample ``s`` the vehicle is at sample ``s + k``, as long as its track lasts.
+All samples are in one table. A sample is one vehicle in one frame; the samples of a track follow
+each other, 0.1 s apart, so ``k`` steps after sample ``s`` the vehicle is at sample ``s + k``, as
+long as its track lasts.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ Integers = NDArray[np.int64]
 
 #: Vehicles kept at a start, the ego included: more than anybody simulates around one ego.
 MOST_VEHICLES = 128
-#: Heading and acceleration are taken over this many frames before and after (half a second), or those of the track.
+#: Heading and acceleration are taken over this many frames before and after (half a second), or
+#: those of the track.
 _HALF_WINDOW = 5
 #: A vehicle that moves less than this in the window keeps its heading along the road, m.
 _LEAST_PATH_M = 1.0
@@ -52,10 +54,11 @@ class Recordings:
 
     Attributes:
         names: of the S scenes.
-        samples: [R, 8] float64, the float fields of ``vehicles`` ordered as in ``ganlane.keys.VEHICLE_FLOATS``.
+        samples: [R, 8] float64, the float fields of ``vehicles`` ordered as in
+            ``ganlane.keys.VEHICLE_FLOATS``.
         last: [R] the last sample of each sample's track.
-        starts: [K, P] samples in an episode's first frame: the vehicle that the ego replaces, then the others,
-            nearest first, at most :data:`MOST_VEHICLES`; -1 if there are fewer than P.
+        starts: [K, P] samples in an episode's first frame: the vehicle that the ego replaces, then
+            the others, nearest first, at most :data:`MOST_VEHICLES`; -1 if there are fewer than P.
         steps: [K] frames from there to the end of the scene.
         scene: [K] number of the scene.
         first_start, starts_in: [S] number of a scene's first start, and its number of starts.
@@ -77,12 +80,17 @@ class Recordings:
     def of(cls, frame: pl.DataFrame, source: str, least_s: float) -> Recordings:
         """From tracks in the schema of :mod:`ganlane.data`, sorted by scene, vehicle and frame.
 
-        The ego of an episode is recorded for ``least_s`` at least. ``source`` names the recordings in messages.
+        The ego of an episode is recorded for ``least_s`` at least. ``source`` names the recordings
+        in messages.
 
         Raises:
             UserError: no vehicle is recorded for that time.
         """
-        widths, counts, tracks = scene_lane_widths(frame), scene_lane_counts(frame), tracks_of_frame(frame)
+        widths, counts, tracks = (
+            scene_lane_widths(frame),
+            scene_lane_counts(frame),
+            tracks_of_frame(frame),
+        )
         starts, steps, names_of_starts = _starts(frame, tracks, round(least_s / FRAME_S))
         if len(steps) == 0:
             raise UserError(
@@ -111,38 +119,58 @@ def _motion(frame: pl.DataFrame, tracks: Tracks) -> Floats:
     """``samples`` of :class:`Recordings`."""
     x, y, speed, length, width = frame.select("x", "y", "speed", "length", "width").to_numpy().T
     index = np.arange(len(x))
-    early, late = np.maximum(index - _HALF_WINDOW, tracks.first), np.minimum(index + _HALF_WINDOW, tracks.last)
+    early, late = (
+        np.maximum(index - _HALF_WINDOW, tracks.first),
+        np.minimum(index + _HALF_WINDOW, tracks.last),
+    )
     heading = np.arctan((y[late] - y[early]) / np.maximum(x[late] - x[early], _LEAST_PATH_M))
     acceleration = (speed[late] - speed[early]) / np.maximum((late - early) * FRAME_S, FRAME_S)
-    fastest = np.maximum.reduceat(speed, np.flatnonzero(tracks.begins))[np.cumsum(tracks.begins) - 1]
+    fastest = np.maximum.reduceat(speed, np.flatnonzero(tracks.begins))[
+        np.cumsum(tracks.begins) - 1
+    ]
     desired = np.maximum(fastest, LEAST_DESIRED_SPEED_MPS)
     return np.stack((x, y, heading, speed, acceleration, length, width, desired), axis=1)
 
 
-def _starts(frame: pl.DataFrame, tracks: Tracks, least: int) -> tuple[Integers, Integers, NDArray[np.str_]]:
+def _starts(
+    frame: pl.DataFrame, tracks: Tracks, least: int
+) -> tuple[Integers, Integers, NDArray[np.str_]]:
     """``starts`` and ``steps`` of :class:`Recordings`, and the names of their scenes.
 
     Every frame with a vehicle that can be replaced; scene by scene, which bounds the memory.
     """
     offset, parts = 0, []
     for rows in frame.partition_by("scene", maintain_order=True):
-        starts, steps = _starts_of_scene(rows, tracks.last[offset : offset + rows.height] - offset, least)
-        parts.append((np.where(starts < 0, -1, starts + offset), steps, np.repeat(rows["scene"][0], len(steps))))
+        starts, steps = _starts_of_scene(
+            rows, tracks.last[offset : offset + rows.height] - offset, least
+        )
+        parts.append(
+            (
+                np.where(starts < 0, -1, starts + offset),
+                steps,
+                np.repeat(rows["scene"][0], len(steps)),
+            )
+        )
         offset += rows.height
     starts_of, steps_of, scene_of = zip(*parts)
     widest = max(each.shape[1] for each in starts_of)
-    wide = [np.pad(each, ((0, 0), (0, widest - each.shape[1])), constant_values=-1) for each in starts_of]
+    wide = [
+        np.pad(each, ((0, 0), (0, widest - each.shape[1])), constant_values=-1)
+        for each in starts_of
+    ]
     return np.concatenate(wide), np.concatenate(steps_of), np.concatenate(scene_of)
 
 
 def _starts_of_scene(rows: pl.DataFrame, last: Integers, least: int) -> tuple[Integers, Integers]:
     """``starts`` and ``steps`` of one scene; samples are counted from its first.
 
-    The ego replaces the vehicle nearest the middle of those that are recorded ``least`` frames on. The middle is the
-    median position along the road of all that are recorded in the frame.
+    The ego replaces the vehicle nearest the middle of those that are recorded ``least`` frames on.
+    The middle is the median position along the road of all that are recorded in the frame.
     """
     by_frame = rows["frame"].to_numpy().argsort(kind="stable")
-    frame, first, count = np.unique(rows["frame"].to_numpy()[by_frame], return_index=True, return_counts=True)
+    frame, first, count = np.unique(
+        rows["frame"].to_numpy()[by_frame], return_index=True, return_counts=True
+    )
     place = np.arange(count.max())
     # The samples in each frame [F, P], -1 where there are fewer than P.
     table = by_frame[np.minimum(first[:, None] + place, len(by_frame) - 1)]
@@ -162,13 +190,13 @@ def _starts_of_scene(rows: pl.DataFrame, last: Integers, least: int) -> tuple[In
 class ReplayTraffic(TrafficModule):
     """Plays recorded tracks as they were driven: **no vehicle reacts to the ego**.
 
-    The ego replaces the recorded vehicle nearest the middle of the episode's first frame, with its position, speed
-    and size; the M - 1 nearest to it (or fewer) are its neighbours for the whole episode. A neighbour whose track
-    ends is no longer valid; the episode ends with the scene. Lanes and lane width are the scene's, so they differ
-    between rows (:meth:`road_of`).
+    The ego replaces the recorded vehicle nearest the middle of the episode's first frame, with its
+    position, speed and size; the M - 1 nearest to it (or fewer) are its neighbours for the whole
+    episode. A neighbour whose track ends is no longer valid; the episode ends with the scene. Lanes
+    and lane width are the scene's, so they differ between rows (:meth:`road_of`).
 
-    Scene and start of an episode follow from its key, that is from (stream, seed, episode), so there is no memory.
-    Scenes are equally likely, whatever their length.
+    Scene and start of an episode follow from its key, that is from (stream, seed, episode), so
+    there is no memory. Scenes are equally likely, whatever their length.
 
     Args:
         stream: as for every traffic module.
@@ -192,7 +220,9 @@ class ReplayTraffic(TrafficModule):
         self.source = "recordings" if recordings else str(path or _found())
         recorded = recordings or Recordings.of(read_scenes(self.source), self.source, least_s)
         # For sizes only; the road of a row is road_of's.
-        super().__init__(Road(int(recorded.lanes.max()), float(recorded.lane_width_m.mean())), stream)
+        super().__init__(
+            Road(int(recorded.lanes.max()), float(recorded.lane_width_m.mean())), stream
+        )
         self.scene_names = recorded.names
         for name, value in vars(recorded).items():
             if isinstance(value, Tensor):
@@ -215,7 +245,10 @@ class ReplayTraffic(TrafficModule):
         return [self.scene_names[number] for number in self.scene_of(key).tolist()]
 
     def steps_of(self, key: Tensor) -> Tensor:
-        """Physics steps until the scene ends, [N] int64: the episode is truncated (``scene_end``) after them."""
+        """Physics steps until the scene ends, [N] int64.
+
+        The episode is truncated (``scene_end``) after them.
+        """
         return self._steps[self.start_of(key)]
 
     def road_of(self, key: Tensor, dtype: torch.dtype = torch.float32) -> Road:
@@ -224,10 +257,11 @@ class ReplayTraffic(TrafficModule):
         return Road(self._lanes[scene], self._lane_width_m[scene].to(dtype))
 
     def recorded(self, key: Tensor, step: Tensor, vehicles: int, dtype: torch.dtype) -> Vehicles:
-        """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is the ego's start.
+        """The vehicles [N, ``vehicles``] as recorded ``step`` [N] steps after the start; x = 0 is
+        the ego's start.
 
-        A vehicle whose track has ended stays at its last position and is invalid. Entries without a vehicle are
-        invalid copies of the ego's start.
+        A vehicle whose track has ended stays at its last position and is invalid. Entries without a
+        vehicle are invalid copies of the ego's start.
         """
         start = self.start_of(key)
         first = self._starts[start, :vehicles]
@@ -238,14 +272,20 @@ class ReplayTraffic(TrafficModule):
         now = begin + step[:, None]
         valid = (first >= 0) & (now <= self._last[begin])
         fields = self._samples[torch.minimum(now, self._last[begin])]
-        fields = torch.cat((fields[..., : _X + 1] - self._samples[own][..., _X, None], fields[..., _X + 1 :]), dim=-1)
+        fields = torch.cat(
+            (fields[..., : _X + 1] - self._samples[own][..., _X, None], fields[..., _X + 1 :]),
+            dim=-1,
+        )
         values = dict(zip(VEHICLE_FLOATS, fields.to(dtype).unbind(-1)))
         lane = self.road_of(key, dtype).lane_of(values["y"]).long()
         seen = torch.full_like(lane, int(self.visibility))
         return Vehicles(**values, target_lane=lane, visibility=seen, valid=valid)
 
     def scenes(
-        self, vehicles: int, ego_visibility: int = Visibility.BODY, ego_desired_speed_mps: float = 25.0
+        self,
+        vehicles: int,
+        ego_visibility: int = Visibility.BODY,
+        ego_desired_speed_mps: float = 25.0,
     ) -> RecordedScenes:
         """The initial scenes of this traffic."""
         return RecordedScenes(self, vehicles, ego_visibility, ego_desired_speed_mps)
@@ -258,7 +298,8 @@ class ReplayTraffic(TrafficModule):
 
 @dataclass(frozen=True)
 class RecordedScenes:
-    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`), M ``vehicles`` with the ego.
+    """The initial scenes of replayed episodes (:class:`ganlane.sim.scenes.Scenes`), M ``vehicles``
+    with the ego.
 
     What is said of the ego is not known of the recorded driver.
     """
@@ -277,7 +318,10 @@ class RecordedScenes:
         """Recorded scenes are not checked."""
 
     def __call__(self, key: Tensor, dtype: torch.dtype) -> Vehicles:
-        """Vehicles [N, M] at the start of the episodes with ``key`` [N]; the ego at index 0 and x = 0."""
+        """Vehicles [N, M] at the start of the episodes with ``key`` [N].
+
+        The ego at index 0 and x = 0.
+        """
         scene = self.traffic.recorded(key, torch.zeros_like(key), self.vehicles, dtype)
         is_ego = torch.arange(self.vehicles, device=key.device) == EGO_INDEX
         return scene.with_(

@@ -1,7 +1,8 @@
 """Traffic driven by a generator: the paper's preset and the calibrated one.
 
-A vehicle that enters has always driven straight along its lane at its present speed: so its history is filled. Its
-latent vector is drawn at the same time and then wanders, one per vehicle. The ego is a neighbour like any other.
+A vehicle that enters has always driven straight along its lane at its present speed: so its history
+is filled. Its latent vector is drawn at the same time and then wanders, one per vehicle. The ego is
+a neighbour like any other.
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ _MOST_NOISE = int(Purpose.RECYCLE) - int(Purpose.NOISE)
 class GeneratedTraffic(TrafficModule):
     """Base of both presets: history and latent vectors.
 
-    Memory: ``motion_0``, ``motion_1`` and so on, [N, M, 4H] each (input projections of the last observed - 1 motions,
-    oldest first), ``displacement`` [N, M, 2] (the newest of them, m), ``noise`` [N, M, Z].
+    Memory: ``motion_0``, ``motion_1`` and so on, [N, M, 4H] each (input projections of the last
+    observed - 1 motions, oldest first), ``displacement`` [N, M, 2] (the newest of them, m),
+    ``noise`` [N, M, Z].
 
     Args:
         generator: the fitted network (:func:`ganlane.generator.load_generator`).
@@ -73,12 +75,18 @@ class GeneratedTraffic(TrafficModule):
         self.motions = [f"motion_{index}" for index in range(sizes.observed - 1)]
         self.purposes = [Purpose.NOISE + index for index in range(sizes.noise)]
         motions: MemoryFields = {name: ((4 * sizes.hidden,), None) for name in self.motions}
-        self.memory_fields = {**motions, "displacement": ((2,), None), "noise": ((sizes.noise,), None)}
+        self.memory_fields = {
+            **motions,
+            "displacement": ((2,), None),
+            "noise": ((sizes.noise,), None),
+        }
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """Straight driving at the present speed, and latent vectors of this episode."""
         along = vehicles.speed * PHYSICS_STEP_S
-        history = start(self.network(vehicles.x.dtype), torch.stack([along, torch.zeros_like(along)], dim=-1))
+        history = start(
+            self.network(vehicles.x.dtype), torch.stack([along, torch.zeros_like(along)], dim=-1)
+        )
         noise = normal(key, -1, vehicles.x.shape[1], self.purposes, vehicles.x.dtype)
         return {**self.kept(history), "noise": noise}
 
@@ -93,7 +101,9 @@ class GeneratedTraffic(TrafficModule):
         return {**dict(zip(self.motions, history.motions)), "displacement": history.displacement}
 
     def before(self, memory: Memory, key: Tensor, step: Tensor) -> tuple[History, Tensor]:
-        """The history of all drivers from the memory, and the latent vectors [N, M, Z] of this step."""
+        """The history of all drivers from the memory, and the latent vectors [N, M, Z] of this
+        step.
+        """
         noise = memory["noise"]
         fresh = normal(key, step, noise.shape[1], self.purposes, noise.dtype)
         history = History(tuple(memory[name] for name in self.motions), memory["displacement"])
@@ -101,14 +111,16 @@ class GeneratedTraffic(TrafficModule):
 
 
 class SocialGanTraffic(GeneratedTraffic):
-    """``traffic=gan``: the paper's preset. Positions only; the first predicted displacement moves the vehicle.
+    """``traffic=gan``: the paper's preset. Positions only; the first predicted displacement moves
+    the vehicle.
 
-    It knows neither lanes nor road: alone the closed loop drifts (design, section 4), so a guard belongs behind it.
-    Lane changes and sudden accelerations are overlays.
+    It knows neither lanes nor road: alone the closed loop drifts (design, section 4), so a guard
+    belongs behind it. Lane changes and sudden accelerations are overlays.
 
     Args:
-        execute_k: predicted displacements driven before predicting again, 1 (the paper) to 8. With more than 1 the
-            memory also holds ``plan`` [N, M, execute_k, 2] in m and ``plan_left`` [N, M].
+        execute_k: predicted displacements driven before predicting again, 1 (the paper) to 8. With
+            more than 1 the memory also holds ``plan`` [N, M, execute_k, 2] in m and ``plan_left``
+            [N, M].
 
     Raises:
         UserError: ``execute_k`` is out of range; see also :class:`GeneratedTraffic`.
@@ -147,16 +159,19 @@ class SocialGanTraffic(GeneratedTraffic):
         """Predict, and drive the first displacement (or what is left of the plan)."""
         (history, noise), network = self.before(memory, key, step), self.network(vehicles.x.dtype)
         plan = Plan(memory["plan"], memory["plan_left"]) if self.execute_k > 1 else None
-        moved, history, plan = paper_step(network, vehicles, history, self.noise_scale * noise, plan)
+        moved, history, plan = paper_step(
+            network, vehicles, history, self.noise_scale * noise, plan
+        )
         kept = {**self.kept(history), "noise": noise}
         return moved, kept if plan is None else {**kept, "plan": plan.ahead, "plan_left": plan.left}
 
 
 class AnchoredGanTraffic(GeneratedTraffic):
-    """``traffic=gan_calibrated``: the network's residual on an anchor of IDM and lane keeping, per-driver headways.
+    """``traffic=gan_calibrated``: the network's residual on an anchor of IDM and lane keeping,
+    per-driver headways.
 
-    It follows ``vehicles.target_lane``, which an overlay sets, and ``vehicles.desired_speed``. Additional memory:
-    ``residual_mean`` [N, M, 2] in m/s2 (the washout), ``headway`` [N, M] in s.
+    It follows ``vehicles.target_lane``, which an overlay sets, and ``vehicles.desired_speed``.
+    Additional memory: ``residual_mean`` [N, M, 2] in m/s2 (the washout), ``headway`` [N, M] in s.
 
     Args:
         headway_quantiles_s: 5, 25, 50, 75 and 95 % quantiles of the drivers' headways.
@@ -177,7 +192,11 @@ class AnchoredGanTraffic(GeneratedTraffic):
     ) -> None:
         super().__init__(generator, road, stream, noise_period_s, noise_scale)
         self.headway_quantiles_s, self.anchor = headway_quantiles_s, anchor
-        self.memory_fields = {**self.memory_fields, "residual_mean": ((2,), None), "headway": ((), None)}
+        self.memory_fields = {
+            **self.memory_fields,
+            "residual_mean": ((2,), None),
+            "headway": ((), None),
+        }
 
     def fresh_memory(self, vehicles: Vehicles, key: Tensor) -> Memory:
         """See :class:`GeneratedTraffic`; a headway for every driver, residual mean 0."""
@@ -192,6 +211,8 @@ class AnchoredGanTraffic(GeneratedTraffic):
         """One :func:`~ganlane.generator.closed_loop.anchored_step`."""
         (history, noise), network = self.before(memory, key, step), self.network(vehicles.x.dtype)
         driver = DriverMemory(history, memory["residual_mean"], memory["headway"])
-        moved, driver = anchored_step(network, vehicles, self.road, driver, self.noise_scale * noise, self.anchor)
+        moved, driver = anchored_step(
+            network, vehicles, self.road, driver, self.noise_scale * noise, self.anchor
+        )
         kept = {"noise": noise, "residual_mean": driver.mean, "headway": driver.headway}
         return moved, {**self.kept(driver.history), **kept}

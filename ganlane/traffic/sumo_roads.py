@@ -1,7 +1,9 @@
-"""N highways side by side in one SUMO simulation, through libsumo: roads, drivers, stand-ins for the egos.
+"""N highways side by side in one SUMO simulation, through libsumo: roads, drivers, stand-ins for
+the egos.
 
-libsumo holds one simulation per process. All highways are edges of the same network, each between dead ends of its
-own, at the same coordinates, so that a vehicle's numbers do not depend on which of them it drives on.
+libsumo holds one simulation per process. All highways are edges of the same network, each between
+dead ends of its own, at the same coordinates, so that a vehicle's numbers do not depend on which of
+them it drives on.
 """
 
 from __future__ import annotations
@@ -22,9 +24,11 @@ Array = NDArray[np.float64]
 
 #: Arguments of :func:`ganlane.traffic.base.require`.
 LIBSUMO = ("libsumo", "sumo", "libsumo", "sumo")
-#: Where x = 0 lies on SUMO's edges, m, and how far they go on from there: 1000 s at 35 m/s and more.
+#: Where x = 0 lies on SUMO's edges, m, and how far they go on from there: 1000 s at 35 m/s and
+#: more.
 ORIGIN_M, LENGTH_M = 2_000.0, 60_000.0
-#: Speed limit of every lane, m/s. Drivers have a speed factor: their desired speed is a multiple of it.
+#: Speed limit of every lane, m/s. Drivers have a speed factor: their desired speed is a multiple of
+#: it.
 LIMIT_MPS = 25.0
 
 
@@ -65,7 +69,9 @@ class SumoRoads:
     #: The one whose simulation libsumo holds.
     _current: SumoRoads | None = None
 
-    def __init__(self, rows: int, lanes: int, lane_width_m: float, change_s: float, keep_right: float) -> None:
+    def __init__(
+        self, rows: int, lanes: int, lane_width_m: float, change_s: float, keep_right: float
+    ) -> None:
         self.libsumo = require(*LIBSUMO)
         if SumoRoads._current is not None:
             SumoRoads._current = None
@@ -103,7 +109,10 @@ class SumoRoads:
     def fill(self, row: int, drivers: Sequence[SumoDriver | None], places: Sequence[Place]) -> None:
         """Put the others of a new episode onto an empty highway; None: no vehicle has this index."""
         self._drivers[row] = list(drivers)
-        self.names[row] = [self._add(row, driver, place) if driver else "" for driver, place in zip(drivers, places)]
+        self.names[row] = [
+            self._add(row, driver, place) if driver else ""
+            for driver, place in zip(drivers, places)
+        ]
         self._flat = None
 
     def _add(self, row: int, driver: SumoDriver, place: Place) -> str:
@@ -125,7 +134,10 @@ class SumoRoads:
         return name
 
     def replace(self, row: int, index: int, place: Place) -> None:
-        """Put one of the others somewhere else: a new vehicle of the same driver. SUMO's own move leaves traces."""
+        """Put one of the others somewhere else: a new vehicle of the same driver.
+
+        SUMO's own move leaves traces.
+        """
         driver = self._drivers[row][index]
         if driver and self.names[row][index]:
             self.libsumo.vehicle.remove(self.names[row][index])
@@ -136,12 +148,15 @@ class SumoRoads:
         """m/s."""
         self.libsumo.vehicle.setSpeedFactor(name, speed / LIMIT_MPS)
 
-    def lead_ego(self, row: int, lanes: range, ego: SumoDriver, place: Place, next_x: float) -> None:
+    def lead_ego(
+        self, row: int, lanes: range, ego: SumoDriver, place: Place, next_x: float
+    ) -> None:
         """Have stand-ins in ``lanes`` that will be at ``next_x`` (m) at the end of the coming step.
 
-        One per lane in which the others see the ego: SUMO's drivers see a vehicle in one lane only. Each stays in its
-        lane. One that is needed no longer is taken off the road; parked, or led along, it would disturb the order of
-        a lane. ``place`` is where the ego is now; its lane does not matter.
+        One per lane in which the others see the ego: SUMO's drivers see a vehicle in one lane only.
+        Each stays in its lane. One that is needed no longer is taken off the road; parked, or led
+        along, it would disturb the order of a lane. ``place`` is where the ego is now; its lane
+        does not matter.
         """
         mine, vehicle = self._stand_ins[row], self.libsumo.vehicle
         for lane in [lane for lane in mine if lane not in lanes]:
@@ -167,9 +182,17 @@ class SumoRoads:
                 self._flat = None
 
     def read(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
-        """Everybody who is there: row, index among the others, (x of the front bumper, y) in m, speed in m/s."""
+        """Everybody who is there.
+
+        Row, index among the others, (x of the front bumper, y) in m, speed in m/s.
+        """
         if self._flat is None:
-            there = [(name, row, i) for row, names in enumerate(self.names) for i, name in enumerate(names) if name]
+            there = [
+                (name, row, i)
+                for row, names in enumerate(self.names)
+                for i, name in enumerate(names)
+                if name
+            ]
             where = np.array([(row, i) for _, row, i in there], dtype=np.int64).reshape(-1, 2)
             self._flat = [name for name, _, _ in there], where[:, 0], where[:, 1]
         names, rows, index = self._flat
@@ -202,12 +225,17 @@ def _network(rows: int, lanes: int, width: float) -> str:
                 f'shape="{x},0"/>'
             )
     box = f"0,0,{end},{lanes * width}"
-    place = f'<location netOffset="0,0" convBoundary="{box}" origBoundary="{box}" projParameter="!"/>'
+    place = (
+        f'<location netOffset="0,0" convBoundary="{box}" origBoundary="{box}" projParameter="!"/>'
+    )
     return f'<net version="1.20">{place}{"".join(edges + junctions)}</net>'
 
 
 def _routes(rows: int, keep_right: float) -> str:
-    """The route file: one route per highway, one type of driver, whose numbers are set vehicle by vehicle."""
+    """The route file.
+
+    One route per highway, one type of driver, whose numbers are set vehicle by vehicle.
+    """
     routes = "".join(f'<route id="{_edge(row)}" edges="{_edge(row)}"/>' for row in range(rows))
     return (
         '<routes><vType id="driver" carFollowModel="Krauss" laneChangeModel="LC2013" sigma="0" speedDev="0" '
@@ -218,7 +246,13 @@ def _routes(rows: int, keep_right: float) -> str:
 def _command(folder: Path, change_s: float) -> list[str]:
     """SUMO's command line. No vehicle is removed for standing still or for a crash."""
     return [
-        *("sumo", "--net-file", str(folder / "net.xml"), "--route-files", str(folder / "routes.xml")),
+        *(
+            "sumo",
+            "--net-file",
+            str(folder / "net.xml"),
+            "--route-files",
+            str(folder / "routes.xml"),
+        ),
         *("--step-length", str(PHYSICS_STEP_S), "--step-method.ballistic", "true"),
         *("--lanechange.duration", str(change_s), "--default.speeddev", "0"),
         *("--collision.action", "none", "--time-to-teleport", "-1", "--xml-validation", "never"),

@@ -29,9 +29,11 @@ VERSION = 2
 RENAMED = {"carrier": "env_state", "meter": "stats", "owed": "pending_decisions"}
 #: Key of an identity that holds the defaults of its options.
 DEFAULTS = "defaults"
-#: Parts of an identity that may change when a run is resumed; the run is bit-exact only if they do not.
+#: Parts of an identity that may change when a run is resumed; the run is bit-exact only if they do
+#: not.
 COMPUTED_BY = ("env.compile",)
-#: After a checkpoint that took t seconds to write, the next comes after 50 t at the earliest: 2 % of the time.
+#: After a checkpoint that took t seconds to write, the next comes after 50 t at the earliest: 2 %
+#: of the time.
 PATIENCE = 50.0
 #: Parts of a checkpoint in which every number must be finite.
 FINITE = ("network", "target", "optimizer", "replay", "window", "stats")
@@ -44,19 +46,24 @@ MASK = ".".join(MASK_KEY)
 class TrainingState:
     """State of a run of ``agent`` in ``env``, batch [N].
 
-    ``pending_decisions`` counts decisions whose updates are still due; ``best`` is the best evaluation so far,
-    ``evaluated_at`` the decisions at the last one. ``identity`` is plain data that a resumed run must share:
-    environment, traffic, reward, seed. Its entry :data:`DEFAULTS`, which is not saved, holds the defaults of options
-    by dotted name, for options that did not exist when an older run was started.
+    ``pending_decisions`` counts decisions whose updates are still due; ``best`` is the best
+    evaluation so far, ``evaluated_at`` the decisions at the last one. ``identity`` is plain data
+    that a resumed run must share: environment, traffic, reward, seed. Its entry :data:`DEFAULTS`,
+    which is not saved, holds the defaults of options by dotted name, for options that did not exist
+    when an older run was started.
     """
 
-    def __init__(self, env: EnvBase | Collector, agent: Rainbow, identity: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, env: EnvBase | Collector, agent: Rainbow, identity: Mapping[str, Any] | None = None
+    ) -> None:
         self.collector = env if isinstance(env, Collector) else SingleCollector(env)
         self.agent, self.identity = agent, dict(identity or {})
         self.defaults = self.identity.pop(DEFAULTS, {})
         self.environments = self.collector.environments
         self.window = agent.window()
-        self.stats = EpisodeStats(self.environments, agent.network.config.actions, agent.config.gamma, agent.device)
+        self.stats = EpisodeStats(
+            self.environments, agent.network.config.actions, agent.config.gamma, agent.device
+        )
         self.decisions, self.pending_decisions, self.evaluated_at = 0, 0, 0
         self.best: float | None = None
         self._before_s, self._started_s = 0.0, time.monotonic()
@@ -73,8 +80,9 @@ class TrainingState:
     def state_dict(self, with_replay: bool = True) -> dict[str, Any]:
         """Tensors and plain data.
 
-        Without the replay buffer the state is small and holds only the episode numbers of the environments: a
-        resumed run starts the next episodes and is not bit-exact. The same holds for collectors that are not exact.
+        Without the replay buffer the state is small and holds only the episode numbers of the
+        environments: a resumed run starts the next episodes and is not bit-exact. The same holds
+        for collectors that are not exact.
         """
         exact = with_replay and self.collector.exact
         counters = ("decisions", "pending_decisions", "wall_s", "best")
@@ -99,10 +107,16 @@ class TrainingState:
         state = load_checkpoint(path, self.agent.device)
         parts = {"agent", "window", "env_state", "stats", "counters", "identity"}
         if not isinstance(state, dict) or not state.keys() >= parts:
-            raise UserError(f"resume={path}: parts of the run are missing in it; give another checkpoint.")
+            raise UserError(
+                f"resume={path}: parts of the run are missing in it; give another checkpoint."
+            )
         if not isinstance(state["identity"], dict):
-            raise UserError(f"resume={path}: it does not say what run it is of; give another checkpoint.")
-        before, now = (flat({**self.defaults, **flat(each)}) for each in (state["identity"], self.identity))
+            raise UserError(
+                f"resume={path}: it does not say what run it is of; give another checkpoint."
+            )
+        before, now = (
+            flat({**self.defaults, **flat(each)}) for each in (state["identity"], self.identity)
+        )
         for name in (*now, *before):
             if name not in COMPUTED_BY and before.get(name) != now.get(name):
                 raise UserError(
@@ -135,22 +149,33 @@ class TrainingState:
             self.window.load_state_dict(state["window"])
             self.stats.load_state_dict(state["stats"])
         counters = state["counters"]
-        self.decisions, self.pending_decisions = counters["decisions"], counters["pending_decisions"]
+        self.decisions, self.pending_decisions = (
+            counters["decisions"],
+            counters["pending_decisions"],
+        )
         self.best, self._before_s = counters["best"], counters["wall_s"]
         if state["agent"]["replay"] is None:
             return "the replay buffer: it is filled again before the next update"
-        return None if exact else "the episodes that were under way: the workers begin the next ones"
+        return (
+            None if exact else "the episodes that were under way: the workers begin the next ones"
+        )
 
 
 class Checkpointer:
-    """Writes ``checkpoints/last.pt`` (to resume), ``last.safetensors`` and ``best.safetensors`` (to drive).
+    """Writes ``checkpoints/last.pt`` (to resume), ``last.safetensors`` and ``best.safetensors`` (to
+    drive).
 
-    ``every_s`` are the least seconds between two checkpoints. To the ``metadata`` of the agent's files the progress
-    of the training is added, under ``training``.
+    ``every_s`` are the least seconds between two checkpoints. To the ``metadata`` of the agent's
+    files the progress of the training is added, under ``training``.
     """
 
     def __init__(
-        self, state: TrainingState, folder: str | Path, every_s: float, with_replay: bool, metadata: Mapping[str, Any]
+        self,
+        state: TrainingState,
+        folder: str | Path,
+        every_s: float,
+        with_replay: bool,
+        metadata: Mapping[str, Any],
     ) -> None:
         self.state, self.path, self.metadata = state, Path(folder) / LAST, metadata
         self.every_s, self.with_replay = every_s, with_replay
@@ -171,9 +196,17 @@ class Checkpointer:
     def save_weights(self, name: str, figures: Mapping[str, Any]) -> None:
         """Write the online network as ``NAME.safetensors``, with ``figures`` in its metadata."""
         state = self.state
-        progress = {"decisions": state.decisions, "updates": state.agent.updates, "wall_s": state.wall_s}
+        progress = {
+            "decisions": state.decisions,
+            "updates": state.agent.updates,
+            "wall_s": state.wall_s,
+        }
         training = {**self.metadata.get("training", {}), **progress, **figures}
-        save_agent(self.path.with_name(f"{name}.safetensors"), state.agent, {**self.metadata, "training": training})
+        save_agent(
+            self.path.with_name(f"{name}.safetensors"),
+            state.agent,
+            {**self.metadata, "training": training},
+        )
 
 
 def save_checkpoint(path: str | Path, state: Any) -> None:
@@ -183,32 +216,42 @@ def save_checkpoint(path: str | Path, state: Any) -> None:
         seal_archive(part)
 
 
-def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: str = "resume") -> Any:
+def load_checkpoint(
+    path: str | Path, device: torch.device | str = "cpu", key: str = "resume"
+) -> Any:
     """Read a file of :func:`save_checkpoint`, with present names; never executes code.
 
-    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`). ``key`` is the
-    configuration key of ``path``, for error messages.
+    Files of versions that wrote no checksum are read too (:func:`note_without_checksum`). ``key``
+    is the configuration key of ``path``, for error messages.
 
     Raises:
-        UserError: the file is absent, damaged in any byte, holds weights that are not finite, or is no training
-            checkpoint of this version.
+        UserError: the file is absent, damaged in any byte, holds weights that are not finite, or is
+            no training checkpoint of this version.
     """
     path, given = Path(path), f"{key}={path}"
     if not path.is_file():
         raise UserError(f"{given}: no such file; give a run's folder or its {LAST}.")
     with path.open("rb") as file:
         empty = file.seek(0, 2) == 0
-        whole = not empty and has_checksum(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), given)
+        whole = not empty and has_checksum(
+            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), given
+        )
     try:
         content = torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # arbitrary bytes can make the unpickler fail in any way
         raise UserError(
             f"{given}: not a readable checkpoint (truncated, or not written by ganlane); give another one."
         ) from error
-    if not isinstance(content, dict) or content.get("kind") != KIND or content.get("version") != VERSION:
+    if (
+        not isinstance(content, dict)
+        or content.get("kind") != KIND
+        or content.get("version") != VERSION
+    ):
         raise UserError(f"{given}: not a {KIND} of version {VERSION}; give a run's {LAST}.")
     if not whole and "sealed" in content:
-        raise UserError(f"{given}: damaged, the checksum that was written with it is missing; give another one.")
+        raise UserError(
+            f"{given}: damaged, the checksum that was written with it is missing; give another one."
+        )
     state = _renamed(content.get("state"))  # :meth:`TrainingState.restore` checks the parts
     if isinstance(state, dict) and "counters" in state:
         state["counters"] = _renamed(state["counters"])
@@ -216,7 +259,9 @@ def load_checkpoint(path: str | Path, device: torch.device | str = "cpu", key: s
     parts = {**state, **agent} if isinstance(agent, dict) else {}
     for name in FINITE:
         if not _finite(parts.get(name)):
-            raise UserError(f"{given}: numbers of its {name} are not finite; give a checkpoint of another run.")
+            raise UserError(
+                f"{given}: numbers of its {name} are not finite; give a checkpoint of another run."
+            )
     if not whole:
         note_without_checksum(given)
     return state
@@ -232,7 +277,11 @@ def _finite(state: Any) -> bool:
 
 
 def _renamed(names: Any) -> Any:
-    return {RENAMED.get(key, key): value for key, value in names.items()} if isinstance(names, dict) else names
+    return (
+        {RENAMED.get(key, key): value for key, value in names.items()}
+        if isinstance(names, dict)
+        else names
+    )
 
 
 def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
@@ -252,13 +301,14 @@ def flat(nested: Mapping[str, Any], above: str = "") -> dict[str, Any]:
 def check_parts(
     state: Mapping[str, Any], agent: Rainbow, environments: Mapping[str, Any], stats: EpisodeStats
 ) -> None:
-    """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run, before it is used.
+    """Compare ``state`` (:meth:`TrainingState.state_dict`) with that of a new run, before it is
+    used.
 
-    A damaged part would do harm later: Adam writes beyond moments that are too short, and a replay buffer that
-    samples rows it does not hold returns arbitrary memory.
+    A damaged part would do harm later: Adam writes beyond moments that are too short, and a replay
+    buffer that samples rows it does not hold returns arbitrary memory.
 
-    ``agent`` has Adam's moments from the checkpoint already; ``environments`` (their state) and ``stats`` are those
-    of the new run.
+    ``agent`` has Adam's moments from the checkpoint already; ``environments`` (their state) and
+    ``stats`` are those of the new run.
 
     Raises:
         ValueError: a part has another structure, shape or type, or impossible numbers.
@@ -273,7 +323,9 @@ def check_parts(
     check_like(moments, adam if moments else {}, "optimizer")
     check_like(state["agent"]["updates"], 0, "updates")
     best = None if counters["best"] is None else 0.0
-    check_like(counters, {"decisions": 0, "pending_decisions": 0, "wall_s": 0.0, "best": best}, "counters")
+    check_like(
+        counters, {"decisions": 0, "pending_decisions": 0, "wall_s": 0.0, "best": best}, "counters"
+    )
     if replay is not None:
         _check_replay(replay, agent)
     if state["window"] is None:  # the resumed run will not be exact
@@ -284,12 +336,16 @@ def check_parts(
         raise ValueError("replay: its masks are those of another run")
     rows, steps = transitions(len(stats.returns), network), state["window"]["steps"]
     observation, end = rows["observation"], rows["next.terminated"]
-    step = Step(observation, rows["action"], rows["next.reward"], observation, end, end, mask)._asdict()
+    step = Step(
+        observation, rows["action"], rows["next.reward"], observation, end, end, mask
+    )._asdict()
     check_like(steps, [step] * min(len(steps), agent.config.n_step - 1), "window")
     for step in steps:
         _check_actions(step["action"], network)
     saved, one = state["stats"], torch.zeros((), dtype=torch.float64)
-    sums = {name: one.expand(len(stats.actions)) if name == "actions" else one for name in saved["sums"]}
+    sums = {
+        name: one.expand(len(stats.actions)) if name == "actions" else one for name in saved["sums"]
+    }
     updates = dict.fromkeys(saved["updates"], torch.zeros(()))
     check_like(saved, {**stats.state_dict(), "sums": sums, "updates": updates}, "stats")
     if updates and saved["update_count"] == 0:
@@ -302,7 +358,9 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
     check_like(replay, {"cursor": 0, "writes": 0}, "replay")
     if rows:
         like = transitions(count, agent.network.config)
-        check_like(rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay")
+        check_like(
+            rows, {name: like[name] for name in like if name != MASK or MASK in rows}, "replay"
+        )
         _check_actions(rows["action"], agent.network.config)
         steps = rows["steps_to_next_obs"]
         if ((steps < 1) | (steps > config.n_step)).any():
@@ -311,7 +369,11 @@ def _check_replay(replay: Mapping[str, Any], agent: Rainbow) -> None:
         raise ValueError(f"replay: {count} rows of {config.capacity}, the next one is {cursor}")
     if config.prioritised:
         own = torch.arange(-(-count // ROW) * ROW, device=agent.device).view(-1, ROW) < count
-        expected: dict[str, Any] = {"priorities": own.float(), "largest": torch.zeros(()), "beta": 0.0}
+        expected: dict[str, Any] = {
+            "priorities": own.float(),
+            "largest": torch.zeros(()),
+            "beta": 0.0,
+        }
         check_like(replay["sampler"], expected, "replay.sampler")
         if not torch.equal(replay["sampler"]["priorities"] > 0, own):
             raise ValueError("replay: priorities of rows that do not exist")
@@ -326,13 +388,23 @@ def transitions(rows: int, network: NetworkConfig) -> dict[str, Tensor]:
     """Shapes and types of the rows of the replay buffer as meta tensors, by dotted key."""
     number = torch.empty(rows, 1, device="meta")
     observation = number.expand(rows, network.observation_size)
-    after = {"next.observation": observation, "next.reward": number, "next.terminated": number.bool()}
+    after = {
+        "next.observation": observation,
+        "next.reward": number,
+        "next.terminated": number.bool(),
+    }
     after[MASK] = number.expand(rows, network.actions).bool()
-    return {"observation": observation, "action": number[:, 0].long(), "steps_to_next_obs": number, **after}
+    return {
+        "observation": observation,
+        "action": number[:, 0].long(),
+        "steps_to_next_obs": number,
+        **after,
+    }
 
 
 def check_like(found: Any, like: Any, name: str) -> None:
-    """Raise :class:`ValueError` unless ``found`` has at least the keys of ``like``, its lengths, shapes and types.
+    """Raise :class:`ValueError` unless ``found`` has at least the keys of ``like``, its lengths,
+    shapes and types.
 
     Numbers outside tensors must be finite, counts at least 0.
     """

@@ -1,8 +1,9 @@
 """Collectors: each step is one decision of all environments, in order of time.
 
-The training loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the environments in this
-process; with :class:`OverlapCollector` worker processes step them while the loop updates. Runs with these two resume
-bit for bit. The collectors of :mod:`ganlane.training.workers` wrap TorchRL's, in worker processes.
+The training loop is the same for every :class:`Collector`. :class:`SingleCollector` steps the
+environments in this process; with :class:`OverlapCollector` worker processes step them while the
+loop updates. Runs with these two resume bit for bit. The collectors of
+:mod:`ganlane.training.workers` wrap TorchRL's, in worker processes.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from ganlane.env.highway import threads_for
 from ganlane.errors import UserError
 from ganlane.transforms.observation import PERCEIVED, SENSORS
 
-#: Makes the environments of a worker from their number and first episode. It is pickled: a module-level function or
-#: a ``functools.partial`` of one.
+#: Makes the environments of a worker from their number and first episode. It is pickled: a
+#: module-level function or a ``functools.partial`` of one.
 MakeEnv = Callable[[int, int], EnvBase]
 #: Distance between the first episodes of two workers, so that no two ever drive the same episode.
 EPISODES_PER_WORKER = 2**40
@@ -54,11 +55,13 @@ class Collector(ABC):
     environments: int
     #: Whether a run resumes bit for bit.
     exact: bool
-    #: Whether the loop makes its updates between :meth:`begin` and :meth:`step` rather than after both.
+    #: Whether the loop makes its updates between :meth:`begin` and :meth:`step` rather than after
+    #: both.
     overlaps: bool = False
 
     def open(self, agent: Rainbow) -> None:  # noqa: B027 (optional)
-        """Start the workers, if there are any; without this call the first :meth:`step` starts them.
+        """Start the workers, if there are any; without this call the first :meth:`step` starts
+        them.
 
         Raises:
             UserError: they cannot be started.
@@ -76,7 +79,10 @@ class Collector(ABC):
 
     @abstractmethod
     def state_dict(self, exact: bool) -> dict[str, Any]:
-        """Tensors and plain data to continue from: bit for bit if ``exact``, else with the next episodes."""
+        """Tensors and plain data to continue from.
+
+        Bit for bit if ``exact``, else with the next episodes.
+        """
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
@@ -106,8 +112,8 @@ class Collector(ABC):
 class SingleCollector(Collector):
     """``collector=single``: steps ``env``, batch [N], in this process.
 
-    ``env_state`` is the TensorDict with the environments' state. TorchRL's ``Collector`` does not expose it; here it
-    is saved, so that a resumed run is exact.
+    ``env_state`` is the TensorDict with the environments' state. TorchRL's ``Collector`` does not
+    expose it; here it is saved, so that a resumed run is exact.
     """
 
     name, exact = "single", True
@@ -126,48 +132,67 @@ class SingleCollector(Collector):
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
         """The state of the environments; unless ``exact``, only their episode numbers."""
-        return pack(self.env_state if exact else self.env_state.select(keys.SEED, keys.EPISODE, strict=False))
+        return pack(
+            self.env_state
+            if exact
+            else self.env_state.select(keys.SEED, keys.EPISODE, strict=False)
+        )
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Restore the state; unless ``exact``, begin the episodes after those of ``state`` (or the first)."""
+        """Restore the state.
+
+        Unless ``exact``, begin the episodes after those of ``state`` (or the first).
+        """
         saved = unpack(state)
         if exact:
             self.env_state = saved
         elif keys.EPISODE in saved:
-            self.env_state = self.env.reset(saved.set(keys.EPISODE, saved.get(keys.EPISODE) + self.environments))
+            self.env_state = self.env.reset(
+                saved.set(keys.EPISODE, saved.get(keys.EPISODE) + self.environments)
+            )
         else:
             self.env_state = self.env.reset()
 
 
 def pack(tensordict: TensorDictBase) -> dict[str, Any]:
     """A TensorDict as plain data, with its (nested) batch sizes."""
-    leaves = {key: pack(value) if isinstance(value, TensorDictBase) else value for key, value in tensordict.items()}
+    leaves = {
+        key: pack(value) if isinstance(value, TensorDictBase) else value
+        for key, value in tensordict.items()
+    }
     return {"batch_size": list(tensordict.batch_size), "items": leaves}
 
 
 def unpack(packed: dict[str, Any]) -> TensorDict:
     """The TensorDict of :func:`pack`."""
-    items = {key: unpack(value) if isinstance(value, dict) else value for key, value in packed["items"].items()}
+    items = {
+        key: unpack(value) if isinstance(value, dict) else value
+        for key, value in packed["items"].items()
+    }
     return TensorDict(items, batch_size=packed["batch_size"])
 
 
 class OverlapCollector(Collector):
-    """``collector=overlap``: worker processes step the environments while this one learns, a barrier per step.
+    """``collector=overlap``: worker processes step the environments while this one learns, a
+    barrier per step.
 
-    :meth:`begin` chooses the actions of all environments with the current weights and sends them to the workers; the
-    loop then makes the updates that are due, and :meth:`step` waits for the slowest worker. So the weights that
-    choose an action lack the updates of one step, compared with ``collector=single``. The result does not depend on
-    which side is faster, and nothing is in flight between two steps: runs are deterministic and resume bit for bit.
+    :meth:`begin` chooses the actions of all environments with the current weights and sends them to
+    the workers; the loop then makes the updates that are due, and :meth:`step` waits for the
+    slowest worker. So the weights that choose an action lack the updates of one step, compared with
+    ``collector=single``. The result does not depend on which side is faster, and nothing is in
+    flight between two steps: runs are deterministic and resume bit for bit.
 
-    The ``environments`` are shared out evenly: row ``w * rows + i`` of a step is row i of worker w, which starts with
-    episode ``w * 2**40 + i``. A worker has one thread.
+    The ``environments`` are shared out evenly: row ``w * rows + i`` of a step is row i of worker w,
+    which starts with episode ``w * 2**40 + i``. A worker has one thread.
     """
 
     name, exact, overlaps = "overlap", True, True
 
     def __init__(self, make_env: MakeEnv, workers: int, environments: int) -> None:
         self.environments, self.rows = environments, environments // workers
-        self._make = [partial(make_env, self.rows, worker * EPISODES_PER_WORKER) for worker in range(workers)]
+        self._make = [
+            partial(make_env, self.rows, worker * EPISODES_PER_WORKER) for worker in range(workers)
+        ]
         self._processes: list[Any] = []
         self._pipes: list[Connection] = []
         #: Input of the policy for every environment, [N]; None: to be requested from the workers.
@@ -193,7 +218,10 @@ class OverlapCollector(Collector):
         self._pipes.append(ours)
 
     def _ask(self, name: str, *arguments: list[Any]) -> list[Any]:
-        """Send a request to all workers, with one argument of each list per worker; return their answers."""
+        """Send a request to all workers, with one argument of each list per worker.
+
+        Return their answers.
+        """
         self.open()
         with self.failures_as_user_errors():
             for worker, pipe in enumerate(self._pipes):
@@ -225,7 +253,9 @@ class OverlapCollector(Collector):
         assert self._given is not None
         answers = self._answers()
         self._results = self._results or answers
-        self._seen, after = (torch.cat([result.get(name) for result in self._results]) for name in ("seen", "after"))
+        self._seen, after = (
+            torch.cat([result.get(name) for result in self._results]) for name in ("seen", "after")
+        )
         step, self._given = self._given.set("next", after.to(agent.device)), None
         return step
 
@@ -265,7 +295,8 @@ class OverlapCollector(Collector):
 def work(pipe: Connection, make_env: Callable[[], EnvBase]) -> None:
     """A worker: answers requests until the other end of ``pipe`` is closed.
 
-    The first answer to ``step`` is the TensorDict in shared memory to which later steps are written.
+    The first answer to ``step`` is the TensorDict in shared memory to which later steps are
+    written.
     """
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         source = SingleCollector(make_env())
@@ -299,7 +330,10 @@ def send(pipe: Connection, message: Any) -> None:
 
 
 def drive(source: SingleCollector, action: npt.NDArray[np.int64]) -> TensorDict:
-    """One decision: ``seen``, the policy's next input (reset after an ended episode); ``after``, before any reset."""
+    """One decision: ``seen``, the policy's next input (reset after an ended episode).
+
+    ``after``, before any reset.
+    """
     given = source.env_state.set(keys.ACTION, torch.from_numpy(action))
     with threads_for(source.env):
         step, source.env_state = source.env.step_and_maybe_reset(given)
@@ -328,7 +362,10 @@ def exit_codes(processes: Sequence[Any]) -> dict[int, int]:
 def why_lost(processes: Sequence[Any]) -> str:
     """Why workers were lost, for an error message."""
     codes = exit_codes(processes)
-    who = ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items()) or "a worker"
+    who = (
+        ", ".join(f"worker {worker} (exit code {code})" for worker, code in codes.items())
+        or "a worker"
+    )
     if any(code > 0 for code in codes.values()):
         return f"{who} failed; its own message is above"
     return f"{who} died, killed from outside or for want of memory (fewer collector.workers or num_envs need less)"
@@ -336,12 +373,14 @@ def why_lost(processes: Sequence[Any]) -> str:
 
 @contextmanager
 def shielded_children() -> Iterator[None]:
-    """Context whose child processes never receive SIGINT and SIGTERM; signal handlers are restored at its end.
+    """Context whose child processes never receive SIGINT and SIGTERM; signal handlers are restored
+    at its end.
 
-    A terminal sends Ctrl-C to all processes of a command, as Slurm and container runtimes do with SIGTERM: a worker
-    would die in the middle of a step that the main process waits for. Children inherit the blocked signals; signals
-    that arrive meanwhile are delivered to this process at the end. The handlers are restored because some libraries
-    (``ray.init``) replace those of the training loop.
+    A terminal sends Ctrl-C to all processes of a command, as Slurm and container runtimes do with
+    SIGTERM: a worker would die in the middle of a step that the main process waits for. Children
+    inherit the blocked signals; signals that arrive meanwhile are delivered to this process at the
+    end. The handlers are restored because some libraries (``ray.init``) replace those of the
+    training loop.
     """
     handlers = {number: signal.getsignal(number) for number in STOPPING}
     can_block = hasattr(signal, "pthread_sigmask")

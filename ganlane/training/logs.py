@@ -46,7 +46,8 @@ class Log(Protocol):
 
 
 class Logs:
-    """All logs of a run: ``metrics.csv``, ``evaluation.csv``, the progress, and the ``further`` ones.
+    """All logs of a run: ``metrics.csv``, ``evaluation.csv``, the progress, and the ``further``
+    ones.
 
     Args:
         folder: of the run.
@@ -57,14 +58,23 @@ class Logs:
     """
 
     def __init__(
-        self, folder: str | Path, actions: int, decisions: int, total: int | None, further: Sequence[Log] = ()
+        self,
+        folder: str | Path,
+        actions: int,
+        decisions: int,
+        total: int | None,
+        further: Sequence[Log] = (),
     ) -> None:
         self.evaluation_file = Path(folder) / "evaluation.csv"
         shares = [f"action_{i}_share" for i in range(actions)]
         metrics = CsvLog(Path(folder) / "metrics.csv", [*COLUMNS, *shares], decisions)
         self.progress = None if total is None else Progress(total, decisions)
         self.further = list(further)
-        self.of_metrics: list[Log] = [metrics, *([] if self.progress is None else [self.progress]), *further]
+        self.of_metrics: list[Log] = [
+            metrics,
+            *([] if self.progress is None else [self.progress]),
+            *further,
+        ]
         before = read_rows(self.evaluation_file)
         if before:  # a resumed run: remove rows beyond its checkpoint
             CsvLog(self.evaluation_file, list(before[0]), decisions).close()
@@ -79,12 +89,19 @@ class Logs:
             log.write({**row, "decisions_per_s": rate})
 
     def write_evaluation(self, row: Mapping[str, float]) -> None:
-        """Write a row of evaluation figures, replacing one at the same decisions from before the run was resumed."""
+        """Write a row of evaluation figures, replacing one at the same decisions from before the
+        run was resumed.
+        """
         evaluation = CsvLog(self.evaluation_file, list(row), int(row["decisions"]) - 1)
         evaluation.write(row)
         evaluation.close()
         for log in self.further:
-            log.write({name if name == "decisions" else f"evaluation/{name}": value for name, value in row.items()})
+            log.write(
+                {
+                    name if name == "decisions" else f"evaluation/{name}": value
+                    for name, value in row.items()
+                }
+            )
 
     def advance(self, decisions: int) -> None:
         """Move the progress bar."""
@@ -105,8 +122,8 @@ class CsvLog:
     """A CSV file with fixed columns, flushed after every row.
 
     Args:
-        path: the file; if it exists, its complete rows up to ``decisions`` are kept: a resumed run continues at its
-            checkpoint, not where it was interrupted.
+        path: the file; if it exists, its complete rows up to ``decisions`` are kept: a resumed run
+            continues at its checkpoint, not where it was interrupted.
         columns: in this order; other entries of a row are dropped, missing ones left empty.
         decisions: already made.
     """
@@ -124,7 +141,10 @@ class CsvLog:
 
     def write(self, row: Mapping[str, float]) -> None:
         """Append one line."""
-        short = {name: format(value, ".6g") if isinstance(value, float) else value for name, value in row.items()}
+        short = {
+            name: format(value, ".6g") if isinstance(value, float) else value
+            for name, value in row.items()
+        }
         self._writer.writerow(short)
         self._file.flush()
 
@@ -146,8 +166,11 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             whole = [line for line in file if line.endswith("\n")]
-        # DictReader gives missing entries of a short row as None, and surplus ones of a long row under the key None.
-        rows = [row for row in csv.DictReader(whole) if None not in row and None not in row.values()]
+        # DictReader gives missing entries of a short row as None, and surplus ones of a long row
+        # under the key None.
+        rows = [
+            row for row in csv.DictReader(whole) if None not in row and None not in row.values()
+        ]
         if whole and "decisions" not in next(csv.reader(whole)):
             raise ValueError("it has no column 'decisions'")
         rows = [row for row in rows if row["decisions"]]
@@ -164,10 +187,12 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 class Progress:
-    """Shows decisions per second, remaining time, mean return and ends of episodes: a bar, or a line per row.
+    """Shows decisions per second, remaining time, mean return and ends of episodes: a bar, or a
+    line per row.
 
-    Figures that a row lacks, because no episode ended in its interval, keep their last value. Of the ``total``
-    decisions of the run, ``done`` have been made before. A terminal as ``stream`` (default stderr) gets the bar.
+    Figures that a row lacks, because no episode ended in its interval, keep their last value. Of
+    the ``total`` decisions of the run, ``done`` have been made before. A terminal as ``stream``
+    (default stderr) gets the bar.
     """
 
     def __init__(self, total: int, done: int = 0, stream: TextIO | None = None) -> None:
@@ -175,7 +200,13 @@ class Progress:
         self.known: dict[str, float] = {}
         self._bar = None
         if self.stream.isatty():
-            options = {"unit": "", "unit_scale": True, "dynamic_ncols": True, "bar_format": BAR, "file": self.stream}
+            options = {
+                "unit": "",
+                "unit_scale": True,
+                "dynamic_ncols": True,
+                "bar_format": BAR,
+                "file": self.stream,
+            }
             self._bar = tqdm(total=total, initial=done, desc="train", **options)
 
     def advance(self, decisions: int) -> None:
@@ -186,7 +217,9 @@ class Progress:
     def write(self, row: Mapping[str, float]) -> None:
         """Show a row of figures."""
         self.known |= {name: row[name] for name in SHOWN if name in row}
-        shown = [form.format(self.known[name]) for name, form in SHOWN.items() if name in self.known]
+        shown = [
+            form.format(self.known[name]) for name, form in SHOWN.items() if name in self.known
+        ]
         if self._bar is not None:
             self._bar.set_postfix_str(", ".join(shown))
             return
@@ -202,8 +235,11 @@ class Progress:
             self._bar.close()
 
 
-def make_logs(options: LoggerConfig, folder: str | Path, about: Mapping[str, Any] | None = None) -> list[Log]:
-    """The logs of ``logger=...`` beyond the CSV files; ``about``: JSON-serialisable settings of the run, for display.
+def make_logs(
+    options: LoggerConfig, folder: str | Path, about: Mapping[str, Any] | None = None
+) -> list[Log]:
+    """The logs of ``logger=...`` beyond the CSV files; ``about``: JSON-serialisable settings of the
+    run, for display.
 
     Raises:
         UserError: a package is not installed.
@@ -243,23 +279,32 @@ class TensorBoardLog:
 
 
 class WandbLog:
-    """A run of Weights & Biases below ``folder/wandb`` (extra ``wandb``), named after ``folder``'s last two parts.
+    """A run of Weights & Biases below ``folder/wandb`` (extra ``wandb``), named after ``folder``'s
+    last two parts.
 
-    Offline, unless the environment variable ``WANDB_MODE`` asks for something else (``online``, ``disabled``). A
-    resumed training is a new run there that starts at the decisions of the checkpoint. ``about`` holds
-    JSON-serialisable settings, shown with the figures.
+    Offline, unless the environment variable ``WANDB_MODE`` asks for something else (``online``,
+    ``disabled``). A resumed training is a new run there that starts at the decisions of the
+    checkpoint. ``about`` holds JSON-serialisable settings, shown with the figures.
 
     Raises:
-        UserError: wandb is not installed, or does not start (``WANDB_MODE=online`` without an account, for instance).
+        UserError: wandb is not installed, or does not start (``WANDB_MODE=online`` without an
+            account, for instance).
     """
 
-    def __init__(self, folder: str | Path, project: str = "ganlane", about: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, folder: str | Path, project: str = "ganlane", about: Mapping[str, Any] | None = None
+    ) -> None:
         wandb = _module("wandb", "wandb")
         mode = os.environ.get("WANDB_MODE") or "offline"
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         name = "/".join(folder.absolute().parts[-2:])
-        options: dict[str, Any] = {"project": project, "name": name, "dir": str(folder), "mode": mode}
+        options: dict[str, Any] = {
+            "project": project,
+            "name": name,
+            "dir": str(folder),
+            "mode": mode,
+        }
         try:
             # W&B's console would capture the stream of the progress bar.
             settings = wandb.Settings(console="off")

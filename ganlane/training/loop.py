@@ -29,12 +29,14 @@ Evaluate = Callable[[GreedyPolicy], Mapping[str, float]]
 
 @dataclass(frozen=True)
 class TrainingConfig(Record):
-    """Length and schedule of a run. ``*_every`` count decisions over all environments; 0 means never.
+    """Length and schedule of a run. ``*_every`` count decisions over all environments; 0 means
+    never.
 
-    A checkpoint is written ``checkpoint_every_s`` seconds after the last one, later if writing is slow, so that it
-    takes at most 2 % of the time. ``checkpoint_replay`` includes the replay buffer; without it a resumed run fills
-    the buffer again and is not bit-exact. ``best_metric`` is the figure of the evaluation that selects the best
-    agent. ``progress`` shows a bar on a terminal and lines elsewhere.
+    A checkpoint is written ``checkpoint_every_s`` seconds after the last one, later if writing is
+    slow, so that it takes at most 2 % of the time. ``checkpoint_replay`` includes the replay
+    buffer; without it a resumed run fills the buffer again and is not bit-exact. ``best_metric`` is
+    the figure of the evaluation that selects the best agent. ``progress`` shows a bar on a terminal
+    and lines elsewhere.
     """
 
     total_decisions: Count
@@ -51,8 +53,8 @@ class TrainingResult:
     """Result of a run.
 
     ``stopped_by`` is the number of the signal that stopped it early, or None (an entry point raises
-    :class:`~ganlane.config.app.Stopped` with it). ``best`` is the ``best_metric`` of the best evaluation.
-    ``checkpoint`` is the file to resume from.
+    :class:`~ganlane.config.app.Stopped` with it). ``best`` is the ``best_metric`` of the best
+    evaluation. ``checkpoint`` is the file to resume from.
     """
 
     decisions: int
@@ -65,10 +67,11 @@ class TrainingResult:
 
 @contextmanager
 def noted_signals() -> Iterator[list[int]]:
-    """Context in which SIGINT and SIGTERM are noted in the list that it gives, instead of ending the process.
+    """Context in which SIGINT and SIGTERM are noted in the list that it gives, instead of ending
+    the process.
 
-    A second Ctrl-C raises KeyboardInterrupt as usual. Outside the main thread, where Python allows no handlers, the
-    context does nothing.
+    A second Ctrl-C raises KeyboardInterrupt as usual. Outside the main thread, where Python allows
+    no handlers, the context does nothing.
     """
     noted: list[int] = []
 
@@ -97,27 +100,35 @@ def train(
     resume: str | Path | None = None,
     identity: Mapping[str, Any] | None = None,
 ) -> TrainingResult:
-    """Train ``agent`` in ``env`` until all decisions are made or a signal stops it; write a checkpoint at the end.
+    """Train ``agent`` in ``env`` until all decisions are made or a signal stops it; write a
+    checkpoint at the end.
 
     Args:
-        env: batch [N], writes ``observation`` and ``reward``; a resumed run is exact only if all of its state is in
-            the TensorDict. Or a collector (:mod:`ganlane.training.collectors`), which the caller closes.
+        env: batch [N], writes ``observation`` and ``reward``; a resumed run is exact only if all of
+            its state is in the TensorDict. Or a collector (:mod:`ganlane.training.collectors`),
+            which the caller closes.
         agent: trained in place.
         config: length and schedule.
-        run_folder: gets ``metrics.csv``, ``evaluation.csv`` and ``checkpoints/{last.pt, last, best.safetensors}``.
+        run_folder: gets ``metrics.csv``, ``evaluation.csv`` and
+            ``checkpoints/{last.pt, last, best.safetensors}``.
         evaluate: called with the greedy policy every ``config.evaluate_every`` decisions.
         logs: logs in addition to the CSV files and the progress.
-        metadata: JSON-serialisable, written into the agent's files, e.g. the name of the observation.
+        metadata: JSON-serialisable, written into the agent's files, e.g. the name of the
+            observation.
         resume: checkpoint to continue from.
-        identity: plain data that identifies the run (environment, traffic, reward, seed); a checkpoint with another
-            identity is refused (:class:`~ganlane.training.checkpoint.TrainingState`).
+        identity: plain data that identifies the run (environment, traffic, reward, seed); a
+            checkpoint with another identity is refused
+            (:class:`~ganlane.training.checkpoint.TrainingState`).
 
     Raises:
-        UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not evaluated.
+        UserError: the checkpoint is unreadable or of another run, or ``config.best_metric`` is not
+            evaluated.
     """
     state = TrainingState(env, agent, identity)
     missing = None if resume is None else state.restore(resume)
-    saver = Checkpointer(state, run_folder, config.checkpoint_every_s, config.checkpoint_replay, metadata or {})
+    saver = Checkpointer(
+        state, run_folder, config.checkpoint_every_s, config.checkpoint_replay, metadata or {}
+    )
     actions = agent.network.config.actions
     shown = config.total_decisions if config.progress else None
     with closing(Logs(run_folder, actions, state.decisions, shown, logs)) as log:
@@ -140,7 +151,9 @@ def train(
                 keep_best(state, evaluate, config.best_metric, log, saver)
             saver.save()
     stopped_by = signals[-1] if signals else None
-    return TrainingResult(state.decisions, agent.updates, state.wall_s, state.best, stopped_by, saver.path)
+    return TrainingResult(
+        state.decisions, agent.updates, state.wall_s, state.best, stopped_by, saver.path
+    )
 
 
 def advance(state: TrainingState) -> TensorDictBase:
@@ -170,7 +183,10 @@ def collect(state: TrainingState) -> TensorDictBase:
 
 
 def learn(state: TrainingState) -> None:
-    """Make the updates that are due, one per ``decisions_per_update``; none until the agent is ready (``warmup``)."""
+    """Make the updates that are due, one per ``decisions_per_update``.
+
+    None until the agent is ready (``warmup``).
+    """
     agent = state.agent
     if not agent.ready:
         return
@@ -183,18 +199,27 @@ def learn(state: TrainingState) -> None:
 def metrics(state: TrainingState) -> dict[str, float]:
     """A row of metrics, copied from the device."""
     agent = state.agent
-    row = {"decisions": state.decisions, "updates": agent.updates, "wall_s": state.wall_s, **state.stats.read()}
+    row = {
+        "decisions": state.decisions,
+        "updates": agent.updates,
+        "wall_s": state.wall_s,
+        **state.stats.read(),
+    }
     return row | {"sigma": float(agent.sigma()), "epsilon": agent.policy.epsilon}
 
 
-def keep_best(state: TrainingState, evaluate: Evaluate, best_metric: str, log: Logs, saver: Checkpointer) -> None:
+def keep_best(
+    state: TrainingState, evaluate: Evaluate, best_metric: str, log: Logs, saver: Checkpointer
+) -> None:
     """Evaluate the greedy policy; save it if it is the best so far."""
     state.evaluated_at = state.decisions
     row = dict(evaluate(state.agent.greedy))
     log.write_evaluation({"decisions": state.decisions, **row})
     if best_metric not in row:
         known = ", ".join(row)
-        raise UserError(f"best_metric={best_metric}: not among the evaluation's figures; choose one of {known}.")
+        raise UserError(
+            f"best_metric={best_metric}: not among the evaluation's figures; choose one of {known}."
+        )
     if state.best is None or row[best_metric] > state.best:
         state.best = row[best_metric]
         saver.save_weights("best", row)

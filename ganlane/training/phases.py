@@ -1,7 +1,8 @@
-"""The phases of ``ganlane train``: one or two runs of the training loop, the second from the agent of the first.
+"""The phases of ``ganlane train``: one or two runs of the training loop, the second from the agent
+of the first.
 
-:func:`phases_of` lists the phases of a config; :func:`run_phase` makes collector and agent, trains, and writes the
-agent into the folder of the phase.
+:func:`phases_of` lists the phases of a config; :func:`run_phase` makes collector and agent, trains,
+and writes the agent into the folder of the phase.
 """
 
 from __future__ import annotations
@@ -19,13 +20,26 @@ import polars as pl
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ganlane.agents import GreedyPolicy, NetworkConfig, Rainbow, RainbowConfig, read_agent, save_agent, warm_start
+from ganlane.agents import (
+    GreedyPolicy,
+    NetworkConfig,
+    Rainbow,
+    RainbowConfig,
+    read_agent,
+    save_agent,
+    warm_start,
+)
 from ganlane.agents.checkpoint import SHIPPED, SUPPORT
 from ganlane.agents.drivers import legal_actions
 from ganlane.agents.network import load_parameters
 from ganlane.build import make_env, make_road, make_traffic, observation_of
 from ganlane.config.traffic import TrafficConfig
-from ganlane.config.train import MultiCollectorConfig, OverlapCollectorConfig, RayCollectorConfig, TrainConfig
+from ganlane.config.train import (
+    MultiCollectorConfig,
+    OverlapCollectorConfig,
+    RayCollectorConfig,
+    TrainConfig,
+)
 from ganlane.errors import UserError
 from ganlane.evaluation import code_version, run_episodes
 from ganlane.evaluation.results import plain
@@ -47,7 +61,10 @@ AGENT_FILE = "agent.safetensors"
 
 @dataclass(frozen=True)
 class Phase:
-    """Training on one traffic: ``folder`` of its files, ``init`` the agent to start from (None: random weights)."""
+    """Training on one traffic: ``folder`` of its files, ``init`` the agent to start from (None.
+
+    Random weights).
+    """
 
     name: str
     folder: Path
@@ -62,7 +79,9 @@ def phases_of(config: TrainConfig, folder: Path) -> list[Phase]:
     before = config.pretrain
     if before.total_decisions == 0 or before.traffic is None:
         return [main]
-    first = Phase("pretrain", folder / "pretrain", before.traffic, before.total_decisions, config.init.path)
+    first = Phase(
+        "pretrain", folder / "pretrain", before.traffic, before.total_decisions, config.init.path
+    )
     return [first, replace(main, init=str(first.folder / AGENT_FILE))]
 
 
@@ -83,12 +102,17 @@ def length_if_finished(config: TrainConfig, phase: Phase) -> dict[str, float] | 
             "that the run was started with."
         )
     if flat(training["traffic"]) != flat(phase.traffic.description()):
-        raise UserError("traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same.")
+        raise UserError(
+            "traffic@pretrain.traffic: this phase is over, on other traffic; resume with the same."
+        )
     return {name: training[name] for name in ("decisions", "updates", "wall_s")}
 
 
-def run_phase(config: TrainConfig, phase: Phase, resume: str | Path | None = None) -> TrainingResult:
-    """Train the agent of one phase and write its :data:`AGENT_FILE`, unless a signal stopped it early.
+def run_phase(
+    config: TrainConfig, phase: Phase, resume: str | Path | None = None
+) -> TrainingResult:
+    """Train the agent of one phase and write its :data:`AGENT_FILE`, unless a signal stopped it
+    early.
 
     ``config`` is that of the whole run, ``resume`` a checkpoint to continue from.
 
@@ -133,7 +157,9 @@ def make_collector(config: TrainConfig, phase: Phase) -> Collector:
     """
     collector = config.collector
     if not isinstance(collector, MultiCollectorConfig | OverlapCollectorConfig):
-        return SingleCollector(training_env(config, phase, collector.num_envs, device=config.device))
+        return SingleCollector(
+            training_env(config, phase, collector.num_envs, device=config.device)
+        )
     training_env(config, phase, 1)  # raises the user's mistakes before any worker is started
     make_worker_env = partial(worker_env, config, phase)
     if isinstance(collector, OverlapCollectorConfig):
@@ -146,8 +172,16 @@ def make_collector(config: TrainConfig, phase: Phase) -> Collector:
 def training_env(
     config: TrainConfig, phase: Phase, rows: int, first_episode: int = 0, device: str = "cpu"
 ) -> EnvBase:
-    """``rows`` environments of the training stream; row i begins with episode ``first_episode + i``."""
-    parts = (make_traffic(phase.traffic, config.env, Stream.TRAIN), config.env, config.observation, config.reward)
+    """``rows`` environments of the training stream.
+
+    Row i begins with episode ``first_episode + i``.
+    """
+    parts = (
+        make_traffic(phase.traffic, config.env, Stream.TRAIN),
+        config.env,
+        config.observation,
+        config.reward,
+    )
     return make_env(*parts, rows, config.seed, device, first_episode, config.mask)
 
 
@@ -159,15 +193,26 @@ def worker_env(config: TrainConfig, phase: Phase, rows: int, first_episode: int)
 
 
 def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
-    """A function that evaluates the greedy policy on the selection stream, whose episodes are never trained on."""
-    parts = (make_traffic(phase.traffic, config.env, Stream.SELECT), config.env, config.observation, config.reward)
+    """A function that evaluates the greedy policy on the selection stream, whose episodes are never
+    trained on.
+    """
+    parts = (
+        make_traffic(phase.traffic, config.env, Stream.SELECT),
+        config.env,
+        config.observation,
+        config.reward,
+    )
     make = partial(make_env, *parts, seed=config.seed, device=config.device, mask=config.mask)
     env = make(min(config.selection_episodes, config.evaluation.num_envs))
     smaller = None if config.env.compile else make
 
     def evaluate(policy: GreedyPolicy) -> dict[str, float]:
-        table = run_episodes(env, policy, range(config.selection_episodes), config.seed, make_smaller=smaller)
-        total = table.select("reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash").sum()
+        table = run_episodes(
+            env, policy, range(config.selection_episodes), config.seed, make_smaller=smaller
+        )
+        total = table.select(
+            "reward", "lane_changes", "distance_m", crashes=pl.col("reason") == "hard_crash"
+        ).sum()
         reward, changes, distance_m, crashes = (float(value) for value in total.row(0))
         spread = float(np.std(table["reward"].to_numpy()))
         return {
@@ -185,7 +230,10 @@ def make_selection(config: TrainConfig, phase: Phase) -> Evaluate:
 
 @dataclass(frozen=True)
 class Start:
-    """A trained agent to start from; ``moments`` are Adam's, by parameter (None: the file holds weights only)."""
+    """A trained agent to start from; ``moments`` are Adam's, by parameter (None.
+
+    The file holds weights only).
+    """
 
     name: str
     weights: Mapping[str, Tensor]
@@ -197,8 +245,9 @@ class Start:
 def read_start(name: str, key: str = "init.path") -> Start:
     """Read the agent of ``init.path``.
 
-    ``name`` is a shipped agent or a ``.safetensors`` file; or a training run's folder or its ``last.pt``, for the
-    agent as the run last saved it, with its moments. ``key`` is its configuration key, for error messages.
+    ``name`` is a shipped agent or a ``.safetensors`` file; or a training run's folder or its
+    ``last.pt``, for the agent as the run last saved it, with its moments. ``key`` is its
+    configuration key, for error messages.
 
     Raises:
         UserError: the file is missing or cannot be read.
@@ -209,15 +258,25 @@ def read_start(name: str, key: str = "init.path") -> Start:
         return Start(name, weights, network, observation_of(metadata))
     path = path / LAST if path.is_dir() else path
     if not path.is_file():
-        raise UserError(f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's file.")
+        raise UserError(
+            f"{key}={path}: no such file; give a training run's folder, its {LAST}, or an agent's file."
+        )
     state = load_checkpoint(path, key=key)
     try:
         agent, trained_on = state["agent"], state["identity"]["observation"]
-        observation = ObservationConfig(**{name: trained_on[name] for name in ("form", "range_m", "speed_mps")})
+        observation = ObservationConfig(
+            **{name: trained_on[name] for name in ("form", "range_m", "speed_mps")}
+        )
         size = observation_size(observation.form, state["identity"]["env"]["vehicles"])
         rainbow = RainbowConfig(**without_removed(agent["config"], f"{key}={path}"))
         weights = {name: value.detach() for name, value in agent["network"].items()}
-        return Start(str(path), weights, NetworkConfig.of(rainbow, size), observation, agent["optimizer"]["state"])
+        return Start(
+            str(path),
+            weights,
+            NetworkConfig.of(rainbow, size),
+            observation,
+            agent["optimizer"]["state"],
+        )
     except RemovedOption:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, UserError) as error:
@@ -228,20 +287,28 @@ def read_start(name: str, key: str = "init.path") -> Start:
 
 
 def make_agent(config: TrainConfig, phase: Phase) -> Rainbow:
-    """A new agent for the observation of ``config``; one that will get trained weights explores little."""
+    """A new agent for the observation of ``config``.
+
+    One that will get trained weights explores little.
+    """
     rainbow = config.agent.for_phase(phase.total_decisions)
     if phase.init is not None:
         rainbow = replace(rainbow, epsilon_start=min(rainbow.epsilon_start, rainbow.epsilon))
     size = observation_size(config.observation.form, config.env.vehicles)
     legal = partial(legal_actions, road=make_road(config.env))
     compile = config.env.compile
-    return Rainbow(rainbow, size, seed=config.seed, device=config.device, legal=legal, compile=compile)
+    return Rainbow(
+        rainbow, size, seed=config.seed, device=config.device, legal=legal, compile=compile
+    )
 
 
-def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | None) -> tuple[TrainConfig, Rainbow]:
+def make_initial_agent(
+    config: TrainConfig, phase: Phase, resume: str | Path | None
+) -> tuple[TrainConfig, Rainbow]:
     """The initial agent of ``phase``, and ``config`` with the agent's support of returns.
 
-    With ``resume`` it is an agent to be restored, since the file that the run started from may no longer exist.
+    With ``resume`` it is an agent to be restored, since the file that the run started from may no
+    longer exist.
 
     Raises:
         UserError: the agent to start from does not fit.
@@ -265,7 +332,9 @@ def make_initial_agent(config: TrainConfig, phase: Phase, resume: str | Path | N
             f"init.optimizer=true: {start.name} holds no moments of the optimiser; give init.path a training run's "
             f"folder or its {LAST}, saved after its first update, or init.optimizer=false."
         )
-    warm_start(agent, start.name, start.weights, start.network, start.moments if with_moments else None)
+    warm_start(
+        agent, start.name, start.weights, start.network, start.moments if with_moments else None
+    )
     return config, agent
 
 
@@ -282,18 +351,30 @@ def check_observation(start: Start, config: TrainConfig) -> None:
             )
 
 
-def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult) -> None:
-    """Write the agent of the phase: the best one by evaluation, if there were evaluations, else the last.
+def save_final_agent(
+    agent: Rainbow, config: TrainConfig, phase: Phase, result: TrainingResult
+) -> None:
+    """Write the agent of the phase: the best one by evaluation, if there were evaluations, else the
+    last.
 
-    The metadata also hold the length of the run and, for the best agent, its figures on the selection stream.
+    The metadata also hold the length of the run and, for the best agent, its figures on the
+    selection stream.
     """
     best, metadata = phase.folder / "checkpoints" / "best.safetensors", describe(config, phase)
     if result.best is not None and best.is_file():
         weights, _, known = read_agent(best)
         load_parameters(agent.network, weights)
-        chosen = {name: value for name, value in known["training"].items() if name not in metadata["training"]}
+        chosen = {
+            name: value
+            for name, value in known["training"].items()
+            if name not in metadata["training"]
+        }
         metadata["selected"] = {**chosen, "episodes": config.selection_episodes, "stream": "select"}
-    metadata["training"] |= {"decisions": result.decisions, "updates": result.updates, "wall_s": result.wall_s}
+    metadata["training"] |= {
+        "decisions": result.decisions,
+        "updates": result.updates,
+        "wall_s": result.wall_s,
+    }
     save_agent(phase.folder / AGENT_FILE, agent, metadata)
 
 
@@ -302,9 +383,15 @@ def save_final_agent(agent: Rainbow, config: TrainConfig, phase: Phase, result: 
 
 def identity(config: TrainConfig, phase: Phase) -> dict[str, Any]:
     """The settings that a resumed run must share with the run that was stopped."""
-    parts: dict[str, Any] = {"env": config.env, "reward": config.reward, "collector": config.collector}
+    parts: dict[str, Any] = {
+        "env": config.env,
+        "reward": config.reward,
+        "collector": config.collector,
+    }
     defaults = flat({name: asdict(type(part)()) for name, part in parts.items()})
-    collector = {name: value for name, value in asdict(config.collector).items() if name != "address"}
+    collector = {
+        name: value for name, value in asdict(config.collector).items() if name != "address"
+    }
     if isinstance(config.collector, OverlapCollectorConfig):
         collector["overlaps"] = True  # ``multi`` has the same options but updates at other times
     return {

@@ -26,11 +26,13 @@ RUNNING = ("returns", "discounted", "to_go", "lengths", "values")
 class EpisodeStats:
     """Statistics of the finished episodes and of the updates since the last :meth:`read`.
 
-    Figures of keys that are not written (``events``, ``ego``, ``chosen_action_value``) are left out.
+    Figures of keys that are not written (``events``, ``ego``, ``chosen_action_value``) are left
+    out.
 
-    **Q-values against realised returns.** ``mean_return_to_go`` is the discounted return from a decision to the end
-    of its episode, averaged over all decisions of finished episodes; ``mean_value`` is the mean Q-value of the chosen
-    actions at the same decisions. The two agree if the values are right (returns after a time limit count as 0).
+    **Q-values against realised returns.** ``mean_return_to_go`` is the discounted return from a
+    decision to the end of its episode, averaged over all decisions of finished episodes;
+    ``mean_value`` is the mean Q-value of the chosen actions at the same decisions. The two agree if
+    the values are right (returns after a time limit count as 0).
 
     Args:
         environments: N.
@@ -39,13 +41,16 @@ class EpisodeStats:
         device: of the sums.
     """
 
-    def __init__(self, environments: int, actions: int, gamma: float, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, environments: int, actions: int, gamma: float, device: torch.device | str = "cpu"
+    ) -> None:
         self.gamma = gamma
         self.returns, self.discounted, self.to_go, self.lengths, self.values = (
             torch.zeros(environments, device=device) for _ in RUNNING
         )
         self.discount = torch.ones(environments, device=device)
-        #: Discounted weight of the next reward in the returns to go of all decisions of the episode so far.
+        #: Discounted weight of the next reward in the returns to go of all decisions of the episode
+        #: so far.
         self.weight = torch.ones(environments, device=device)
         self.actions = torch.arange(actions, device=device)
         self.sums: dict[str, Tensor] = {}
@@ -79,7 +84,9 @@ class EpisodeStats:
         going = ~done
         for name in RUNNING:
             setattr(self, name, getattr(self, name) * going)
-        self.discount, self.weight = (torch.where(done, 1.0, value) for value in (self.discount, self.weight))
+        self.discount, self.weight = (
+            torch.where(done, 1.0, value) for value in (self.discount, self.weight)
+        )
 
     def update(self, metrics: Mapping[str, Tensor]) -> None:
         """Add the 0-dim ``metrics`` of one update."""
@@ -101,7 +108,10 @@ class EpisodeStats:
         row["episodes"] = episodes
         if episodes == 0.0:
             return row
-        row |= {"mean_return": sums["returns"] / episodes, "mean_discounted_return": sums["discounted"] / episodes}
+        row |= {
+            "mean_return": sums["returns"] / episodes,
+            "mean_discounted_return": sums["discounted"] / episodes,
+        }
         decisions = max(sums["lengths"], 1.0)
         row["mean_return_to_go"] = sums["to_go"] / decisions
         if "values" in sums:

@@ -1,4 +1,7 @@
-"""``collector=multi`` and ``collector=ray``: TorchRL's collectors; their batches are returned step by step."""
+"""``collector=multi`` and ``collector=ray``: TorchRL's collectors.
+
+Their batches are returned step by step.
+"""
 
 from __future__ import annotations
 
@@ -68,9 +71,9 @@ def read_by_loop(steps: TensorDictBase) -> TensorDictBase:
 class WorkerCollector(Collector):
     """Steps from TorchRL's collectors, on the CPUs of the workers.
 
-    The workers make ``config.steps`` steps with the same weights, then wait for the learner. They are started by
-    :meth:`open` or the first :meth:`step`. Row ``w * config.num_envs + i`` of a step is row i of worker w, which
-    starts with episode ``w * 2**40 + i``.
+    The workers make ``config.steps`` steps with the same weights, then wait for the learner. They
+    are started by :meth:`open` or the first :meth:`step`. Row ``w * config.num_envs + i`` of a step
+    is row i of worker w, which starts with episode ``w * 2**40 + i``.
     """
 
     exact = False
@@ -85,23 +88,39 @@ class WorkerCollector(Collector):
 
     @abstractmethod
     def start(self, environments: Factories, policies: Factories, frames: int) -> BaseCollector:
-        """TorchRL's collector of these environments and policies, ``frames`` decisions of all workers per batch."""
+        """TorchRL's collector of these environments and policies, ``frames`` decisions of all
+        workers per batch.
+        """
 
     def open(self, agent: Rainbow) -> None:
         """Start the workers, if they are not running; each has its own episodes and exploration."""
         if self.collector is not None:
             return
-        seed, config, legal = agent.generators["collect"].initial_seed(), agent.network.config, agent.policy.legal
-        environments = [partial(self.make_env, self.config.num_envs, first) for first in self.first_episodes]
-        policies = [partial(make_policy, config, legal, noise_seed(seed, first)) for first in self.first_episodes]
+        seed, config, legal = (
+            agent.generators["collect"].initial_seed(),
+            agent.network.config,
+            agent.policy.legal,
+        )
+        environments = [
+            partial(self.make_env, self.config.num_envs, first) for first in self.first_episodes
+        ]
+        policies = [
+            partial(make_policy, config, legal, noise_seed(seed, first))
+            for first in self.first_episodes
+        ]
         threads = torch.get_num_threads()
         with self.failures_as_user_errors(), shielded_children():
-            self.collector = self.start(environments, policies, self.environments * self.config.steps)
+            self.collector = self.start(
+                environments, policies, self.environments * self.config.steps
+            )
         torch.set_num_threads(threads)
         self._batches = iter(self.collector)
 
     def step(self, agent: Rainbow) -> TensorDictBase:
-        """The next step of the batch; after the last one, collect a new batch with the agent's current weights."""
+        """The next step of the batch.
+
+        After the last one, collect a new batch with the agent's current weights.
+        """
         if not self._steps:
             self.open(agent)
             with self.failures_as_user_errors():
@@ -116,18 +135,24 @@ class WorkerCollector(Collector):
     def _send_weights(self, agent: Rainbow) -> None:
         """Send weights and epsilon to every worker; all wait for it.
 
-        TorchRL's ``update_policy_weights_`` would send the current noise of the noisy layers too, and no epsilon.
+        TorchRL's ``update_policy_weights_`` would send the current noise of the noisy layers too,
+        and no epsilon.
         """
         assert self.collector is not None
         weights = {name: value.cpu() for name, value in agent.weights().items()}
-        self.collector.map_fn("policy.load", [(weights, agent.policy.epsilon)] * self.config.workers)
+        self.collector.map_fn(
+            "policy.load", [(weights, agent.policy.epsilon)] * self.config.workers
+        )
 
     def state_dict(self, exact: bool) -> dict[str, Any]:
         """The episode numbers at the end of the last batch."""
         return pack(self._last)
 
     def load_state_dict(self, state: dict[str, Any], exact: bool) -> None:
-        """Each worker begins after the last episode that it had begun; call before the first :meth:`step` only."""
+        """Each worker begins after the last episode that it had begun.
+
+        Call before the first :meth:`step` only.
+        """
         self._last = unpack(state)
         if keys.EPISODE in self._last:
             begun = self._last.get(keys.EPISODE).reshape(self.config.workers, -1).amax(1)
@@ -172,9 +197,11 @@ class ProcessCollector(WorkerCollector):
 
 
 class ClusterCollector(WorkerCollector):
-    """``collector=ray``: TorchRL's ``RayCollector``, one actor per worker, on this machine or a cluster.
+    """``collector=ray``: TorchRL's ``RayCollector``, one actor per worker, on this machine or a
+    cluster.
 
-    The state of the simulation is not sent. On a cluster, ganlane must be installed on its machines.
+    The state of the simulation is not sent. On a cluster, ganlane must be installed on its
+    machines.
 
     Raises:
         UserError: Ray is not installed (extra ``ray``).
@@ -186,7 +213,9 @@ class ClusterCollector(WorkerCollector):
         try:
             import ray  # noqa: F401
         except ModuleNotFoundError as error:
-            raise UserError("collector=ray: Ray is not installed; run pip install 'ganlane[ray]'.") from error
+            raise UserError(
+                "collector=ray: Ray is not installed; run pip install 'ganlane[ray]'."
+            ) from error
         super().__init__(make_env, config)
         self.address = config.address
 
@@ -196,14 +225,23 @@ class ClusterCollector(WorkerCollector):
 
         connection: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
         if self.address is None:
-            connection |= {"address": "local", "num_cpus": self.config.workers, "include_dashboard": False}
+            connection |= {
+                "address": "local",
+                "num_cpus": self.config.workers,
+                "include_dashboard": False,
+            }
         else:
             check_reachable(self.address)
             connection["address"] = self.address
         # One dictionary per worker: TorchRL writes the worker's policy into it.
-        own = [{"postproc": read_by_loop, "auto_register_policy_transforms": False} for _ in environments]
+        own = [
+            {"postproc": read_by_loop, "auto_register_policy_transforms": False}
+            for _ in environments
+        ]
         # TorchRL warns twice that it has no weights to send; :meth:`_send_weights` sends them.
-        warnings.filterwarnings("ignore", message="RayCollector iteration started before weight synchronization")
+        warnings.filterwarnings(
+            "ignore", message="RayCollector iteration started before weight synchronization"
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return RayCollector(

@@ -1,7 +1,8 @@
-"""TorchRL transforms of the environment: observation (Table III), reward (section V.C), sensor errors, action mask.
+"""TorchRL transforms of the environment: observation (Table III), reward (section V.C), sensor
+errors, action mask.
 
-Each reads TensorDict keys that :class:`ganlane.env.HighwayEnv` writes and adds its own. A transform of your own is
-used in the same way::
+Each reads TensorDict keys that :class:`ganlane.env.HighwayEnv` writes and adds its own. A transform
+of your own is used in the same way::
 
     TransformedEnv(env, Compose(MyObservation(env), RewardTransform()))
 

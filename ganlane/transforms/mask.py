@@ -1,13 +1,15 @@
 """Action masks: which of the ego's three actions are allowed at each decision.
 
-A mask is a safety layer between a driver and the road (action masking, Krasowski et al. 2020; shielding, Alshiekh
-et al. 2018): computed by rules, never learnt, and the same for every driver. ``legal`` removes commands without an
-effect (off the road, or during a lane change). ``safe`` also removes lane changes that violate MOBIL's safety
-criterion (Kesting et al. 2007): after the change neither the new follower nor the ego itself would have to brake
-harder than ``safe_deceleration`` by IDM. Keeping the lane is always allowed.
+A mask is a safety layer between a driver and the road (action masking, Krasowski et al. 2020;
+shielding, Alshiekh et al. 2018): computed by rules, never learnt, and the same for every driver.
+``legal`` removes commands without an effect (off the road, or during a lane change). ``safe`` also
+removes lane changes that violate MOBIL's safety criterion (Kesting et al. 2007): after the change
+neither the new follower nor the ego itself would have to brake harder than ``safe_deceleration`` by
+IDM. Keeping the lane is always allowed.
 
-The mask uses what the ego perceives: with sensor errors it can be wrong. It holds at the instant of the command; a
-lane change that has begun continues (or, with ``abort_lane_change``, can be turned back if that is safe).
+The mask uses what the ego perceives: with sensor errors it can be wrong. It holds at the instant of
+the command; a lane change that has begun continues (or, with ``abort_lane_change``, can be turned
+back if that is safe).
 """
 
 from __future__ import annotations
@@ -33,24 +35,31 @@ from ganlane.transforms.observation import PerceptionTransform
 
 
 def on_road_actions(target_lane: Tensor, lanes: int | Tensor) -> Tensor:
-    """Actions that stay on the road, bool [N, 3]; ``target_lane`` [N] of the ego, ``lanes`` one number or [N]."""
+    """Actions that stay on the road, bool [N, 3].
+
+    ``target_lane`` [N] of the ego, ``lanes`` one number or [N].
+    """
     return torch.stack((target_lane >= 0, target_lane < lanes - 1, target_lane > 0), dim=1)
 
 
 def obeyed_actions(change_direction: Tensor, abort: bool) -> Tensor:
-    """Actions with an effect, bool [N, 3], during a lane change in ``change_direction`` (-1, 0, 1; [N]).
+    """Actions with an effect, bool [N, 3], during a lane change in ``change_direction`` (-1, 0, 1;
+    [N]).
 
     During a lane change commands are ignored; with ``abort`` the opposite command turns back.
     """
-    left, right = (change_direction <= 0, change_direction >= 0) if abort else (change_direction == 0,) * 2
+    left, right = (
+        (change_direction <= 0, change_direction >= 0) if abort else (change_direction == 0,) * 2
+    )
     return torch.stack((torch.ones_like(left), left, right), dim=1)
 
 
 def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V) -> Tensor:
-    """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3] (keep, left, right).
+    """Hardest braking that each action requires by IDM, as an acceleration in m/s2, [N, 3] (keep,
+    left, right).
 
-    The smaller of the ego's acceleration in that lane and its follower's there. A lane that does not exist has no
-    vehicles; :func:`on_road_actions` excludes it.
+    The smaller of the ego's acceleration in that lane and its follower's there. A lane that does
+    not exist has no vehicles; :func:`on_road_actions` excludes it.
     """
     scene = ego_scene(vehicles, road)
     lane = scene.observers.target_lane.to(vehicles.x.dtype)
@@ -62,11 +71,12 @@ def braking_demand(vehicles: Vehicles, road: Road, idm: IdmParameters = TABLE_V)
 class ActionMaskTransform(PerceptionTransform):
     """Write ``action_mask`` [N, 3] bool: which actions are allowed; TorchRL's key and meaning.
 
-    Belongs after a :class:`~ganlane.transforms.SensorTransform`. Append TorchRL's own ``ActionMask()`` to restrict
-    the action spec, and with it ``env.rand_action``.
+    Belongs after a :class:`~ganlane.transforms.SensorTransform`. Append TorchRL's own
+    ``ActionMask()`` to restrict the action spec, and with it ``env.rand_action``.
 
-    With ``form="safe"`` it also writes ``no_safe_action`` [N, 1] bool: no lane change is allowed, and keeping the
-    lane requires the ego or its follower to brake harder than is safe. The ego then keeps its lane and brakes.
+    With ``form="safe"`` it also writes ``no_safe_action`` [N, 1] bool: no lane change is allowed,
+    and keeping the lane requires the ego or its follower to brake harder than is safe. The ego then
+    keeps its lane and brakes.
 
     Args:
         road: the environment's.
@@ -74,7 +84,8 @@ class ActionMaskTransform(PerceptionTransform):
         safe_deceleration: m/s2, above 0; MOBIL's ``b_safe``.
         idm: by which braking is judged.
         abort: whether the ego may turn back during a lane change (``env.ego.abort_lane_change``).
-        native_vehicles: M, where the native kernel computes ``safe`` (float32, CPU); None: the tensor code does.
+        native_vehicles: M, where the native kernel computes ``safe`` (float32, CPU); None: the
+            tensor code does.
 
     Raises:
         UserError: an unknown form, or a deceleration that is not above 0.
@@ -90,9 +101,13 @@ class ActionMaskTransform(PerceptionTransform):
         native_vehicles: int | None = None,
     ) -> None:
         if form not in MASKS[1:]:
-            raise UserError(f"mask.form={form!r}: expected one of {', '.join(MASKS[1:])}; choose one of them.")
+            raise UserError(
+                f"mask.form={form!r}: expected one of {', '.join(MASKS[1:])}; choose one of them."
+            )
         if safe_deceleration <= 0:
-            raise UserError(f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2.")
+            raise UserError(
+                f"mask.safe_deceleration={safe_deceleration:g}: expected a number above 0, in m/s2."
+            )
         out_keys = [keys.ACTION_MASK, *([keys.NO_SAFE_ACTION] if form == "safe" else [])]
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=out_keys)
         self.road, self.form, self.idm, self.abort = road, form, idm, abort
@@ -104,10 +119,13 @@ class ActionMaskTransform(PerceptionTransform):
     def allowed(self, vehicles: Vehicles, direction: Tensor, road: Road) -> tuple[Tensor, Tensor]:
         """The mask [N, 3], and whether no action is safe [N].
 
-        ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane change.
+        ``vehicles`` are as the ego perceives them; ``direction`` [N] is that of its current lane
+        change.
         """
         lanes = road.lanes[:, 0] if isinstance(road.lanes, Tensor) else road.lanes
-        legal = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes) & obeyed_actions(direction, self.abort)
+        legal = on_road_actions(vehicles.target_lane[:, EGO_INDEX], lanes) & obeyed_actions(
+            direction, self.abort
+        )
         if self.form == "legal":
             return legal, torch.zeros_like(legal[:, 0])
         safe = braking_demand(vehicles, road, self.idm) >= -self.safe_deceleration
@@ -135,5 +153,7 @@ class ActionMaskTransform(PerceptionTransform):
         device, (rows, *_) = observation_spec.device, observation_spec.shape
         sizes = {keys.ACTION_MASK: ACTIONS, keys.NO_SAFE_ACTION: 1}
         for name in self.out_keys:
-            observation_spec[name] = Binary(shape=(rows, sizes[name]), dtype=torch.bool, device=device)
+            observation_spec[name] = Binary(
+                shape=(rows, sizes[name]), dtype=torch.bool, device=device
+            )
         return observation_spec

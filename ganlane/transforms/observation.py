@@ -1,24 +1,28 @@
-"""What the agent perceives: sensor errors, Table III of the paper, and the forms of it that were found to teach more.
+"""What the agent perceives: sensor errors, Table III of the paper, and the forms of it that were
+found to teach more.
 
-:class:`SensorTransform` writes ``perceived`` next to ``vehicles``: what the ego perceives of the others is noisy, has
-gaps and comes late. Observation and mask use it where it is present; physics, reward, events and the rule-based
-drivers read the true ``vehicles``. Measurements not yet delivered travel in the TensorDict as ``sensors``, so a state
-can be saved, branched and resumed.
+:class:`SensorTransform` writes ``perceived`` next to ``vehicles``: what the ego perceives of the
+others is noisy, has gaps and comes late. Observation and mask use it where it is present; physics,
+reward, events and the rule-based drivers read the true ``vehicles``. Measurements not yet delivered
+travel in the TensorDict as ``sensors``, so a state can be saved, branched and resumed.
 
 =================================  ===============  ================================================
 ``perceived.x, y, speed, valid``   [N, M]           the scene as it was measured ``delay_s`` ago
-``sensors.x, y, speed, valid``     [N, K, M]        the last K measurements, oldest first (with a delay
+``sensors.x, y, speed, valid``     [N, K, M]        the last K measurements, oldest first (with a
+delay
                                                     of K decisions)
 =================================  ===============  ================================================
 
-Column 0 is the ego where it was when it measured, without error: what it perceives is relative to that.
+Column 0 is the ego where it was when it measured, without error: what it perceives is relative to
+that.
 
-:class:`ObservationTransform` makes the observation of it. :data:`OBSERVATIONS` names the forms. A form is a sequence
-of parts, each a function from a :class:`View` to [N, size].
+:class:`ObservationTransform` makes the observation of it. :data:`OBSERVATIONS` names the forms. A
+form is a sequence of parts, each a function from a :class:`View` to [N, size].
 
-Lane view: for the left, own and right lane the nearest vehicle ahead and behind, each with gap, ``exp(-gap / 15 m)``
-and relative speed. A small network learns the advantages of a lane change from it, but not from the list of vehicles,
-nearest first: the order of that list changes whenever two vehicles swap ranks.
+Lane view: for the left, own and right lane the nearest vehicle ahead and behind, each with gap,
+``exp(-gap / 15 m)`` and relative speed. A small network learns the advantages of a lane change from
+it, but not from the list of vehicles, nearest first: the order of that list changes whenever two
+vehicles swap ranks.
 """
 
 from __future__ import annotations
@@ -66,11 +70,16 @@ class Measurement(NamedTuple):
 
     def as_tensordict(self) -> TensorDictBase:
         """The fields by name, batch [N]."""
-        return TensorDict._new_unsafe(self._asdict(), batch_size=self.x.shape[:1], device=self.x.device)
+        return TensorDict._new_unsafe(
+            self._asdict(), batch_size=self.x.shape[:1], device=self.x.device
+        )
 
 
-def measure(vehicles: Vehicles, key: Tensor, step: Tensor, parameters: SensorParameters) -> Measurement:
-    """A measurement of the true ``vehicles`` [N, M] at the physics steps ``step`` [N], without the delay.
+def measure(
+    vehicles: Vehicles, key: Tensor, step: Tensor, parameters: SensorParameters
+) -> Measurement:
+    """A measurement of the true ``vehicles`` [N, M] at the physics steps ``step`` [N], without the
+    delay.
 
     ``key`` [N]: of the episodes (:func:`ganlane.sim.random.episode_key`).
     """
@@ -79,14 +88,21 @@ def measure(vehicles: Vehicles, key: Tensor, step: Tensor, parameters: SensorPar
     count = x.shape[1]
     other = torch.arange(count, device=x.device) != keys.EGO_INDEX
     if any(scales):
-        purposes: list[int] = [Purpose.SENSED_POSITION, Purpose.SENSED_LATERAL, Purpose.SENSED_SPEED]
+        purposes: list[int] = [
+            Purpose.SENSED_POSITION,
+            Purpose.SENSED_LATERAL,
+            Purpose.SENSED_SPEED,
+        ]
         noise = normal(key, step, count, purposes, x.dtype)
         x, y, speed = (
             torch.where(other, value + scale * noise[..., i], value)
             for i, (value, scale) in enumerate(zip((x, y, speed), scales))
         )
     if parameters.dropout > 0:
-        lost = uniform(key, step, count, [Purpose.SENSED_DROPOUT], x.dtype)[..., 0] < parameters.dropout
+        lost = (
+            uniform(key, step, count, [Purpose.SENSED_DROPOUT], x.dtype)[..., 0]
+            < parameters.dropout
+        )
         valid = valid & ~(lost & other)
     return Measurement(x, y, speed, valid)
 
@@ -95,36 +111,47 @@ class PerceptionTransform(Transform):
     """Base of the transforms that read what the ego perceives: subclasses implement :meth:`write`."""
 
     def write(self, state: TensorDictBase, vehicles: Vehicles, seen: Vehicles) -> TensorDictBase:
-        """Write the out keys into ``state``; ``vehicles`` are true, ``seen`` as the ego perceives them."""
+        """Write the out keys into ``state``.
+
+        ``vehicles`` are true, ``seen`` as the ego perceives them.
+        """
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the out keys into any TensorDict that holds the raw state."""
-        vehicles, perceived = Vehicles.of(tensordict.get(keys.VEHICLES)), tensordict.get(PERCEIVED, None)
-        seen = vehicles if perceived is None else vehicles.with_(**Measurement.of(perceived)._asdict())
+        vehicles, perceived = (
+            Vehicles.of(tensordict.get(keys.VEHICLES)),
+            tensordict.get(PERCEIVED, None),
+        )
+        seen = (
+            vehicles if perceived is None else vehicles.with_(**Measurement.of(perceived)._asdict())
+        )
         return self.write(tensordict, vehicles, seen)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return self.forward(tensordict_reset)
 
 
 class SensorTransform(Transform):
-    """Write ``perceived``, and with a delay ``sensors``; belongs before the :class:`ObservationTransform`.
+    """Write ``perceived``, and with a delay ``sensors``; belongs before the
+    :class:`ObservationTransform`.
 
-    The errors follow from (stream, seed, episode, vehicle, physics step, purpose), so an episode is the same in any
-    batch and when it is replayed. The ego measures once per decision, at its end; until the first measurement of an
-    episode is old enough, that one is delivered.
+    The errors follow from (stream, seed, episode, vehicle, physics step, purpose), so an episode is
+    the same in any batch and when it is replayed. The ego measures once per decision, at its end;
+    until the first measurement of an episode is old enough, that one is delivered.
 
     Args:
         parameters: sizes of the errors; None: none.
         stream, decision_period_s: the environment's.
 
     Raises:
-        UserError: the delay is not a multiple of the decision period; in a step, if the state comes from an
-            environment without this delay.
+        UserError: the delay is not a multiple of the decision period; in a step, if the state comes
+            from an environment without this delay.
     """
 
     def __init__(
@@ -142,7 +169,9 @@ class SensorTransform(Transform):
     def measured(self, state: TensorDictBase) -> Measurement:
         """The measurement of the true state in ``state``, fields [N, M]."""
         key = episode_key(self.stream, state.get(keys.SEED), state.get(keys.EPISODE))
-        return measure(Vehicles.of(state.get(keys.VEHICLES)), key, state.get(keys.STEP), self.parameters)
+        return measure(
+            Vehicles.of(state.get(keys.VEHICLES)), key, state.get(keys.STEP), self.parameters
+        )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         new = self.measured(next_tensordict)
@@ -160,7 +189,9 @@ class SensorTransform(Transform):
         oldest = Measurement(*(old[:, 0].clone() for old in kept))
         return next_tensordict.set(PERCEIVED, oldest.as_tensordict())
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         first = self.measured(tensordict_reset)
         if self.delay > 0:
             filled = (field[:, None].repeat(1, self.delay, 1) for field in first)
@@ -168,7 +199,9 @@ class SensorTransform(Transform):
         return tensordict_reset.set(PERCEIVED, first.as_tensordict())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write what the ego would perceive if the raw state in ``tensordict`` were an episode's first."""
+        """Write what the ego would perceive if the raw state in ``tensordict`` were an episode's
+        first.
+        """
         return self._reset(tensordict, tensordict)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
@@ -178,18 +211,22 @@ class SensorTransform(Transform):
         rows, count = true.shape
         for name, shape in ((PERCEIVED, (rows, count)), (SENSORS, (rows, self.delay, count))):
             if name == PERCEIVED or self.delay > 0:
-                fields = {each: Unbounded(shape=shape, dtype=true.dtype) for each in ("x", "y", "speed")}
+                fields = {
+                    each: Unbounded(shape=shape, dtype=true.dtype) for each in ("x", "y", "speed")
+                }
                 fields["valid"] = Binary(shape=shape, dtype=torch.bool)
                 observation_spec[name] = Composite(fields, shape=shape[:1]).to(true.device)
         return observation_spec
 
 
 class Others(NamedTuple):
-    """The other vehicles relative to the ego, each [N, M - 1]; the first three are clipped to [-1, 1].
+    """The other vehicles relative to the ego, each [N, M - 1]; the first three are clipped to [-1,
+    1].
 
-    Table III: relative position, relative speed, lane difference (left is positive), and whether the vehicle exists.
-    Not in Table III: ``drift``, the position within its lane (0 in the centre, 1 on the left line, -1 on the
-    right one), and ``bumpers_m``, half of the ego's length plus half of its own, m.
+    Table III: relative position, relative speed, lane difference (left is positive), and whether
+    the vehicle exists. Not in Table III: ``drift``, the position within its lane (0 in the centre,
+    1 on the left line, -1 on the right one), and ``bumpers_m``, half of the ego's length plus half
+    of its own, m.
     """
 
     position: Tensor
@@ -203,8 +240,9 @@ class Others(NamedTuple):
 class View(NamedTuple):
     """What the parts of an observation are computed from.
 
-    ``vehicles`` is the true state; ``seen`` the others as the ego perceives them, with the ego (column 0) where it
-    was at that moment. ``progress`` and ``direction`` [N] belong to the ego's own lane change.
+    ``vehicles`` is the true state; ``seen`` the others as the ego perceives them, with the ego
+    (column 0) where it was at that moment. ``progress`` and ``direction`` [N] belong to the ego's
+    own lane change.
     """
 
     vehicles: Vehicles
@@ -224,9 +262,13 @@ def other_vehicles(vehicles: Vehicles, road: Road, scale: ObservationScale) -> O
     own_lane = road.lane_of(others.y)
     lane = ((own_lane - road.lane_of(ego.y)) / _widest(road.lanes)).clamp(-1.0, 1.0)
     # Offset to the left of the lane's centre over half of the lane's width.
-    drift = (2.0 * (others.y - road.centre_of(own_lane, others.y.dtype)) / road.lane_width_m).clamp(-1.0, 1.0)
+    drift = (2.0 * (others.y - road.centre_of(own_lane, others.y.dtype)) / road.lane_width_m).clamp(
+        -1.0, 1.0
+    )
     bumpers_m, valid = 0.5 * ego.length + 0.5 * others.length, others.valid
-    speed, lane, drift, bumpers_m = (torch.where(valid, each, 0.0) for each in (speed, lane, drift, bumpers_m))
+    speed, lane, drift, bumpers_m = (
+        torch.where(valid, each, 0.0) for each in (speed, lane, drift, bumpers_m)
+    )
     return Others(torch.where(valid, position, 1.0), speed, lane, valid, drift, bumpers_m)
 
 
@@ -236,29 +278,38 @@ def _widest(lanes: int | Tensor) -> int | Tensor:
 
 
 def own_state(view: View) -> Tensor:
-    """s1 to s3, [N, 3]: speed over desired speed (not clipped), a lane to the left, a lane to the right."""
+    """s1 to s3, [N, 3].
+
+    Speed over desired speed (not clipped), a lane to the left, a lane to the right.
+    """
     ego, road = view.vehicles.columns(slice(0, 1)), view.road
     lane = road.lane_of(ego.y)
     beside = (lane < road.lanes - 1, lane > 0)
-    return torch.cat((ego.speed / ego.desired_speed, *(there.to(ego.y.dtype) for there in beside)), dim=1)
+    return torch.cat(
+        (ego.speed / ego.desired_speed, *(there.to(ego.y.dtype) for there in beside)), dim=1
+    )
 
 
 def vehicle_list(view: View) -> Tensor:
-    """s4, s5, s6, s7, ..., [N, 3 (M - 1)]: position, speed and lane of each vehicle, nearest first, invalid last."""
+    """s4, s5, s6, s7, ..., [N, 3 (M - 1)].
+
+    Position, speed and lane of each vehicle, nearest first, invalid last.
+    """
     distance = view.road.distance_ahead(view.seen.x[:, :1], view.seen.x[:, 1:]).abs()
     order = torch.where(view.others.valid, distance, torch.inf).argsort(dim=1, stable=True)
     return torch.stack([field.gather(1, order) for field in view.others[:3]], dim=-1).flatten(1)
 
 
 def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
-    """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1, 0, 0) if empty.
+    """[N, 18]: left, own and right lane x ahead and behind x (gap, nearness, relative speed); (1,
+    0, 0) if empty.
 
-    The nearest vehicle is the one with the nearest centre; one exactly level with the ego counts as behind. The gap,
-    over the range of sight, is from bumper to bumper.
+    The nearest vehicle is the one with the nearest centre; one exactly level with the ego counts as
+    behind. The gap, over the range of sight, is from bumper to bumper.
 
-    ``drift`` adds a fourth number, :attr:`Others.drift`, [N, 24], which shows a lane change before its middle. With
-    ``overlap``, where two bodies overlap along the road the gap is below 0, and the nearness above 1 by 1 per metre;
-    otherwise the gap is 0 there.
+    ``drift`` adds a fourth number, :attr:`Others.drift`, [N, 24], which shows a lane change before
+    its middle. With ``overlap``, where two bodies overlap along the road the gap is below 0, and
+    the nearness above 1 by 1 per metre; otherwise the gap is 0 there.
     """
     others, range_m = view.others, view.scale.range_m
     side, ahead = (others.position.new_tensor(each)[:, None] for each in (_SIDES, _AHEAD))
@@ -279,8 +330,15 @@ def lane_view(view: View, drift: bool = False, overlap: bool = False) -> Tensor:
     gap_m = gap_m if overlap else gap_m.clamp_min(0.0)
     gap = torch.where(found, gap_m / range_m, 1.0)
     overlap_m = (-gap_m).clamp_min(0.0)
-    nearness = torch.where(found, torch.exp(-gap_m.clamp_min(0.0) / NEARNESS_M) + overlap_m / OVERLAP_M, 0.0)
-    numbers = (gap, nearness, of_the_nearest(others.speed), *((of_the_nearest(others.drift),) if drift else ()))
+    nearness = torch.where(
+        found, torch.exp(-gap_m.clamp_min(0.0) / NEARNESS_M) + overlap_m / OVERLAP_M, 0.0
+    )
+    numbers = (
+        gap,
+        nearness,
+        of_the_nearest(others.speed),
+        *((of_the_nearest(others.drift),) if drift else ()),
+    )
     return torch.cat(numbers, dim=-1).flatten(1)
 
 
@@ -320,7 +378,8 @@ def observation_size(name: str, vehicles: int) -> int:
 
 
 class ObservationTransform(PerceptionTransform):
-    """Write ``observation`` [N, D] from the raw state, the others as ``perceived`` where that is present.
+    """Write ``observation`` [N, D] from the raw state, the others as ``perceived`` where that is
+    present.
 
     Args:
         road, vehicles: the environment's; M, the ego included.
@@ -342,9 +401,13 @@ class ObservationTransform(PerceptionTransform):
     ) -> None:
         super().__init__(in_keys=[keys.VEHICLES, keys.EGO], out_keys=[keys.OBSERVATION])
         if form not in OBSERVATIONS:
-            raise UserError(f"observation.form={form!r} is unknown; choose one of {', '.join(OBSERVATIONS)}.")
+            raise UserError(
+                f"observation.form={form!r} is unknown; choose one of {', '.join(OBSERVATIONS)}."
+            )
         if vehicles < 2:
-            raise UserError(f"vehicles={vehicles}: an observation is of at least one other vehicle; give 2 or more.")
+            raise UserError(
+                f"vehicles={vehicles}: an observation is of at least one other vehicle; give 2 or more."
+            )
         self.road, self.vehicles, self.form = road, vehicles, form
         self.scale = scale or ObservationScale()
         self.native: LaneView | None = None
@@ -352,9 +415,17 @@ class ObservationTransform(PerceptionTransform):
             self.native = LaneView(road, vehicles, self.scale, form)
 
     def observe(
-        self, vehicles: Vehicles, progress: Tensor, direction: Tensor, road: Road, seen: Vehicles | None = None
+        self,
+        vehicles: Vehicles,
+        progress: Tensor,
+        direction: Tensor,
+        road: Road,
+        seen: Vehicles | None = None,
     ) -> Tensor:
-        """The observation [N, D]; arguments as the fields of :class:`View`, ``seen=None``: as they are."""
+        """The observation [N, D]; arguments as the fields of :class:`View`, ``seen=None``.
+
+        As they are.
+        """
         seen = vehicles if seen is None else seen
         others = other_vehicles(seen, road, self.scale)
         view = View(vehicles, seen, others, road, self.scale, progress, direction)
@@ -369,7 +440,9 @@ class ObservationTransform(PerceptionTransform):
         ego, road = state.get(keys.EGO), road_in(state, self.road)
         progress, direction = ego.get("change_progress"), ego.get("change_direction")
         if self.native is not None:
-            return state.set(keys.OBSERVATION, self.native.observe(vehicles, progress, direction, seen))
+            return state.set(
+                keys.OBSERVATION, self.native.observe(vehicles, progress, direction, seen)
+            )
         return state.set(keys.OBSERVATION, self.observe(vehicles, progress, direction, road, seen))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
@@ -377,5 +450,7 @@ class ObservationTransform(PerceptionTransform):
         assert isinstance(observation_spec, Composite)
         shape = (*observation_spec.shape, observation_size(self.form, self.vehicles))
         dtype = observation_spec[keys.VEHICLES, "x"].dtype
-        observation_spec[keys.OBSERVATION] = Unbounded(shape=shape, dtype=dtype, device=observation_spec.device)
+        observation_spec[keys.OBSERVATION] = Unbounded(
+            shape=shape, dtype=dtype, device=observation_spec.device
+        )
         return observation_spec

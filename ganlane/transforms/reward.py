@@ -16,9 +16,14 @@ from ganlane.parameters.observation import RewardParameters
 
 
 def speed_reward(
-    speed: Tensor, desired_speed: Tensor, mean_acceleration: Tensor, parameters: RewardParameters | None = None
+    speed: Tensor,
+    desired_speed: Tensor,
+    mean_acceleration: Tensor,
+    parameters: RewardParameters | None = None,
 ) -> Tensor:
-    """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard on average over the decision."""
+    """``(v - 15) / (v_des - 15)``, or its negation where the ego braked hard on average over the
+    decision.
+    """
     p = parameters or RewardParameters()
     reward = (speed - p.base_speed_mps) / (desired_speed - p.base_speed_mps)
     punished = -reward if p.literal_low_acceleration else -reward.abs()
@@ -26,15 +31,21 @@ def speed_reward(
 
 
 class RewardTransform(Transform):
-    """Write ``reward`` [N, 1] and ``reward_terms.*`` [N, 1] once per decision, on the speed at its end.
+    """Write ``reward`` [N, 1] and ``reward_terms.*`` [N, 1] once per decision, on the speed at its
+    end.
 
     Args:
         decision_period_s: factor of the terms that accrue with time, s.
         parameters: section V.C; a ``soft_crash_behind`` other than 0 adds a term of that name.
     """
 
-    def __init__(self, decision_period_s: float = 1.0, parameters: RewardParameters | None = None) -> None:
-        super().__init__(in_keys=[keys.VEHICLES, keys.EGO, keys.EVENTS], out_keys=[keys.REWARD, keys.REWARD_TERMS])
+    def __init__(
+        self, decision_period_s: float = 1.0, parameters: RewardParameters | None = None
+    ) -> None:
+        super().__init__(
+            in_keys=[keys.VEHICLES, keys.EGO, keys.EVENTS],
+            out_keys=[keys.REWARD, keys.REWARD_TERMS],
+        )
         self.period = decision_period_s
         self.parameters = parameters or RewardParameters()
 
@@ -42,10 +53,13 @@ class RewardTransform(Transform):
         """Name to reward term [N, 1] of the decision that led to the state in ``tensordict``."""
         p, vehicles = self.parameters, tensordict.get(keys.VEHICLES)
         ego, events = tensordict.get(keys.EGO), tensordict.get(keys.EVENTS)
-        speed, desired = (vehicles.get(name)[:, EGO_INDEX, None] for name in ("speed", "desired_speed"))
+        speed, desired = (
+            vehicles.get(name)[:, EGO_INDEX, None] for name in ("speed", "desired_speed")
+        )
         dtype = speed.dtype
         terms = {
-            "speed": self.period * speed_reward(speed, desired, ego.get("mean_acceleration")[:, None], p),
+            "speed": self.period
+            * speed_reward(speed, desired, ego.get("mean_acceleration")[:, None], p),
             "lane_change": p.lane_change * ego.get("started_change")[:, None].to(dtype),
             "out_of_road": p.out_of_road * events.get("out_of_road").to(dtype),
             "hard_crash": p.hard_crash * events.get("hard_crash").to(dtype),
@@ -53,15 +67,21 @@ class RewardTransform(Transform):
             "goal": p.goal * events.get("goal").to(dtype),
         }
         if p.soft_crash_behind:
-            terms[keys.SOFT_CRASH_BEHIND] = p.soft_crash_behind * events.get(keys.SOFT_CRASH_BEHIND).to(dtype)
+            terms[keys.SOFT_CRASH_BEHIND] = p.soft_crash_behind * events.get(
+                keys.SOFT_CRASH_BEHIND
+            ).to(dtype)
         return terms
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.terms(next_tensordict)
         nested = TensorDict._new_unsafe(terms, batch_size=next_tensordict.batch_size)
-        return next_tensordict.set(keys.REWARD_TERMS, nested).set(keys.REWARD, reduce(torch.add, terms.values()))
+        return next_tensordict.set(keys.REWARD_TERMS, nested).set(
+            keys.REWARD, reduce(torch.add, terms.values())
+        )
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         zero = torch.zeros_like(tensordict_reset.get(keys.VEHICLES).get("x")[:, :1])
         terms = {name: zero for name in self.parameters.term_names}
         nested = TensorDict._new_unsafe(terms, batch_size=tensordict_reset.batch_size)
@@ -71,7 +91,9 @@ class RewardTransform(Transform):
         """Add the terms to the observation spec; they are zero after a reset."""
         assert isinstance(observation_spec, Composite)
         device, shape = observation_spec.device, observation_spec.shape
-        term = Unbounded(shape=(*shape, 1), dtype=observation_spec[keys.VEHICLES, "x"].dtype, device=device)
+        term = Unbounded(
+            shape=(*shape, 1), dtype=observation_spec[keys.VEHICLES, "x"].dtype, device=device
+        )
         terms = {name: term.clone() for name in self.parameters.term_names}
         observation_spec[keys.REWARD_TERMS] = Composite(terms, shape=shape).to(device)
         return observation_spec

@@ -1,4 +1,7 @@
-"""What frames are drawn with: colours, letters, metres to pixels, and the road, which does not move."""
+"""What frames are drawn with.
+
+Colours, letters, metres to pixels, and the road, which does not move.
+"""
 
 from __future__ import annotations
 
@@ -78,9 +81,17 @@ def text_mask(text: str, size: int) -> Image.Image:
 
 
 def put_text(
-    image: Image.Image, position: tuple[float, float], text: str, size: int, colour: Colour, anchor: float = 0.0
+    image: Image.Image,
+    position: tuple[float, float],
+    text: str,
+    size: int,
+    colour: Colour,
+    anchor: float = 0.0,
 ) -> None:
-    """Write ``text`` with its top at ``position``; ``anchor`` 0 starts there, 0.5 centres, 1 ends there."""
+    """Write ``text`` with its top at ``position``.
+
+    ``anchor`` 0 starts there, 0.5 centres, 1 ends there.
+    """
     if text:
         mask = text_mask(text, size)
         image.paste(colour, (round(position[0] - anchor * mask.width), round(position[1])), mask)
@@ -90,8 +101,9 @@ def put_text(
 class WindowParameters:
     """Size of the picture in pixels and how much road it shows.
 
-    Across the road the scale is up to ``lateral_exaggeration`` times that along it (less where many lanes
-    need the room): vehicles and lateral movements look wider than they are, overlaps stay overlaps.
+    Across the road the scale is up to ``lateral_exaggeration`` times that along it (less where many
+    lanes need the room): vehicles and lateral movements look wider than they are, overlaps stay
+    overlaps.
     """
 
     width: int = 1280
@@ -119,8 +131,8 @@ class Window:
     """The scale of a picture for a road of ``lanes`` lanes; rows of the picture count downwards.
 
     Attributes:
-        along, across: pixels per metre along and across the road; across it is exaggerated, but never more than the
-            picture has room for.
+        along, across: pixels per metre along and across the road; across it is exaggerated, but
+            never more than the picture has room for.
         edges: rows of the left (upper) and right (lower) edge of the road.
     """
 
@@ -136,7 +148,11 @@ class Window:
     def row(self, y_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Picture rows of lateral positions, m."""
         centre = 0.5 * (self.lanes - 1) * self.lane_width_m
-        return HEADER_HEIGHT + self._room / 2 - (np.asarray(y_m, dtype=np.float64) - centre) * self.across
+        return (
+            HEADER_HEIGHT
+            + self._room / 2
+            - (np.asarray(y_m, dtype=np.float64) - centre) * self.across
+        )
 
     def column(self, x_m: npt.ArrayLike, ego_x_m: float) -> npt.NDArray[np.float64]:
         """Picture columns of positions along the road, m, with the ego at ``ego_x_m``."""
@@ -145,7 +161,10 @@ class Window:
 
 
 class Backdrop:
-    """Verges, asphalt, edge lines and dashed lane marks: drawn once, one period wider than the picture."""
+    """Verges, asphalt, edge lines and dashed lane marks.
+
+    Drawn once, one period wider than the picture.
+    """
 
     def __init__(self, window: Window):
         self.window = window
@@ -156,7 +175,8 @@ class Backdrop:
         half = self.period / 2
         upper, lower = window.edges
         starts = np.arange(0, strip.width, half)
-        for start in starts[::2]:  # every second period's verge is a shade lighter so that movement shows
+        # every second period's verge is a shade lighter so that movement shows
+        for start in starts[::2]:
             draw.rectangle((start, 0, start + half - 1, size.height), fill=VERGE_STRIPE)
         draw.rectangle((0, upper - 5, strip.width, lower + 5), fill=ASPHALT)
         for edge in (upper, lower):
@@ -166,7 +186,9 @@ class Backdrop:
                 draw.line((start, mark, start + DASH_M * window.along, mark), fill=MARK, width=2)
 
     def at(self, ego_x_m: float) -> Image.Image:
-        """A fresh picture of the road around the ego, with posts that tell the distance from the start, m."""
+        """A fresh picture of the road around the ego, with posts that tell the distance from the
+        start, m.
+        """
         shift = round(-float(self.window.column(0.0, ego_x_m))) % self.period
         size, (_, lower) = self.window.parameters, self.window.edges
         picture = self.strip.crop((shift, 0, shift + size.width, size.height))

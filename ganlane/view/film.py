@@ -20,9 +20,11 @@ Format = Literal["mp4", "gif", "png"]
 #: Frames of a film strip, as in the paper's Figure 3.
 STRIP_FRAMES = 4
 _H264 = "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -preset medium -movflags +faststart -f mp4"
-#: Frames from which a GIF's palette is taken, and colours of large flat areas, which are kept as they are.
+#: Frames from which a GIF's palette is taken, and colours of large flat areas, which are kept as
+#: they are.
 _PALETTE_FRAMES, _FLAT_COLOURS = 8, 8
-#: Tried in turn to make a GIF fit: share of the picture's size, colours, and every how many frames one is kept.
+#: Tried in turn to make a GIF fit: share of the picture's size, colours, and every how many frames
+#: one is kept.
 _GIF_SIZES = (
     *((1.0, 128, 1), (0.85, 96, 1), (0.75, 64, 1)),
     *((0.75, 64, 2), (0.6, 64, 2), (0.5, 48, 2), (0.5, 32, 3), (0.4, 32, 4)),
@@ -64,7 +66,10 @@ class Film:
         last = int(np.searchsorted(time, end + 1e-9, side="right") - 1)
         wanted = np.arange(start_s, end + 1e-9, speedup / fps)
         shown = np.searchsorted(time, wanted + 1e-9, side="right") - 1
-        self._frames: list[int] = [*shown.clip(0, last).tolist(), *[last] * max(1, round(hold_s * fps))]
+        self._frames: list[int] = [
+            *shown.clip(0, last).tolist(),
+            *[last] * max(1, round(hold_s * fps)),
+        ]
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -96,16 +101,19 @@ def write_film(
     """Write a film, whole or not at all, and return its path.
 
     Args:
-        frames: pictures [height, width, 3] uint8, all of one size; no more than a few are held at once.
+        frames: pictures [height, width, 3] uint8, all of one size; no more than a few are held at
+            once.
         path: where to write.
-        fps: frames per second; a GIF counts in hundredths of a second, so 10, 20, 25 and 50 are exact.
-        format: ``mp4`` (needs the extra ``video``), ``gif`` or ``png`` (a strip of four frames, stacked);
-            by default the file's ending.
+        fps: frames per second; a GIF counts in hundredths of a second, so 10, 20, 25 and 50 are
+            exact.
+        format: ``mp4`` (needs the extra ``video``), ``gif`` or ``png`` (a strip of four frames,
+            stacked); by default the file's ending.
         max_bytes: for a GIF: size, frame rate and colours are lowered until it fits.
         scale: size of the film's picture, as a share of the frames'.
 
     Raises:
-        UserError: unknown format, no frames, the extra ``video`` is missing, or no GIF is small enough.
+        UserError: unknown format, no frames, the extra ``video`` is missing, or no GIF is small
+            enough.
     """
     kind = film_format(path, format)
     if len(frames) == 0:
@@ -144,12 +152,18 @@ def _spread(length: int, count: int) -> list[int]:
 def _scaled(picture: Picture, scale: float, multiple: int = 1) -> Image.Image:
     """The picture at ``scale``, its sides a multiple of so many pixels."""
     image = Image.fromarray(picture)
-    width, height = (max(multiple, round(side * scale / multiple) * multiple) for side in image.size)
+    width, height = (
+        max(multiple, round(side * scale / multiple) * multiple) for side in image.size
+    )
     same = (width, height) == image.size
-    return image if same else image.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2.0)
+    return (
+        image if same else image.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=2.0)
+    )
 
 
-def _encode_gif(frames: Film | Sequence[Picture], fps: float, scale: float, colours: int, every: int) -> bytes:
+def _encode_gif(
+    frames: Film | Sequence[Picture], fps: float, scale: float, colours: int, every: int
+) -> bytes:
     """An endless GIF with one palette for the whole film."""
     palette = _shared_palette(frames, scale, colours)
     pictures = [
@@ -160,16 +174,22 @@ def _encode_gif(frames: Film | Sequence[Picture], fps: float, scale: float, colo
     ends = np.rint(np.arange(len(pictures) + 1) * 100.0 / (fps / every)).astype(int)
     durations_ms = (np.diff(ends).clip(min=2) * 10).tolist()
     file = io.BytesIO()
-    options: dict[str, Any] = {"duration": durations_ms, "loop": 0, "optimize": False, "disposal": 1}
+    options: dict[str, Any] = {
+        "duration": durations_ms,
+        "loop": 0,
+        "optimize": False,
+        "disposal": 1,
+    }
     pictures[0].save(file, format="GIF", save_all=True, append_images=pictures[1:], **options)
     return file.getvalue()
 
 
 def _shared_palette(frames: Film | Sequence[Picture], scale: float, colours: int) -> Image.Image:
-    """A palette image for all frames, from some of them: the commonest colours as they are, the others covered.
+    """A palette image for all frames, from some of them: the commonest colours as they are, the
+    others covered.
 
-    Without the former, large flat areas would change their colour a little; without the latter, small
-    bright things would lose theirs.
+    Without the former, large flat areas would change their colour a little; without the latter,
+    small bright things would lose theirs.
     """
     chosen = _spread(len(frames), _PALETTE_FRAMES)
     stack = np.concatenate([np.asarray(_scaled(frames[index], scale)) for index in chosen])
@@ -177,19 +197,24 @@ def _shared_palette(frames: Film | Sequence[Picture], scale: float, colours: int
     values, counts = np.unique(packed, return_counts=True)
     top = values[np.argsort(-counts, kind="stable")[:_FLAT_COLOURS]]
     exact = np.stack([top >> 16, (top >> 8) & 255, top & 255], axis=1)
-    covering = Image.fromarray(stack).quantize(colours - len(exact), method=Image.Quantize.MAXCOVERAGE)
+    covering = Image.fromarray(stack).quantize(
+        colours - len(exact), method=Image.Quantize.MAXCOVERAGE
+    )
     palette = Image.new("P", (1, 1))
     palette.putpalette([*exact.ravel().tolist(), *(covering.getpalette() or [])])
     return palette
 
 
-def _write_mp4(frames: Film | Sequence[Picture], path: str | Path, fps: float, scale: float) -> None:
+def _write_mp4(
+    frames: Film | Sequence[Picture], path: str | Path, fps: float, scale: float
+) -> None:
     """H.264 through the ffmpeg that imageio-ffmpeg brings along."""
     try:
         from imageio_ffmpeg import get_ffmpeg_exe  # an extra
 
         ffmpeg = get_ffmpeg_exe()
-    except (ImportError, RuntimeError) as error:  # not installed, or without a program for this machine
+    # not installed, or without a program for this machine
+    except (ImportError, RuntimeError) as error:
         raise UserError(
             f"{path}: mp4 needs the extra 'video'; run `pip install \"ganlane[video]\"` or choose format=gif."
         ) from error
@@ -198,7 +223,9 @@ def _write_mp4(frames: Film | Sequence[Picture], path: str | Path, fps: float, s
     raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {rate} -i -"
     with atomic_path(path) as part:
         line = [ffmpeg, "-y", "-v", "error", *raw.split(), *_H264.split(), str(part)]
-        pictures = (_scaled(frames[index], scale, multiple=2).tobytes() for index in range(len(frames)))
+        pictures = (
+            _scaled(frames[index], scale, multiple=2).tobytes() for index in range(len(frames))
+        )
         failure = _run_with_input(line, pictures)
         if failure is not None:
             raise UserError(f"{path}: ffmpeg cannot write it ({failure}); choose format=gif.")
@@ -207,11 +234,14 @@ def _write_mp4(frames: Film | Sequence[Picture], path: str | Path, fps: float, s
 def _run_with_input(line: Sequence[str], pictures: Iterable[bytes]) -> str | None:
     """Feed ``pictures`` to a program; its error message if it fails.
 
-    imageio-ffmpeg's own writer ignores the exit status: on a full disk it takes half a film for a whole one.
+    imageio-ffmpeg's own writer ignores the exit status: on a full disk it takes half a film for a
+    whole one.
     """
     # In a session of its own, so that Ctrl-C reaches this process alone, which then ends the other.
     pipe = subprocess.PIPE
-    program = subprocess.Popen(line, stdin=pipe, stderr=pipe, stdout=subprocess.DEVNULL, start_new_session=True)
+    program = subprocess.Popen(
+        line, stdin=pipe, stderr=pipe, stdout=subprocess.DEVNULL, start_new_session=True
+    )
     assert program.stdin is not None
     try:
         for picture in pictures:

@@ -1,9 +1,10 @@
 """Frames of a recorded episode, drawn with Pillow alone: no display is needed.
 
-A top view that follows the ego (orange, pointed, with a white edge); the others are blue, the faster the paler, with
-glass, indicators and brake lights. White trails show where vehicles came from, numbers on the roofs are speeds in
-m/s. Overlapping vehicles have a red edge. The scale across the road is larger than along it
-(:class:`~ganlane.view.canvas.WindowParameters`), as the header says.
+A top view that follows the ego (orange, pointed, with a white edge); the others are blue, the
+faster the paler, with glass, indicators and brake lights. White trails show where vehicles came
+from, numbers on the roofs are speeds in m/s. Overlapping vehicles have a red edge. The scale across
+the road is larger than along it (:class:`~ganlane.view.canvas.WindowParameters`), as the header
+says.
 """
 
 from __future__ import annotations
@@ -37,7 +38,16 @@ _EGO_COVERAGE, _OTHER_COVERAGE = (110, 175, 240), (45, 80, 120)
 
 #: Outlines as shares of length (to the front) and width (to the left).
 _BODY = np.array(
-    [(-0.5, 0.42), (-0.46, 0.5), (0.38, 0.5), (0.5, 0.34), (0.5, -0.34), (0.38, -0.5), (-0.46, -0.5), (-0.5, -0.42)]
+    [
+        (-0.5, 0.42),
+        (-0.46, 0.5),
+        (0.38, 0.5),
+        (0.5, 0.34),
+        (0.5, -0.34),
+        (0.38, -0.5),
+        (-0.46, -0.5),
+        (-0.5, -0.42),
+    ]
 )
 _EGO = np.array([(-0.5, 0.5), (0.2, 0.5), (0.5, 0.08), (0.5, -0.08), (0.2, -0.5), (-0.5, -0.5)])
 _GLASS = (
@@ -113,18 +123,34 @@ class FramePainter:
         if self.drawing.leader_line:
             self._draw_leader_line(picture, frame)
         in_picture = (columns > -reach) & (columns < size.width + reach) & t.valid[frame]
-        for vehicle in np.flatnonzero(in_picture)[::-1].tolist():  # the ego comes last, on top of the others
+        # the ego comes last, on top of the others
+        for vehicle in np.flatnonzero(in_picture)[::-1].tolist():
             self._draw_vehicle(picture, frame, vehicle, float(columns[vehicle]))
         if t.outcome == "hard_crash" and frame == len(t) - 1:
-            column, row, radius = float(columns[0]), float(self.window.row(t.y[frame, 0])), 6.0 * self.window.along
+            column, row, radius = (
+                float(columns[0]),
+                float(self.window.row(t.y[frame, 0])),
+                6.0 * self.window.along,
+            )
             ring = (column - radius, row - radius, column + radius, row + radius)
             ImageDraw.Draw(picture).ellipse(ring, outline=canvas.CRASH, width=3)
         # How many vehicles are behind and ahead of the picture.
         room_above = self.window.edges[0] - HEADER_HEIGHT > 2 * _SMALL
         top = HEADER_HEIGHT + 6 if room_above else size.height - _SMALL - 6
-        behind, ahead = (int((t.valid[frame] & out).sum()) for out in (columns < 0, columns > size.width))
-        canvas.put_text(picture, (12, top), f"{behind} behind" if behind else "", _SMALL, canvas.FAINT)
-        canvas.put_text(picture, (size.width - 12, top), f"{ahead} ahead" if ahead else "", _SMALL, canvas.FAINT, 1.0)
+        behind, ahead = (
+            int((t.valid[frame] & out).sum()) for out in (columns < 0, columns > size.width)
+        )
+        canvas.put_text(
+            picture, (12, top), f"{behind} behind" if behind else "", _SMALL, canvas.FAINT
+        )
+        canvas.put_text(
+            picture,
+            (size.width - 12, top),
+            f"{ahead} ahead" if ahead else "",
+            _SMALL,
+            canvas.FAINT,
+            1.0,
+        )
         self._header.draw(picture, frame)
         return np.asarray(picture)
 
@@ -163,7 +189,9 @@ class FramePainter:
         picture.paste(smooth, (int(origin[0]), int(origin[1])), smooth)
         if self.drawing.speeds:
             place = (column - 0.09 * forward[0], middle[1] - _SMALL * 0.62)
-            canvas.put_text(picture, place, f"{t.speed[at]:.0f}", _SMALL, canvas.readable_on(colour), 0.5)
+            canvas.put_text(
+                picture, place, f"{t.speed[at]:.0f}", _SMALL, canvas.readable_on(colour), 0.5
+            )
 
     def _signal(self, frame: int, vehicle: int) -> int:
         """Side to which the vehicle's indicator is lit now, +1 for the left, or 0; it blinks."""
@@ -173,41 +201,60 @@ class FramePainter:
         return int(np.sign(offset)) if lit and abs(offset) > _SIGNAL_M else 0
 
     def _draw_trails(self, picture: Image.Image, frame: int, ego_x: float) -> None:
-        """Trails over the last seconds, as in the paper's Figure 3: the ego's brighter, older parts fainter."""
+        """Trails over the last seconds, as in the paper's Figure 3.
+
+        The ego's brighter, older parts fainter.
+        """
         steps = round(self.drawing.trail_s / self.trajectory.frame_s)
         if steps < 1 or frame == 0:
             return
         t, past = self.trajectory, slice(max(0, frame - steps), frame + 1)
         # What came before a jump belongs to another place.
-        jumps_to_come: npt.NDArray[np.int64] = np.cumsum(self._jumped[past][::-1], axis=0)[::-1] - self._jumped[past]
+        jumps_to_come: npt.NDArray[np.int64] = (
+            np.cumsum(self._jumped[past][::-1], axis=0)[::-1] - self._jumped[past]
+        )
         known = t.valid[past] & t.valid[frame] & (jumps_to_come == 0)
-        places = np.stack((self.window.column(t.x[past], ego_x), self.window.row(t.y[past])), axis=-1)
+        places = np.stack(
+            (self.window.column(t.x[past], ego_x), self.window.row(t.y[past])), axis=-1
+        )
         for vehicle in range(t.vehicles - 1, -1, -1):
             trail = places[:, vehicle][known[:, vehicle]]
             if len(trail) > 1:
                 self._draw_trail(picture, trail, _OTHER_COVERAGE if vehicle else _EGO_COVERAGE)
 
-    def _draw_trail(self, picture: Image.Image, trail: FloatArray, coverage: tuple[int, int, int]) -> None:
-        """Places [S, 2], oldest first, as three lines that share their ends, on a mask no larger than they are.
+    def _draw_trail(
+        self, picture: Image.Image, trail: FloatArray, coverage: tuple[int, int, int]
+    ) -> None:
+        """Places [S, 2], oldest first, as three lines that share their ends, on a mask no larger
+        than they are.
 
         What is outside the road and a margin is cut off.
         """
         upper, lower = self.window.edges
         (left, top), (right, bottom) = trail.min(axis=0).astype(int), trail.max(axis=0).astype(int)
         left, right = max(0, left - _TRAIL_MARGIN), min(picture.width, right + _TRAIL_MARGIN)
-        top, bottom = max(int(upper) - 20, top - _TRAIL_MARGIN), min(int(lower) + 20, bottom + _TRAIL_MARGIN)
+        top, bottom = (
+            max(int(upper) - 20, top - _TRAIL_MARGIN),
+            min(int(lower) + 20, bottom + _TRAIL_MARGIN),
+        )
         if left >= right or top >= bottom:
             return
-        mask = Image.new("L", ((right - left) * _TRAIL_OVERSAMPLING, (bottom - top) * _TRAIL_OVERSAMPLING))
+        mask = Image.new(
+            "L", ((right - left) * _TRAIL_OVERSAMPLING, (bottom - top) * _TRAIL_OVERSAMPLING)
+        )
         draw, points = ImageDraw.Draw(mask), (trail - (left, top)) * _TRAIL_OVERSAMPLING
         cuts = np.linspace(0, len(points) - 1, 4).astype(int)
         parts = [points[start : end + 1] for start, end in pairwise(cuts) if end > start]
         for part, strength in zip(parts, coverage):
-            draw.line([(x, y) for x, y in part.tolist()], fill=strength, width=2 * _TRAIL_OVERSAMPLING)
+            draw.line(
+                [(x, y) for x, y in part.tolist()], fill=strength, width=2 * _TRAIL_OVERSAMPLING
+            )
         picture.paste((255, 255, 255), (left, top), mask.reduce(_TRAIL_OVERSAMPLING))
 
     def _draw_leader_line(self, picture: Image.Image, frame: int) -> None:
-        """A line from the ego's front to the rear of the nearest vehicle ahead in its lane, with the net gap in m."""
+        """A line from the ego's front to the rear of the nearest vehicle ahead in its lane, with
+        the net gap in m.
+        """
         t, lane = self.trajectory, self.trajectory.lane()[frame]
         ahead = t.valid[frame] & (lane == lane[0]) & (t.x[frame] > t.x[frame, 0])
         if not ahead.any():
@@ -219,11 +266,16 @@ class FramePainter:
         row = float(self.window.row(t.y[frame, 0]))
         ImageDraw.Draw(picture).line((start, row, end, row), fill=canvas.LEADER, width=1)
         middle = (start + min(end, self.window.parameters.width)) / 2
-        canvas.put_text(picture, (middle, row - 17), f"{rear - front:.0f} m", _SMALL, canvas.LEADER, 0.5)
+        canvas.put_text(
+            picture, (middle, row - 17), f"{rear - front:.0f} m", _SMALL, canvas.LEADER, 0.5
+        )
 
 
 class _Header:
-    """The line above the picture: driver, traffic, episode, and the frame's time, speed, return and action."""
+    """The line above the picture.
+
+    Driver, traffic, episode, and the frame's time, speed, return and action.
+    """
 
     def __init__(self, trajectory: Trajectory, window: Window) -> None:
         self.trajectory, self.width = trajectory, window.parameters.width
@@ -232,7 +284,11 @@ class _Header:
         self._fixed = fixed = Image.new("RGB", (self.width, HEADER_HEIGHT), canvas.HEADER)
         label = trajectory.label
         title = f"{label.agent}  on  {label.traffic}"
-        fitting = (size for size in _TITLE_SIZES if canvas.text_mask(title, size).width < self._columns - 24)
+        fitting = (
+            size
+            for size in _TITLE_SIZES
+            if canvas.text_mask(title, size).width < self._columns - 24
+        )
         canvas.put_text(fixed, (16, 8), title, next(fitting, _TITLE_SIZES[-1]), canvas.TEXT)
         facts = f"episode {label.episode}, seed {label.seed}, {label.lanes} lane{'s' if label.lanes > 1 else ''}"
         if (factor := window.across / window.along) > 1.05:
@@ -255,7 +311,9 @@ class _Header:
         canvas.put_text(self._fixed, (left, 9), "others' speed, m/s", _SMALL, canvas.FAINT)
         for speed in (0, 10, 20, 30):
             at = left + speed / canvas.FAST_MPS * (right - left)
-            canvas.put_text(self._fixed, (at, 38), f"{speed}", 11, canvas.FAINT, 0.0 if speed == 0 else 0.5)
+            canvas.put_text(
+                self._fixed, (at, 38), f"{speed}", 11, canvas.FAINT, 0.0 if speed == 0 else 0.5
+            )
 
     def draw(self, picture: Image.Image, frame: int) -> None:
         """Put the header of one frame on the picture, and the outcome on the last frame."""
@@ -279,5 +337,7 @@ class _Header:
         width = int(np.ceil(canvas.text_mask(text, 24).width)) + 40
         left = (self.width - width) // 2
         box = (left, HEADER_HEIGHT + 6, left + width, HEADER_HEIGHT + 44)
-        ImageDraw.Draw(picture).rounded_rectangle(box, 8, fill=canvas.HEADER, outline=colour, width=2)
+        ImageDraw.Draw(picture).rounded_rectangle(
+            box, 8, fill=canvas.HEADER, outline=colour, width=2
+        )
         canvas.put_text(picture, (self.width / 2, HEADER_HEIGHT + 11), text, 24, colour, 0.5)

@@ -1,11 +1,11 @@
 """One self-contained HTML page that plays episodes: road, action values, reward, the ego's comfort.
 
-The page is ``player_page/page.html`` with its style and scripts and the episodes as JSON. It loads nothing
-and runs nothing but these scripts.
+The page is ``player_page/page.html`` with its style and scripts and the episodes as JSON. It loads
+nothing and runs nothing but these scripts.
 
-Numbers are whole multiples of small units. A *series* [T] is a list of T whole numbers: the first sample, then each
-sample's difference from the one before. *Steps* are values that change now and then: a flat list ``[sample, value,
-sample, value, ...]`` of the changes.
+Numbers are whole multiples of small units. A *series* [T] is a list of T whole numbers: the first
+sample, then each sample's difference from the one before. *Steps* are values that change now and
+then: a flat list ``[sample, value, sample, value, ...]`` of the changes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ MAX_BYTES_PER_EPISODE = 660_000
 UNITS = dict(time=0.01, x=0.01, y=0.01, heading=0.001, speed=0.01, acceleration=0.01, jerk=0.1)
 
 
-def write_player(trajectories: Sequence[Trajectory], path: str | Path, max_bytes: int | None = None) -> Path:
+def write_player(
+    trajectories: Sequence[Trajectory], path: str | Path, max_bytes: int | None = None
+) -> Path:
     """Write :func:`player_page` to ``path``, atomically, and return it."""
     write_bytes(path, player_page(trajectories, max_bytes).encode())
     return Path(path)
@@ -43,8 +45,8 @@ def write_player(trajectories: Sequence[Trajectory], path: str | Path, max_bytes
 def player_page(trajectories: Sequence[Trajectory], max_bytes: int | None = None) -> str:
     """A whole HTML page that plays ``trajectories`` side by side.
 
-    Where the page is larger than ``max_bytes`` (None: 660 kB an episode), samples are taken 0.2, 0.3, 0.5 or 1 s
-    apart instead of 0.1 s; the player interpolates.
+    Where the page is larger than ``max_bytes`` (None: 660 kB an episode), samples are taken 0.2,
+    0.3, 0.5 or 1 s apart instead of 0.1 s; the player interpolates.
 
     Raises:
         UserError: there is no episode, or the page is too large even so.
@@ -52,9 +54,14 @@ def player_page(trajectories: Sequence[Trajectory], max_bytes: int | None = None
     if not trajectories:
         raise UserError("format=html: no episode to play; record at least one.")
     limit = max_bytes or MAX_BYTES_PER_EPISODE * len(trajectories)
-    title = ", ".join(dict.fromkeys(f"{each.label.agent} on {each.label.traffic}" for each in trajectories))
+    title = ", ".join(
+        dict.fromkeys(f"{each.label.agent} on {each.label.traffic}" for each in trajectories)
+    )
     for stride in (1, 2, 3, 5, 10):
-        page = _fill(title, {"units": UNITS, "episodes": [episode_data(each, stride) for each in trajectories]})
+        page = _fill(
+            title,
+            {"units": UNITS, "episodes": [episode_data(each, stride) for each in trajectories]},
+        )
         size = len(page.encode())
         if size <= limit:
             return page
@@ -72,7 +79,8 @@ def _fill(title: str, data: dict[str, Any]) -> str:
         return (folder / name).read_text(encoding="utf-8")
 
     style = text("style.css")
-    scripts = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")  # in this order
+    # in this order
+    scripts = ("episode.js", "road.js", "chart.js", "events.js", "panel.js", "player.js")
     script = "(() => {\n'use strict';\n" + "\n".join(map(text, scripts)) + "})();\n"
     parts = {
         "title": html.escape(title),
@@ -96,7 +104,10 @@ def _hash(text: str) -> str:
 
 
 def series(values: npt.NDArray[np.float64], unit: float) -> list[int]:
-    """[T] numbers as whole multiples of ``unit``, by their differences; rounding errors do not add up."""
+    """[T] numbers as whole multiples of ``unit``, by their differences.
+
+    Rounding errors do not add up.
+    """
     whole = np.rint(np.nan_to_num(values) / unit).astype(np.int64)
     return np.diff(whole, prepend=np.int64(0)).tolist()
 
@@ -110,7 +121,9 @@ def steps(values: npt.NDArray[Any]) -> list[Any]:
         return int(value)
 
     rounded = [plain(value) for value in values.tolist()]
-    changed = [index for index, value in enumerate(rounded) if index == 0 or value != rounded[index - 1]]
+    changed = [
+        index for index, value in enumerate(rounded) if index == 0 or value != rounded[index - 1]
+    ]
     return [entry for index in changed for entry in (index, rounded[index])]
 
 
@@ -122,11 +135,12 @@ def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:
         stride: frames from one sample to the next; the last frame is always a sample.
 
     Returns:
-        The label's fields; ``outcome``; ``time`` (series); ``x, y, heading, speed`` (a series per vehicle);
-        ``length, width, target_lane, valid`` (steps per vehicle); ``acceleration`` and ``jerk`` of the ego (series);
-        ``action, reward, return`` (steps, of the decision that is carried out from a sample on); ``action_values``
-        (steps per action; empty if unknown) with ``action_names``; ``comfort`` (:meth:`Trajectory.comfort`);
-        ``soft_crash``, the ends of the decisions with any, s.
+        The label's fields; ``outcome``; ``time`` (series); ``x, y, heading, speed`` (a series per
+        vehicle); ``length, width, target_lane, valid`` (steps per vehicle); ``acceleration`` and
+        ``jerk`` of the ego (series); ``action, reward, return`` (steps, of the decision that is
+        carried out from a sample on); ``action_values`` (steps per action; empty if unknown) with
+        ``action_names``; ``comfort`` (:meth:`Trajectory.comfort`); ``soft_crash``, the ends of the
+        decisions with any, s.
     """
     t = trajectory
     kept = np.union1d(np.arange(0, len(t), stride), len(t) - 1)
@@ -139,14 +153,22 @@ def episode_data(trajectory: Trajectory, stride: int = 1) -> dict[str, Any]:
         **asdict(t.label),
         "outcome": t.outcome,
         "time": series(t.time_s[kept], UNITS["time"]),
-        **{name: [series(row, UNITS[name]) for row in per_vehicle(name)] for name in ("x", "y", "heading", "speed")},
-        **{name: [steps(row) for row in per_vehicle(name)] for name in ("length", "width", "target_lane", "valid")},
+        **{
+            name: [series(row, UNITS[name]) for row in per_vehicle(name)]
+            for name in ("x", "y", "heading", "speed")
+        },
+        **{
+            name: [steps(row) for row in per_vehicle(name)]
+            for name in ("length", "width", "target_lane", "valid")
+        },
         "acceleration": series(t.acceleration[kept, 0], UNITS["acceleration"]),
         "jerk": series(t.jerk()[kept, 0], UNITS["jerk"]),
         "action": steps(t.action[under_way]),
         "reward": steps(t.reward[under_way]) if len(t.reward) else [],
         "return": steps(t.returns[kept]),
-        "action_values": [steps(row) for row in t.action_values[under_way].T] if t.action_values.size else [],
+        "action_values": [steps(row) for row in t.action_values[under_way].T]
+        if t.action_values.size
+        else [],
         "action_names": list(ACTION_NAMES),
         "comfort": t.comfort(),
         "soft_crash": [round(float(time), 2) for time in t.soft_crash_s if time >= t.time_s[0]],

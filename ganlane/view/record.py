@@ -1,4 +1,7 @@
-"""Episodes recorded at every physics step: as plain arrays, while they run, and as tracks of recorded traffic."""
+"""Episodes recorded at every physics step.
+
+As plain arrays, while they run, and as tracks of recorded traffic.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +62,8 @@ class EpisodeLabel:
 class Trajectory:
     """T frames of M vehicles; the ego has index 0.
 
-    Frame 0 is the state after the reset. SI units: positions of the bodies' centres in m, ``x`` along the
-    road, ``y`` to the left; ``heading`` in rad, anticlockwise.
+    Frame 0 is the state after the reset. SI units: positions of the bodies' centres in m, ``x``
+    along the road, ``y`` to the left; ``heading`` in rad, anticlockwise.
     """
 
     label: EpisodeLabel
@@ -126,7 +129,9 @@ class Trajectory:
         return np.where(begins | self.jumped(), 0.0, change)
 
     def comfort(self) -> dict[str, float]:
-        """The ego's ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and ``rms_jerk``, m/s3."""
+        """The ego's ``rms_acceleration`` and ``hardest_braking`` (0 or below), m/s2, and
+        ``rms_jerk``, m/s3.
+        """
         acceleration, jerk = self.acceleration[:, 0], self.jerk()[:, 0]
         return {
             "rms_acceleration": round(float(np.sqrt(np.mean(acceleration**2))), 3),
@@ -142,9 +147,15 @@ class Trajectory:
         """
         first = int(np.searchsorted(self.time_s, start_s - 1e-9))
         if first == len(self):
-            raise UserError(f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it.")
+            raise UserError(
+                f"start at {start_s:g} s: the episode lasts {self.time_s[-1]:g} s; choose a part of it."
+            )
         whole = replace(self, driven_jerk=self.jerk())
-        frames = [each.name for each in fields(self) if each.name not in ("label", "outcome", "soft_crash_s")]
+        frames = [
+            each.name
+            for each in fields(self)
+            if each.name not in ("label", "outcome", "soft_crash_s")
+        ]
         later: dict[str, Any] = {name: getattr(whole, name)[first:] for name in frames}
         return replace(whole, **later)
 
@@ -166,7 +177,8 @@ class Recorder:
     row: int = 0
     #: What a trajectory keeps of a frame, by its name there.
     frames: list[dict[str, Any]] = field(default_factory=list)
-    #: Frames recorded by the end of each decision, and its reward; empty if rewards are not recorded.
+    #: Frames recorded by the end of each decision, and its reward; empty if rewards are not
+    #: recorded.
     decisions: list[tuple[int, float]] = field(default_factory=list)
     #: Ends of the decisions with a soft crash, s.
     soft_crash_s: list[float] = field(default_factory=list)
@@ -180,13 +192,20 @@ class Recorder:
         return self.frames[-1]["time_s"]
 
     def __call__(self, vehicles: Vehicles, running: Tensor) -> None:
-        """Hook of the environment: vehicles [N, M] after a physics step, ``running`` [N] the rows that took it."""
+        """Hook of the environment.
+
+        Vehicles [N, M] after a physics step, ``running`` [N] the rows that took it.
+        """
         if bool(running[self.row]):
             self.add(vehicles.as_dict(), self.time_s + keys.PHYSICS_STEP_S)
 
     def add(self, vehicles: Mapping[str, Tensor] | TensorDictBase, time_s: float) -> None:
         """Append a frame."""
-        frame: dict[str, Any] = {"time_s": time_s, "action": self.current_action, "returns": self.current_return}
+        frame: dict[str, Any] = {
+            "time_s": time_s,
+            "action": self.current_action,
+            "returns": self.current_return,
+        }
         for name, kind in _FIELDS.items():
             frame[name] = vehicles[name][self.row].detach().cpu().numpy().astype(kind)
         self.frames.append({**frame, "action_values": self.current_values})
@@ -197,7 +216,10 @@ class Recorder:
         begin = 1
         for end, paid in self.decisions:
             reward[begin:end], begin = paid, end
-        arrays = {name: np.stack([frame[name] for frame in self.frames]) for name in (*_FIELDS, "action", "returns")}
+        arrays = {
+            name: np.stack([frame[name] for frame in self.frames])
+            for name in (*_FIELDS, "action", "returns")
+        }
         arrays["returns"][-1] = self.current_return
         values = [frame["action_values"] for frame in self.frames]
         width = max(map(len, values))
@@ -214,7 +236,10 @@ class Recorder:
 
 
 def road_of_row(state: TensorDictBase, road: Road, row: int) -> tuple[int, float]:
-    """Lanes and lane width, m, of a row: of its replayed scene if ``state`` has one, else of ``road``."""
+    """Lanes and lane width, m, of a row.
+
+    Of its replayed scene if ``state`` has one, else of ``road``.
+    """
     found = road_in(state, road)
     lanes, width = (torch.as_tensor(value).flatten() for value in (found.lanes, found.lane_width_m))
     return int(lanes[min(row, len(lanes) - 1)]), float(width[min(row, len(width) - 1)])
@@ -251,7 +276,9 @@ def record_episode(
     while hasattr(base, "base_env"):
         base = base.base_env
     if not hasattr(base, "recorder"):
-        raise UserError(f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this process.")
+        raise UserError(
+            f"env={type(base).__name__}: it cannot be recorded; expected a HighwayEnv of this process."
+        )
     before, base.recorder = base.recorder, (recorder := Recorder())
     try:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -265,12 +292,18 @@ def record_episode(
     return recorder.trajectory(label, outcome_of(state))
 
 
-def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder) -> TensorDictBase:
+def _decide(
+    env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, recorder: Recorder
+) -> TensorDictBase:
     """One decision; the state after it."""
     recorder.current_action = int(state[keys.ACTION][0])
     # Action values [N, A]: from the policy's network, or its output; None if it has none.
     is_greedy = isinstance(policy, GreedyPolicy)
-    values = policy.network.values(state[keys.OBSERVATION]) if is_greedy else state.get("action_value", None)
+    values = (
+        policy.network.values(state[keys.OBSERVATION])
+        if is_greedy
+        else state.get("action_value", None)
+    )
     if values is not None and values.ndim == 2:
         recorder.current_values = values[0].double().cpu().numpy()
     stepped = env.step(state)
@@ -285,12 +318,15 @@ def _decide(env: EnvBase, policy: TensorDictModuleBase, state: TensorDictBase, r
 # Tracks
 
 
-def write_tracks(trajectories: Sequence[Trajectory], path: str | Path, format: Literal["csv", "parquet"]) -> Path:
-    """Write episodes, a scene each, atomically, as a file that :func:`ganlane.data.read_scenes` reads back.
+def write_tracks(
+    trajectories: Sequence[Trajectory], path: str | Path, format: Literal["csv", "parquet"]
+) -> Path:
+    """Write episodes, a scene each, atomically, as a file that :func:`ganlane.data.read_scenes`
+    reads back.
 
-    Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings from elsewhere, the
-    speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is 0 at the centre of lane 1. It has no
-    lane width, and a rightmost lane without vehicles is lost.
+    Parquet holds the schema (:mod:`ganlane.data.schema`) itself. In CSV, the form of recordings
+    from elsewhere, the speed is called ``v``, lanes are counted from the left, from 1, and ``y`` is
+    0 at the centre of lane 1. It has no lane width, and a rightmost lane without vehicles is lost.
 
     Raises:
         UserError: there is no episode, or one whose frames are not 0.1 s apart.
@@ -328,12 +364,19 @@ def to_tracks(trajectory: Trajectory, scene: str = "simulated") -> pl.DataFrame:
         "lane": trajectory.lane(),
     }
     shown = trajectory.valid
-    table = pl.DataFrame({"scene": [scene] * int(shown.sum()), **{k: v[shown] for k, v in columns.items()}})
-    return table.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items()).sort("scene", "vehicle", "frame")
+    table = pl.DataFrame(
+        {"scene": [scene] * int(shown.sum()), **{k: v[shown] for k, v in columns.items()}}
+    )
+    return table.select(pl.col(name).cast(kind) for name, kind in SCHEMA.items()).sort(
+        "scene", "vehicle", "frame"
+    )
 
 
 def scene_names(labels: Sequence[EpisodeLabel]) -> list[str]:
-    """A name for each episode's scene, ``AGENT_TRAFFIC_SEED_EPISODE``; a number follows where two would be alike."""
+    """A name for each episode's scene, ``AGENT_TRAFFIC_SEED_EPISODE``.
+
+    A number follows where two would be alike.
+    """
     names: list[str] = []
     for label in labels:
         name = f"{Path(label.agent).stem}_{label.traffic}_{label.seed}_{label.episode}"

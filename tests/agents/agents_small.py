@@ -38,4 +38,6 @@ def transitions(size, rows=64, seed=0):
 
 
 def same_weights(first, second):
-    return all(torch.equal(a, b) for a, b in zip(first.weights().values(), second.weights().values()))
+    return all(
+        torch.equal(a, b) for a, b in zip(first.weights().values(), second.weights().values())
+    )

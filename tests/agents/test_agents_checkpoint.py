@@ -5,7 +5,15 @@ import torch
 from agents_small import agent, same_weights, saved_in
 from tensordict import TensorDict
 
-from ganlane.agents import RainbowConfig, agent_file, checkpoint, load_agent, read_agent, save_agent, warm_start
+from ganlane.agents import (
+    RainbowConfig,
+    agent_file,
+    checkpoint,
+    load_agent,
+    read_agent,
+    save_agent,
+    warm_start,
+)
 from ganlane.agents.checkpoint import load_moments
 from ganlane.errors import UserError
 from ganlane.parameters.agent import AGENT_OPTIONS, LAST_REVISION
@@ -53,13 +61,17 @@ def test_shipped_agents_are_found_by_name(saved, monkeypatch):
     assert load_agent("agent_idm")[1]["observation"] == "table3"
 
 
-def test_removed_options_at_their_defaults_load_and_others_name_the_revision_that_had_them(tmp_path):
+def test_removed_options_at_their_defaults_load_and_others_name_the_revision_that_had_them(
+    tmp_path,
+):
     assert load_agent(saved_in(tmp_path, agent=AGENT_OPTIONS))[1]["agent"] == {}
     for option, shown in (
         ({"encoder": "shared"}, "encoder=shared"),
         ({"decide_when_free": True}, "decide_when_free=true"),
     ):
-        with pytest.raises(UserError, match=f"agent.{shown} was removed after revision {LAST_REVISION}; check out"):
+        with pytest.raises(
+            UserError, match=f"agent.{shown} was removed after revision {LAST_REVISION}; check out"
+        ):
             load_agent(saved_in(tmp_path, agent={**AGENT_OPTIONS, **option}))
 
 
@@ -78,7 +90,10 @@ def test_a_warm_start_takes_the_saved_weights(saved):
     ("options", "message"),
     [
         ({"v_min": -10.0}, r"here: agent.v_min=-10\).*init.support=trained, set agent.v_min=-120,"),
-        ({"hidden": (8,), "atoms": 51}, r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or start"),
+        (
+            {"hidden": (8,), "atoms": 51},
+            r"atoms=51\); set agent.hidden=\[8,8\] agent.atoms=101, or start",
+        ),
     ],
 )
 def test_another_network_or_support_is_refused_naming_the_ways_out(options, message, saved):
@@ -117,7 +132,10 @@ def test_adam_goes_on_from_the_moments_that_it_is_given():
 
 
 def test_only_moments_are_taken_over_the_rate_is_ones_own():
-    trained, fresh = agent(learning_rate=1e-2, adam_eps=1e-3), agent(learning_rate=1e-4, adam_eps=1e-8)
+    trained, fresh = (
+        agent(learning_rate=1e-2, adam_eps=1e-3),
+        agent(learning_rate=1e-4, adam_eps=1e-8),
+    )
     descend(trained, 1)
     load_moments(fresh, trained.optimizer.state_dict()["state"])
     (group,) = fresh.optimizer.param_groups
@@ -131,7 +149,9 @@ def test_moments_kept_in_half_precision_come_back_as_floats():
     exact, rounded = (learner.optimizer.state_dict()["state"] for learner in (trained, fresh))
     for row in exact:
         assert rounded[row]["exp_avg_sq"].dtype == torch.float32
-        torch.testing.assert_close(rounded[row]["exp_avg"], exact[row]["exp_avg"], rtol=2**-8, atol=0.0)
+        torch.testing.assert_close(
+            rounded[row]["exp_avg"], exact[row]["exp_avg"], rtol=2**-8, atol=0.0
+        )
 
 
 @pytest.mark.parametrize("damage", ["absent", "fewer", "another shape", "no step", "text"])

@@ -40,7 +40,10 @@ def test_random_drivers_use_all_actions_equally():
 
 def test_the_legal_random_driver_never_asks_for_a_lane_that_is_not_there():
     state = states(6000)
-    lane, action = state["vehicles", "target_lane"][:, 0], RandomLegalDriver(Road())(state)["action"]
+    lane, action = (
+        state["vehicles", "target_lane"][:, 0],
+        RandomLegalDriver(Road())(state)["action"],
+    )
     assert not ((lane == 2) & (action == LEFT)).any()
     assert not ((lane == 0) & (action == RIGHT)).any()
     for own, legal in ((0, (KEEP, LEFT)), (1, (KEEP, LEFT, RIGHT)), (2, (KEEP, RIGHT))):

@@ -1,4 +1,6 @@
-"""The lean losses equal TorchRL's, the projection a reference, and the whole update autograd and Adam."""
+"""The lean losses equal TorchRL's, the projection a reference, and the whole update autograd and
+Adam.
+"""
 
 from copy import deepcopy
 
@@ -53,7 +55,9 @@ def unlike_target(loss):
 @pytest.mark.parametrize("noisy", [True, False])
 def test_the_distributional_loss_equals_torchrls(noisy, rows):
     """Also when the batch has as many rows as there are atoms, where a wrong shape would broadcast."""
-    loss = unlike_target(LeanDistributionalLoss(network(noisy=noisy), gamma=0.97, kl_priority=False))
+    loss = unlike_target(
+        LeanDistributionalLoss(network(noisy=noisy), gamma=0.97, kl_priority=False)
+    )
     theirs, ours, parameters = batch(rows=rows), batch(rows=rows), list(loss.network.parameters())
     expected, actual = DistributionalDQNLoss.forward(loss, theirs)["loss"], loss(ours)["loss"]
     torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-6)
@@ -120,7 +124,9 @@ def test_the_kl_priority_is_the_cross_entropy_less_the_targets_entropy():
     cross_entropy = loss(data)["loss"].detach()
     target = loss._target(data, loss.network.weights())[0].detach()
     entropy = -(target * target.clamp_min(1e-30).log()).sum(-1)
-    torch.testing.assert_close(data["td_error"].squeeze(-1), cross_entropy - entropy, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        data["td_error"].squeeze(-1), cross_entropy - entropy, atol=1e-5, rtol=1e-5
+    )
     assert (data["td_error"] >= 0).all()
 
 
@@ -147,9 +153,15 @@ def test_the_target_network_is_torchrls_target_parameters():
 @pytest.mark.parametrize("double", [True, False])
 @pytest.mark.parametrize("distributional", [True, False])
 def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
-    """Where one next action alone is allowed, the target is that of a network to which it is the best."""
-    kind, options = (LeanDistributionalLoss, {}) if distributional else (LeanDQNLoss, {"distributional": False})
-    loss = unlike_target(kind(network(noisy=False, dueling=False, **options), gamma=0.97, double=double))
+    """Where one next action alone is allowed, the target is that of a network to which it is the
+    best.
+    """
+    kind, options = (
+        (LeanDistributionalLoss, {}) if distributional else (LeanDQNLoss, {"distributional": False})
+    )
+    loss = unlike_target(
+        kind(network(noisy=False, dueling=False, **options), gamma=0.97, double=double)
+    )
     data = batch()
     only = torch.randint(0, 3, (64,), generator=torch.Generator().manual_seed(1))
     data["next", "action_mask"] = torch.nn.functional.one_hot(only, 3).bool()
@@ -169,12 +181,21 @@ def test_the_next_action_is_one_that_the_mask_allows(distributional, double):
 
 
 def agent(graph=None, masked=False, **options):
-    usual = {"hidden": (16, 24), "atoms": 7, "batch_size": 32, "warmup": 100, "capacity": 1000, "target_period": 3}
+    usual = {
+        "hidden": (16, 24),
+        "atoms": 7,
+        "batch_size": 32,
+        "warmup": 100,
+        "capacity": 1000,
+        "target_period": 3,
+    }
     config = RainbowConfig(**{**usual, "v_min": -20.0, "v_max": 20.0, **options})
     made = Rainbow(config, SIZE, seed=0)
     data = batch(rows=600, scale=30.0)  # some targets lie outside the support
     if masked:
-        data["next", "action_mask"] = torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) < 0.6
+        data["next", "action_mask"] = (
+            torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) < 0.6
+        )
         data["next", "action_mask"][:, 0] = True
     made.store(data)
     if graph is not None:
@@ -229,7 +250,9 @@ def test_training_can_change_from_one_way_to_the_other_and_be_resumed():
     assert_close(plain, back)
 
 
-@pytest.mark.parametrize("part", ["distributional", "double", "dueling", "noisy", "prioritised", "kl_priority"])
+@pytest.mark.parametrize(
+    "part", ["distributional", "double", "dueling", "noisy", "prioritised", "kl_priority"]
+)
 def test_an_agent_without_one_of_the_components_keeps_the_other_way(part):
     config = RainbowConfig(**{part: False})
     assert Rainbow(config, SIZE, compile=True).graph is None

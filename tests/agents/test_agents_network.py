@@ -32,7 +32,9 @@ def test_the_relu_is_that_of_torch(gradients):
     x, weight, bias = torch.randn(20, 8), torch.randn(6, 8), torch.randn(6)
     with torch.set_grad_enabled(gradients):
         output = linear(x, weight, bias, relu=True)
-    torch.testing.assert_close(output, functional.linear(x, weight, bias).relu(), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        output, functional.linear(x, weight, bias).relu(), atol=1e-5, rtol=1e-5
+    )
 
 
 def test_other_types_shapes_and_builds_take_the_ordinary_way(monkeypatch):

@@ -9,7 +9,10 @@ from ganlane.agents.n_step import NStepWindow
 
 
 def recorded(steps, environments, seed):
-    """Steps with random ends; the observation is a serial number, and the one after a reset is another."""
+    """Steps with random ends.
+
+    The observation is a serial number, and the one after a reset is another.
+    """
     generator = torch.Generator().manual_seed(seed)
     serial, current, result = 0.0, torch.zeros(environments, 1), []
     for _ in range(steps):
@@ -56,7 +59,9 @@ def test_each_transition_equals_the_loop_over_its_own_steps(n, environments, see
             reward, length, following, terminated = brute_force(steps, start, row, n, gamma)
             assert torch.equal(transition["observation"][row], steps[start]["observation"][row])
             assert transition["action"][row] == steps[start]["action"][row]
-            torch.testing.assert_close(float(transition["next", "reward"][row]), reward, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(
+                float(transition["next", "reward"][row]), reward, atol=1e-5, rtol=1e-5
+            )
             assert transition["steps_to_next_obs"][row] == length
             assert torch.equal(transition["next", "observation"][row], following)
             assert transition["next", "terminated"][row] == terminated

@@ -1,4 +1,7 @@
-"""The assembled agent: exploration, updates, switches, saving, and no touch of the global random state."""
+"""The assembled agent.
+
+Exploration, updates, switches, saving, and no touch of the global random state.
+"""
 
 import pytest
 import torch
@@ -10,7 +13,14 @@ from ganlane.agents import Rainbow, RainbowConfig
 from ganlane.errors import UserError
 
 SIZE = 4
-SMALL = {"hidden": (16, 16), "batch_size": 32, "warmup": 32, "capacity": 500, "v_min": -5.0, "v_max": 5.0}
+SMALL = {
+    "hidden": (16, 16),
+    "batch_size": 32,
+    "warmup": 32,
+    "capacity": 500,
+    "v_min": -5.0,
+    "v_max": 5.0,
+}
 
 
 def agent(seed=0, **options):
@@ -31,7 +41,9 @@ def trained(updates=5, **options):
 
 
 def observations(rows=2000):
-    return TensorDict({"observation": torch.randn(rows, SIZE, generator=torch.Generator().manual_seed(9))}, [rows])
+    return TensorDict(
+        {"observation": torch.randn(rows, SIZE, generator=torch.Generator().manual_seed(9))}, [rows]
+    )
 
 
 # --- exploration
@@ -43,8 +55,12 @@ def test_the_noise_is_drawn_anew_at_every_step():
     assert not torch.equal(first, second)
 
 
-@pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN])
-def test_under_deterministic_exploration_the_policy_is_greedy_which_has_no_noise_whatever_the_context(kind):
+@pytest.mark.parametrize(
+    "kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN]
+)
+def test_under_deterministic_exploration_the_policy_is_greedy_which_has_no_noise_whatever_the_context(
+    kind,
+):
     explorer, data = agent(noisy_sigma=3.0), observations()
     greedy = explorer.greedy(data.clone())["action"]
     explorer.policy(data.clone())  # leaves its noise in the network
@@ -150,7 +166,9 @@ SWITCHES = ["noisy", "dueling", "distributional", "double", "prioritised"]
 
 @pytest.mark.parametrize("off", [[name] for name in SWITCHES] + [SWITCHES])
 def test_each_component_can_be_switched_off_and_the_rest_learns(off):
-    learner = filled(**dict.fromkeys(off, False), learning_rate=3e-3, target_period=1000, noisy_sigma=0.1)
+    learner = filled(
+        **dict.fromkeys(off, False), learning_rate=3e-3, target_period=1000, noisy_sigma=0.1
+    )
     before = learner.loss(transitions(SIZE))["loss"].mean()
     for _ in range(80):
         learner.update()
@@ -158,7 +176,10 @@ def test_each_component_can_be_switched_off_and_the_rest_learns(off):
 
 
 def test_the_agent_learns_the_values_of_a_known_chain():
-    """Two states, the reward of the second is its action; worth gamma^0 * 2 at best, and the first gamma * 2."""
+    """Two states, the reward of the second is its action.
+
+    Worth gamma^0 * 2 at best, and the first gamma * 2.
+    """
     learner = agent(learning_rate=3e-3, target_period=20, gamma=0.5, n_step=1, noisy=False)
     rows = 300
     state = torch.arange(rows) % 2
@@ -168,12 +189,18 @@ def test_the_agent_learns_the_values_of_a_known_chain():
         "reward": (state * action).float()[:, None],
         "terminated": (state == 1)[:, None],
     }
-    content = {"observation": torch.nn.functional.one_hot(state, SIZE).float(), "action": action, "next": after}
+    content = {
+        "observation": torch.nn.functional.one_hot(state, SIZE).float(),
+        "action": action,
+        "next": after,
+    }
     learner.store(TensorDict({**content, "steps_to_next_obs": torch.ones(rows, 1)}, [rows]))
     for _ in range(300):
         learner.update()
     values = learner.network.values(torch.eye(SIZE)[:2])
-    torch.testing.assert_close(values, torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 2.0]]), atol=0.15, rtol=0.0)
+    torch.testing.assert_close(
+        values, torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 2.0]]), atol=0.15, rtol=0.0
+    )
 
 
 # --- randomness and saving
@@ -199,12 +226,19 @@ def test_a_restored_agent_goes_on_to_the_same_weights(options, tmp_path):
         restored.update()
     assert same_weights(restored, whole)
     data = observations()
-    assert torch.equal(restored.policy(data.clone())["action"], whole.policy(data.clone())["action"])
+    assert torch.equal(
+        restored.policy(data.clone())["action"], whole.policy(data.clone())["action"]
+    )
 
 
 @pytest.mark.parametrize(
     ("options", "name"),
-    [({"n_step": 0}, "n_step"), ({"gamma": 1.5}, "gamma"), ({"v_min": 9.0}, "v_min"), ({"warmup": 1}, "warmup")],
+    [
+        ({"n_step": 0}, "n_step"),
+        ({"gamma": 1.5}, "gamma"),
+        ({"v_min": 9.0}, "v_min"),
+        ({"warmup": 1}, "warmup"),
+    ],
 )
 def test_impossible_hyperparameters_are_refused(options, name):
     with pytest.raises(UserError, match=f"^{name}="):

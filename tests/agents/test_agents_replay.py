@@ -60,7 +60,9 @@ def test_importance_weights_are_those_of_schaul_over_the_largest_of_the_batch():
     share = (priority + 1e-8) ** 0.5
     weight = (200 * share / share.sum()) ** -0.7
     weight = weight[drawn["index"]]
-    torch.testing.assert_close(drawn["priority_weight"], weight / weight.max(), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        drawn["priority_weight"], weight / weight.max(), atol=1e-5, rtol=1e-5
+    )
 
 
 def test_a_new_item_has_the_largest_priority_seen():
@@ -93,7 +95,9 @@ def test_draws_come_from_the_buffers_own_generator(prioritised):
     before, numpy_before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
     first, second = (buffer(prioritised=prioritised, seed=4) for _ in range(2))
     assert torch.equal(first.sample()["index"], second.sample()["index"])
-    assert not torch.equal(first.sample()["index"], buffer(prioritised=prioritised, seed=5).sample()["index"])
+    assert not torch.equal(
+        first.sample()["index"], buffer(prioritised=prioritised, seed=5).sample()["index"]
+    )
     assert torch.equal(torch.get_rng_state(), before)
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
 

@@ -41,7 +41,9 @@ def napping(seconds=0.002, log=None, name=""):
 
 def test_cases_take_turns_after_the_warm_up():
     log = []
-    take_turns([CASE, CASE], [napping(log=log, name=name) for name in "AB"], repetitions=3, seconds=0.004)
+    take_turns(
+        [CASE, CASE], [napping(log=log, name=name) for name in "AB"], repetitions=3, seconds=0.004
+    )
     assert "".join(log[-6:]) == "ABABAB"
 
 
@@ -76,13 +78,19 @@ def test_a_row_holds_medians_over_the_turns():
 
 
 def test_spread_is_the_interquartile_range_over_the_median():
-    assert make_row(LABELS, [Sample(s, 1.0, 1, 1) for s in (1, 2, 3, 4, 5)])["spread"] == pytest.approx(2 / 3)
+    assert make_row(LABELS, [Sample(s, 1.0, 1, 1) for s in (1, 2, 3, 4, 5)])[
+        "spread"
+    ] == pytest.approx(2 / 3)
     assert make_row(LABELS, [Sample(7, 1.0, 1, 1)])["spread"] == 0
 
 
 def test_a_ratio_compares_turns_of_the_same_round():
-    # Both are ten times slower in the second round, when the machine was busy: the ratio does not see it.
-    mine, peer = ([Sample(wall_s, *each) for wall_s in (1.0, 10.0, 1.0)] for each in ((1.0, 1, 300), (0.5, 1, 10)))
+    # Both are ten times slower in the second round, when the machine was busy: the ratio does not
+    # see it.
+    mine, peer = (
+        [Sample(wall_s, *each) for wall_s in (1.0, 10.0, 1.0)]
+        for each in ((1.0, 1, 300), (0.5, 1, 10))
+    )
     row = make_row(LABELS, mine, peer)
     assert (row["ratio"], row["ratio_cpu"]) == pytest.approx((30, 15))
 
@@ -92,8 +100,16 @@ def test_a_turn_too_short_for_the_cpu_clock_divides_by_no_zero():
 
 
 def test_the_best_row_is_that_of_each_system_and_traffic_on_each_device():
-    found = [("a", "idm", "cpu", 1), ("a", "idm", "cpu", 3), ("a", "idm", "cuda", 9), ("a", "gan", "cpu", 2)]
-    rows = [dict(zip(("system", "traffic", "device", "n"), each)) for each in (*found, ("b", "idm", "cpu", 0))]
+    found = [
+        ("a", "idm", "cpu", 1),
+        ("a", "idm", "cpu", 3),
+        ("a", "idm", "cuda", 9),
+        ("a", "gan", "cpu", 2),
+    ]
+    rows = [
+        dict(zip(("system", "traffic", "device", "n"), each))
+        for each in (*found, ("b", "idm", "cpu", 0))
+    ]
     assert [row["n"] for row in best_rows(rows, "n")] == [3, 9, 2, 0]
 
 
@@ -107,6 +123,8 @@ def hold(batch):
 def test_growth_finds_what_an_environment_holds():
     if peak_resident_bytes() is None:
         pytest.skip("this system does not report a process's peak memory")
-    small, large = (Case(replace(LABELS, batch=batch), partial(hold, batch)) for batch in (400, 2400))
+    small, large = (
+        Case(replace(LABELS, batch=batch), partial(hold, batch)) for batch in (400, 2400)
+    )
     # 40 to 240 MB, of which the rest of the process moves by a few.
     assert growth_per_environment(small, large) == pytest.approx(4 * 25_000, rel=0.05)

@@ -10,7 +10,15 @@ import torch
 
 from ganlane.bench import suites
 from ganlane.bench.measure import measure
-from ganlane.bench.suites import ENVIRONMENT, PHYSICS, TRAFFIC, TRAINING, SimSuite, TrafficSuite, TrainSuite
+from ganlane.bench.suites import (
+    ENVIRONMENT,
+    PHYSICS,
+    TRAFFIC,
+    TRAINING,
+    SimSuite,
+    TrafficSuite,
+    TrainSuite,
+)
 from ganlane.config.commands import BenchConfig
 from ganlane.config.env import EnvConfig
 from ganlane.config.traffic import IdmTrafficConfig, TrafficConfig
@@ -19,12 +27,25 @@ from ganlane.errors import UserError
 from ganlane.parameters.agent import RainbowConfig
 
 SHORT = {"repetitions": 2, "seconds": 0.001}
-RAINBOW = RainbowConfig(hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64)
+RAINBOW = RainbowConfig(
+    hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64
+)
 
 
 def suite(kind=SimSuite, **options):
-    usual = {"traffic": IdmTrafficConfig(), "memory": False, "modes": ["eager"], "threads": [1], "devices": ["cpu"]}
-    usual |= {"train_batches": [16], "train_stored": 64, "train_traffics": ["idm_mobil", "idm"], "agent": RAINBOW}
+    usual = {
+        "traffic": IdmTrafficConfig(),
+        "memory": False,
+        "modes": ["eager"],
+        "threads": [1],
+        "devices": ["cpu"],
+    }
+    usual |= {
+        "train_batches": [16],
+        "train_stored": 64,
+        "train_traffics": ["idm_mobil", "idm"],
+        "agent": RAINBOW,
+    }
     return kind(BenchConfig(**{**usual, "peers": False, **options}))
 
 
@@ -32,13 +53,26 @@ def suite(kind=SimSuite, **options):
     ("kind", "system", "option", "traffics", "modes"),
     [
         (TrafficSuite, TRAFFIC, "traffics", ["idm", "gan"], ["eager", "compiled"]),
-        (TrainSuite, TRAINING, "train_traffics", ["idm_mobil", "idm"], ["eager", "compiled", "native"]),
+        (
+            TrainSuite,
+            TRAINING,
+            "train_traffics",
+            ["idm_mobil", "idm"],
+            ["eager", "compiled", "native"],
+        ),
     ],
 )
-def test_every_traffic_takes_turns_in_every_mode_batch_and_thread_count(kind, system, option, traffics, modes):
+def test_every_traffic_takes_turns_in_every_mode_batch_and_thread_count(
+    kind, system, option, traffics, modes
+):
     options = {f"{kind.name}_batches": [2, 4], option: traffics}
     groups = suite(kind, **options, modes=modes, threads=[1, 2]).groups()
-    assert [(group.threads, group.cases[0].labels.batch) for group in groups] == [(1, 2), (1, 4), (2, 2), (2, 4)]
+    assert [(group.threads, group.cases[0].labels.batch) for group in groups] == [
+        (1, 2),
+        (1, 4),
+        (2, 2),
+        (2, 4),
+    ]
     seen = [(case.labels.system, case.labels.traffic, case.labels.mode) for case in groups[0].cases]
     assert seen == [(system, traffic, mode) for traffic in traffics for mode in modes]
     assert groups[0].reference is None
@@ -59,7 +93,11 @@ def test_a_gpu_is_run_with_one_thread_count(monkeypatch):
 
 def test_growth_is_measured_side_by_side():
     groups = suite(batches=[1, 8, 32], linear_from=8, scaling_batch=4).groups()
-    growth = {group.title: [case.labels for case in group.cases] for group in groups if "growth" in group.title}
+    growth = {
+        group.title: [case.labels for case in group.cases]
+        for group in groups
+        if "growth" in group.title
+    }
     assert len(growth) == 4
     assert [label.batch for label in growth[f"{PHYSICS}, growth with the batch"]] == [8, 32]
     vehicles = growth[f"{ENVIRONMENT}, growth with the vehicles"]
@@ -101,7 +139,9 @@ def test_what_cannot_be_compiled_is_left_out_with_the_reason(monkeypatch):
 
         return run
 
-    monkeypatch.setattr(suites, "_START", dict.fromkeys((PHYSICS, ENVIRONMENT, suites.GYMNASIUM), start))
+    monkeypatch.setattr(
+        suites, "_START", dict.fromkeys((PHYSICS, ENVIRONMENT, suites.GYMNASIUM), start)
+    )
     measured = suite(batches=[1, 2], vehicle_counts=[9], modes=["eager", "compiled"], linear_from=4)
     rows = measure(measured, **SHORT)["rows"]
     assert {row["mode"] for row in rows} == {"eager"}
@@ -111,13 +151,21 @@ def test_what_cannot_be_compiled_is_left_out_with_the_reason(monkeypatch):
 def test_cost_that_doubles_with_the_size_grows_linearly():
     # Twenty decisions of the whole batch in each turn.
     rows = [
-        {"part": "batch", "system": PHYSICS, "batch": batch, "wall_s": batch / 1024, "decisions": 20 * batch}
+        {
+            "part": "batch",
+            "system": PHYSICS,
+            "batch": batch,
+            "wall_s": batch / 1024,
+            "decisions": 20 * batch,
+        }
         for batch in (1024, 2048, 4096)
     ]
     (growth,) = suites.scaling(rows)
     assert growth["milliseconds"] == pytest.approx([50, 100, 200])
     assert growth["exponent"] == pytest.approx(1)
-    assert suites.exponent([9, 15, 30], [0.3 * size**1.7 for size in (9, 15, 30)]) == pytest.approx(1.7)
+    assert suites.exponent([9, 15, 30], [0.3 * size**1.7 for size in (9, 15, 30)]) == pytest.approx(
+        1.7
+    )
     assert suites.exponent([9, 9], [1.0, 2.0]) is None
 
 
@@ -134,8 +182,12 @@ def test_without_the_peer_a_sentence_says_what_to_install(monkeypatch):
 
 
 def test_the_peer_takes_turns_in_every_group_and_makes_one_row(monkeypatch):
-    pytest.importorskip("highway_env", reason="highway-env is not installed; it comes with the extra 'bench'")
-    monkeypatch.setattr(suites, "installed_version", lambda name: None if name == "envpool" else version(name))
+    pytest.importorskip(
+        "highway_env", reason="highway-env is not installed; it comes with the extra 'bench'"
+    )
+    monkeypatch.setattr(
+        suites, "installed_version", lambda name: None if name == "envpool" else version(name)
+    )
     measured = suite(batches=[1, 2], vehicle_counts=[9], linear_from=4, peers=True)
     labels = measured.peer().labels
     assert (labels.vehicles, labels.lanes, labels.batch) == (9, 3, 1)
@@ -167,13 +219,20 @@ def test_a_training_has_rows_and_the_best_of_each_traffic():
 
 
 def test_each_traffic_is_compared_at_its_best_with_the_peer_at_its_best():
-    rates = {(TRAINING, "idm_mobil"): [4000, 6000], (TRAINING, "gan"): [1500], ("peer", "its own"): [60, 50]}
+    rates = {
+        (TRAINING, "idm_mobil"): [4000, 6000],
+        (TRAINING, "gan"): [1500],
+        ("peer", "its own"): [60, 50],
+    }
     rows = [
         {"system": system, "traffic": traffic, "device": "cpu", "decisions_per_s": rate}
         for (system, traffic), each in rates.items()
         for rate in each
     ]
-    assert [row["times_peer"] for row in suite(TrainSuite).findings(rows)["speeds"]] == [100.0, 25.0]
+    assert [row["times_peer"] for row in suite(TrainSuite).findings(rows)["speeds"]] == [
+        100.0,
+        25.0,
+    ]
 
 
 def test_quick_is_small_and_trains_eagerly():

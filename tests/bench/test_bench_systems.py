@@ -1,4 +1,6 @@
-"""The systems that are timed drive, count and learn as they say, and the peers do on the same road and schedule."""
+"""The systems that are timed drive, count and learn as they say, and the peers do on the same road
+and schedule.
+"""
 
 from __future__ import annotations
 
@@ -55,8 +57,8 @@ def test_bare_physics_goes_on_past_goal_and_time_out(mode):
 
 
 def test_only_simulated_steps_are_counted():
-    # On a single lane every change leaves the road at once; whoever keeps to it drives ten steps. Two vehicles
-    # that follow IDM do not crash.
+    # On a single lane every change leaves the road at once; whoever keeps to it drives ten steps.
+    # Two vehicles that follow IDM do not crash.
     run = start_environment(scenario(IdmTrafficConfig(), lanes=1, vehicles=2), "eager", "cpu", 8)
     kept = sum(int((run.actions[i % 64] == keys.KEEP).sum()) for i in range(1, 13))
     assert 0 < kept < 12 * 8
@@ -71,7 +73,9 @@ def test_actions_are_the_same_for_the_same_seed():
 
 @pytest.mark.parametrize("batch", [1, 6])
 def test_gymnasium_simulates_the_steps_that_its_episodes_last(batch):
-    run = GymnasiumRunner(scenario(IdmTrafficConfig(), lanes=1, vehicles=2, goal_m=200.0), "native", "cpu", batch)
+    run = GymnasiumRunner(
+        scenario(IdmTrafficConfig(), lanes=1, vehicles=2, goal_m=200.0), "native", "cpu", batch
+    )
     kept = sum(int((run.actions[i % 64] == keys.KEEP).sum()) for i in range(1, 26))
     # The last decision before the goal is shorter; whoever changes lanes is out.
     assert 8 * kept < run(25) <= 10 * kept
@@ -79,12 +83,22 @@ def test_gymnasium_simulates_the_steps_that_its_episodes_last(batch):
 
 # Training
 
-RAINBOW = RainbowConfig(hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64)
+RAINBOW = RainbowConfig(
+    hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=512, warmup=64
+)
 
 
 def train_suite(**options):
-    small = {"train_batches": [16], "train_stored": 64, "modes": ["eager"], "threads": [1], "devices": ["cpu"]}
-    return TrainSuite(BenchConfig(suite="train", **{**small, "peers": False, "agent": RAINBOW, **options}))
+    small = {
+        "train_batches": [16],
+        "train_stored": 64,
+        "modes": ["eager"],
+        "threads": [1],
+        "devices": ["cpu"],
+    }
+    return TrainSuite(
+        BenchConfig(suite="train", **{**small, "peers": False, "agent": RAINBOW, **options})
+    )
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +141,9 @@ def test_it_learns_though_cases_are_timed_without_gradients(run):
 
 @pytest.fixture
 def _peer():
-    pytest.importorskip("highway_env", reason="highway-env is not installed; it comes with the extra 'bench'")
+    pytest.importorskip(
+        "highway_env", reason="highway-env is not installed; it comes with the extra 'bench'"
+    )
 
 
 @pytest.mark.usefixtures("_peer")
@@ -156,12 +172,16 @@ def test_envpool_drives_the_same_road():
 
 
 ROAD = EnvConfig(vehicles=4, lanes=2)
-LEARNER = RainbowConfig(hidden=(12, 8), batch_size=16, decisions_per_update=8, capacity=64, warmup=16)
+LEARNER = RainbowConfig(
+    hidden=(12, 8), batch_size=16, decisions_per_update=8, capacity=64, warmup=16
+)
 
 
 @pytest.fixture(scope="module")
 def baseline():
-    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed; extra 'bench'")
+    pytest.importorskip(
+        "stable_baselines3", reason="stable-baselines3 is not installed; extra 'bench'"
+    )
     pytest.importorskip("highway_env", reason="highway-env is not installed; extra 'bench'")
     return BaselinesRunner(ROAD, LEARNER, seed=0)
 

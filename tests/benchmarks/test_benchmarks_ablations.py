@@ -1,4 +1,7 @@
-"""Agents trained again with one thing changed: each option is one there is, trainings are compared seed for seed."""
+"""Agents trained again with one thing changed.
+
+Each option is one there is, trainings are compared seed for seed.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,14 @@ def trained(monkeypatch):
     def save(folder, name, seed, options):
         asked.append((name, seed, tuple(options)))
         agent = Rainbow(
-            RainbowConfig(hidden=(8,), batch_size=8, warmup=8, capacity=100), observation_size("lane_view", 9)
+            RainbowConfig(hidden=(8,), batch_size=8, warmup=8, capacity=100),
+            observation_size("lane_view", 9),
         )
         training = {"seed": seed, "phase": "train", "traffic": {}, "init": None}
-        seen = {"observation": "lane_view", "observation_scale": {"range_m": 200.0, "speed_mps": 30.0}}
+        seen = {
+            "observation": "lane_view",
+            "observation_scale": {"range_m": 200.0, "speed_mps": 30.0},
+        }
         save_agent(folder / "agent.safetensors", agent, {**seen, "training": training})
 
     monkeypatch.setattr(ablations, "train", save)
@@ -41,11 +48,27 @@ def test_what_is_changed_differs_from_the_base_in_that_alone(name):
     assert {key for key in base if base[key] != changed[key]} <= {*base} - same
 
 
-def test_every_training_is_done_once_and_compared_with_the_one_without_a_change(trained, tmp_path, capsys):
-    line = [f"--runs={tmp_path}/runs", f"--out={tmp_path}/out", "--only", "nothing", "safe", "--seeds", "0", "3"]
+def test_every_training_is_done_once_and_compared_with_the_one_without_a_change(
+    trained, tmp_path, capsys
+):
+    line = [
+        f"--runs={tmp_path}/runs",
+        f"--out={tmp_path}/out",
+        "--only",
+        "nothing",
+        "safe",
+        "--seeds",
+        "0",
+        "3",
+    ]
     for _ in range(2):
-        assert ablations.main([*line, "--train", "threads=1", "--", *FEW, f"cells={tmp_path}/cells"]) == 0
-    assert trained == [(name, seed, ("threads=1",)) for seed in (0, 3) for name in ("nothing", "safe")]
+        assert (
+            ablations.main([*line, "--train", "threads=1", "--", *FEW, f"cells={tmp_path}/cells"])
+            == 0
+        )
+    assert trained == [
+        (name, seed, ("threads=1",)) for seed in (0, 3) for name in ("nothing", "safe")
+    ]
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert [(row["driver"], row["trainings"], row["episodes"]) for row in results["rows"]] == [
         ("mobil", 1, 3),
@@ -68,6 +91,8 @@ def test_a_name_that_there_is_not_is_refused_before_anything_is_trained(trained,
 
 def test_a_training_that_fails_is_named_with_its_log(tmp_path, monkeypatch):
     monkeypatch.setitem(ablations.ABLATIONS, "typo", ("agent.noizy=false",))
-    with pytest.raises(ablations.UserError, match=r"typo, seed 0: the training ended with 2; see .*log.txt"):
+    with pytest.raises(
+        ablations.UserError, match=r"typo, seed 0: the training ended with 2; see .*log.txt"
+    ):
         ablations.train(tmp_path / "run", "typo", 0, [])
     assert "agent.noizy: no such key" in (tmp_path / "run" / "log.txt").read_text()

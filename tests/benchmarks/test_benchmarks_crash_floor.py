@@ -1,4 +1,6 @@
-"""A driver who knows what comes finds the way out if there is one, and what it finds can be driven again."""
+"""A driver who knows what comes finds the way out if there is one, and what it finds can be driven
+again.
+"""
 
 import itertools
 
@@ -20,8 +22,13 @@ from ganlane.sim.state import Road
 from ganlane.traffic import IdmTraffic, TrafficModule
 from ganlane.transforms import RewardTransform
 
-#: Ego at 20 m/s, which wants no more; somebody who never brakes comes from behind; the lane to the right is taken.
-CHASED = SceneVehicle(0.0, 1, 20.0, 20.0), SceneVehicle(-35.0, 1, 30.0), SceneVehicle(0.0, 0, 20.0, length_m=60.0)
+#: Ego at 20 m/s, which wants no more; somebody who never brakes comes from behind; the lane to the
+#: right is taken.
+CHASED = (
+    SceneVehicle(0.0, 1, 20.0, 20.0),
+    SceneVehicle(-35.0, 1, 30.0),
+    SceneVehicle(0.0, 0, 20.0, length_m=60.0),
+)
 #: Too fast to stop before a car that stands ahead, and lorries on both sides.
 LORRIES = [SceneVehicle(0.0, lane, 30.0, length_m=120.0) for lane in (0, 2)]
 TRAPPED = SceneVehicle(0.0, 1, 30.0), SceneVehicle(25.0, 1, 0.0), *LORRIES
@@ -42,7 +49,10 @@ class Hopeless(FixedScene):
 
 
 def highway(scene=None, rows=4, goal_m=300.0, traffic=Cruise, **others):
-    scenes, episode = None if scene is None else Hopeless(scene), EpisodeParameters(goal_m=goal_m, timeout_s=60.0)
+    scenes, episode = (
+        None if scene is None else Hopeless(scene),
+        EpisodeParameters(goal_m=goal_m, timeout_s=60.0),
+    )
     model = traffic(Road(), Stream.REPORT)
     base = HighwayEnv(model, num_envs=rows, scenes=scenes, episode=episode, **others)
     return TransformedEnv(base, RewardTransform())
@@ -95,7 +105,9 @@ def somebody_comes_through(env, episode, seed):
     state = env.reset(start)
     running = torch.ones(len(sequences)).bool()
     for decision in itertools.count():
-        state["action"] = sequences[:, decision] if decision < 5 else torch.zeros_like(sequences[:, 0])
+        state["action"] = (
+            sequences[:, decision] if decision < 5 else torch.zeros_like(sequences[:, 0])
+        )
         state = env.step(state)["next"].exclude("reward", "action")
         if (running & state["events", "goal"][:, 0]).any():
             return True

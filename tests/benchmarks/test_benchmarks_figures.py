@@ -1,4 +1,7 @@
-"""The figures of the docs: shapes and weights are those of the loaded networks, courses those of the vehicles."""
+"""The figures of the docs.
+
+Shapes and weights are those of the loaded networks, courses those of the vehicles.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,13 @@ from ganlane.view.figures import COLOURS, INK
 @pytest.mark.parametrize("preset", ["paper", "calibrated"])
 def test_the_architecture_shows_every_weight_and_the_shapes_of_the_loaded_generator(preset):
     generator, _ = load_generator(shipped_generator(preset), preset)
-    sizes, blocks = generator.sizes, {block.title: block for block in generator_blocks(generator, vehicles=5)}
-    assert sum(block.parameters for block in blocks.values()) == sum(p.numel() for p in generator.parameters())
+    sizes, blocks = (
+        generator.sizes,
+        {block.title: block for block in generator_blocks(generator, vehicles=5)},
+    )
+    assert sum(block.parameters for block in blocks.values()) == sum(
+        p.numel() for p in generator.parameters()
+    )
     assert blocks["observed displacements"].shape == (5, sizes.observed, 2)
     assert blocks["embedding"].shape == (5, sizes.observed - 1, 4 * sizes.hidden)
     assert blocks["context"].shape == (5, sizes.hidden - sizes.noise)
@@ -32,7 +40,9 @@ def test_the_discriminator_gives_one_logit_per_vehicle_and_every_block_has_its_b
     discriminator = Discriminator()
     blocks = discriminator_blocks(discriminator, 16, vehicles=5)
     assert blocks[-1].shape == (5,)
-    assert sum(block.parameters for block in blocks) == sum(p.numel() for p in discriminator.parameters())
+    assert sum(block.parameters for block in blocks) == sum(
+        p.numel() for p in discriminator.parameters()
+    )
     (axes,) = draw_architecture({"discriminator": blocks}).axes
     texts = [text.get_text() for text in axes.texts]
     assert len(axes.patches) == 4
@@ -44,7 +54,9 @@ def test_the_discriminator_gives_one_logit_per_vehicle_and_every_block_has_its_b
 
 def course(lanes):
     rows = [
-        (vehicle, frame, 10.0 * vehicle + frame, lane) for vehicle, lane in enumerate(lanes) for frame in range(5)
+        (vehicle, frame, 10.0 * vehicle + frame, lane)
+        for vehicle, lane in enumerate(lanes)
+        for frame in range(5)
     ]
     return pl.DataFrame(rows, schema=["vehicle", "frame", "x", "lane"], orient="row")
 

@@ -9,7 +9,15 @@ import torch
 from tensordict import TensorDict
 
 from benchmarks import pack_seeds
-from ganlane.agents import Rainbow, RainbowConfig, agent_file, checkpoint, load_agent, read_agent, save_agent
+from ganlane.agents import (
+    Rainbow,
+    RainbowConfig,
+    agent_file,
+    checkpoint,
+    load_agent,
+    read_agent,
+    save_agent,
+)
 from ganlane.agents.checkpoint import with_seeds
 from ganlane.build import make_drivers
 from ganlane.config.env import EnvConfig
@@ -30,7 +38,11 @@ def run(folder, seed, hidden=(8, 8), **more):
     """The folder of a finished training with ``seed``."""
     size = observation_size("lane_view_overlap", VEHICLES)
     config = RainbowConfig(hidden=hidden, batch_size=8, warmup=8, capacity=100)
-    metadata = {**RECIPE, "training": {"seed": seed, "phase": "train", "traffic": {}, "init": START}, **more}
+    metadata = {
+        **RECIPE,
+        "training": {"seed": seed, "phase": "train", "traffic": {}, "init": START},
+        **more,
+    }
     save_agent(folder / "agent.safetensors", Rainbow(config, size, seed=seed), metadata)
     return folder
 
@@ -49,7 +61,9 @@ def packed(tmp_path, monkeypatch):
 
 
 def test_each_seed_drives_as_it_did_alone(packed, tmp_path):
-    data = TensorDict({"observation": torch.randn(200, observation_size("lane_view_overlap", VEHICLES))}, [200])
+    data = TensorDict(
+        {"observation": torch.randn(200, observation_size("lane_view_overlap", VEHICLES))}, [200]
+    )
     for seed in (1, 2):
         alone, _ = load_agent(tmp_path / str(seed) / "agent.safetensors")
         ours, metadata = load_agent(f"agent_idm@{seed}")
@@ -76,12 +90,17 @@ def test_names_of_seeds_stand_for_their_agents(packed):
         with_seeds("agent_gan@all")
     assert with_seeds(f"{packed}@all") == [f"{packed}@1", f"{packed}@2"]
     assert with_seeds("mobil") == ["mobil"]
-    assert agent_file("agent_idm@0") == agent_file("agent_idm") != agent_file("agent_idm@1") == packed
+    assert (
+        agent_file("agent_idm@0") == agent_file("agent_idm") != agent_file("agent_idm@1") == packed
+    )
 
 
 def test_a_table_takes_every_seed_once(packed):
     drivers = make_drivers(["agent_idm@all+safe", "agent_idm@1+safe", "mobil"], EnvConfig())
-    assert [driver.name for driver in drivers] == [*(f"agent_idm@{seed}+safe" for seed in range(3)), "mobil"]
+    assert [driver.name for driver in drivers] == [
+        *(f"agent_idm@{seed}+safe" for seed in range(3)),
+        "mobil",
+    ]
     assert {driver.mask.form for driver in drivers[:3]} == {"safe"}
 
 
@@ -101,7 +120,9 @@ def test_the_installation_check_loads_every_seed(packed, monkeypatch):
         ("checkpoints/seeds_of_agent_idm.safetensors", "of kind agent, found agents;"),
     ],
 )
-def test_a_seed_that_is_not_there_or_not_named_ends_in_a_sentence(name, said, packed, tmp_path, monkeypatch):
+def test_a_seed_that_is_not_there_or_not_named_ends_in_a_sentence(
+    name, said, packed, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=said):
         load_agent(name)
@@ -118,7 +139,9 @@ def test_only_runs_of_one_recipe_and_different_seeds_are_packed(tmp_path, capsys
         "name no seed": run(tmp_path / "foreign", 2, training={}),
     }
     for said, other in cases.items():
-        assert pack_seeds.main([str(one), str(other), "--out", str(tmp_path / "out.safetensors")]) == 2
+        assert (
+            pack_seeds.main([str(one), str(other), "--out", str(tmp_path / "out.safetensors")]) == 2
+        )
         assert said in capsys.readouterr().err
     assert not (tmp_path / "out.safetensors").exists()
 
@@ -131,7 +154,12 @@ def test_a_training_joins_a_packed_file_and_leaves_the_others_as_they_are(packed
         before, after = read_agent(f"{packed}@{seed}"), read_agent(f"{out}@{seed}")
         assert after[1:] == before[1:]
         assert all(torch.equal(value, before[0][name]) for name, value in after[0].items())
-    assert pack_seeds.main([f"{packed}@all", f"{packed}@2", "--out", str(tmp_path / "twice.safetensors")]) == 2
+    assert (
+        pack_seeds.main(
+            [f"{packed}@all", f"{packed}@2", "--out", str(tmp_path / "twice.safetensors")]
+        )
+        == 2
+    )
     assert "another run has seed 2" in capsys.readouterr().err
 
 

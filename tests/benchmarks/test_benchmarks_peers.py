@@ -1,4 +1,6 @@
-"""ganlane's drivers compared with those of HighwayEnv and SUMO, and the tolerance between them (docs/peers.md)."""
+"""ganlane's drivers compared with those of HighwayEnv and SUMO, and the tolerance between them
+(docs/peers.md).
+"""
 
 from __future__ import annotations
 
@@ -45,13 +47,16 @@ from ganlane.sim.neighbours import FREE_GAP_M
 
 ROOT = Path(__file__).parents[2]
 EULERS = (Scheme.EXPLICIT_EULER, Scheme.SEMI_IMPLICIT_EULER)
-#: Where a peer reads IDM as ganlane does, it has to drive as ganlane does. HighwayEnv's missing floor of the desired
-#: gap shows in 'step' only, its reversing in 'standing obstacle' only, its centres everywhere but on a free road.
+#: Where a peer reads IDM as ganlane does, it has to drive as ganlane does. HighwayEnv's missing
+#: floor of the desired gap shows in 'step' only, its reversing in 'standing obstacle' only, its
+#: centres everywhere but on a free road.
 SAME_LAW = [
     (scene, peer)
     for peer in simulators.PEERS
     for scene in SCENES
-    if peer.module == "libsumo" or scene is FREE_ROAD or (peer.name == "HighwayEnv" and scene not in (STEP, OBSTACLE))
+    if peer.module == "libsumo"
+    or scene is FREE_ROAD
+    or (peer.name == "HighwayEnv" and scene not in (STEP, OBSTACLE))
 ]
 
 
@@ -75,7 +80,9 @@ def test_the_step_takes_one_physics_step_and_the_ramp_five_seconds():
 
 @pytest.mark.parametrize("scene", [FREE_ROAD, CONSTANT, OBSTACLE], ids=lambda scene: scene.name)
 def test_the_plain_equations_drive_as_the_traffic_module_does(scene):
-    assert within(between(integrate(scene, Scheme.BALLISTIC), simulators.drive_ours(scene)), ROUNDING)
+    assert within(
+        between(integrate(scene, Scheme.BALLISTIC), simulators.drive_ours(scene)), ROUNDING
+    )
 
 
 def test_on_a_free_road_the_schemes_give_one_speed_and_positions_that_half_a_step_tells_apart():
@@ -87,14 +94,18 @@ def test_on_a_free_road_the_schemes_give_one_speed_and_positions_that_half_a_ste
         assert np.allclose(ahead, (scheme.value - 0.5) * 0.1 * gained, atol=1e-9)
 
 
-@pytest.mark.parametrize("law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"])
+@pytest.mark.parametrize(
+    "law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"]
+)
 def test_a_platoon_at_the_equilibrium_gap_does_not_accelerate(law):
     for v in SETTLED_MPS:
         speed = np.array([v])
         assert abs(acceleration(speed, np.array([equilibrium_gap(v, law)]), speed, law)[0]) < 1e-12
 
 
-@pytest.mark.parametrize("law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"])
+@pytest.mark.parametrize(
+    "law", [LAW, Law(LENGTH_M, floored=False, reverses=True)], ids=["ganlane", "highway_env"]
+)
 def test_slopes_are_the_derivatives_of_the_acceleration(law):
     rng = np.random.default_rng(0)
     at = rng.uniform([0.5, 3.0, 0.5], [24.0, 100.0, 24.0], (500, 3)).T
@@ -109,7 +120,9 @@ def test_slopes_are_the_derivatives_of_the_acceleration(law):
 
 @pytest.mark.parametrize("scheme", EULERS)
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
-def test_the_derived_tolerance_covers_the_other_scheme_and_no_more_than_a_fifth_beyond(scene, scheme):
+def test_the_derived_tolerance_covers_the_other_scheme_and_no_more_than_a_fifth_beyond(
+    scene, scheme
+):
     trace = integrate(scene, Scheme.BALLISTIC)
     found, allowed = between(integrate(scene, scheme), trace), tolerance(trace, scene, scheme)
     assert within(found, allowed)
@@ -135,9 +148,14 @@ def test_what_has_not_settled_is_told_from_the_motion_left():
 
 
 def test_the_command_says_what_is_missing(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(simulators, "find_spec", lambda module: None if module == "libsumo" else object())
+    monkeypatch.setattr(
+        simulators, "find_spec", lambda module: None if module == "libsumo" else object()
+    )
     assert compare.main(["--out", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == "libsumo: not installed; pip install 'ganlane[bench]' brings the peers.\n"
+    assert (
+        capsys.readouterr().err
+        == "libsumo: not installed; pip install 'ganlane[bench]' brings the peers.\n"
+    )
     assert not list(tmp_path.iterdir())
     with pytest.raises(UserError, match="libsumo"):
         simulators.require_peers()
@@ -199,7 +217,9 @@ def test_the_scheme_and_the_reading_account_for_all_that_tells_a_peer_from_us(sc
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("peer", [None, *simulators.PEERS], ids=lambda peer: "ours" if peer is None else title(peer))
+@pytest.mark.parametrize(
+    "peer", [None, *simulators.PEERS], ids=lambda peer: "ours" if peer is None else title(peer)
+)
 @pytest.mark.parametrize("speed_mps", SETTLED_MPS)
 def test_a_platoon_settles_at_the_equilibrium_gap(speed_mps, peer):
     if peer is not None:
@@ -214,7 +234,10 @@ def test_a_platoon_settles_at_the_equilibrium_gap(speed_mps, peer):
 @pytest.mark.slow
 @each_peer
 def test_a_car_comes_to_rest_at_the_obstacle(peer):
-    """At the minimum gap where it may reverse; where it may not, at the same 0.1 m short of it as ours."""
+    """At the minimum gap where it may reverse.
+
+    Where it may not, at the same 0.1 m short of it as ours.
+    """
     final = theirs(OBSTACLE, peer).gap[-1, 0]
     if peer.law.reverses:
         assert final == pytest.approx(TABLE_V.min_gap_m, abs=1e-3)
@@ -225,7 +248,9 @@ def test_a_car_comes_to_rest_at_the_obstacle(peer):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("peer", [peer for peer in simulators.PEERS if not peer.law.offset_m], ids=title)
+@pytest.mark.parametrize(
+    "peer", [peer for peer in simulators.PEERS if not peer.law.offset_m], ids=title
+)
 @pytest.mark.parametrize(
     "other",
     [
@@ -236,7 +261,9 @@ def test_a_car_comes_to_rest_at_the_obstacle(peer):
     ids=["headway", "deceleration", "acceleration"],
 )
 def test_a_peer_with_another_driver_is_found_out(other, peer):
-    """A headway 0.02 s shorter is more than the scheme may account for, and so are small changes of the others."""
+    """A headway 0.02 s shorter is more than the scheme may account for, and so are small changes of
+    the others.
+    """
     need(peer.module)
     found = between(peer.drive(CONSTANT, idm=other), mine(CONSTANT))
     assert not within(found, tolerance(mine(CONSTANT), CONSTANT, peer.scheme))

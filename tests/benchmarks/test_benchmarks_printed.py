@@ -1,4 +1,6 @@
-"""The tables of README and docs, made again from the committed results, and the figures around them."""
+"""The tables of README and docs, made again from the committed results, and the figures around
+them.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def test_every_table_and_figure_in_the_documents_is_that_of_the_committed_result
 @pytest.mark.parametrize("document", ["README.md", "docs/results.md", "docs/carry_over.md"])
 def test_another_digit_in_a_table_is_found(results, documents, document):
     path = documents / document
-    begin, end = printed.markers(next(name for place, name in printed.SECTIONS if place == document))
+    begin, end = printed.markers(
+        next(name for place, name in printed.SECTIONS if place == document)
+    )
     text = path.read_text(encoding="utf-8")
     table = text[text.index(begin) : text.index(end)]
     digit = next(place for place in range(len(table) - 1, 0, -1) if table[place].isdigit())

@@ -7,13 +7,19 @@ import json
 from benchmarks import roads
 
 
-def test_every_road_is_driven_and_an_agent_is_compared_with_mobil_on_the_same_one(tmp_path, monkeypatch, capsys):
+def test_every_road_is_driven_and_an_agent_is_compared_with_mobil_on_the_same_one(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(roads, "ROADS", ((9, 3), (4, 2)))
     few = ["agents=[mobil,agent_idm@1+safe]", "traffics=[idm]", "episodes=2", "env.goal_m=60"]
     assert roads.main([*few, f"cells={tmp_path}/cells", "--out", str(tmp_path / "out")]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    places = [(row["vehicles"], row["lanes"], row["driver"], row["episodes"]) for row in results["rows"]]
-    assert places == [(m, n, driver, 2) for m, n in roads.ROADS for driver in ("mobil", "agent_idm+safe")]
+    places = [
+        (row["vehicles"], row["lanes"], row["driver"], row["episodes"]) for row in results["rows"]
+    ]
+    assert places == [
+        (m, n, driver, 2) for m, n in roads.ROADS for driver in ("mobil", "agent_idm+safe")
+    ]
     leads = [row["minus_mobil"] for row in results["rows"]]
     means = [row["mean_reward"] for row in results["rows"]]
     assert leads[0] is leads[2] is None

@@ -21,7 +21,9 @@ def test_the_help_is_the_description_unchanged_and_names_the_markers(capsys):
     assert END in shown
 
 
-def test_only_the_text_between_the_markers_is_replaced_and_a_document_without_them_refused_at_once(tmp_path):
+def test_only_the_text_between_the_markers_is_replaced_and_a_document_without_them_refused_at_once(
+    tmp_path,
+):
     document = tmp_path / "page.md"
     document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
     ReportSection(document, BEGIN, END).write("new")
@@ -48,7 +50,9 @@ def test_the_result_is_printed_and_a_users_mistake_is_one_sentence_and_status_2(
     assert capsys.readouterr() == ("", "error: seed=-1: expected 0 or more.\n")
 
 
-@pytest.mark.parametrize("page", ["", "<!-- begin crash floor idm -->\n<!-- end crash floor idm -->\n", None])
+@pytest.mark.parametrize(
+    "page", ["", "<!-- begin crash floor idm -->\n<!-- end crash floor idm -->\n", None]
+)
 def test_nothing_is_driven_for_a_document_without_the_markers(page, tmp_path, monkeypatch, capsys):
     document, driven = tmp_path / "page.md", []
     if page is not None:

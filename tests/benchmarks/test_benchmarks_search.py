@@ -36,7 +36,9 @@ def sweep(tmp_path):
     return folder
 
 
-def test_only_the_options_that_differ_are_columns_and_the_agent_of_the_first_phase_is_no_run_of_its_own(sweep):
+def test_only_the_options_that_differ_are_columns_and_the_agent_of_the_first_phase_is_no_run_of_its_own(
+    sweep,
+):
     (sweep / "2" / "pretrain").mkdir()
     (sweep / "2" / "pretrain" / "metrics.csv").write_text("decisions,wall_s\n1,1\n")
     assert len(read_runs([sweep])) == 2
@@ -46,19 +48,42 @@ def test_only_the_options_that_differ_are_columns_and_the_agent_of_the_first_pha
 def test_runs_are_ranked_by_their_best_evaluation(sweep):
     first, second = table(read_runs([sweep]))
     assert first == {
-        **{"run": "sweep/10", "agent.gamma": "0.99", "agent.noisy": "false", "agent.hidden": "[64]"},
+        **{
+            "run": "sweep/10",
+            "agent.gamma": "0.99",
+            "agent.noisy": "false",
+            "agent.hidden": "[64]",
+        },
         **{"decisions": "1000", "best": "20.0", "best s.e.": "2.5", "best at": "500"},
-        **{"last": "15.0", "last s.e.": "3.0", "crash rate": "0.000", "changes/km": "1.25", "decisions/s": "500"},
+        **{
+            "last": "15.0",
+            "last s.e.": "3.0",
+            "crash rate": "0.000",
+            "changes/km": "1.25",
+            "decisions/s": "500",
+        },
     }
-    assert [second[name] for name in ("run", "best", "last", "decisions/s")] == ["sweep/2", "12.5", "12.5", "250"]
+    assert [second[name] for name in ("run", "best", "last", "decisions/s")] == [
+        "sweep/2",
+        "12.5",
+        "12.5",
+        "250",
+    ]
 
 
 def test_a_reader_sees_only_what_is_unlike_most_runs(sweep):
     for name in ("3", "4"):
-        make_run(sweep / name, "seed: 0\nenv: {lanes: 3}\nagent: {gamma: 0.98, noisy: true, hidden: [64]}\n")
+        make_run(
+            sweep / name,
+            "seed: 0\nenv: {lanes: 3}\nagent: {gamma: 0.98, noisy: true, hidden: [64]}\n",
+        )
     runs = read_runs([sweep])
     shown = [row["what differs"] for row in compact(table(runs), differing(runs))]
-    assert shown == ["`agent.gamma=0.99 agent.noisy=false`", "`agent.hidden=[256,256]`", *["(the middle)"] * 2]
+    assert shown == [
+        "`agent.gamma=0.99 agent.noisy=false`",
+        "`agent.hidden=[256,256]`",
+        *["(the middle)"] * 2,
+    ]
 
 
 def test_a_run_without_an_evaluation_or_a_standard_error_has_empty_cells(sweep):
@@ -66,7 +91,9 @@ def test_a_run_without_an_evaluation_or_a_standard_error_has_empty_cells(sweep):
     last = table(read_runs([sweep]))[-1]
     assert last["agent.gamma"] == "0.9"
     assert last["agent.noisy"] == "null"
-    assert {last[name] for name in ("best", "best at", "last", "crash rate", "decisions", "decisions/s")} == {""}
+    assert {
+        last[name] for name in ("best", "best at", "last", "crash rate", "decisions", "decisions/s")
+    } == {""}
     (sweep / "2" / "evaluation.csv").write_text("decisions,mean_reward,crash_rate\n500,99,0\n")
     best = table(read_runs([sweep]))[0]
     assert (best["best"], best["best s.e."], best["changes/km"]) == ("99.0", "", "")

@@ -28,7 +28,9 @@ def test_the_tables_of_a_run_go_into_the_document(tmp_path, capsys):
 def test_the_scene_loop_treats_every_scene_as_if_it_were_alone(pool_every_step):
     torch.manual_seed(0)
     network = SceneLoopGenerator(SMALL, pool_every_step)
-    network.with_noise = lambda context, ends: torch.cat([context, torch.zeros(len(context), SMALL.noise)], dim=1)
+    network.with_noise = lambda context, ends: torch.cat(
+        [context, torch.zeros(len(context), SMALL.noise)], dim=1
+    )
     moves, position = torch.randn(8, 5, 2), torch.randn(5, 2)
     together = network(moves, position, [(0, 2), (2, 5)])
     torch.testing.assert_close(together[:, 2:], network(moves[:, 2:], position[2:], [(0, 3)]))
@@ -56,7 +58,12 @@ def test_a_baseline_moves_every_vehicle_and_counts_its_steps(name):
 
 def test_each_counts_at_its_best():
     def row(system, wall, cpu, traffic="Social-GAN"):
-        return {"system": system, "traffic": traffic, "physics_steps_per_s": wall, "physics_steps_per_cpu_s": cpu}
+        return {
+            "system": system,
+            "traffic": traffic,
+            "physics_steps_per_s": wall,
+            "physics_steps_per_cpu_s": cpu,
+        }
 
     rows = [row(TRAFFIC, 900, 400, "gan"), row(TRAFFIC, 600, 600, "gan")]
     rows += [row(name, rate, 10) for name in BASELINES for rate in (20, 30)]

@@ -75,7 +75,9 @@ def test_another_content_of_a_sealed_file_must_not_pass_in_silence(trial):
 
 @pytest.mark.parametrize("way", list(dict.fromkeys(damages.TEXT)), ids=lambda way: way.__name__)
 def test_damage_changes_a_file_and_is_the_same_for_the_same_number(way):
-    one, other = ([way(random.Random(number), SCENE.encode()) for number in range(20)] for _ in range(2))
+    one, other = (
+        [way(random.Random(number), SCENE.encode()) for number in range(20)] for _ in range(2)
+    )
     assert one == other
     assert sum(each != SCENE.encode() for each in one) > 15
 

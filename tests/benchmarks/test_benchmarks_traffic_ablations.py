@@ -108,4 +108,6 @@ def test_a_plan_is_what_the_generator_predicts_in_one_go(steps):
         now = seen if step == 0 else later
         found = planner.decode(planner.summarise(now), noise, now, 1)
         torch.testing.assert_close(found[..., 0, :], expected[..., step, :])
-    assert not torch.allclose(planner.decode(planner.summarise(later), noise, later, 1)[..., 0, :], found[..., 0, :])
+    assert not torch.allclose(
+        planner.decode(planner.summarise(later), noise, later, 1)[..., 0, :], found[..., 0, :]
+    )

@@ -24,7 +24,9 @@ from ganlane.config.commands import BenchConfig
 from ganlane.parameters.agent import RainbowConfig
 
 CONFIG = BenchConfig(suite="train", threads=[1, 2])
-AGENT = RainbowConfig(hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=256, warmup=64)
+AGENT = RainbowConfig(
+    hidden=(16, 16), batch_size=32, decisions_per_update=8, capacity=256, warmup=64
+)
 TRAINING = Training(Scenario.of(CONFIG, CONFIG.chosen_train_traffics()["idm_mobil"]), AGENT, 128)
 
 
@@ -106,4 +108,6 @@ def test_every_part_of_the_real_loop_takes_time():
 def test_both_losses_and_the_whole_update_are_measured_for_every_number_of_threads():
     table = compare_losses(TrainSuite(CONFIG), TRAINING, 2, 0.001)
     names = [train_profile.THEIRS, train_profile.OURS, train_profile.WHOLE_UPDATE]
-    assert [line[:3] for line in table.lines] == [[name, str(n), "32"] for n in (1, 2) for name in names]
+    assert [line[:3] for line in table.lines] == [
+        [name, str(n), "32"] for n in (1, 2) for name in names
+    ]

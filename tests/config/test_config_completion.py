@@ -1,6 +1,7 @@
 """Shell completion: what a line could become, and that bash, zsh and fish get to see it.
 
-The shells are real ones, as far as they are installed; each is told what docs/command_line.md tells its user.
+The shells are real ones, as far as they are installed; each is told what docs/command_line.md tells
+its user.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ TRAFFICS = sorted(path.stem for path in (ROOT / "conf" / "traffic").glob("*.yaml
         ("ganlane nothing traffic=", []),
         ("ganlane doctor ", []),
         ("ganlane train traffic=", [f"traffic={name}" for name in TRAFFICS]),
-        ("ganlane train traffic=idm_", ["traffic=idm_faults", "traffic=idm_mobil", "traffic=idm_random"]),
+        (
+            "ganlane train traffic=idm_",
+            ["traffic=idm_faults", "traffic=idm_mobil", "traffic=idm_random"],
+        ),
         ("ganlane train env.lane", ["env.lane_width_m=", "env.lanes="]),
         ("ganlane train -m seed=0,1 total_", ["total_decisions="]),
         ("ganlane evaluate episodes", ["episodes="]),
@@ -75,7 +79,8 @@ def environment(tmp_path):
     program = tmp_path / "bin" / "ganlane"
     program.parent.mkdir()
     program.write_text(
-        f"#!{sys.executable}\nimport sys\nfrom ganlane.__main__ import main\nsys.exit(main())\n", encoding="utf-8"
+        f"#!{sys.executable}\nimport sys\nfrom ganlane.__main__ import main\nsys.exit(main())\n",
+        encoding="utf-8",
     )
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     path = f"{program.parent}:{Path(sys.executable).parent}:{os.environ['PATH']}"
@@ -88,7 +93,13 @@ def typed(shell: str, script: str, environment: dict[str, str], *flags: str) -> 
         pytest.skip(f"{shell} is not installed")
     start = [shell, *flags, "-c", script]
     done = subprocess.run(
-        start, env=environment, cwd=environment["HOME"], capture_output=True, text=True, timeout=120, check=False
+        start,
+        env=environment,
+        cwd=environment["HOME"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert done.stderr == ""
     return done.stdout
@@ -112,7 +123,9 @@ complete -p ganlane 2> /dev/null || echo gone
 
 
 def test_bash_completes_and_forgets(environment):
-    registered, *offered, last = typed("bash", BASH, environment, "--norc", "--noprofile").splitlines()
+    registered, *offered, last = typed(
+        "bash", BASH, environment, "--norc", "--noprofile"
+    ).splitlines()
     assert registered.endswith("-F hydra_bash_completion ganlane")
     assert offered == ["train train_generator", " ".join(f"traffic={name}" for name in TRAFFICS)]
     assert last == "gone"
@@ -129,11 +142,13 @@ complete -C 'ganlane train traffic='
 
 def test_fish_completes_and_forgets(environment):
     offered = typed("fish", FISH, environment, "--no-config").splitlines()
-    offered = [each for each in offered if not each.endswith("/")]  # the folders that happen to be here
+    # the folders that happen to be here
+    offered = [each for each in offered if not each.endswith("/")]
     assert offered == ["train", "train_generator", *(f"traffic={name}" for name in TRAFFICS)]
 
 
-#: Keys pressed in an interactive zsh on a terminal of its own; each read waits until its pattern has appeared.
+#: Keys pressed in an interactive zsh on a terminal of its own; each read waits until its pattern
+#: has appeared.
 ZSH = r"""
 zmodload zsh/zpty
 zpty z 'PS1= zsh -f -i'

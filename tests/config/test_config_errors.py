@@ -1,4 +1,5 @@
-"""A wrong value or flag, or a disk that refuses, gives one sentence, and leaves nothing half-written behind.
+"""A wrong value or flag, or a disk that refuses, gives one sentence, and leaves nothing
+half-written behind.
 
 A wrong value is reported without waiting for torch.
 """
@@ -40,7 +41,9 @@ def leaves(node: Any, prefix: str = "") -> list[tuple[str, Any]]:
     return found
 
 
-KEYS = [(command, key, value) for command, config in COMPOSED.items() for key, value in leaves(config)]
+KEYS = [
+    (command, key, value) for command, config in COMPOSED.items() for key, value in leaves(config)
+]
 LISTS = [(c, k) for c, k, v in KEYS if isinstance(v, ListConfig)]
 
 
@@ -68,16 +71,25 @@ def test_lists_need_no_brackets_and_whole_numbers_may_have_an_exponent(command, 
 
 
 def test_in_a_sweep_a_comma_separates_runs():
-    assert as_meant("evaluate", "agents=mobil,agent_idm", multirun=True) == "agents=['mobil'],['agent_idm']"
+    assert (
+        as_meant("evaluate", "agents=mobil,agent_idm", multirun=True)
+        == "agents=['mobil'],['agent_idm']"
+    )
     assert as_meant("evaluate", "episodes=range(1,3)", multirun=True) == "episodes=range(1,3)"
-    assert as_meant("train", "total_decisions=1e3,2e3", multirun=True) == "total_decisions=1000,2000"
+    assert (
+        as_meant("train", "total_decisions=1e3,2e3", multirun=True) == "total_decisions=1000,2000"
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_whole_number_may_have_an_exponent_and_every_list_may_lack_brackets(command):
     whole = [key for c, key, value in KEYS if c == command and type(value) is int]
     assert [key for key in whole if as_meant(command, f"{key}=2e1") != f"{key}=20"] == []
-    lists = [key for key in (key for c, key in LISTS if c == command) if "[" not in as_meant(command, f"{key}=1")]
+    lists = [
+        key
+        for key in (key for c, key in LISTS if c == command)
+        if "[" not in as_meant(command, f"{key}=1")
+    ]
     assert lists == []
 
 
@@ -86,7 +98,9 @@ def test_a_key_that_there_is_passes_the_check_before_composing(command):
     refuse_unknown_keys(command, parse([f"{key}=1" for c, key, _ in KEYS if c == command]))
 
 
-@pytest.mark.parametrize("group", ["env", "collector", "init", "data", "generator", "agent", "traffic"])
+@pytest.mark.parametrize(
+    "group", ["env", "collector", "init", "data", "generator", "agent", "traffic"]
+)
 def test_a_key_that_any_option_of_a_group_has_passes_it_too(group):
     command = {"data": "train_generator", "generator": "train_generator"}.get(group, "train")
     of_options = {each.name for kind in SCHEMAS[group].values() for each in fields(kind)}
@@ -153,13 +167,18 @@ def test_a_mistake_ends_in_one_sentence_and_leaves_nothing(line, empty_folder, c
     assert MISTAKES[line] in refusal(capsys, *line.split())
 
 
-@pytest.mark.parametrize("stop", [KeyboardInterrupt(), Stopped(signal.SIGTERM)], ids=["SIGINT", "SIGTERM"])
-def test_a_signal_while_the_configuration_is_composed_is_no_error(stop, empty_folder, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "stop", [KeyboardInterrupt(), Stopped(signal.SIGTERM)], ids=["SIGINT", "SIGTERM"]
+)
+def test_a_signal_while_the_configuration_is_composed_is_no_error(
+    stop, empty_folder, monkeypatch, capsys
+):
 
     def interrupted(self):
         raise stop
 
-    monkeypatch.setattr(Node, "_key", interrupted)  # omegaconf cleans up after it, with an error of its own
+    # omegaconf cleans up after it, with an error of its own
+    monkeypatch.setattr(Node, "_key", interrupted)
     assert main(["train", "traffic=idm"]) == 128 + getattr(stop, "number", signal.SIGINT)
     assert capsys.readouterr().err in ("", "ganlane train: stopped by Ctrl-C.\n")
     assert list(empty_folder.iterdir()) == []
@@ -170,7 +189,12 @@ def loaded(program: str, *names: str) -> str:
     program = f"import sys; {program}; print([name for name in {names} if name in sys.modules])"
     environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PATH": "/usr/bin:/bin"}
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, env=environment, check=True
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment,
+        check=True,
     )
     return done.stdout
 
@@ -181,15 +205,23 @@ def test_parameters_are_declared_without_torch():
     assert loaded(program, "torch", "hydra", "omegaconf", "ganlane.sim") == "[]\n"
 
 
-@pytest.mark.parametrize("line", ["train env.lane=3", "train env.lanes=0", "evaluate traffics=[gann]"])
+@pytest.mark.parametrize(
+    "line", ["train env.lane=3", "train env.lanes=0", "evaluate traffics=[gann]"]
+)
 def test_a_mistake_is_reported_without_torch(line):
     """Which takes seconds to load."""
-    assert loaded(f"from ganlane.__main__ import main; main({line.split()})", "torch", "ganlane.sim") == "[]\n"
+    assert (
+        loaded(f"from ganlane.__main__ import main; main({line.split()})", "torch", "ganlane.sim")
+        == "[]\n"
+    )
 
 
 @pytest.mark.parametrize("started", ["-m", "/bin/ganlane"])
 def test_a_mistake_is_reported_without_gymnasium(started):
-    """Whose import would take a third of the time; whoever imports the package has its environments at once."""
+    """Whose import would take a third of the time.
+
+    Whoever imports the package has its environments at once.
+    """
     mistake = "from ganlane.__main__ import main; main(['train', 'env.lane=3'])"
     assert loaded(f"sys.argv[0] = {started!r}; {mistake}", "gymnasium") == "[]\n"
     assert loaded("import ganlane", "gymnasium") == "['gymnasium']\n"
@@ -210,7 +242,9 @@ def test_a_pickled_run_is_not_opened(empty_folder, capsys):
 
 def test_a_command_that_there_is_not(capsys):
     assert main(["fly"]) == 2
-    assert capsys.readouterr().err.startswith("ganlane: fly: no such command; choose one of train, evaluate")
+    assert capsys.readouterr().err.startswith(
+        "ganlane: fly: no such command; choose one of train, evaluate"
+    )
 
 
 def test_resolve_and_package_go_with_cfg(capsys):
@@ -241,7 +275,10 @@ def test_a_whole_number_of_more_than_64_bits_is_out_of_range(key):
 
 
 def refused(capsys, task, *arguments):
-    """The sentence with which ``ganlane evaluate`` ends when its task is this one; nothing new is left."""
+    """The sentence with which ``ganlane evaluate`` ends when its task is this one.
+
+    Nothing new is left.
+    """
     before = everything_below(Path.cwd())
     assert run_command("evaluate", arguments, task) == 2
     out, err = capsys.readouterr()
@@ -298,11 +335,15 @@ def test_a_run_folder_below_a_file(empty_folder, capsys):
     assert "file/run: Not a directory; check the path." in err
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the administrator may write anywhere")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the administrator may write anywhere"
+)
 def test_a_folder_without_the_right_to_write(empty_folder, capsys):
     empty_folder.chmod(0o555)
     try:
-        assert "Permission denied; check the permissions" in refused(capsys, lambda config, folder: None)
+        assert "Permission denied; check the permissions" in refused(
+            capsys, lambda config, folder: None
+        )
     finally:
         empty_folder.chmod(0o755)
 

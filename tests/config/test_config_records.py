@@ -35,14 +35,22 @@ class Garage(Record):
 @pytest.mark.parametrize(
     ("kind", "given", "told"),
     [
-        (Car, {"length_m": 0.0}, "length_m=0: expected a number above 0; give for instance length_m=4.5."),
+        (
+            Car,
+            {"length_m": 0.0},
+            "length_m=0: expected a number above 0; give for instance length_m=4.5.",
+        ),
         (Car, {"length_m": float("nan")}, "length_m=nan: expected a number above 0"),
         (Car, {"doors": 6}, "doors=6: expected a number from 2 to 5"),
         (Van, {"doors": 6}, "doors=6: expected a number from 2 to 5; give for instance doors=5."),
         (Car, {"paint": "rust"}, "paint=rust: expected one of red, blue"),
         (Car, {"tow_share": 1.5}, "tow_share=1.5: expected null or a number from 0 to 1."),
         (Car, {"speed_mps": [3, 2]}, "speed_mps=[3,2]: expected two numbers [low, high]"),
-        (Car, {"wheels": [1, 0]}, "wheels=[1,0]: expected a list, not empty, each entry at least 1"),
+        (
+            Car,
+            {"wheels": [1, 0]},
+            "wheels=[1,0]: expected a list, not empty, each entry at least 1",
+        ),
         (Car, {"wheels": [1, 1]}, "wheels=[1,1]: expected a list of different entries"),
         (Garage, {"sizes": []}, "sizes=[]: expected a list, not empty"),
     ],

@@ -1,4 +1,7 @@
-"""A run's folder has one run at a time; what a run has earned can be gone on with, however it ended."""
+"""A run's folder has one run at a time.
+
+What a run has earned can be gone on with, however it ended.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,15 @@ from training.test_training_loop import ToyRoad, agent, settings, train
 
 from ganlane.config.app import run_command
 from ganlane.config.command_line import parse, quoted, single_runs, without_repetitions
-from ganlane.config.runs import CONFIG, LOCK, OVERRIDES, held, newest_unfinished, unused, with_resumed
+from ganlane.config.runs import (
+    CONFIG,
+    LOCK,
+    OVERRIDES,
+    held,
+    newest_unfinished,
+    unused,
+    with_resumed,
+)
 from ganlane.errors import UserError
 from ganlane.training.checkpoint import LAST, load_checkpoint
 
@@ -83,19 +94,27 @@ class Disk:
 @pytest.mark.parametrize(
     "writes", [3, 7, 10, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4, 5, 6, 8, 9, 11))]
 )
-def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(writes, here, undisturbed, monkeypatch, capsys):
+def test_a_run_ended_by_a_full_disk_goes_on_to_the_same_weights(
+    writes, here, undisturbed, monkeypatch, capsys
+):
     with monkeypatch.context() as patch:
         patch.setattr("ganlane.files.os.fsync", Disk(writes))
         patch.setattr("ganlane.training.checkpoint.PATIENCE", 0.0)
         assert command("hydra.run.dir=run") == 2
     assert "No space left on device; make room" in capsys.readouterr().err
     assert not list(here.rglob("*.part"))
-    assert (here / "run" / LAST).is_file() == (here / "run" / OVERRIDES).is_file() == (here / "run").exists()
+    assert (
+        (here / "run" / LAST).is_file()
+        == (here / "run" / OVERRIDES).is_file()
+        == (here / "run").exists()
+    )
     assert command("resume=run" if (here / "run").exists() else "hydra.run.dir=run") == 0
     assert same(left_by(here / "run"), undisturbed)
 
 
-@pytest.mark.parametrize("error", [UserError("a worker died"), OSError(errno.EIO, "Input/output error")])
+@pytest.mark.parametrize(
+    "error", [UserError("a worker died"), OSError(errno.EIO, "Input/output error")]
+)
 def test_a_run_that_ends_in_an_error_after_training_keeps_its_command_line(error, here, capsys):
     def task(config, folder):
         toy_run(config, folder)
@@ -140,9 +159,14 @@ def test_the_lock_of_a_killed_run_stops_nobody_and_its_half_written_files_go(her
         "    part.write_bytes(b'half'); print('at work', flush=True); time.sleep(60)"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, env=environment) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, env=environment
+    ) as process:
         assert process.stdout.readline() == b"at work\n"
-        with pytest.raises(UserError, match=rf"process {process.pid} on .*; wait for its end"), held(Path("run")):
+        with (
+            pytest.raises(UserError, match=rf"process {process.pid} on .*; wait for its end"),
+            held(Path("run")),
+        ):
             pass
         process.kill()
     assert (here / "run" / LOCK).is_file()
@@ -208,7 +232,11 @@ def test_a_checkpoint_stands_for_its_run(tmp_path):
     make_run(run, [])
     make_run(run / "pretrain", [])
     (run / "pretrain" / OVERRIDES).unlink()
-    for path in (run / "checkpoints" / "last.pt", run / "pretrain", run / "pretrain" / "checkpoints" / "last.pt"):
+    for path in (
+        run / "checkpoints" / "last.pt",
+        run / "pretrain",
+        run / "pretrain" / "checkpoints" / "last.pt",
+    ):
         assert f"hydra.run.dir='{run}'" in with_resumed("train", [f"resume={path}"], multirun=False)
 
 
@@ -218,11 +246,16 @@ def test_auto_takes_the_newest_unfinished_run(tmp_path):
     make_run(runs / "new", [], age_s=50)
     make_run(runs / "done", [], finished=True)
     assert newest_unfinished(runs) == runs / "new"
-    assert "hydra.run.dir='outputs/train/new'" in with_resumed("train", ["resume=auto"], multirun=False)
+    assert "hydra.run.dir='outputs/train/new'" in with_resumed(
+        "train", ["resume=auto"], multirun=False
+    )
 
 
 def test_auto_starts_afresh_without_an_unfinished_run():
-    assert with_resumed("train", ["resume=auto", "seed=1"], multirun=False) == ["resume=null", "seed=1"]
+    assert with_resumed("train", ["resume=auto", "seed=1"], multirun=False) == [
+        "resume=null",
+        "seed=1",
+    ]
 
 
 def test_a_folder_without_a_checkpoint_is_refused(tmp_path):
@@ -231,13 +264,18 @@ def test_a_folder_without_a_checkpoint_is_refused(tmp_path):
 
 
 def test_the_last_of_several_overrides_counts():
-    assert without_repetitions(["traffic=idm", "seed=1", "traffic=gan"]) == ["traffic=gan", "seed=1"]
+    assert without_repetitions(["traffic=idm", "seed=1", "traffic=gan"]) == [
+        "traffic=gan",
+        "seed=1",
+    ]
 
 
 def test_a_sweep_is_every_combination():
     runs = single_runs(["seed=0,1", "traffic=idm,gan", "threads=1"], multirun=True)
     assert [sorted(run) for run in runs] == [
-        sorted([f"seed={seed}", f"traffic={traffic}", "threads=1"]) for seed in (0, 1) for traffic in ("idm", "gan")
+        sorted([f"seed={seed}", f"traffic={traffic}", "threads=1"])
+        for seed in (0, 1)
+        for traffic in ("idm", "gan")
     ]
 
 

@@ -1,4 +1,7 @@
-"""highD recordings, made by hand: two directions of travel, seen as their drivers see them, at 10 Hz."""
+"""highD recordings, made by hand.
+
+Two directions of travel, seen as their drivers see them, at 10 Hz.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +28,8 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
     assert (upper.name, lower.name) == ("highd-01-upper", "highd-01-lower")
     assert upper.frame.schema == lower.frame.schema == SCHEMA
     assert (upper.lane_width_m, lower.lane_width_m) == (4.0, 4.0)
-    # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12) and 3.
-    # Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
+    # Upwards in the picture is to the right for those who drive to the left: lanes 2 (y 8 to 12)
+    # and 3. Lower lanes: 5 (y 20 to 24) is the left one, 6 the right one; left is up.
     expected = {1: (0, 0.0, 30.0), 2: (1, 4.5, 35.0), 3: (0, 0.0, 25.0), 4: (1, 4.0, 28.0)}
     begin = {}
     for scene in (upper, lower):
@@ -36,12 +39,19 @@ def test_each_direction_is_a_scene_at_10_hz_with_x_forward_and_lane_0_rightmost(
             lane, y, speed = expected[vehicle]
             assert rows["lane"].unique().to_list() == [lane]
             assert begin[vehicle]["y"] == pytest.approx(y)
-            assert [begin[vehicle][name] for name in ("length", "width", "speed")] == [5.0, 2.0, speed]
-            assert np.diff(rows["x"].to_numpy()) / 0.1 == pytest.approx(np.full(rows.height - 1, speed))
+            assert [begin[vehicle][name] for name in ("length", "width", "speed")] == [
+                5.0,
+                2.0,
+                speed,
+            ]
+            assert np.diff(rows["x"].to_numpy()) / 0.1 == pytest.approx(
+                np.full(rows.height - 1, speed)
+            )
             # Recorded are the frames 1 to 200 at 25 Hz, 0.04 to 8 s.
             assert rows["frame"].to_list() == list(range(1, 81))
     assert begin.keys() == expected.keys()
-    # Car 2 starts 20 m further to the left than car 1, that is ahead of it; both are read at 0.1 s, frame 2.5.
+    # Car 2 starts 20 m further to the left than car 1, that is ahead of it; both are read at 0.1 s,
+    # frame 2.5.
     assert begin[2]["x"] - begin[1]["x"] == pytest.approx(20.0 + 0.06 * 5.0)
 
 
@@ -50,7 +60,9 @@ def test_a_folder_is_read_recording_by_recording(tmp_path):
     write_highd(tmp_path, "02", seconds=4.0)
     count = RowCount()
     names = [scene.name for scene in highd_scenes(tmp_path, count)]
-    assert names == [f"highd-{number}-{side}" for number in ("01", "02") for side in ("upper", "lower")]
+    assert names == [
+        f"highd-{number}-{side}" for number in ("01", "02") for side in ("upper", "lower")
+    ]
     assert (count.read, count.kept) == (4 * 300, 4 * 300)
 
 
@@ -98,14 +110,18 @@ def test_units_that_cannot_be_are_refused(recording):
 def test_the_metadata_files_are_required_and_checked(recording):
     meta = recording.with_name("01_recordingMeta.csv")
     damaged(meta, "upperLaneMarkings", 0, "8.0;moon")
-    with pytest.raises(UserError, match=r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'"):
+    with pytest.raises(
+        UserError, match=r"recordingMeta.csv, line 2, column upperlanemarkings: '8.0;moon'"
+    ):
         read_recordings("highd", recording)
     meta.unlink()
     with pytest.raises(UserError, match=r"01_recordingMeta.csv: no such file"):
         read_recordings("highd", recording)
     write_highd(recording.parent)
     damaged(recording.with_name("01_tracksMeta.csv"), "drivingDirection", 1, "3")
-    with pytest.raises(UserError, match=r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither"):
+    with pytest.raises(
+        UserError, match=r"01_tracksMeta.csv, line 3, column drivingdirection: 3 is neither"
+    ):
         read_recordings("highd", recording)
     with pytest.raises(UserError, match=r"no XX_tracks.csv in this folder"):
         read_recordings("highd", recording.parent.parent)
@@ -113,14 +129,22 @@ def test_the_metadata_files_are_required_and_checked(recording):
         read_recordings("highd", meta)
 
 
-@given(first=st.integers(0, 40), length=st.integers(1, 120), rate=st.sampled_from([10.0, 25.0, 30.0, 50.0]))
+@given(
+    first=st.integers(0, 40),
+    length=st.integers(1, 120),
+    rate=st.sampled_from([10.0, 25.0, 30.0, 50.0]),
+)
 def test_resampling_agrees_with_interpolation_over_time(first, length, rate):
     frame = np.concatenate((np.arange(length) + first, np.arange(7)))
     begins = np.r_[True, np.zeros(length - 1, bool), True, np.zeros(6, bool)]
     values = np.sin(0.3 * frame) + frame
     new = resample(begins, frame, rate)
     one = slice(0, int(np.searchsorted(new.before, length)))
-    inside = [k for k in range(2000) if first / rate - 1e-9 <= k * 0.1 <= (first + length - 1) / rate + 1e-9]
+    inside = [
+        k
+        for k in range(2000)
+        if first / rate - 1e-9 <= k * 0.1 <= (first + length - 1) / rate + 1e-9
+    ]
     assert new.frame[one].tolist() == inside
     expected = np.interp(0.1 * new.frame[one], frame[:length] / rate, values[:length])
     np.testing.assert_allclose(new.linear(values)[one], expected, atol=1e-9)

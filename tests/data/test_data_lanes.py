@@ -5,7 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ganlane.data import find_lane_changes, lane_changes_of_arrays, synthetic_scenes, tracks_of_frame
+from ganlane.data import (
+    find_lane_changes,
+    lane_changes_of_arrays,
+    synthetic_scenes,
+    tracks_of_frame,
+)
 from ganlane.data.lanes import Tracks, lane_width
 
 
@@ -20,7 +25,8 @@ def test_lane_keepers_tell_the_width_to_a_few_centimetres(width, seed):
 
 def test_vehicles_on_the_boundary_tell_the_width_where_lane_keepers_sit_off_centre():
     width = 3.5
-    # All keep half a metre to the left but in lane 0, so the spacing of the medians says 3.75 m; some cross over.
+    # All keep half a metre to the left but in lane 0, so the spacing of the medians says 3.75 m;
+    # some cross over.
     keepers = np.concatenate((np.full(50, 0.0), np.full(50, 4.0), np.full(50, 7.5)))
     crossing = np.linspace(0.0, 7.0, 71)
     y = np.concatenate((keepers, crossing))
@@ -46,17 +52,24 @@ def found(y, new_track_at=()):
 
 
 def test_a_ramp_is_timed_from_and_to_three_tenths_off_the_centres():
-    # The boundary, 1.8 m, is crossed at 3.85 s. Going back, 2.3 s is the first sample within 0.3 m of the old
-    # centre (0.25 m); going on, 5.4 s is the first within 0.3 m of the new one (3.35 m).
+    # The boundary, 1.8 m, is crossed at 3.85 s. Going back, 2.3 s is the first sample within 0.3 m
+    # of the old centre (0.25 m); going on, 5.4 s is the first within 0.3 m of the new one (3.35 m).
     change = found(RAMP)
-    assert (change.old_lane.tolist(), change.new_lane.tolist(), change.sample.tolist()) == ([0], [1], [38])
-    assert (change.tau_s[0], change.tau_e[0], change.duration_s[0]) == pytest.approx((1.55, 1.55, 3.1))
+    assert (change.old_lane.tolist(), change.new_lane.tolist(), change.sample.tolist()) == (
+        [0],
+        [1],
+        [38],
+    )
+    assert (change.tau_s[0], change.tau_e[0], change.duration_s[0]) == pytest.approx(
+        (1.55, 1.55, 3.1)
+    )
     assert change.lateral_speed[0] == pytest.approx(1.0)
     assert change.complete[0]
 
 
 def test_a_driver_who_stops_beside_the_centre_has_ended_the_change():
-    # Stops at 2.68 m. Over 1 s about 5.1 s it moves 0.13 m, about 5.2 s 0.03 m: the change ends at 5.2 s.
+    # Stops at 2.68 m. Over 1 s about 5.1 s it moves 0.13 m, about 5.2 s 0.03 m: the change ends at
+    # 5.2 s.
     change = found(np.minimum(RAMP, 2.68))
     assert change.tau_e[0] == pytest.approx(5.2 - 3.85)
     assert change.lateral_speed[0] == pytest.approx((2.68 - 0.25) / (5.2 - 2.3))

@@ -1,4 +1,7 @@
-"""NGSIM files, generated from synthetic recordings: what is read, in how many blocks, and errors in damaged files."""
+"""NGSIM files, generated from synthetic recordings.
+
+What is read, in how many blocks, and errors in damaged files.
+"""
 
 from __future__ import annotations
 
@@ -30,25 +33,38 @@ def same_driving(read: pl.DataFrame, made: pl.DataFrame) -> None:
     made, same = made.sort("vehicle", "frame"), ["vehicle", "frame", "lane"]
     assert read.select(same).equals(made.select(same))
     # Lane width and the first lane's centre are estimated from positions that wander by 0.15 m.
-    for name, tolerance in {**dict.fromkeys(("x", "speed", "length", "width"), 1e-5), "y": 0.2}.items():
+    for name, tolerance in {
+        **dict.fromkeys(("x", "speed", "length", "width"), 1e-5),
+        "y": 0.2,
+    }.items():
         assert (read[name] - made[name]).abs().max() < tolerance, name
 
 
 def test_raw_text_gives_back_the_recording_in_metres_from_centres_and_from_the_right(tmp_path):
     path = text_file(tmp_path, ngsim_rows(FIRST))
     (scene,) = ngsim_scenes(path)
-    assert (scene.name, scene.frame.schema, scene.lanes) == ("trajectories-0750am-0805am-1", SCHEMA, 3)
+    assert (scene.name, scene.frame.schema, scene.lanes) == (
+        "trajectories-0750am-0805am-1",
+        SCHEMA,
+        3,
+    )
     assert scene.lane_width_m == pytest.approx(LANE_M, abs=0.1)
     same_driving(scene.frame, FIRST)
     validate(scene.frame, "read")
     assert read_recordings("ngsim", path).equals(scene.frame)
-    with pytest.raises(UserError, match="moon: no such kind of recordings; expected scenes, ngsim or highd"):
+    with pytest.raises(
+        UserError, match="moon: no such kind of recordings; expected scenes, ngsim or highd"
+    ):
         read_recordings("moon", path)
 
 
 @pytest.mark.parametrize(("block_bytes", "thousands"), [(10_000, True), (2**25, False)])
-def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(tmp_path, block_bytes, thousands):
-    rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, LATER_MS))).sample(fraction=1.0, shuffle=True, seed=1)
+def test_the_portals_periods_are_separated_by_time_in_any_order_and_blocks(
+    tmp_path, block_bytes, thousands
+):
+    rows = pl.concat((ngsim_rows(FIRST), ngsim_rows(SECOND, LATER_MS))).sample(
+        fraction=1.0, shuffle=True, seed=1
+    )
     path = portal_file(tmp_path, portal_csv(rows, thousands=thousands))
     count = RowCount()
     scenes = list(ngsim_scenes(path, NgsimParameters(block_bytes=block_bytes), count))
@@ -63,7 +79,10 @@ def test_duplicates_and_other_places_are_dropped_and_counted(tmp_path):
     other = rows.head(1).with_columns(v_Vel=pl.lit(9.0))
     parts = [
         portal_csv(pl.concat((rows, rows.head(30), other))),
-        *(portal_csv(rows.head(n), place).partition("\n")[2] for place, n in (("lankershim", 7), ("peachtree", 5))),
+        *(
+            portal_csv(rows.head(n), place).partition("\n")[2]
+            for place, n in (("lankershim", 7), ("peachtree", 5))
+        ),
     ]
     count = RowCount()
     scenes = list(ngsim_scenes(portal_file(tmp_path, "".join(parts)), count=count))
@@ -84,7 +103,12 @@ def test_ramps_are_left_out_and_end_a_track(tmp_path):
     count = RowCount()
     (scene,) = ngsim_scenes(text_file(tmp_path, rows), count=count)
     assert dict(count.dropped) == {"ramp": 10}
-    frames = dict(scene.frame.filter(pl.col("vehicle") % 10_000 == 2).group_by("vehicle").agg("frame").iter_rows())
+    frames = dict(
+        scene.frame.filter(pl.col("vehicle") % 10_000 == 2)
+        .group_by("vehicle")
+        .agg("frame")
+        .iter_rows()
+    )
     assert sorted(frames) == [2, 10_002]
     assert frames[2] == list(range(20))
     assert frames[10_002] == list(range(30, 60))
@@ -114,13 +138,25 @@ def changed(folder, row: int, column: str, value: str):
         (8, "v_length", "0", r"line 10, column v_length: 0.0 is not above 0"),
         (6, "local_y", '"1,2"', r"line 8, column local_y: '1,2' is not a number"),
         (6, "location", "us-10", r"line 8, column location: 'us-10' is no known place"),
-        (9, "frame_id", "9000000", r"line 11, columns frame_id and global_time: frame 9000000 .* fits no recording"),
+        (
+            9,
+            "frame_id",
+            "9000000",
+            r"line 11, columns frame_id and global_time: frame 9000000 .* fits no recording",
+        ),
         (9, "frame_id", "7", r"line 11, column frame_id: 7 does not grow with global_time"),
-        (9, "global_time", f"{START_MS + 950}", r"line 11, column global_time: .* is not 100 ms a frame"),
+        (
+            9,
+            "global_time",
+            f"{START_MS + 950}",
+            r"line 11, column global_time: .* is not 100 ms a frame",
+        ),
     ],
 )
 @pytest.mark.parametrize("block_bytes", [20_000, 2**25])
-def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column, value, message, block_bytes):
+def test_a_damaged_field_is_named_by_file_line_and_column(
+    tmp_path, row, column, value, message, block_bytes
+):
     path = changed(tmp_path, row, column, value)
     with pytest.raises(UserError, match=message) as caught:
         read_recordings("ngsim", path, NgsimParameters(block_bytes=block_bytes))
@@ -131,8 +167,12 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
     rows = ngsim_rows(FIRST)
     whole = portal_csv(rows, thousands=False)
     assert read_recordings("ngsim", portal_file(tmp_path, whole.rstrip("\n"))).height == 540
-    with pytest.raises(UserError, match=r"line 541, column lane_id: the file breaks off here, 14 of 19 columns"):
-        read_recordings("ngsim", portal_file(tmp_path, ",".join(whole.rstrip("\n").split(",")[:-5])))
+    with pytest.raises(
+        UserError, match=r"line 541, column lane_id: the file breaks off here, 14 of 19 columns"
+    ):
+        read_recordings(
+            "ngsim", portal_file(tmp_path, ",".join(whole.rstrip("\n").split(",")[:-5]))
+        )
     text = text_file(tmp_path, rows)
     text.write_bytes(text.read_bytes()[:-30])
     with pytest.raises(UserError, match=r"line 540, column \w+: the file breaks off here"):
@@ -142,7 +182,11 @@ def test_a_truncated_file_is_refused_and_a_whole_one_read(tmp_path):
 @pytest.mark.parametrize(
     ("columns", "factor", "message"),
     [
-        (("Local_X", "Local_Y", "v_length", "v_Width", "v_Vel"), 0.3048, "column v_length: .*they look like metres"),
+        (
+            ("Local_X", "Local_Y", "v_length", "v_Width", "v_Vel"),
+            0.3048,
+            "column v_length: .*they look like metres",
+        ),
         (("v_Vel",), 1.09728, "columns local_y and v_vel: vehicles cover 0.91 times"),
         (("v_Vel",), 0.3048, "columns local_y and v_vel: vehicles cover 3.28 times"),
         (("v_Vel",), 0.681818, "columns local_y and v_vel: vehicles cover 1.47 times"),

@@ -1,4 +1,7 @@
-"""Recordings read, prepared and pooled: what is written reads back the same; the error for each kind of damage."""
+"""Recordings read, prepared and pooled: what is written reads back the same.
+
+The error for each kind of damage.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,9 @@ def changed(column: str, change, only: int | None = None) -> list[str]:
     return [",".join(line.values()) for line in lines]
 
 
-def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows_are_sorted(tmp_path):
+def test_lanes_are_counted_from_the_right_y_from_the_right_lanes_centre_and_rows_are_sorted(
+    tmp_path,
+):
     frame = data.read_scenes(written(tmp_path, ROWS))
     assert frame.schema == data.SCHEMA
     assert frame["lane"].to_list() == [1] * 6 + [0] * 6
@@ -56,7 +61,13 @@ def test_a_synthetic_recording_survives_the_file(tmp_path):
     exact = ["scene", "vehicle", "frame", "lane"]
     assert read.select(exact).equals(made.select(exact))
     # The lane width is estimated anew, to 4 cm; two lanes to the left that makes 8 cm.
-    for name, tolerance in {"x": 1e-4, "speed": 1e-4, "length": 1e-9, "width": 1e-9, "y": 0.08}.items():
+    for name, tolerance in {
+        "x": 1e-4,
+        "speed": 1e-4,
+        "length": 1e-9,
+        "width": 1e-9,
+        "y": 0.08,
+    }.items():
         assert (read[name] - made[name]).abs().max() <= tolerance
 
 
@@ -81,7 +92,11 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
     ("column", "factor", "message"),
     [
         ("v", 10.0, "line 2, column speed: the median is 100.0"),
-        ("v", 3.6, "line 3, columns x and speed: x moves by 10.0 m per second where speed says 36.0"),
+        (
+            "v",
+            3.6,
+            "line 3, columns x and speed: x moves by 10.0 m per second where speed says 36.0",
+        ),
         ("x", 3.28, "x moves by 32.8 m per second where speed says 10.0"),
         ("x", -1.0, "x moves by -10.0 m per second"),
         ("length", 3.28, "line 2, column length: the median is 14.8"),
@@ -91,13 +106,18 @@ def test_a_damaged_field_is_named_by_file_line_and_column(tmp_path, row, column,
 )
 def test_units_and_directions_that_cannot_be_are_refused(tmp_path, column, factor, message):
     with pytest.raises(UserError, match=message):
-        data.read_scenes(written(tmp_path, changed(column, lambda field: str(float(field) * factor))))
+        data.read_scenes(
+            written(tmp_path, changed(column, lambda field: str(float(field) * factor)))
+        )
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"scene,vehicle,frame,x,y,speed\ns,1,0,0,0,10\n", r"line 1: no column v, lane.*found .*speed; expected"),
+        (
+            b"scene,vehicle,frame,x,y,speed\ns,1,0,0,0,10\n",
+            r"line 1: no column v, lane.*found .*speed; expected",
+        ),
         (HEADER.encode() + b"\n", "a header but no rows"),
         (b"\x89PNG\r\n\x1a\n\x00\xff\xfe" * 50, r"line 1: not text"),
     ],
@@ -117,8 +137,12 @@ def test_absent_files_are_refused(name, tmp_path):
 
 def test_a_scene_in_two_files_is_refused(tmp_path):
     data.write_prepared(data.synthetic_scenes(), tmp_path / "a.parquet")
-    data.write_prepared(data.synthetic_scenes(data.SyntheticTraffic(scenes=1)), tmp_path / "b.parquet")
-    with pytest.raises(UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"):
+    data.write_prepared(
+        data.synthetic_scenes(data.SyntheticTraffic(scenes=1)), tmp_path / "b.parquet"
+    )
+    with pytest.raises(
+        UserError, match=r"b.parquet: scene synthetic-0 is in .*a.parquet too; remove one"
+    ):
         data.read_scenes(tmp_path)
 
 
@@ -164,10 +188,14 @@ def test_scenes_one_by_one_say_what_they_say_together(seed):
     assert vars(apart.exposure) == pytest.approx(vars(together.exposure))
     assert apart.lane_changes.duration == together.lane_changes.duration
     for name in ("count", "per_vehicle_km", "srlc"):
-        assert getattr(apart.lane_changes, name) == pytest.approx(getattr(together.lane_changes, name)), name
+        assert getattr(apart.lane_changes, name) == pytest.approx(
+            getattr(together.lane_changes, name)
+        ), name
     for name in ("speed", "acceleration_raw", "acceleration_smoothed", "headway"):
         one, other = apart.describe(name), getattr(together, name)
-        assert (one.count, one.mean, one.sd) == pytest.approx((other.count, other.mean, other.sd)), name
+        assert (one.count, one.mean, one.sd) == pytest.approx(
+            (other.count, other.mean, other.sd)
+        ), name
         assert one.quantiles == pytest.approx(other.quantiles, abs=0.02), name
 
 
@@ -182,7 +210,9 @@ def test_what_is_written_reads_back_the_same(csv, tmp_path):
     prepared = data.prepare_recordings("scenes", csv, tmp_path / "out")
     assert prepared.files == ("synthetic-0.parquet", "synthetic-1.parquet")
     assert data.read_scenes(tmp_path / "out").equals(data.read_scenes(csv))
-    assert data.read_scenes(tmp_path / "out" / prepared.files[1])["scene"].unique().to_list() == ["synthetic-1"]
+    assert data.read_scenes(tmp_path / "out" / prepared.files[1])["scene"].unique().to_list() == [
+        "synthetic-1"
+    ]
     assert prepared.written == prepared.count.kept == data.synthetic_scenes(seed=5).height
     again = data.prepare_recordings("scenes", tmp_path / "out", tmp_path / "again")
     assert again.to_dict()["rows"] == prepared.to_dict()["rows"]
@@ -194,7 +224,9 @@ def test_long_recordings_are_cut_into_scenes_when_written_and_measured_whole(csv
     assert cut.statistics.lane_changes == whole
     scenes = data.read_scenes(tmp_path / "cut")
     per_scene = scenes.group_by("scene", maintain_order=True).agg(pl.col("frame").n_unique())
-    assert per_scene["scene"].to_list() == [f"synthetic-{k}-00{part}" for k in range(2) for part in range(3)]
+    assert per_scene["scene"].to_list() == [
+        f"synthetic-{k}-00{part}" for k in range(2) for part in range(3)
+    ]
     assert per_scene["frame"].to_list() == [40, 40, 20] * 2
     assert cut_into_scenes(scenes, 100.0)["scene"].n_unique() == 6
 
@@ -224,7 +256,9 @@ def test_the_output_folder_appears_only_when_everything_was_written(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["bad.csv"]
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "precious").write_text("")
-    with pytest.raises(UserError, match=r"out: there already; choose another folder with out=FOLDER"):
+    with pytest.raises(
+        UserError, match=r"out: there already; choose another folder with out=FOLDER"
+    ):
         data.prepare_recordings("ngsim", tmp_path / "bad.csv", tmp_path / "out")
     assert (tmp_path / "out" / "precious").exists()
 
@@ -236,7 +270,9 @@ def refused(frame: pl.DataFrame, folder: Path, message: str) -> None:
 
 
 def test_parked_cars_and_names_that_differ_in_a_blank_alone_are_refused(tmp_path):
-    parked = data.synthetic_scenes().with_columns(speed=pl.lit(0.0), x=pl.col("x").first().over("scene", "vehicle"))
+    parked = data.synthetic_scenes().with_columns(
+        speed=pl.lit(0.0), x=pl.col("x").first().over("scene", "vehicle")
+    )
     refused(parked, tmp_path, "no scene in which anybody drives")
     names = pl.col("scene").replace({"synthetic-0": "my road", "synthetic-1": "my_road"})
     message = r"a second scene that my_road.parquet is the file of"
@@ -252,7 +288,9 @@ def test_recordings_without_vehicles_on_the_lanes_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("absolute", [True, False])
-def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(absolute, tmp_path, monkeypatch):
+def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(
+    absolute, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     out = (tmp_path if absolute else Path()) / "scenes"
     long = out.with_name("s" * 250)  # the hidden one beside it has a longer name
@@ -261,7 +299,12 @@ def test_an_error_names_the_folder_to_be_and_other_files_as_they_are(absolute, t
         raise FileNotFoundError(errno.ENOENT, "No such file or directory", name)
 
     cases = [
-        (out, lambda folder: write_bytes(folder / ("s" * 300), b""), errno.ENAMETOOLONG, str(out / ("s" * 300))),
+        (
+            out,
+            lambda folder: write_bytes(folder / ("s" * 300), b""),
+            errno.ENAMETOOLONG,
+            str(out / ("s" * 300)),
+        ),
         (out, Path.mkdir, errno.EEXIST, str(out)),
         (long, absent, errno.ENAMETOOLONG, str(long)),
     ]

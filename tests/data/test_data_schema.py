@@ -1,4 +1,6 @@
-"""Text tables, whose rows, line numbers and errors do not depend on the size of a block, and the validator."""
+"""Text tables, whose rows, line numbers and errors do not depend on the size of a block, and the
+validator.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ def read(path, content: bytes, blanks: bool = False, block_bytes: int = 2**20) -
     windows=st.booleans(),
     ended=st.booleans(),
 )
-def test_the_size_of_a_block_changes_nothing(tmp_path_factory, rows, block_bytes, blanks, windows, ended):
+def test_the_size_of_a_block_changes_nothing(
+    tmp_path_factory, rows, block_bytes, blanks, windows, ended
+):
     lines = [("  {}   {}\t{} " if blanks else "{},{},{}").format(*row) for row in rows]
     end = "\r\n" if windows else "\n"
     content = end.join([*([] if blanks else ["a,b,c"]), *lines]) + (end if ended else "")
@@ -83,7 +87,10 @@ def test_quoted_fields_may_hold_commas(tmp_path):
 @pytest.mark.parametrize(
     ("text", "kind", "message"),
     [
-        *((text, pl.Float64, "is not a number") for text in ("1,23", "12,34,567", "1,2345", "1.234,5", ",5", "far")),
+        *(
+            (text, pl.Float64, "is not a number")
+            for text in ("1,23", "12,34,567", "1,2345", "1.234,5", ",5", "far")
+        ),
         ("NaN", pl.Float64, "'NaN' is not a finite number"),
         ("", pl.String, "the field is empty; the row is incomplete"),
         ("5.5", pl.Int64, "'5.5' is not a whole number"),

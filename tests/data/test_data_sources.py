@@ -1,4 +1,6 @@
-"""Where recordings are, downloads from a server in trouble, and synthetic recordings, in which nobody overlaps."""
+"""Where recordings are, downloads from a server in trouble, and synthetic recordings, in which
+nobody overlaps.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def names(folder):
 def test_a_file_arrives_whole_with_progress(tmp_path):
     steps = []
     with Server() as server:
-        path = data.download(server.url, tmp_path / "new" / "f", SHA256, lambda *step: steps.append(step), **QUICK)
+        path = data.download(
+            server.url, tmp_path / "new" / "f", SHA256, lambda *step: steps.append(step), **QUICK
+        )
     assert path.read_bytes() == CONTENT
     assert names(path.parent) == ["f"]
     assert steps[-1] == (len(CONTENT), len(CONTENT))
@@ -52,7 +56,9 @@ def test_a_broken_transfer_resumes_only_where_server_and_version_allow(server, r
 
 def test_a_later_run_resumes_what_an_earlier_one_left(tmp_path):
     with Server(breaks=[400_000, 0, 0, 0]) as server:
-        with pytest.raises(UserError, match=r"cannot be fetched, 400000 bytes came .*continues from there"):
+        with pytest.raises(
+            UserError, match=r"cannot be fetched, 400000 bytes came .*continues from there"
+        ):
             fetch(server, tmp_path / "f", SHA256)
         assert "f" not in names(tmp_path)
         server.breaks = []
@@ -73,7 +79,10 @@ def test_a_part_of_another_version_or_longer_than_the_file_is_discarded(content,
 
 
 def test_a_corrupt_transfer_leaves_nothing(tmp_path):
-    with Server(content=CONTENT[:-1] + b"?") as server, pytest.raises(UserError, match=f"its SHA-256 is .*{SHA256}"):
+    with (
+        Server(content=CONTENT[:-1] + b"?") as server,
+        pytest.raises(UserError, match=f"its SHA-256 is .*{SHA256}"),
+    ):
         fetch(server, tmp_path / "f", SHA256.upper())
     assert names(tmp_path) == []
 
@@ -114,12 +123,16 @@ def test_a_failing_server_is_tried_again_and_an_absent_one_is_named(tmp_path):
         pytest.param(
             lambda part: part.symlink_to("/dev/full"),
             errno.ENOSPC,
-            marks=pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full"),
+            marks=pytest.mark.skipif(
+                not Path("/dev/full").exists(), reason="there is no /dev/full"
+            ),
         ),
         (Path.mkdir, errno.EISDIR),
     ],
 )
-def test_an_error_of_the_disk_is_reported_at_once_and_not_as_a_network_error(spoil, number, tmp_path):
+def test_an_error_of_the_disk_is_reported_at_once_and_not_as_a_network_error(
+    spoil, number, tmp_path
+):
     spoil(tmp_path / ".f.part")
     with Server() as server, pytest.raises(OSError) as caught:  # noqa: PT011
         fetch(server, tmp_path / "f", SHA256)
@@ -128,7 +141,9 @@ def test_an_error_of_the_disk_is_reported_at_once_and_not_as_a_network_error(spo
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_progress_shows_bytes_on_a_terminal_and_nothing_of_short_work_elsewhere(terminal, capsys, monkeypatch):
+def test_progress_shows_bytes_on_a_terminal_and_nothing_of_short_work_elsewhere(
+    terminal, capsys, monkeypatch
+):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     with data.byte_progress("read") as show:
         show(2_000_000, 4_000_000)
@@ -139,7 +154,9 @@ def test_progress_shows_bytes_on_a_terminal_and_nothing_of_short_work_elsewhere(
 def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
     monkeypatch.setenv("GANLANE_DATA", str(tmp_path))
     assert data.data_folder() == tmp_path
-    with pytest.raises(UserError, match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"):
+    with pytest.raises(
+        UserError, match=r"set GANLANE_DATA to a folder that holds ngsim/us101_scenes\.csv"
+    ):
         data.default_scenes()
     (tmp_path / "ngsim").mkdir()
     deep = tmp_path / "ngsim" / "us101_scenes.csv"
@@ -153,7 +170,9 @@ def test_the_recordings_are_found_through_the_variable(tmp_path, monkeypatch):
 def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("GANLANE_DATA", raising=False)
     module = sys.modules["ganlane.data.sources"]
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "sources.py"))
+    monkeypatch.setattr(
+        module, "__file__", str(tmp_path / "site" / "ganlane" / "data" / "sources.py")
+    )
     work = tmp_path / "work"
     work.mkdir()
     monkeypatch.chdir(work)
@@ -164,14 +183,22 @@ def test_the_recordings_are_found_beside_the_current_folder(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("length", [True, False, "9" * 5000])
 def test_a_file_larger_than_wanted_is_refused_and_leaves_nothing(length, tmp_path):
-    with Server(length=length) as server, pytest.raises(UserError, match=r"the file has .* GB or more"):
+    with (
+        Server(length=length) as server,
+        pytest.raises(UserError, match=r"the file has .* GB or more"),
+    ):
         fetch(server, tmp_path / "f", most_bytes=len(CONTENT) - 1)
     assert names(tmp_path) == []
 
 
-@pytest.mark.parametrize("place", ["ftp://here/f", "file:///etc/hostname", "data:,f", "http://[::1"])
+@pytest.mark.parametrize(
+    "place", ["ftp://here/f", "file:///etc/hostname", "data:,f", "http://[::1"]
+)
 def test_no_redirection_leads_away_from_http(place, tmp_path):
-    with Server(sends_to=place) as server, pytest.raises(UserError, match=r"not allowed|expected http|Invalid"):
+    with (
+        Server(sends_to=place) as server,
+        pytest.raises(UserError, match=r"not allowed|expected http|Invalid"),
+    ):
         fetch(server, tmp_path / "f")
     assert "f" not in names(tmp_path)
 
@@ -204,6 +231,8 @@ def test_nobody_comes_near_another_along_the_road(seed):
 
 def test_the_share_of_changing_vehicles_is_found_by_the_detector():
     for changing, wander_m in ((40, 0.0), (0, data.SyntheticTraffic.wander_m)):
-        traffic = data.SyntheticTraffic(scenes=1, vehicles=40, changing_share=changing / 40, wander_m=wander_m)
+        traffic = data.SyntheticTraffic(
+            scenes=1, vehicles=40, changing_share=changing / 40, wander_m=wander_m
+        )
         tracks = data.tracks_of_frame(data.synthetic_scenes(traffic), {"synthetic-0": 3.5})
         assert len(data.find_lane_changes(tracks)) == changing

@@ -1,4 +1,6 @@
-"""Statistics against values worked by hand, and the figures published with the US-101 recordings, where they are."""
+"""Statistics against values worked by hand, and the figures published with the US-101 recordings,
+where they are.
+"""
 
 import json
 
@@ -38,12 +40,23 @@ def track(vehicle, x, lane=0, scene="s", y=None, length=4.0):
     n = len(x)
     speed = np.gradient(x, 0.1)
     y = np.full(n, 3.5 * lane) if y is None else y
-    columns = [[scene] * n, [vehicle] * n, range(n), x, y, speed, np.rint(y / 3.5), [length] * n, [2.0] * n]
+    columns = [
+        [scene] * n,
+        [vehicle] * n,
+        range(n),
+        x,
+        y,
+        speed,
+        np.rint(y / 3.5),
+        [length] * n,
+        [2.0] * n,
+    ]
     return pl.DataFrame(dict(zip(SCHEMA, columns)), schema=SCHEMA, strict=False)
 
 
 @pytest.mark.parametrize(
-    ("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39), (57, 43.17, 73.85)]
+    ("count", "low", "high"),
+    [(0, 0.0, 3.689), (1, 0.0253, 5.572), (10, 4.795, 18.39), (57, 43.17, 73.85)],
 )
 def test_the_exact_interval_of_a_count_is_the_tabled_one(count, low, high):
     # Garwood's limits as tabled in textbooks of epidemiology.
@@ -81,7 +94,9 @@ def test_the_headway_is_the_followers_own():
     leader = track(1, 26.0 + 10.0 * time)
     follower = track(2, 10.0 * time)  # gap 22 m at 10 m/s: (22 - 2) / 10 = 2 s
     beside = track(3, 13.0 + 10.0 * time, lane=1)
-    assert quantities(pl.concat((leader, follower, beside)))["headway"].tolist() == pytest.approx([2.0])
+    assert quantities(pl.concat((leader, follower, beside)))["headway"].tolist() == pytest.approx(
+        [2.0]
+    )
     far = track(1, 100.0 + 10.0 * time)
     short = pl.concat((leader, follower)).filter(pl.col("frame") < 9)
     for without in (pl.concat((far, follower)), short):
@@ -94,7 +109,9 @@ def recording():
     moves = np.clip(time - 10.05, 0.0, 3.5)
     one = track(1, 20.0 * time, y=moves)
     other = track(2, 20.0 * time, lane=1)
-    early, late = (track(v, 20.0 * time[:51] + off, lane=2) for v, off in ((3, 0.0), (10_003, 400.0)))
+    early, late = (
+        track(v, 20.0 * time[:51] + off, lane=2) for v, off in ((3, 0.0), (10_003, 400.0))
+    )
     return pl.concat((one, other, early, late.with_columns(pl.col("frame") + 200)))
 
 
@@ -103,7 +120,8 @@ def test_a_recording_is_measured_as_by_hand():
     exposure, changes = measured.exposure, measured.lane_changes
     assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (1, 4, 3, 604)
     assert exposure.road_m == pytest.approx(500.0)
-    # Straight: 500 + 500 + 100 + 100 m; the change adds 3.5 s of sqrt(20^2 + 1) less 20 m/s, 0.09 m.
+    # Straight: 500 + 500 + 100 + 100 m; the change adds 3.5 s of sqrt(20^2 + 1) less 20 m/s, 0.09
+    # m.
     assert exposure.vehicle_km == pytest.approx(1.2001, abs=1e-4)
     assert changes.count == 1
     assert changes.srlc == pytest.approx(1 / 3 * 1000 / 500)
@@ -128,7 +146,9 @@ def test_speeds_differ_within_a_frame_but_not_within_a_lane():
     assert measured.speed_sd_in_lane == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("frame", [recording(), synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1))])
+@pytest.mark.parametrize(
+    "frame", [recording(), synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1))]
+)
 def test_statistics_survive_json(frame):
     measured = driving_statistics(frame)
     stored = json.dumps(measured.to_dict(), allow_nan=False)
@@ -145,7 +165,9 @@ def test_foreign_statistics_are_refused():
 
 
 def test_a_lone_lane_keeper_leaves_the_rest_open():
-    measured = driving_statistics(synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0)))
+    measured = driving_statistics(
+        synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=1, changing_share=0.0))
+    )
     changes = measured.lane_changes
     assert (changes.count, changes.t_m_srlc_steps, changes.per_vehicle_km_low) == (0, None, 0.0)
     assert changes.per_vehicle_km_high > 0.0
@@ -164,13 +186,16 @@ def test_a_histogram_describes_a_sample_to_a_bins_width(values, parts):
     for level in (0.25, 0.5, 0.95):
         # Between the neighbours of the exact place, and a bin's width more.
         at = level * len(ordered)
-        low, high = ordered[max(int(np.floor(at)) - 1, 0)], ordered[min(int(np.ceil(at)), len(ordered) - 1)]
+        low, high = (
+            ordered[max(int(np.floor(at)) - 1, 0)],
+            ordered[min(int(np.ceil(at)), len(ordered) - 1)],
+        )
         assert low - 0.1 - 1e-9 <= found.quantile(level) <= high + 0.1 + 1e-9
 
 
 def test_the_survival_curve_takes_censored_times_as_lower_bounds():
-    # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one ends at 3 (2/3 of
-    # 4/5), one is cut off at 4, the last ends at 5.
+    # Worked by hand: of 5, one ends at 1 (4/5 are left), one is cut off at 2, of the other 3 one
+    # ends at 3 (2/3 of 4/5), one is cut off at 4, the last ends at 5.
     times, shares = survival_curve([3.0, 1.0, 2.0, 5.0, 4.0], [True, True, False, True, False])
     assert times.tolist() == [1.0, 3.0, 5.0]
     assert shares == pytest.approx([0.8, 0.8 * 2 / 3, 0.0])
@@ -183,7 +208,11 @@ def test_the_survival_curve_takes_censored_times_as_lower_bounds():
 
 def test_durations_that_are_all_censored_have_no_mean():
     durations = describe_durations([1.0, 2.0], [False, False])
-    assert (durations.censored, durations.survival_mean_s, durations.complete.mean) == (2, None, None)
+    assert (durations.censored, durations.survival_mean_s, durations.complete.mean) == (
+        2,
+        None,
+        None,
+    )
     # One seen and a longer one cut off: the curve stays at one half or above after the last end.
     open_ended = describe_durations([1.0, 2.0, 2.5], [True, False, False])
     assert open_ended.survival_median_s is None
@@ -216,15 +245,27 @@ def measured(scenes):
 
 def test_the_amount_of_driving(measured):
     exposure = measured.exposure
-    assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (11, 645, 539, 47_382)
+    assert (exposure.scenes, exposure.tracks, exposure.cars, exposure.samples) == (
+        11,
+        645,
+        539,
+        47_382,
+    )
     assert exposure.vehicle_km == pytest.approx(61.7, abs=0.05)
     assert exposure.road_m == pytest.approx(309, abs=0.5)
-    assert (measured.speed.mean, measured.speed.quantile(0.5)) == pytest.approx((13.2, 13.7), abs=0.05)
+    assert (measured.speed.mean, measured.speed.quantile(0.5)) == pytest.approx(
+        (13.2, 13.7), abs=0.05
+    )
 
 
 def test_the_lane_changes(scenes, measured):
     changes = measured.lane_changes
-    rates = (changes.srlc, changes.per_vehicle_km, changes.per_vehicle_km_low, changes.per_vehicle_km_high)
+    rates = (
+        changes.srlc,
+        changes.per_vehicle_km,
+        changes.per_vehicle_km_low,
+        changes.per_vehicle_km_high,
+    )
     assert rates == pytest.approx((0.34, 0.92, 0.70, 1.20), abs=0.005)
     assert changes.t_m_srlc_steps == pytest.approx(2220, abs=5)
     assert changes.count == changes.duration.complete.count + changes.duration.censored == 57
@@ -232,20 +273,36 @@ def test_the_lane_changes(scenes, measured):
     assert 2.5 < changes.duration.survival_mean_s < 4.5
     rows = find_lane_changes(tracks_of_frame(scenes)).sample
     counts = dict(scenes[rows]["scene"].value_counts().iter_rows())
-    assert [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"] == [16, 5, 3, 21, 2, 0, 3, 3, 0, 3, 1]
+    assert [counts.get(f"us101-{letter}", 0) for letter in "abcdefghijk"] == [
+        16,
+        5,
+        3,
+        21,
+        2,
+        0,
+        3,
+        3,
+        0,
+        3,
+        1,
+    ]
 
 
 def test_the_lane_widths(scenes):
     published = [3.50, 3.54, 3.44, 3.42, 3.58, 3.56, 3.52, 3.33, 3.53, 3.35, 3.39]
     widths = scene_lane_widths(scenes)
-    assert [widths[f"us101-{letter}"] for letter in "abcdefghijk"] == pytest.approx(published, abs=0.035)
+    assert [widths[f"us101-{letter}"] for letter in "abcdefghijk"] == pytest.approx(
+        published, abs=0.035
+    )
     width = scenes["scene"].replace_strict(widths).to_numpy()
     assert np.mean(np.rint(scenes["y"].to_numpy() / width) == scenes["lane"].to_numpy()) > 0.999
     assert scenes.filter(pl.col("scene") == "us101-d")["lane"].max() == 6
 
 
 def test_the_spread_of_speeds_accelerations_and_headways(measured):
-    assert (measured.speed_sd_in_frame, measured.speed_sd_in_lane) == pytest.approx((2.8, 1.7), abs=0.05)
+    assert (measured.speed_sd_in_frame, measured.speed_sd_in_lane) == pytest.approx(
+        (2.8, 1.7), abs=0.05
+    )
     smooth = [measured.acceleration_smoothed.quantile(level) for level in (0.05, 0.95)]
     assert smooth == pytest.approx([-1.2, 1.4], abs=0.05)
     headways = [measured.headway.quantile(level) for level in (0.05, 0.25, 0.5, 0.75, 0.95)]

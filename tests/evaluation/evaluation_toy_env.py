@@ -1,7 +1,8 @@
 """A toy batched environment whose episodes are known beforehand, for the tests of the evaluation.
 
-Episode ``e`` of seed ``s`` lasts ``length(s, e)`` decisions and ends for ``reason(e)``. Each decision pays
-``episode + 1`` for action 1 and 0.5 otherwise, drives 20 m and, on every third decision, has a soft crash.
+Episode ``e`` of seed ``s`` lasts ``length(s, e)`` decisions and ends for ``reason(e)``. Each
+decision pays ``episode + 1`` for action 1 and 0.5 otherwise, drives 20 m and, on every third
+decision, has a soft crash.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ def _nested(n: int, names: list[str], shape: tuple[int, ...], dtype: torch.dtype
 
 
 class ToyEnv(EnvBase):
-    """N rows; an automatic reset goes on with episode + N, or with the ``next_episode`` that is asked for."""
+    """N rows.
+
+    An automatic reset goes on with episode + N, or with the ``next_episode`` that is asked for.
+    """
 
     def __init__(self, n: int):
         super().__init__(batch_size=[n])
@@ -39,7 +43,10 @@ class ToyEnv(EnvBase):
         ego.update(_nested(n, ["lane_changes", "decisions"], (), torch.int64))
         events = _nested(n, list(keys.END_EVENTS), (1,), torch.bool)
         events.update(_nested(n, [keys.SOFT_CRASH, keys.SOFT_CRASH_BEHIND], (1,), torch.int64))
-        counters = {name: Unbounded((n,), dtype=torch.int64) for name in (keys.SEED, keys.EPISODE, keys.STEP)}
+        counters = {
+            name: Unbounded((n,), dtype=torch.int64)
+            for name in (keys.SEED, keys.EPISODE, keys.STEP)
+        }
         terms = _nested(n, ["speed", "goal"], (1,), torch.float32)
         self.observation_spec = Composite(
             {**counters, "ego": ego, "events": events, "reward_terms": terms}, shape=(n,)
@@ -51,13 +58,20 @@ class ToyEnv(EnvBase):
         return seed
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, next_episode: torch.Tensor | None = None, **kwargs
+        self,
+        tensordict: TensorDictBase | None = None,
+        next_episode: torch.Tensor | None = None,
+        **kwargs,
     ) -> TensorDictBase:
         self.reset_calls += 1
         fresh = self.observation_spec.zero()
         if tensordict is not None and keys.SEED in tensordict:
             again = "_reset" in tensordict
-            following = tensordict[keys.EPISODE] + self.batch_size[0] if next_episode is None else next_episode
+            following = (
+                tensordict[keys.EPISODE] + self.batch_size[0]
+                if next_episode is None
+                else next_episode
+            )
             fresh[keys.SEED] = tensordict[keys.SEED].clone()
             fresh[keys.EPISODE] = following if again else tensordict[keys.EPISODE].clone()
         return fresh.update(self.full_done_spec.zero())
@@ -78,7 +92,9 @@ class ToyEnv(EnvBase):
             {
                 **{keys.SEED: seed, keys.EPISODE: episode, keys.STEP: step + 10},
                 "ego": TensorDict({**driven, "decisions": decisions}, n),
-                "events": TensorDict({**ends, "soft_crash": soft, "soft_crash_behind": 2 * soft}, n),
+                "events": TensorDict(
+                    {**ends, "soft_crash": soft, "soft_crash_behind": 2 * soft}, n
+                ),
                 "reward_terms": TensorDict({"speed": speed, "goal": goal}, n),
                 **{"reward": speed + goal, "done": done, "terminated": done.clone()},
             },
@@ -88,4 +104,6 @@ class ToyEnv(EnvBase):
 
 def always(action: int) -> TensorDictModule:
     """A policy that always takes ``action``."""
-    return TensorDictModule(lambda step: torch.full_like(step, action), in_keys=[keys.STEP], out_keys=["action"])
+    return TensorDictModule(
+        lambda step: torch.full_like(step, action), in_keys=[keys.STEP], out_keys=["action"]
+    )

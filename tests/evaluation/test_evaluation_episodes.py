@@ -1,4 +1,7 @@
-"""Given episodes are run to their own ends; each is what it is alone, whatever drives in the other rows."""
+"""Given episodes are run to their own ends.
+
+Each is what it is alone, whatever drives in the other rows.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,12 @@ from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_driver, make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import GanTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig, ReplayTrafficConfig
+from ganlane.config.traffic import (
+    GanTrafficConfig,
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+    ReplayTrafficConfig,
+)
 from ganlane.data import SyntheticTraffic, synthetic_scenes, write_scene_csv
 from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
@@ -72,7 +80,13 @@ def test_the_policy_acts_deterministically_and_without_gradients_while_progress_
         return torch.zeros_like(step)
 
     policy = TensorDictModule(look, in_keys=["step"], out_keys=["action"])
-    run_episodes(ToyEnv(4), policy, range(6), seed=0, on_progress=lambda done, total: seen.append((done, total)))
+    run_episodes(
+        ToyEnv(4),
+        policy,
+        range(6),
+        seed=0,
+        on_progress=lambda done, total: seen.append((done, total)),
+    )
     assert modes == {(ExplorationType.DETERMINISTIC, False)}
     assert seen == sorted(seen)
     assert seen[-1] == (6, 6)
@@ -85,7 +99,10 @@ def test_an_end_that_the_environment_does_not_name_is_called_other():
             after["events", "goal"].zero_()
             return after
 
-    assert run_episodes(Nameless(1), always(0), [0, 1], seed=0)["reason"].to_list() == ["other", "hard_crash"]
+    assert run_episodes(Nameless(1), always(0), [0, 1], seed=0)["reason"].to_list() == [
+        "other",
+        "hard_crash",
+    ]
 
 
 class Remade:
@@ -102,7 +119,9 @@ class Remade:
 
 
 def alone(make, policy, episodes):
-    """Decisions, reward, distance and end of each episode, driven with nothing beside it and counted by hand."""
+    """Decisions, reward, distance and end of each episode, driven with nothing beside it and
+    counted by hand.
+    """
     env, rows = make(1), []
     for episode in episodes:
         counters = {keys.SEED: torch.tensor([SEED]), keys.EPISODE: torch.tensor([episode])}
@@ -115,7 +134,9 @@ def alone(make, policy, episodes):
         ends = [name for name in keys.END_EVENTS if bool(state["events", name])]
         distance = float(state["ego", "distance"])
         rows.append((episode, decisions, reward, distance, ends[0] if ends else "other"))
-    return pl.DataFrame(rows, schema=["episode", "decisions", "reward", "distance_m", "reason"], orient="row")
+    return pl.DataFrame(
+        rows, schema=["episode", "decisions", "reward", "distance_m", "reason"], orient="row"
+    )
 
 
 def compared(table):
@@ -132,9 +153,13 @@ def recordings(tmp_path_factory):
 def sources(recordings):
     return {
         "recycled": Remade(IdmTrafficConfig(), EnvConfig(goal_m=90.0, recycle=True)),
-        "late sensors": Remade(IdmMobilTrafficConfig(), sensors=SensorParameters(position_noise_m=2.0, delay_s=2.0)),
+        "late sensors": Remade(
+            IdmMobilTrafficConfig(), sensors=SensorParameters(position_noise_m=2.0, delay_s=2.0)
+        ),
         "replayed": Remade(recordings),
-        "cut short": Remade(IdmTrafficConfig(), wrap=lambda env: env.append_transform(StepCounter(max_steps=3))),
+        "cut short": Remade(
+            IdmTrafficConfig(), wrap=lambda env: env.append_transform(StepCounter(max_steps=3))
+        ),
     }
 
 
@@ -144,7 +169,9 @@ def test_every_episode_is_bit_for_bit_what_it_is_alone(name, recordings, monkeyp
     make, driver = sources(recordings)[name], "agent_idm" if name == "late sensors" else "random"
     policy, episodes = make_driver(driver, make.env).policy, [*range(30, 47), 7, 3]
     expected = alone(make, policy, episodes)
-    assert_frame_equal(compared(run_episodes(make(5), policy, episodes, SEED)), expected, check_exact=True)
+    assert_frame_equal(
+        compared(run_episodes(make(5), policy, episodes, SEED)), expected, check_exact=True
+    )
     make.sizes.clear()
     wide = run_episodes(make(17), policy, episodes, SEED, make_smaller=make)
     assert_frame_equal(compared(wide), expected, check_exact=True)
@@ -164,11 +191,15 @@ def test_generated_traffic_is_the_same_up_to_rounding_when_rows_move():
 
 
 @pytest.mark.parametrize("may_move", [True, False])
-def test_the_last_episodes_move_to_ever_smaller_environments_if_the_policy_says_that_they_may(may_move):
+def test_the_last_episodes_move_to_ever_smaller_environments_if_the_policy_says_that_they_may(
+    may_move,
+):
     sizes, policy = [], always(1)
     if may_move:
         policy.rows_must_stay = False
-    frame = run_episodes(ToyEnv(64), policy, range(64), 0, make_smaller=lambda n: sizes.append(n) or ToyEnv(n))
+    frame = run_episodes(
+        ToyEnv(64), policy, range(64), 0, make_smaller=lambda n: sizes.append(n) or ToyEnv(n)
+    )
     assert frame["decisions"].to_list() == [length(0, e) for e in range(64)]
     # Episodes last 3 to 13 decisions; after 8 of them those of 9 to 13 are left.
     assert sizes == ([sum(length(0, e) > 8 for e in range(64))] if may_move else [])
@@ -198,7 +229,9 @@ class Watchful(IdmTraffic):
 def test_rows_stay_and_are_never_driven_on_where_the_traffic_holds_something_per_row():
     traffic, make = Watchful(), Remade(IdmTrafficConfig())
     env, policy = make_env(traffic, SHORT, num_envs=17), make_driver("random", SHORT).policy
-    table = run_episodes(env, policy, range(30), SEED, make_smaller=lambda rows: pytest.fail("moved"))
+    table = run_episodes(
+        env, policy, range(30), SEED, make_smaller=lambda rows: pytest.fail("moved")
+    )
     moved = table.filter(pl.col("duration_s") > 0)["episode"]
     assert set(moved) <= set(traffic.begun) <= set(range(30))
     assert_frame_equal(table, run_episodes(make(17), policy, range(30), SEED), check_exact=True)
@@ -258,7 +291,9 @@ def test_a_rollout_is_the_evaluated_episode_and_comes_back_from_its_actions():
     ],
 )
 def test_where_the_ego_was_hit(other, side):
-    scene = vehicles({"x": 0.0, "y": 0.0, "target_lane": 0}, {"x": 0.0, "y": 0.0, "target_lane": 0, **other})
+    scene = vehicles(
+        {"x": 0.0, "y": 0.0, "target_lane": 0}, {"x": 0.0, "y": 0.0, "target_lane": 0, **other}
+    )
     assert SIDES[int(contact_side(scene, Road()))] == side
 
 

@@ -23,13 +23,20 @@ class Config:
 
 
 def test_numbers_and_their_origin_are_kept(tmp_path):
-    numbers = {"rows": [{"mean_reward": np.float32(1.5), "ci": np.array([1.0, 2.0]), "score": float("nan")}]}
+    numbers = {
+        "rows": [
+            {"mean_reward": np.float32(1.5), "ci": np.array([1.0, 2.0]), "score": float("nan")}
+        ]
+    }
     config = {"evaluate": Config(("mobil",), Path("a/b")), "weight": torch.tensor(2)}
     path = write_results(tmp_path / "run", numbers, config, {"seed": 3, "episodes": range(3)})
     read = json.loads(path.read_text())
     assert path.name == "results.json"
     assert read["rows"] == [{"mean_reward": 1.5, "ci": [1.0, 2.0], "score": None}]
-    assert read["config"] == {"evaluate": {"agents": ["mobil"], "folder": str(Path("a/b"))}, "weight": 2}
+    assert read["config"] == {
+        "evaluate": {"agents": ["mobil"], "folder": str(Path("a/b"))},
+        "weight": 2,
+    }
     assert read["seeds"] == {"seed": 3, "episodes": [0, 1, 2]}
     assert read["code"]["version"] == ganlane.__version__
     assert read["machine"]["torch"] == torch.__version__

@@ -1,4 +1,7 @@
-"""An evaluation's numbers, entry by entry, from hand-made episodes; compared with SciPy and hand-worked values."""
+"""An evaluation's numbers, entry by entry, from hand-made episodes.
+
+Compared with SciPy and hand-worked values.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +26,18 @@ from ganlane.evaluation import (
 
 
 def episodes(agent, rewards, reasons=None, traffic="idm", first=0):
-    """Episodes of 5000 m in 200 s with two lane changes each; three soft crashes in the first of them."""
+    """Episodes of 5000 m in 200 s with two lane changes each.
+
+    Three soft crashes in the first of them.
+    """
     n = len(rewards)
-    same = {"agent": agent, "traffic": traffic, "seed": 7, "soft_crash_behind": 1, "lane_changes": 2}
+    same = {
+        "agent": agent,
+        "traffic": traffic,
+        "seed": 7,
+        "soft_crash_behind": 1,
+        "lane_changes": 2,
+    }
     return pl.DataFrame(
         {
             "episode": range(first, first + n),
@@ -34,12 +46,17 @@ def episodes(agent, rewards, reasons=None, traffic="idm", first=0):
             "reward": [float(reward) for reward in rewards],
             **{"duration_s": [200.0] * n, "distance_m": [5000.0] * n},
         }
-    ).with_columns(had_soft_crash=pl.col("soft_crash") > 0, **{name: pl.lit(value) for name, value in same.items()})
+    ).with_columns(
+        had_soft_crash=pl.col("soft_crash") > 0,
+        **{name: pl.lit(value) for name, value in same.items()},
+    )
 
 
 @pytest.fixture
 def rows():
-    agent = episodes("agent_idm", [20, 24, -80, 26], ["goal", "timeout", "hard_crash", "out_of_road"])
+    agent = episodes(
+        "agent_idm", [20, 24, -80, 26], ["goal", "timeout", "hard_crash", "out_of_road"]
+    )
     mobil = episodes("mobil", [30, 32, 34, 36])
     random_legal = episodes("random_legal", [-10, -8, -6, -4])
     return evaluation_rows(pl.concat([agent, mobil, random_legal]))
@@ -57,7 +74,12 @@ def test_ends_are_counted_once_and_soft_crashes_by_episode(rows):
 
 def test_rates_relate_to_the_distance_of_all_episodes(rows):
     expected = {
-        **{"distance_km": 20.0, "mean_speed_mps": 25.0, "lane_changes_per_km": 8 / 20, "crashes_per_1000_km": 50.0},
+        **{
+            "distance_km": 20.0,
+            "mean_speed_mps": 25.0,
+            "lane_changes_per_km": 8 / 20,
+            "crashes_per_1000_km": 50.0,
+        },
         **{"hard_crash_share": 0.25, "out_of_road_share": 0.25},
     }
     assert {name: rows[0][name] for name in expected} == pytest.approx(expected)
@@ -68,7 +90,9 @@ def test_rates_relate_to_the_distance_of_all_episodes(rows):
 
 def test_the_score_runs_from_random_to_mobil(rows):
     # The agent's mean is -2.5, MOBIL's 33, the random driver's -7.
-    assert [row["normalized_percent"] for row in rows] == pytest.approx([100 * 4.5 / 40, 100.0, 0.0])
+    assert [row["normalized_percent"] for row in rows] == pytest.approx(
+        [100 * 4.5 / 40, 100.0, 0.0]
+    )
     assert rows[1]["normalized_percent_ci"] == pytest.approx([100.0, 100.0])
 
 
@@ -83,7 +107,10 @@ def test_the_form_of_the_score_fits_both_rows_of_the_papers_table_and_needs_a_sc
 
 
 def test_the_score_is_computed_on_shared_episodes_whatever_their_order():
-    mobil, random_legal = episodes("mobil", [30, 32, 34, 36]), episodes("random_legal", [0, 2, 4, 6])
+    mobil, random_legal = (
+        episodes("mobil", [30, 32, 34, 36]),
+        episodes("random_legal", [0, 2, 4, 6]),
+    )
     agent = episodes("a", [15, 17, 19, 21])
     straight = evaluation_rows(pl.concat([agent, mobil, random_legal]))[0]
     turned = evaluation_rows(pl.concat([agent.reverse(), mobil, random_legal.reverse()]))[0]
@@ -93,7 +120,9 @@ def test_the_score_is_computed_on_shared_episodes_whatever_their_order():
 
 
 def test_without_the_drivers_of_the_scale_a_reason_replaces_the_score_and_nobody_leads_mobil():
-    rows = evaluation_rows(pl.concat([episodes("a", [1, 2, 3], traffic=name) for name in ("idm", "gan")]))
+    rows = evaluation_rows(
+        pl.concat([episodes("a", [1, 2, 3], traffic=name) for name in ("idm", "gan")])
+    )
     assert [row["traffic"] for row in rows] == ["idm", "gan"]
     assert rows[0]["normalized_percent"] is rows[0]["minus_mobil"] is None
     assert "mobil is missing" in rows[0]["normalized_percent_reason"]
@@ -121,13 +150,21 @@ def test_the_lead_over_mobil_is_paired_by_episode_whatever_their_order():
 
 
 def test_resamples_without_a_lead_do_not_spoil_the_interval():
-    """In one of the four episodes MOBIL leads by nothing; a resample of that one alone has no scale."""
-    mobil, random_legal, agent = [10.0, 20.0, 30.0, 40.0], [10.0, 0.0, 0.0, 0.0], [10.0, 10.0, 15.0, 20.0]
+    """In one of the four episodes MOBIL leads by nothing.
+
+    A resample of that one alone has no scale.
+    """
+    mobil, random_legal, agent = (
+        [10.0, 20.0, 30.0, 40.0],
+        [10.0, 0.0, 0.0, 0.0],
+        [10.0, 10.0, 15.0, 20.0],
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         score = normalized_percent(agent, mobil, random_legal, resamples=4000)
     assert score.percent == pytest.approx(100.0 * 45.0 / 90.0)
-    # In the other episodes the agent is half way from random to MOBIL, and where all are equal it changes nothing.
+    # In the other episodes the agent is half way from random to MOBIL, and where all are equal it
+    # changes nothing.
     assert score.interval == pytest.approx([50.0, 50.0])
 
 
@@ -137,9 +174,16 @@ def test_the_lead_is_the_mean_difference_with_scipys_interval():
     rewards = {"trained": common + generator.normal(6.0, 15.0, 120), "mobil": common}
     (row,) = paired_rows(pl.concat([episodes(*each, traffic="gan") for each in rewards.items()]))
     difference = rewards["trained"] - rewards["mobil"]
-    expected = stats.bootstrap((difference,), np.mean, n_resamples=10_000, method="BCa", random_state=1)
+    expected = stats.bootstrap(
+        (difference,), np.mean, n_resamples=10_000, method="BCa", random_state=1
+    )
     low, high = expected.confidence_interval
-    assert (row["agent"], row["over"], row["traffic"], row["episodes"]) == ("trained", "mobil", "gan", 120)
+    assert (row["agent"], row["over"], row["traffic"], row["episodes"]) == (
+        "trained",
+        "mobil",
+        "gan",
+        120,
+    )
     assert row["lead"] == pytest.approx(difference.mean())
     assert row["lead_ci"] == pytest.approx([low, high], abs=0.05 * (high - low))
     assert row["verdict"] == "above"
@@ -165,7 +209,9 @@ def test_only_episodes_that_both_drove_count_in_whatever_order_and_an_interval_t
     other = episodes("mobil", [10.0, 20.0, 30.0, 99.0], first=2).reverse()
     (row,) = paired_rows(pl.concat([episodes("a", [-50.0, -60.0, 12.0, 24.0, 36.0]), other]))
     assert (row["episodes"], row["lead"]) == (3, pytest.approx(4.0))
-    (row,) = paired_rows(pl.concat([episodes("a", [1.0, -1.0, 2.0, -2.0]), episodes("b", [0.0, 0.0, 0.0, 0.1])]))
+    (row,) = paired_rows(
+        pl.concat([episodes("a", [1.0, -1.0, 2.0, -2.0]), episodes("b", [0.0, 0.0, 0.0, 0.1])])
+    )
     assert row["lead_ci"][0] < 0.0 < row["lead_ci"][1]
     assert row["verdict"] == "undecided"
 
@@ -190,15 +236,24 @@ def test_the_table_gives_the_sign_the_interval_and_the_verdict():
 
 def recorded(*rows: tuple[str, int, int, float]) -> tuple[pl.DataFrame, list[str]]:
     """(scene, episodes, crashes, m per episode) as episodes and their scenes."""
-    each = [(scene, number < crashes, metres) for scene, count, crashes, metres in rows for number in range(count)]
+    each = [
+        (scene, number < crashes, metres)
+        for scene, count, crashes, metres in rows
+        for number in range(count)
+    ]
     ends = [("hard_crash" if crashed else "scene_end", metres) for _, crashed, metres in each]
-    return pl.DataFrame(ends, schema=["reason", "distance_m"], orient="row"), [scene for scene, *_ in each]
+    return pl.DataFrame(ends, schema=["reason", "distance_m"], orient="row"), [
+        scene for scene, *_ in each
+    ]
 
 
 def test_the_rate_is_all_crashes_over_all_kilometres():
     found = crashes_by_scene(*recorded(("b", 10, 1, 100.0), ("a", 5, 3, 400.0)))
     assert found.per_km.value == pytest.approx(4 / 3.0)
-    assert [(row["scene"], row["episodes"], row["hard_crash"]) for row in found.rows] == [("a", 5, 3), ("b", 10, 1)]
+    assert [(row["scene"], row["episodes"], row["hard_crash"]) for row in found.rows] == [
+        ("a", 5, 3),
+        ("b", 10, 1),
+    ]
     assert [row["distance_km"] for row in found.rows] == pytest.approx([2.0, 1.0])
     assert [row["crashes_per_km"] for row in found.rows] == pytest.approx([1.5, 1.0])
     # Garwood's exact bounds for one event: 0.0253 and 5.572.
@@ -209,7 +264,9 @@ def test_the_interval_is_that_of_all_resamples_of_the_scenes():
     scenes = [("a", 10, 2, 100.0), ("b", 10, 0, 300.0), ("c", 10, 5, 200.0)]
     crashes, km = np.array([2.0, 0.0, 5.0]), np.array([1.0, 3.0, 2.0])
     # All 27 resamples of three scenes are equally likely.
-    ratios = [crashes[list(drawn)].sum() / km[list(drawn)].sum() for drawn in product(range(3), repeat=3)]
+    ratios = [
+        crashes[list(drawn)].sum() / km[list(drawn)].sum() for drawn in product(range(3), repeat=3)
+    ]
     low, high = np.quantile(np.repeat(ratios, 1000), [0.025, 0.975])
     found = crashes_by_scene(*recorded(*scenes)).per_km
     assert (found.low, found.high) == pytest.approx((low, high))
@@ -217,8 +274,12 @@ def test_the_interval_is_that_of_all_resamples_of_the_scenes():
 
 
 def test_more_episodes_of_the_same_scenes_do_not_narrow_the_interval_and_no_crash_is_not_certainty():
-    few = crashes_by_scene(*recorded(("a", 10, 2, 100.0), ("b", 10, 1, 300.0), ("c", 10, 5, 200.0))).per_km
-    many = crashes_by_scene(*recorded(("a", 100, 20, 100.0), ("b", 100, 10, 300.0), ("c", 100, 50, 200.0))).per_km
+    few = crashes_by_scene(
+        *recorded(("a", 10, 2, 100.0), ("b", 10, 1, 300.0), ("c", 10, 5, 200.0))
+    ).per_km
+    many = crashes_by_scene(
+        *recorded(("a", 100, 20, 100.0), ("b", 100, 10, 300.0), ("c", 100, 50, 200.0))
+    ).per_km
     assert (few.low, few.high) == pytest.approx((many.low, many.high))
     found = crashes_by_scene(*recorded(("a", 10, 0, 100.0), ("b", 10, 0, 100.0))).per_km
     assert (found.value, found.low) == (0.0, 0.0)
@@ -242,5 +303,11 @@ def test_what_does_not_fit_together_is_refused():
 
 def test_every_failure_is_listed_with_its_seed_and_episode():
     table = episodes("mobil", [0, 0, 0], ["hard_crash", "goal", "out_of_road"], "gan")
-    expected = {"driver": "mobil", "traffic": "gan", "seed": 7, "hard_crash": [0], "out_of_road": [2]}
+    expected = {
+        "driver": "mobil",
+        "traffic": "gan",
+        "seed": 7,
+        "hard_crash": [0],
+        "out_of_road": [2],
+    }
     assert failed_episodes(table) == [expected]

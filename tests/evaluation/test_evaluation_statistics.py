@@ -37,11 +37,17 @@ def test_the_interval_is_scipys_bca_and_repeats_with_its_seed():
     # Returns as they look here: most near 260, a few crashes far below.
     skewed = np.where(generator.random(200) < 0.08, -20.0, 260.0) + generator.normal(0, 20, 200)
     ours = mean_interval(skewed)
-    theirs = stats.bootstrap((skewed,), np.mean, n_resamples=10_000, method="BCa", random_state=5).confidence_interval
+    theirs = stats.bootstrap(
+        (skewed,), np.mean, n_resamples=10_000, method="BCa", random_state=5
+    ).confidence_interval
     width = theirs.high - theirs.low
     assert ours.value == pytest.approx(skewed.mean())
     assert ours.interval == pytest.approx([theirs.low, theirs.high], abs=0.04 * width)
-    assert mean_interval(skewed, seed=4) == mean_interval(skewed, seed=4) != mean_interval(skewed, seed=5)
+    assert (
+        mean_interval(skewed, seed=4)
+        == mean_interval(skewed, seed=4)
+        != mean_interval(skewed, seed=5)
+    )
 
 
 def test_the_95_percent_interval_covers_the_mean_about_95_times_in_a_hundred():
@@ -64,7 +70,11 @@ def test_an_estimate_is_scaled_with_its_bounds_and_gives_a_rows_entries():
     assert rate.interval == pytest.approx([1.623 / 2.5, 11.668 / 2.5], abs=1e-3)
     assert Estimate(4.0).scaled(0.5) == Estimate(2.0)
     assert entries("rate", Estimate(2.0, 1.0, 3.0)) == {"rate": 2.0, "rate_ci": [1.0, 3.0]}
-    assert entries("rate", None) == entries("rate", Estimate(float("nan"))) == {"rate": None, "rate_ci": None}
+    assert (
+        entries("rate", None)
+        == entries("rate", Estimate(float("nan")))
+        == {"rate": None, "rate_ci": None}
+    )
 
 
 def test_pairing_removes_what_the_episodes_have_in_common():
@@ -85,16 +95,21 @@ def test_the_binomial_interval_agrees_with_scipy(data):
     trials = data.draw(st.integers(1, 2000))
     count = data.draw(st.integers(0, trials))
     theirs = stats.binomtest(count, trials).proportion_ci(0.95, "exact")
-    assert clopper_pearson(count, trials).interval == pytest.approx([theirs.low, theirs.high], abs=1e-9)
+    assert clopper_pearson(count, trials).interval == pytest.approx(
+        [theirs.low, theirs.high], abs=1e-9
+    )
 
 
-@pytest.mark.parametrize(("count", "bounds"), [(0, [0.0, 1 - 0.025 ** (1 / 50)]), (50, [0.025 ** (1 / 50), 1.0])])
+@pytest.mark.parametrize(
+    ("count", "bounds"), [(0, [0.0, 1 - 0.025 ** (1 / 50)]), (50, [0.025 ** (1 / 50), 1.0])]
+)
 def test_none_and_all_of_fifty_have_bounds_in_closed_form(count, bounds):
     assert clopper_pearson(count, 50).interval == pytest.approx(bounds)
 
 
 @pytest.mark.parametrize(
-    ("count", "low", "high"), [(0, 0.0, 3.689), (1, 0.025, 5.572), (5, 1.623, 11.668), (10, 4.795, 18.390)]
+    ("count", "low", "high"),
+    [(0, 0.0, 3.689), (1, 0.025, 5.572), (5, 1.623, 11.668), (10, 4.795, 18.390)],
 )
 def test_the_poisson_interval_is_garwoods_table(count, low, high):
     assert poisson_interval(count).interval == pytest.approx([low, high], abs=1e-3)
@@ -104,7 +119,9 @@ def test_the_poisson_interval_is_garwoods_table(count, low, high):
 
 
 def scores(trainings, episodes, between=0.0, shared=0.0, own=0.0, seed=0):
-    """Scores [S, E] that vary between trainings, between episodes (alike for all trainings), and otherwise."""
+    """Scores [S, E] that vary between trainings, between episodes (alike for all trainings), and
+    otherwise.
+    """
     generator = np.random.default_rng(seed)
     of_training = between * generator.normal(size=(trainings, 1))
     of_episode = shared * generator.normal(size=(1, episodes))
@@ -121,7 +138,9 @@ def test_the_interquartile_mean_is_that_of_the_middle_half():
     assert interquartile_mean([[1.0, 3.0], [5.0, 7.0]]) == pytest.approx([2.0, 6.0])
 
 
-@pytest.mark.parametrize("table", [scores(1, 400, own=10.0), scores(200, 1, between=3.0)], ids=["one", "many"])
+@pytest.mark.parametrize(
+    "table", [scores(1, 400, own=10.0), scores(200, 1, between=3.0)], ids=["one", "many"]
+)
 def test_one_training_has_the_interval_of_its_episodes_and_one_episode_that_of_its_trainings(table):
     estimate = over_trainings(table)
     assert estimate.value == pytest.approx(table.mean())
@@ -144,7 +163,10 @@ def test_a_recipe_whose_trainings_differ_has_a_wider_interval_than_its_episodes_
 @pytest.mark.parametrize("between", [0.0, 2.0, 20.0])
 @pytest.mark.parametrize("trainings", [3, 5])
 def test_an_interval_holds_the_truth_in_95_of_100_recipes(trainings, between):
-    tables = [scores(trainings, 100, between=between, shared=10.0, own=10.0, seed=seed) for seed in range(200)]
+    tables = [
+        scores(trainings, 100, between=between, shared=10.0, own=10.0, seed=seed)
+        for seed in range(200)
+    ]
     held = [estimate.low <= 0.0 <= estimate.high for estimate in map(over_trainings, tables)]
     # The plain bootstrap of three holds it in three quarters of them where trainings differ by 20.
     assert 0.91 <= np.mean(held) <= 0.99
@@ -159,7 +181,9 @@ def test_a_difference_pairs_the_episodes_and_resamples_the_trainings_of_both():
     first, second = scores(6, 1, between=1.0), scores(6, 1, between=1.0, seed=2)
     theirs = stats.ttest_ind(first[:, 0], second[:, 0], equal_var=False).confidence_interval()
     ours = difference(first, second)
-    assert ours.interval == pytest.approx([theirs.low, theirs.high], abs=0.1 * (theirs.high - theirs.low))
+    assert ours.interval == pytest.approx(
+        [theirs.low, theirs.high], abs=0.1 * (theirs.high - theirs.low)
+    )
 
 
 def test_the_probability_of_improvement_is_the_share_of_pairs():
@@ -169,7 +193,10 @@ def test_the_probability_of_improvement_is_the_share_of_pairs():
     first, second = [[1.0], [3.0], [2.0]], [[2.0], [0.0]]
     # Above 2: the 3, and half of the tie; above 0: all three.
     assert probability_of_improvement(first, second).value == pytest.approx((1.5 + 3) / 6)
-    a, b = np.random.default_rng(0).normal(size=(7, 3)), np.random.default_rng(1).normal(size=(9, 3))
+    a, b = (
+        np.random.default_rng(0).normal(size=(7, 3)),
+        np.random.default_rng(1).normal(size=(9, 3)),
+    )
     u = stats.mannwhitneyu(a.mean(axis=1), b.mean(axis=1)).statistic
     assert probability_of_improvement(a, b).value == pytest.approx(u / 63)
 
@@ -199,7 +226,9 @@ def test_mcnemar_counts_the_episodes_in_which_the_drivers_differ():
 
 def test_what_is_no_table_and_other_episodes_are_refused():
     for wrong in ([1.0, 2.0], [[]]):
-        with pytest.raises(ValueError, match=r"expected a table of trainings and episodes, \[S, E\]"):
+        with pytest.raises(
+            ValueError, match=r"expected a table of trainings and episodes, \[S, E\]"
+        ):
             over_trainings(wrong)
     with pytest.raises(ValueError, match="same episodes"):
         difference(np.zeros((2, 3)), np.zeros((2, 4)))

@@ -22,7 +22,13 @@ from ganlane.generator.checkpoint import (
     shipped_generator,
 )
 from ganlane.generator.fit import split_for_fit
-from ganlane.generator.forecasts import BASELINE, paper_forecasts, repeated, rollout_errors, scene_metrics
+from ganlane.generator.forecasts import (
+    BASELINE,
+    paper_forecasts,
+    repeated,
+    rollout_errors,
+    scene_metrics,
+)
 from ganlane.generator.windows import cut_windows, group_windows, scene_tracks
 from ganlane.parameters.generator import CalibratedConfig, PaperConfig
 from ganlane.weights import save_weights
@@ -31,9 +37,14 @@ CONFIGS = {"paper": PaperConfig(), "calibrated": CalibratedConfig()}
 
 
 def test_save_and_load_give_the_same_network_and_its_description(tmp_path):
-    path, config = tmp_path / "generator.safetensors", json.loads(json.dumps(asdict(CONFIGS["paper"])))
+    path, config = (
+        tmp_path / "generator.safetensors",
+        json.loads(json.dumps(asdict(CONFIGS["paper"]))),
+    )
     module, metrics, statistics = small_generator(), {"all": {"ade_m/mean": 0.5}}, {"headway": {}}
-    FitResult("paper", module, metrics, config, {"file": "a.csv"}, statistics, 7, 1.25).save(path, {"splits": []})
+    FitResult("paper", module, metrics, config, {"file": "a.csv"}, statistics, 7, 1.25).save(
+        path, {"splits": []}
+    )
     generator, metadata = load_generator(path, "paper")
     for name, tensor in module.state_dict().items():
         assert (generator.state_dict()[name] == tensor).all(), name
@@ -61,7 +72,12 @@ def test_wrong_checkpoints_are_refused_in_one_sentence(tmp_path):
         ({"preset": "calibrated"}, "calibrated", "further inputs"),
         ({}, "paper", "no driving statistics"),
     ):
-        given = {"kind": "generator", "preset": "paper", "sizes": sizes, "tensors": small_generator().state_dict()}
+        given = {
+            "kind": "generator",
+            "preset": "paper",
+            "sizes": sizes,
+            "tensors": small_generator().state_dict(),
+        }
         given |= wrong
         save_weights(path, given.pop("kind"), given.pop("tensors"), given)
         with pytest.raises(UserError, match=message):
@@ -83,14 +99,18 @@ def test_the_shipped_weights_are_of_the_default_settings_and_beat_constant_veloc
     assert 0 < metadata["metrics"]["fit"]["seconds"] < 1800
     held_out = metadata["metrics"]["all"]
     for name, share in most.items():
-        assert held_out[name] < share * held_out[f"{name.partition('/')[0]}/constant_velocity"], name
+        assert held_out[name] < share * held_out[f"{name.partition('/')[0]}/constant_velocity"], (
+            name
+        )
 
 
 @pytest.mark.parametrize(
     ("preset", "least"),
     [("paper", {"mean": 15, "single": 5, "best_of_20": 35}), ("calibrated", {"mean": 9})],
 )
-def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in_the_docs(preset, least):
+def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in_the_docs(
+    preset, least
+):
     folds = load_generator(shipped_generator(preset), preset)[1]["folds"]
     scores = folds["open_loop"]
     for kind, percent in least.items():
@@ -104,10 +124,18 @@ def test_pooled_over_folds_the_errors_stay_under_constant_velocitys_and_stand_in
         assert folds["rollout"]["tracks"] > 400
         assert folds["rollout"]["ratio_to_constant_velocity"]["mean"] <= 0.75
     page = (Path(__file__).parents[2] / "docs" / "generator_results.md").read_text()
-    for kind, text in (("mean", "mean prediction"), ("single", "a single sample"), ("best_of_20", "best of 20")):
-        row = next(line for line in page.splitlines() if line.startswith(f"| `generator_{preset}`, {text}"))
+    for kind, text in (
+        ("mean", "mean prediction"),
+        ("single", "a single sample"),
+        ("best_of_20", "best of 20"),
+    ):
+        row = next(
+            line for line in page.splitlines() if line.startswith(f"| `generator_{preset}`, {text}")
+        )
         figures = (f"{scores['ade_m'][kind]:.3f}", f"{scores['fde_m'][kind]:.3f}")
-        assert all(figure in row for figure in (*figures, f"{scores['ade_change_percent'][kind]:+.1f} %"))
+        assert all(
+            figure in row for figure in (*figures, f"{scores['ade_change_percent'][kind]:+.1f} %")
+        )
 
 
 @pytest.fixture(scope="module")
@@ -122,14 +150,19 @@ def recordings():
 def test_the_stated_errors_are_those_of_the_shipped_weights(preset, recordings):
     generator, metadata = load_generator(shipped_generator(preset), preset)
     config = CONFIGS[preset]
-    held_out = split_for_fit(scene_tracks(recordings), tuple(metadata["data"]["held_out"])).held_out[:1]
+    held_out = split_for_fit(
+        scene_tracks(recordings), tuple(metadata["data"]["held_out"])
+    ).held_out[:1]
     stated = metadata["metrics"][held_out[0].name]
     if preset == "paper":
         windows = cut_windows(held_out, config.held_out_stride)
         groups = group_windows(windows, config.group_size, config.seed)
         forecasts = paper_forecasts(generator, windows, groups, samples=0)
         forecasts[BASELINE] = repeated(windows.past[:, -1], 8)
-        measured, names = scene_metrics(windows, forecasts)["all"], ("fde_m/mean", "ade_m/constant_velocity")
+        measured, names = (
+            scene_metrics(windows, forecasts)["all"],
+            ("fde_m/mean", "ade_m/constant_velocity"),
+        )
     else:
         measured = rollout_errors(generator, held_out, config)["all"]
         names = ("end_m/mean", "end_m/constant_velocity")
@@ -169,7 +202,12 @@ def test_where_the_cache_is_and_that_it_may_be_off_or_unwritable(monkeypatch, tm
 
 def test_the_hash_sees_settings_values_shapes_and_types():
     values = np.arange(6.0)
-    other = [(values + 1e-9,), (values.reshape(2, 3),), (values.astype(np.float32),), (values, values)]
+    other = [
+        (values + 1e-9,),
+        (values.reshape(2, 3),),
+        (values.astype(np.float32),),
+        (values, values),
+    ]
     hashes = {
         content_hash({"size": 8}, values),
         *(content_hash({"size": 9}, *given) for given in [(values,), *other]),

@@ -21,8 +21,15 @@ ROAD = Road(3, 4.0)
 def vehicles(x, y=None, speed=20.0, desired=25.0, target=None):
     y = [0.0] * len(x) if y is None else y
     target = [round(at / 4.0) for at in y] if target is None else target
-    same = {"speed": speed, "desired_speed": desired, "width": 2.0, "visibility": int(Visibility.BODY)}
-    return placed(*({"x": a, "y": b, "target_lane": lane, **same} for a, b, lane in zip(x, y, target)))
+    same = {
+        "speed": speed,
+        "desired_speed": desired,
+        "width": 2.0,
+        "visibility": int(Visibility.BODY),
+    }
+    return placed(
+        *({"x": a, "y": b, "target_lane": lane, **same} for a, b, lane in zip(x, y, target))
+    )
 
 
 def silent_generator() -> Generator:
@@ -46,7 +53,9 @@ def test_without_a_residual_a_follower_settles_at_its_own_equilibrium_gap():
     state, _ = drive(silent_generator(), state, 60)
     gap = state.x[0, 1] - state.x[0, 0] - 4.5
     own = IdmParameters(headway_s=1.27)
-    assert gap.item() == pytest.approx(equilibrium_gap(state.speed[0, 0], 25.0, own).item(), rel=0.02)
+    assert gap.item() == pytest.approx(
+        equilibrium_gap(state.speed[0, 0], 25.0, own).item(), rel=0.02
+    )
 
 
 def test_without_a_residual_a_lane_change_arrives_and_does_not_overshoot():
@@ -85,7 +94,11 @@ def test_a_network_that_always_pushes_sideways_does_not_push_the_body_out_of_its
 
 
 def test_only_what_pushes_outwards_is_left_out():
-    offset, still, room = torch.tensor([-1.0, -1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 0.0, 2.0]), torch.tensor(0.8)
+    offset, still, room = (
+        torch.tensor([-1.0, -1.0, 0.0, 0.0]),
+        torch.tensor([0.0, 0.0, 0.0, 2.0]),
+        torch.tensor(0.8),
+    )
     push = torch.tensor([0.5, -0.5, 0.5, 0.5])
     allowed = closed_loop.inside_lane(push, offset, still, room, damping=1.1)
     torch.testing.assert_close(allowed, torch.tensor([0.0, -0.5, 0.5, 0.0]))
@@ -93,7 +106,9 @@ def test_only_what_pushes_outwards_is_left_out():
 
 def test_nobody_rolls_back_or_slides_sideways():
     state = vehicles([0.0, 0.0], speed=0.0)
-    after = closed_loop.moved_by(state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double())
+    after = closed_loop.moved_by(
+        state, torch.tensor([[-3.0, 10.0]]).double(), torch.tensor([[2.0, 9.0]]).double()
+    )
     assert (after.x[0, 0].item(), after.y[0, 0].item()) == (0.0, 0.0)
     assert (after.y[0, 1].item(), after.heading[0, 1].item()) == pytest.approx(
         (closed_loop.STEEPEST, math.atan(closed_loop.STEEPEST))
@@ -102,7 +117,9 @@ def test_nobody_rolls_back_or_slides_sideways():
 
 def test_speed_and_heading_carry_the_whole_displacement():
     state = vehicles([100.0, 200.0])
-    after = closed_loop.moved_by(state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double())
+    after = closed_loop.moved_by(
+        state, torch.tensor([[20.0, 7.0]]).double(), torch.tensor([[0.4, -1.0]]).double()
+    )
     step = torch.stack([after.x - state.x, after.y - state.y], dim=-1)
     torch.testing.assert_close(closed_loop.displacement_of(after), step, atol=1e-8, rtol=1e-8)
 
@@ -121,15 +138,25 @@ def test_the_latent_vector_stays_standard_normal_and_forgets_in_its_period():
 def test_headways_have_the_quantiles_asked_for():
     headways = closed_loop.headway_from_uniform((torch.arange(100000) + 0.5) / 100000)
     quantiles = headways.quantile(torch.tensor([0.05, 0.25, 0.5, 0.75, 0.95]))
-    torch.testing.assert_close(quantiles, torch.tensor(closed_loop.HEADWAY_QUANTILES_S), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        quantiles, torch.tensor(closed_loop.HEADWAY_QUANTILES_S), atol=1e-3, rtol=0
+    )
 
 
 @pytest.mark.parametrize("execute_k", [1, 3])
 def test_the_paper_drives_the_first_k_predictions_before_planning_anew(execute_k):
-    generator, state = small_generator().double().requires_grad_(False), vehicles([0.0, 25.0], y=[0.0, 4.0])
-    history, noise = closed_loop.start(generator, closed_loop.displacement_of(state)), torch.randn(1, 2, 4).double()
+    generator, state = (
+        small_generator().double().requires_grad_(False),
+        vehicles([0.0, 25.0], y=[0.0, 4.0]),
+    )
+    history, noise = (
+        closed_loop.start(generator, closed_loop.displacement_of(state)),
+        torch.randn(1, 2, 4).double(),
+    )
     past = closed_loop.displacement_of(state)[..., None, :].expand(1, 2, 8, 2)
-    predicted = generator(generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise)
+    predicted = generator(
+        generator.observe(past, torch.stack([state.x, state.y], -1), state.valid), noise
+    )
     plan = (
         closed_loop.Plan(torch.zeros(1, 2, 3, 2).double(), torch.zeros(1, 2, dtype=torch.long))
         if execute_k > 1
@@ -176,7 +203,9 @@ def test_a_rollout_is_the_same_with_more_padding(segments, generator):
         length=pad(segments.length, (0, 4), value=1.0),
         width=pad(segments.width, (0, 4), value=1.0),
     )
-    torch.testing.assert_close(typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments))
+    torch.testing.assert_close(
+        typical_rollout(generator, wide)[:, :, :7], typical_rollout(generator, segments)
+    )
 
 
 def test_vehicles_that_come_later_start_when_they_appear_and_are_not_scored(scenes, generator):
@@ -212,7 +241,10 @@ def test_nothing_of_the_future_enters_an_evaluation(segments, generator):
 
 
 def test_sampled_driver_params_are_above_the_present_speed_and_repeatable(segments):
-    one, other = (closed_loop.driver_params(segments, random=torch.Generator().manual_seed(4)) for _ in range(2))
+    one, other = (
+        closed_loop.driver_params(segments, random=torch.Generator().manual_seed(4))
+        for _ in range(2)
+    )
     assert all((a == b).all() for a, b in zip(one, other))
     speed = (segments.positions[:, 8] - segments.positions[:, 7]).norm(dim=-1) * 10
     assert (one[1] > speed + 0.99).all()

@@ -1,4 +1,7 @@
-"""``ganlane train_generator`` in process: on recordings as they are published, with folds, resuming and ablations."""
+"""``ganlane train_generator`` in process.
+
+On recordings as they are published, with folds, resuming and ablations.
+"""
 
 import json
 from pathlib import Path
@@ -16,7 +19,12 @@ from ganlane.prepare import main as prepare
 from ganlane.realism.starts import check_folds_cover, fold_weights
 from ganlane.train_generator import main
 
-FEW = ["generator.loop.updates=2", "generator.loop.evaluate_every=1", "generator.batch=4", "generator.stride=6"]
+FEW = [
+    "generator.loop.updates=2",
+    "generator.loop.evaluate_every=1",
+    "generator.batch=4",
+    "generator.stride=6",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +48,11 @@ def run(*arguments: str, folder: str = "fit") -> dict:
     _, metadata = load_generator(Path(folder) / "generator_paper.safetensors", "paper")
     results = json.loads((Path(folder) / "results.json").read_text())
     assert metadata["data"] == results["data"]
-    assert results["ade_m"].keys() == results["fde_m"].keys() == {"mean", "single", "best_of_20", "constant_velocity"}
+    assert (
+        results["ade_m"].keys()
+        == results["fde_m"].keys()
+        == {"mean", "single", "best_of_20", "constant_velocity"}
+    )
     return results
 
 
@@ -96,9 +108,15 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared
     scenes = traffic(scenes=3).partition_by("scene", maintain_order=True)
     rows = pl.concat(ngsim_rows(scene, START_MS + 900_000 * k) for k, scene in enumerate(scenes))
     with Server(content=portal_csv(rows).encode()) as server:
-        fetched = run("data=ngsim", "data.path=got.csv", "data.download=true", f"data.url={server.url}")
+        fetched = run(
+            "data=ngsim", "data.path=got.csv", "data.download=true", f"data.url={server.url}"
+        )
     data = fetched["data"]
-    assert (data["fitted"], data["validation"], data["held_out"]) == (["us-101-3"], ["us-101-1"], ["us-101-2"])
+    assert (data["fitted"], data["validation"], data["held_out"]) == (
+        ["us-101-3"],
+        ["us-101-1"],
+        ["us-101-2"],
+    )
     assert (data["file"], data["rows"], data["tracks"]) == ("got.csv", 3 * 9 * 60, 27)
     assert prepare(["data=ngsim", "data.path=got.csv", "out=prepared"]) == 0
     prepared = run("data.path=prepared")
@@ -111,7 +129,10 @@ def test_the_periods_of_an_ngsim_file_are_the_scenes_whether_fetched_or_prepared
     ("arguments", "part"),
     [
         (["data=ngsim"], "data=ngsim: which file is missing; give data.path=FILE."),
-        (["data=ngsim", "data.path=one.txt"], "recordings of one scene, one-1: one has to be fitted to and another"),
+        (
+            ["data=ngsim", "data.path=one.txt"],
+            "recordings of one scene, one-1: one has to be fitted to and another",
+        ),
         (["data=ngsim", "data.path=cut.txt"], "cut.txt, line 200"),
         (["data.path=recordings.csv", "data.held_out=[moon]"], "moon"),
         (["data.path=recordings.csv", "folds=1"], "folds=1"),

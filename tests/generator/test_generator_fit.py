@@ -32,7 +32,10 @@ def scenes():
         synthetic_scenes(SyntheticTraffic(scenes=1, vehicles=6, seconds=2.5 + number), seed=number)
         for number in range(7)
     ]
-    return [replace(scene_tracks(frame)[0], name=f"scene-{number}") for number, frame in enumerate(frames)]
+    return [
+        replace(scene_tracks(frame)[0], name=f"scene-{number}")
+        for number, frame in enumerate(frames)
+    ]
 
 
 @pytest.mark.parametrize("folds", [2, 3, 5, 7])
@@ -49,7 +52,9 @@ def test_reported_scenes_have_no_say_in_when_to_stop(scenes):
     for held_out in assign_folds(scenes, 3):
         split = split_for_fit(scenes, held_out)
         names = split.names
-        assert sorted(name for part in names.values() for name in part) == [scene.name for scene in scenes]
+        assert sorted(name for part in names.values() for name in part) == [
+            scene.name for scene in scenes
+        ]
         assert tuple(names["held_out"]) == held_out
         held = sum(map(count_windows, split.validation))
         total = held + sum(map(count_windows, split.fitted))
@@ -58,7 +63,11 @@ def test_reported_scenes_have_no_say_in_when_to_stop(scenes):
 
 def test_a_single_other_scene_is_fitted_to_and_chooses_when_to_stop(scenes):
     split = split_for_fit(scenes[:2], ("scene-1",))
-    assert split.names == {"fitted": ["scene-0"], "validation": ["scene-0"], "held_out": ["scene-1"]}
+    assert split.names == {
+        "fitted": ["scene-0"],
+        "validation": ["scene-0"],
+        "held_out": ["scene-1"],
+    }
 
 
 def test_more_folds_than_scenes_and_splits_without_two_parts_are_refused(scenes):
@@ -102,26 +111,40 @@ def scored(frame, folder):
     results = {}
     for config in (PAPER, CALIBRATED):
         fits = {}
-        scores = cross_validate(frame, config, 3, folder, on_fold=fits.__setitem__, source="folder/made.csv")
+        scores = cross_validate(
+            frame, config, 3, folder, on_fold=fits.__setitem__, source="folder/made.csv"
+        )
         results[config.preset] = scores, fits
     return results
 
 
 def test_every_scene_is_forecast_once_by_a_generator_that_never_saw_it(scored):
     scores, _ = scored["paper"]
-    assert {name for split in scores["splits"] for name in split["held_out"]} == set(scores["open_loop"]["scenes"])
+    assert {name for split in scores["splits"] for name in split["held_out"]} == set(
+        scores["open_loop"]["scenes"]
+    )
     for split in scores["splits"]:
         assert not set(split["held_out"]) & {*split["fitted"], *split["validation"]}
     pooled = scores["open_loop"]
     assert pooled["windows"] == sum(row["windows"] for row in pooled["folds"].values()) > 0
-    kinds = {"mean", "single", "best_of_20", "constant_velocity", "constant_acceleration", "ridge", "idm"}
+    kinds = {
+        "mean",
+        "single",
+        "best_of_20",
+        "constant_velocity",
+        "constant_acceleration",
+        "ridge",
+        "idm",
+    }
     assert kinds <= set(pooled["ade_m"])
     assert "best_of_20" in fold_tables(scores)
 
 
 def test_what_is_fitted_is_not_fitted_again_and_gives_the_same(frame, folder, scored):
     updates, fits = [], {}
-    scores = cross_validate(frame, PAPER, 3, folder, on_progress=updates.append, on_fold=fits.__setitem__)
+    scores = cross_validate(
+        frame, PAPER, 3, folder, on_progress=updates.append, on_fold=fits.__setitem__
+    )
     first, first_fits = scored["paper"]
     assert scores == first
     assert not updates
@@ -149,9 +172,14 @@ def test_the_folds_generators_name_the_scenes_they_were_fitted_to(preset, frame,
     for fit, split in zip(fits.values(), scores["splits"]):
         fit.save(tmp_path / "fold.safetensors")
         _, metadata = load_generator(tmp_path / "fold.safetensors", preset)
-        assert (metadata["data"]["held_out"], metadata["data"]["file"]) == (split["held_out"], "made.csv")
+        assert (metadata["data"]["held_out"], metadata["data"]["file"]) == (
+            split["held_out"],
+            "made.csv",
+        )
         # Its driving statistics are those of its other scenes.
-        others = measure_exposure(frame.filter(~pl.col("scene").is_in(split["held_out"]))).vehicle_km
+        others = measure_exposure(
+            frame.filter(~pl.col("scene").is_in(split["held_out"]))
+        ).vehicle_km
         assert 0.0 < metadata["driving_statistics"]["exposure"]["vehicle_km"] == others
         assert others < measure_exposure(frame).vehicle_km
 
@@ -174,7 +202,9 @@ def test_every_variant_has_a_quarter_of_the_updates_and_differs_in_its_part_alon
 
 
 @pytest.mark.parametrize("config", [PAPER, CALIBRATED])
-def test_ablations_stand_side_by_side_and_the_calibrated_ones_are_rolled_out_too(config, frame, tmp_path):
+def test_ablations_stand_side_by_side_and_the_calibrated_ones_are_rolled_out_too(
+    config, frame, tmp_path
+):
     config = replace(config, loop=LoopConfig(updates=4, evaluate_every=4, warmup=1))
     names, updates = [], []
     told = (names.append, updates.append) if config.preset == "paper" else ()

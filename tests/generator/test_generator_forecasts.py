@@ -12,11 +12,23 @@ from ganlane.parameters.generator import EXTRA_INPUTS, CalibratedConfig
 
 
 def windows_of(positions: np.ndarray, lanes=0, lengths=4) -> Windows:
-    """Windows at ``positions`` [W, T, 2] or, where they stand still before, with that future; scenes a, b in turn."""
+    """Windows at ``positions`` [W, T, 2] or, where they stand still before, with that future.
+
+    Scenes a, b in turn.
+    """
     if positions.shape[1] == 8:
         positions = np.concatenate([np.zeros((len(positions), 9, 2)), positions], axis=1)
     zero, scene = np.zeros(len(positions), dtype=np.int64), np.arange(len(positions)) % 2
-    return Windows(positions, scene, zero, zero, zero, zero + lanes, zero + np.array(lengths, float), ("a", "b"))
+    return Windows(
+        positions,
+        scene,
+        zero,
+        zero,
+        zero,
+        zero + lanes,
+        zero + np.array(lengths, float),
+        ("a", "b"),
+    )
 
 
 def test_errors_by_hand():
@@ -55,17 +67,33 @@ def test_direction_counts_only_who_moves_sideways():
 def test_parts_are_lanes_and_classes_with_enough_windows():
     windows = windows_of(np.zeros((6, 8, 2)), [1, 1, 1, 2, 2, 3], [4, 4, 4, 7, 7, 4])
     parts = forecasts.parts_of(windows, 2)
-    assert {name: int(rows.sum()) for name, rows in parts.items()} == {"lane 1": 3, "lane 2": 2, "car": 4, "truck": 2}
+    assert {name: int(rows.sum()) for name, rows in parts.items()} == {
+        "lane 1": 3,
+        "lane 2": 2,
+        "car": 4,
+        "truck": 2,
+    }
 
 
 def test_every_part_is_held_against_the_baseline():
     future = np.ones((4, 8, 2))
     windows = windows_of(future, [1, 1, 2, 2])
-    found = {"constant_velocity": future + 1.0, "mean": future + np.array([0.1, 0.1, 3.0, 3.0])[:, None, None]}
+    found = {
+        "constant_velocity": future + 1.0,
+        "mean": future + np.array([0.1, 0.1, 3.0, 3.0])[:, None, None],
+    }
     scores = forecasts.open_loop_scores(windows, found, np.array([0, 0, 1, 1]), least_part=1)
     change = {name: row["ade_change_percent"]["mean"] for name, row in scores["parts"].items()}
-    assert change == {"lane 1": pytest.approx(-90.0), "lane 2": pytest.approx(200.0), "car": pytest.approx(55.0)}
-    assert {name: row["windows"] for name, row in scores["parts"].items()} == {"lane 1": 2, "lane 2": 2, "car": 4}
+    assert change == {
+        "lane 1": pytest.approx(-90.0),
+        "lane 2": pytest.approx(200.0),
+        "car": pytest.approx(55.0),
+    }
+    assert {name: row["windows"] for name, row in scores["parts"].items()} == {
+        "lane 1": 2,
+        "lane 2": 2,
+        "car": 4,
+    }
     assert scores["folds"]["0"]["ade_change_percent"]["mean"] == pytest.approx(-90.0)
     assert scores["scenes"].keys() == {"a", "b"}
     assert scores["windows"] == 4
@@ -75,7 +103,10 @@ def test_over_the_whole_window_the_observed_move_counts_too():
     recorded, course = sideways(-0.05, 0.3), sideways(0.0, -0.1)
     scores = forecasts.direction_scores({"own": course}, recorded, observed=np.array([0.4, 0.02]))
     assert scores == {"windows": 2, "share_right": {"own": 0.5}}
-    assert forecasts.direction_scores({"own": course}, recorded) == {"windows": 1, "share_right": {"own": 0.0}}
+    assert forecasts.direction_scores({"own": course}, recorded) == {
+        "windows": 1,
+        "share_right": {"own": 0.0},
+    }
 
 
 def test_the_side_classifier_finds_what_the_history_tells_and_no_more():
@@ -95,7 +126,9 @@ def test_the_side_classifier_finds_what_the_history_tells_and_no_more():
 def test_nobody_moving_sideways_has_no_side():
     windows = windows_of(np.zeros((2, 8, 2)), [1, 2])
     assert forecasts.side_classifier_share(windows, np.array([0, 1])) is None
-    assert forecasts.direction_scores({"own": windows.future}, windows.future)["share_right"] == {"own": None}
+    assert forecasts.direction_scores({"own": windows.future}, windows.future)["share_right"] == {
+        "own": None
+    }
 
 
 STRIDE = 7
@@ -113,7 +146,9 @@ def scenes():
 @pytest.mark.parametrize("horizon", [8, 20])
 def test_driven_windows_are_the_cut_windows_in_the_same_order(scenes, horizon):
     windows = cut_windows(scenes, STRIDE, 9 + horizon)
-    recorded = forecasts.driven_windows(lambda segments: segments.future[None], scenes, horizon, STRIDE)[0]
+    recorded = forecasts.driven_windows(
+        lambda segments: segments.future[None], scenes, horizon, STRIDE
+    )[0]
     np.testing.assert_allclose(recorded, windows.future, atol=1e-4)
 
 
@@ -138,15 +173,22 @@ def test_forecasts_of_the_papers_preset_score_alike_in_a_fit_and_over_folds(scen
         assert metrics["all"][f"ade_m/{kind}"] == row["ade_m"][kind]
         assert metrics["all"][f"fde_m/{kind}"] == row["fde_m"][kind]
     assert metrics.keys() == {"all", "synthetic-0", "synthetic-1"}
-    assert sum(metrics[scene.name]["windows"] for scene in scenes) == metrics["all"]["windows"] == len(windows)
+    assert (
+        sum(metrics[scene.name]["windows"] for scene in scenes)
+        == metrics["all"]["windows"]
+        == len(windows)
+    )
     assert row["ade_m"]["best_of_20"] < row["ade_m"]["mean"] < 1.5 * row["ade_m"]["single"]
 
 
 def test_without_noise_in_the_weights_all_samples_of_a_rollout_agree(scenes):
     generator = silenced(small_generator(EXTRA_INPUTS))
-    found = forecasts.calibrated_forecasts(generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3)
+    found = forecasts.calibrated_forecasts(
+        generator, scenes, 8, STRIDE, CalibratedConfig(), samples=3
+    )
     np.testing.assert_allclose(found["single"], found["mean"], atol=1e-5)
-    # without a residual the anchor alone drives: along the road that is IDM with the driver's own headway
+    # without a residual the anchor alone drives: along the road that is IDM with the driver's own
+    # headway
     idm = forecasts.idm_forecasts(scenes, 8, STRIDE)["idm_own_headway"]
     np.testing.assert_allclose(found["mean"][..., 0], idm[..., 0], atol=1e-3)
 
@@ -160,7 +202,9 @@ RANDOM = np.random.default_rng(0)
 
 
 def course(start_mps: float, acceleration: float, frames: int = 17) -> np.ndarray:
-    """Positions [1, frames, 2] of a vehicle whose displacement per 0.1 s changes by ``acceleration / 100`` m."""
+    """Positions [1, frames, 2] of a vehicle whose displacement per 0.1 s changes by
+    ``acceleration / 100`` m.
+    """
     steps = start_mps * 0.1 + 0.01 * acceleration * np.arange(frames - 1)
     x = np.concatenate([[0.0], steps.cumsum()])
     return np.stack([x, np.zeros(frames)], axis=-1)[None]
@@ -180,8 +224,11 @@ def test_steady_driving_is_foreseen_by_all():
 
 def test_steady_acceleration_is_foreseen_by_constant_acceleration_alone():
     windows = windows_of(course(10.0, 1.5))
-    np.testing.assert_allclose(forecasts.constant_acceleration(windows.past, 8), windows.future, atol=1e-9)
-    # the displacement grows by 0.015 m a step, so after 8 steps 0.015 * (1 + 2 + ... + 8) m are missing
+    np.testing.assert_allclose(
+        forecasts.constant_acceleration(windows.past, 8), windows.future, atol=1e-9
+    )
+    # the displacement grows by 0.015 m a step, so after 8 steps 0.015 * (1 + 2 + ... + 8) m are
+    # missing
     missing = windows.future - forecasts.repeated(windows.past[:, -1], 8)
     np.testing.assert_allclose(missing[0, -1], [0.015 * 36, 0.0], atol=1e-9)
 
@@ -196,7 +243,10 @@ def test_the_mean_velocity_looks_at_all_that_was_observed():
 
 
 def noisy_followers(count: int) -> np.ndarray:
-    """Displacements that swing back: what constant velocity misses is linear in the last difference."""
+    """Displacements that swing back.
+
+    What constant velocity misses is linear in the last difference.
+    """
     past = 1.0 + 0.1 * RANDOM.normal(size=(count, 8, 2))
     future = past[:, -1:] - 0.5 * (past[:, -1:] - past[:, -2:-1]) + np.zeros((count, 8, 2))
     steps = np.concatenate([past, future], axis=1)
@@ -207,14 +257,19 @@ def test_ridge_regression_finds_a_linear_law_and_keeps_left_and_right_alike():
     known, fresh = windows_of(noisy_followers(400)), windows_of(noisy_followers(50))
     predicted = forecasts.ridge_forecast(known, fresh.past)
     assert np.abs(predicted - fresh.future).mean() < 0.02 * np.abs(fresh.future).mean()
-    np.testing.assert_allclose(forecasts.ridge_forecast(known, fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8)
+    np.testing.assert_allclose(
+        forecasts.ridge_forecast(known, fresh.past * (1, -1)), predicted * (1, -1), atol=1e-8
+    )
 
 
 def test_metrics_of_rollouts_name_every_scene_and_count_its_vehicles(scenes):
     config = CalibratedConfig(held_out_horizon=9, held_out_stride=20)
     metrics = forecasts.rollout_errors(small_generator(EXTRA_INPUTS), scenes, config)
     assert set(metrics) == {"all", "synthetic-0", "synthetic-1"}
-    assert metrics["all"]["windows"] == metrics["synthetic-0"]["windows"] + metrics["synthetic-1"]["windows"]
+    assert (
+        metrics["all"]["windows"]
+        == metrics["synthetic-0"]["windows"] + metrics["synthetic-1"]["windows"]
+    )
     assert metrics["all"]["end_s"] == pytest.approx(0.9)
     assert metrics["all"]["fde_m/mean"] > metrics["all"]["ade_m/mean"]
 
@@ -223,7 +278,9 @@ def test_the_energy_score_is_least_for_the_right_spread():
     torch.manual_seed(0)
     recorded = torch.randn(20000, 2)
     scores = {
-        spread: forecasts.energy_score(spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded)
+        spread: forecasts.energy_score(
+            spread * torch.randn(20000, 2), spread * torch.randn(20000, 2), recorded
+        )
         .mean()
         .item()
         for spread in (0.01, 0.5, 1.0, 1.5, 2.5)

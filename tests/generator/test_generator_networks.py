@@ -23,7 +23,12 @@ def scene():
 def pooled(scene):
     """A pooling and its arguments: hidden states [3, 13, 12], positions, displacements and mask."""
     _, position, mask = scene
-    return networks.PairPooling(12, 10, 6, 8), (torch.randn(3, 13, 12), position, torch.randn(3, 13, 2), mask)
+    return networks.PairPooling(12, 10, 6, 8), (
+        torch.randn(3, 13, 12),
+        position,
+        torch.randn(3, 13, 2),
+        mask,
+    )
 
 
 @pytest.fixture
@@ -46,7 +51,9 @@ def test_it_is_a_linear_layer_for_few_rows_and_for_many(shape, relu):
     with torch.no_grad():
         torch.testing.assert_close(networks.apply(layer, x, relu), expected)
         torch.testing.assert_close(networks.dense(x, layer.weight), x @ layer.weight.T)
-        torch.testing.assert_close(networks.apply(layer.double(), x.double(), relu).float(), expected)
+        torch.testing.assert_close(
+            networks.apply(layer.double(), x.double(), relu).float(), expected
+        )
 
 
 def test_gradients_reach_the_weights_of_many_rows():
@@ -71,7 +78,8 @@ def test_the_recurrence_is_torchs_own_lstm():
     torch.manual_seed(2)
     lstm = networks.MotionLSTM(5, 7)
     reference = nn.LSTM(5, 7, batch_first=True)
-    order = torch.arange(28).reshape(4, 7)[[0, 1, 3, 2]].flatten()  # torch's: input, forget, new, output
+    # torch's: input, forget, new, output
+    order = torch.arange(28).reshape(4, 7)[[0, 1, 3, 2]].flatten()
     with torch.no_grad():
         reference.weight_ih_l0.copy_(lstm.input.weight[order])
         reference.bias_ih_l0.copy_(lstm.input.bias[order])
@@ -79,7 +87,9 @@ def test_the_recurrence_is_torchs_own_lstm():
         reference.bias_hh_l0.zero_()
     displacement, difference = torch.randn(4, 6, 2), 0.05 * torch.randn(4, 6, 2)
     embedded = torch.relu(lstm.embed(networks.motion_features(displacement, difference)))
-    torch.testing.assert_close(lstm.encode(lstm.project(displacement, difference)), reference(embedded)[1][0][0])
+    torch.testing.assert_close(
+        lstm.encode(lstm.project(displacement, difference)), reference(embedded)[1][0][0]
+    )
 
 
 def test_pooling_does_not_depend_on_the_order_of_vehicles(pooled):
@@ -94,7 +104,9 @@ def test_pooling_ignores_padding(pooled, count):
     pooling, whole = pooled
     hidden, position, motion, mask = given = [part[:, :count] for part in whole]
     expected, real = pooling(*given), mask[..., None]
-    noisy = pooling(torch.where(real, hidden, 99.0), torch.where(real, position, -3.0), motion, mask)
+    noisy = pooling(
+        torch.where(real, hidden, 99.0), torch.where(real, position, -3.0), motion, mask
+    )
     torch.testing.assert_close(noisy[mask], expected[mask])
     torch.testing.assert_close(pooling(*(part[1:2, :7] for part in given)), expected[1:2, :7])
 
@@ -102,7 +114,9 @@ def test_pooling_ignores_padding(pooled, count):
 def test_the_split_first_layer_equals_the_whole_one(pooled):
     pooling, (hidden, position, motion, mask) = pooled
     index, seen = networks.nearest(position, mask, 8)
-    state = torch.cat([position / torch.tensor([20.0, 4.0]), motion / torch.tensor([0.4, 0.05])], dim=-1)
+    state = torch.cat(
+        [position / torch.tensor([20.0, 4.0]), motion / torch.tensor([0.4, 0.05])], dim=-1
+    )
     pairs = networks.gather_vehicles(state, index) - state[..., None, :]
     whole = nn.Linear(4 + 12, 10)
     with torch.no_grad():
@@ -132,7 +146,9 @@ def test_a_few_vehicles_are_all_each_others_neighbours(scene):
 
 
 def test_vehicles_out_of_range_have_no_influence():
-    position = torch.tensor([[[0.0, 0.0], [networks.RANGE_M + 1.0, 0.0], [networks.RANGE_M - 1.0, 0.0]]])
+    position = torch.tensor(
+        [[[0.0, 0.0], [networks.RANGE_M + 1.0, 0.0], [networks.RANGE_M - 1.0, 0.0]]]
+    )
     _, seen = networks.nearest(position, torch.ones(1, 3, dtype=torch.bool), 8)
     assert seen[0, 0].tolist() == [False, False, True]
 
@@ -140,7 +156,9 @@ def test_vehicles_out_of_range_have_no_influence():
 def test_a_recorded_jump_is_cut_off_before_it_reaches_the_network():
     jump, cut = torch.tensor([1.5, 0.0]), torch.tensor([5.0 * networks.DIFFERENCE_SCALE_M[0], 0.0])
     same = torch.zeros(2)
-    torch.testing.assert_close(networks.motion_features(same, jump), networks.motion_features(same, cut))
+    torch.testing.assert_close(
+        networks.motion_features(same, jump), networks.motion_features(same, cut)
+    )
 
 
 def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generator, now):
@@ -152,7 +170,9 @@ def test_with_a_head_of_zeros_the_prediction_is_constant_velocity(scene, generat
 @pytest.mark.parametrize("execute_k", [1, 3, 8])
 def test_the_first_k_decoder_steps_are_those_of_the_whole(generator, now, execute_k):
     noise = torch.randn(3, 13, 4)
-    torch.testing.assert_close(generator(now, noise, execute_k), generator(now, noise)[..., :execute_k, :])
+    torch.testing.assert_close(
+        generator(now, noise, execute_k), generator(now, noise)[..., :execute_k, :]
+    )
 
 
 def test_samples_share_one_context(generator, now):
@@ -167,13 +187,17 @@ def test_kept_projections_equal_those_computed_anew(generator):
         history, difference = push(generator, history, displacements[..., step, :])
         anew = generator.project(displacements[..., step - 7 : step + 1, :])
         torch.testing.assert_close(torch.stack(history.motions, -2), anew)
-        torch.testing.assert_close(difference, displacements[..., step, :] - displacements[..., step - 1, :])
+        torch.testing.assert_close(
+            difference, displacements[..., step, :] - displacements[..., step - 1, :]
+        )
 
 
 def test_a_fresh_history_is_that_of_constant_velocity(generator):
     displacement = torch.tensor([[[1.7, 0.0], [0.9, 0.0]]])
     always = displacement[..., None, :].expand(1, 2, 8, 2)
-    torch.testing.assert_close(torch.stack(start(generator, displacement).motions, -2), generator.project(always))
+    torch.testing.assert_close(
+        torch.stack(start(generator, displacement).motions, -2), generator.project(always)
+    )
 
 
 def test_gradient_reaches_every_parameter_of_both_networks(scene, generator, now):

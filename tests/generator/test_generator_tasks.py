@@ -1,4 +1,7 @@
-"""What is fitted: losses, updates and scores of both presets; the loop's early stopping and resuming."""
+"""What is fitted: losses, updates and scores of both presets.
+
+The loop's early stopping and resuming.
+"""
 
 import math
 from dataclasses import replace
@@ -20,7 +23,9 @@ def scenes():
 def paper_task(scenes, **changes) -> tasks.PaperTask:
     loop = LoopConfig(evaluate_every=10, learning_rate=5e-3, warmup=1, **changes)
     fitted, validation = scenes
-    return tasks.PaperTask([fitted], [validation], replace(PAPER, loop=loop, stride=4, samples=3, batch=8))
+    return tasks.PaperTask(
+        [fitted], [validation], replace(PAPER, loop=loop, stride=4, samples=3, batch=8)
+    )
 
 
 def test_fitting_the_papers_preset_lowers_its_error(scenes):
@@ -66,7 +71,9 @@ def test_foreign_states_are_refused(scenes, tmp_path):
         tasks.FitLoop(task, path)
     path.unlink()
     tasks.FitLoop(task, path).run()
-    other = tasks.PaperTask(*([scene] for scene in scenes), replace(task.config, sizes=replace(SIZES, hidden=20)))
+    other = tasks.PaperTask(
+        *([scene] for scene in scenes), replace(task.config, sizes=replace(SIZES, hidden=20))
+    )
     with pytest.raises(UserError, match="another fit"):
         tasks.FitLoop(other, path)
 
@@ -81,7 +88,9 @@ def test_the_learning_rate_rises_and_then_falls_to_nothing():
 
 def test_distances_are_euclidean_accumulate_and_have_a_finite_gradient_at_0():
     predicted = torch.tensor([[[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]])
-    torch.testing.assert_close(tasks.distances(predicted, torch.zeros(1, 3, 2)), torch.tensor([[5.0, 5.0, 10.0]]))
+    torch.testing.assert_close(
+        tasks.distances(predicted, torch.zeros(1, 3, 2)), torch.tensor([[5.0, 5.0, 10.0]])
+    )
     perfect = torch.zeros(1, 8, 2, requires_grad=True)
     tasks.distances(perfect, torch.zeros(1, 8, 2)).sum().backward()
     assert perfect.grad.isfinite().all()
@@ -97,4 +106,6 @@ def test_losses_by_hand():
     zeros, ones = torch.zeros(1, 2), torch.ones(1, 2)
     for recorded in (0.0, 1.0):
         assert tasks.cross_entropy(zeros, recorded).item() == pytest.approx(math.log(2))
-    assert [tasks.discriminator_accuracy(ones, generated).item() for generated in (-ones, ones)] == [1.0, 0.5]
+    assert [
+        tasks.discriminator_accuracy(ones, generated).item() for generated in (-ones, ones)
+    ] == [1.0, 0.5]

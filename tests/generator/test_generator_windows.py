@@ -37,7 +37,19 @@ def recording(seed: int = 0, scenes: int = 3, vehicles: int = 14) -> pl.DataFram
             for frame in range(100 + first, 100 + last):
                 if frame != 100 + gap:
                     x, y = x + random.uniform(0.5, 2.0), y + random.normal(0, 0.05)
-                    rows.append((f"scene-{scene}", 1000 + vehicle, frame, x, y, 12.0, lane, 4.5 + vehicle % 3, 2.0))
+                    rows.append(
+                        (
+                            f"scene-{scene}",
+                            1000 + vehicle,
+                            frame,
+                            x,
+                            y,
+                            12.0,
+                            lane,
+                            4.5 + vehicle % 3,
+                            2.0,
+                        )
+                    )
     return pl.DataFrame(rows, schema=SCHEMA, orient="row")
 
 
@@ -92,7 +104,9 @@ def test_constant_velocity_errs_as_worked_by_hand(scenes):
 
 
 def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int, int], np.ndarray]:
-    """(scene, start row, vehicle number) -> positions, lane and length, by looking every frame up in a dictionary."""
+    """(scene, start row, vehicle number) -> positions, lane and length, by looking every frame up
+    in a dictionary.
+    """
     columns = ("scene", "vehicle", "frame", "x", "y", "lane", "length")
     found, rows = {}, {row[:3]: row[3:] for row in frame.select(columns).iter_rows()}
     begins = dict(frame.group_by("scene").agg(pl.col("frame").min()).iter_rows())
@@ -100,7 +114,10 @@ def brute_force_windows(frame: pl.DataFrame, stride: int) -> dict[tuple[str, int
         course = [rows.get((scene, vehicle, first + step)) for step in range(WINDOW_FRAMES)]
         row = first - begins[scene]
         if None not in course and row % stride == 0:
-            found[scene, row, vehicle] = np.array([place[:2] for place in course]), course[PRESENT][2:]
+            found[scene, row, vehicle] = (
+                np.array([place[:2] for place in course]),
+                course[PRESENT][2:],
+            )
     return found
 
 
@@ -110,12 +127,16 @@ def test_windows_are_those_of_a_brute_force_search(stride):
     scenes = scene_tracks(frame)
     windows, expected = cut_windows(scenes, stride), brute_force_windows(frame, stride)
     numbers = [scenes[s].vehicles[v] for s, v in zip(windows.scene, windows.vehicle)]
-    keys = [(windows.scene_names[s], t, v) for s, t, v in zip(windows.scene, windows.start, numbers)]
+    keys = [
+        (windows.scene_names[s], t, v) for s, t, v in zip(windows.scene, windows.start, numbers)
+    ]
     assert sorted(keys) == sorted(expected)
     np.testing.assert_array_equal(windows.positions, np.stack([expected[key][0] for key in keys]))
     assert list(zip(windows.lane, windows.length)) == [expected[key][1] for key in keys]
     if stride == 1:
-        assert [count_windows(scene) for scene in scenes] == [len(cut_windows([scene])) for scene in scenes]
+        assert [count_windows(scene) for scene in scenes] == [
+            len(cut_windows([scene])) for scene in scenes
+        ]
 
 
 def test_recordings_without_a_needed_column_or_too_short_are_refused():
@@ -127,7 +148,9 @@ def test_recordings_without_a_needed_column_or_too_short_are_refused():
         cut_windows(scene_tracks(recording().filter(pl.col("frame") < 110)))
 
 
-def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacements_of_their_windows(windows):
+def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacements_of_their_windows(
+    windows,
+):
     groups = group_windows(windows, size=4)
     assert (groups.window == group_windows(windows, size=4).window).all()
     assert sorted(groups.window[groups.mask].tolist()) == list(range(len(windows)))
@@ -136,7 +159,9 @@ def test_groups_never_mix_scenes_or_frames_lose_nobody_and_hold_the_displacement
         assert len(set(zip(windows.scene[inside], windows.start[inside]))) == 1
         kept, place = groups.displacements[row][mask].numpy(), windows.positions[inside, PRESENT]
         np.testing.assert_allclose(kept, np.diff(windows.positions[inside], axis=1), atol=1e-6)
-        np.testing.assert_allclose(groups.position[row][mask].numpy(), place - place.mean(0), atol=1e-4)
+        np.testing.assert_allclose(
+            groups.position[row][mask].numpy(), place - place.mean(0), atol=1e-4
+        )
 
 
 def test_kmeans_puts_two_distant_platoons_into_two_groups():
@@ -149,6 +174,9 @@ def test_kmeans_puts_two_distant_platoons_into_two_groups():
 def test_mirroring_flips_only_the_chosen_groups(windows):
     groups = group_windows(windows, size=4).select(slice(0, 2))
     flipped = groups.mirrored(torch.tensor([False, True]))
-    for now, before in ((flipped.displacements, groups.displacements), (flipped.position, groups.position)):
+    for now, before in (
+        (flipped.displacements, groups.displacements),
+        (flipped.position, groups.position),
+    ):
         assert (now[0] == before[0]).all()
         assert (now[1] == before[1] * torch.tensor([1.0, -1.0])).all()

@@ -1,4 +1,6 @@
-"""The batch on NumPy arrays drives, observes, rewards and restarts exactly as the TorchRL environment does."""
+"""The batch on NumPy arrays drives, observes, rewards and restarts exactly as the TorchRL
+environment does.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,11 @@ def assert_equal(state, batch, masked):
     for name, value in state["vehicles"].items():
         np.testing.assert_array_equal(value.numpy(), batch.state[name], name)
     low, high = batch.bounds
-    seen = state["observation"].numpy().clip([0.0, *[low] * (batch.observation.shape[1] - 1)], max(high, 4.0))
+    seen = (
+        state["observation"]
+        .numpy()
+        .clip([0.0, *[low] * (batch.observation.shape[1] - 1)], max(high, 4.0))
+    )
     np.testing.assert_array_equal(seen, batch.observation)
     for name, value in state["reward_terms"].items():
         np.testing.assert_array_equal(value[:, 0].numpy(), batch.reward_terms()[name], name)
@@ -55,7 +61,13 @@ LORRIES = {"truck_share": 0.3, "truck_desired_speed_mps": (20.0, 22.0)}
     ("traffic", "options", "observation", "reward", "mask"),
     [
         ("idm_mobil", {"goal_m": 700.0}, "lane_view_overlap", {}, "none"),
-        ("idm", {"goal_m": 700.0, "lanes": 5, "vehicles": 30, "spread_m": 500.0}, "lane_view", {}, "legal"),
+        (
+            "idm",
+            {"goal_m": 700.0, "lanes": 5, "vehicles": 30, "spread_m": 500.0},
+            "lane_view",
+            {},
+            "legal",
+        ),
         (
             "idm_mobil",
             {"recycle": True, "recycle_share": 0.5, "goal_m": 900.0, **LORRIES},
@@ -65,14 +77,20 @@ LORRIES = {"truck_share": 0.3, "truck_desired_speed_mps": (20.0, 22.0)}
         ),
         (
             "idm_mobil",
-            {"decision_period_s": 0.5, "timeout_s": 9.0, "ego": EgoParameters(abort_lane_change=True)},
+            {
+                "decision_period_s": 0.5,
+                "timeout_s": 9.0,
+                "ego": EgoParameters(abort_lane_change=True),
+            },
             "lane_view_overlap",
             {},
             "safe",
         ),
     ],
 )
-def test_a_batch_gives_the_torchrl_environments_numbers(traffic, options, observation, reward, mask):
+def test_a_batch_gives_the_torchrl_environments_numbers(
+    traffic, options, observation, reward, mask
+):
     config = EnvConfig(**options)
     batch = batch_of(
         config,
@@ -82,7 +100,14 @@ def test_a_batch_gives_the_torchrl_environments_numbers(traffic, options, observ
         mask=MaskParameters(mask),
     )
     env = make_env(
-        traffic, ROWS, env=config, kernel="native", observation=observation, reward=reward, mask=mask, seed=5
+        traffic,
+        ROWS,
+        env=config,
+        kernel="native",
+        observation=observation,
+        reward=reward,
+        mask=mask,
+        seed=5,
     )
     state = env.reset()
     batch.start(5, np.arange(ROWS))

@@ -19,7 +19,9 @@ needs_compiler = pytest.mark.skipif(library.why_not() is not None, reason="no C+
 def empty_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("GANLANE_CACHE", str(tmp_path / "cache"))
     # Nothing is driven here: the compiler need not optimise.
-    monkeypatch.setattr(library, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in library.FLAGS))
+    monkeypatch.setattr(
+        library, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in library.FLAGS)
+    )
     library._load.cache_clear()
     yield
     library._load.cache_clear()
@@ -44,7 +46,9 @@ def test_another_source_is_another_library(monkeypatch, tmp_path):
     library.load("default")
     for source in library.SOURCES:
         (tmp_path / source.name).write_text(source.read_text() + "\n")
-    monkeypatch.setattr(library, "SOURCES", tuple(tmp_path / source.name for source in library.SOURCES))
+    monkeypatch.setattr(
+        library, "SOURCES", tuple(tmp_path / source.name for source in library.SOURCES)
+    )
     library._load.cache_clear()
     library.load("default")
     assert len(built()) == 2
@@ -55,7 +59,8 @@ def test_another_source_is_another_library(monkeypatch, tmp_path):
 def test_processes_that_build_at_once_do_not_disturb_each_other():
     script = "from ganlane.native import library; library.load('default'); print('loaded')"
     processes = [
-        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, env=os.environ) for _ in range(3)
+        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, env=os.environ)
+        for _ in range(3)
     ]
     assert [process.communicate()[0] for process in processes] == [b"loaded\n"] * 3
     assert len(built()) == 1
@@ -64,7 +69,9 @@ def test_processes_that_build_at_once_do_not_disturb_each_other():
 
 def test_without_a_compiler_one_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setattr(library, "find_compiler", lambda: None)
-    with pytest.raises(UserError, match=r"needs a C\+\+ compiler.*g\+\+.*ganlane\[native\].*env\.kernel=torch"):
+    with pytest.raises(
+        UserError, match=r"needs a C\+\+ compiler.*g\+\+.*ganlane\[native\].*env\.kernel=torch"
+    ):
         library.load()
 
 
@@ -107,7 +114,9 @@ V4 = f"{V3} avx512f avx512bw avx512cd avx512dq avx512vl"
         ("x86_64", V4, "AVX512"),
     ],
 )
-def test_a_processor_gets_the_fastest_variant_that_it_runs(monkeypatch, tmp_path, machine, flags, variant):
+def test_a_processor_gets_the_fastest_variant_that_it_runs(
+    monkeypatch, tmp_path, machine, flags, variant
+):
     (tmp_path / "cpuinfo").write_text(f"processor\t: 0\nflags\t\t: fpu {flags} sse\n")
     monkeypatch.setattr(library.platform, "machine", lambda: machine)
     monkeypatch.setattr(library, "CPU_INFO", tmp_path / "cpuinfo")
@@ -116,7 +125,8 @@ def test_a_processor_gets_the_fastest_variant_that_it_runs(monkeypatch, tmp_path
 
 @needs_compiler
 def test_the_library_of_a_wheel_is_taken_and_needs_no_compiler(monkeypatch, tmp_path):
-    monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})  # the others take seconds
+    # the others take seconds
+    monkeypatch.setattr(library, "VARIANTS", {"default": library.VARIANTS["default"]})
     (made,) = library.build_all(tmp_path / "wheel")
     monkeypatch.setattr(library, "PREBUILT", made.parent)
     monkeypatch.setattr(library, "find_compiler", lambda: None)

@@ -1,4 +1,7 @@
-"""The native kernel on tensors, on random highways in float32: against the tensor code, and against itself."""
+"""The native kernel on tensors, on random highways in float32.
+
+Against the tensor code, and against itself.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +30,21 @@ RUNNABLE = list(VARIANTS)[list(VARIANTS).index(best_variant()) :]
 #: Events by the kernel's names, and what the ego remembers without the fractions.
 EVENTS = {name: name for name in ("goal", "hard_crash", "out_of_road", "timeout")}
 EVENTS |= {"soft_crashes": "soft_crash", "soft_crashes_behind": "soft_crash_behind"}
-EGO_EXACT = ("change_direction", "decisions", "lane_changes", "started_change", "soft_crash", "soft_crash_behind")
+EGO_EXACT = (
+    "change_direction",
+    "decisions",
+    "lane_changes",
+    "started_change",
+    "soft_crash",
+    "soft_crash_behind",
+)
 MOTION = ("x", "y", "heading", "speed", "acceleration")
 
 
 def random_highway(rng: random.Random, rows: int, most_vehicles: int) -> HighwayEnv:
-    """1 to 6 lanes, 2 to 60 vehicles, dense and sparse, with and without MOBIL, all periods and visibilities."""
+    """1 to 6 lanes, 2 to 60 vehicles, dense and sparse, with and without MOBIL, all periods and
+    visibilities.
+    """
     lanes, vehicles = rng.randint(1, 6), rng.randint(2, most_vehicles)
     spacing = rng.choice([8.0, 12.0, 25.0])
     return environment(
@@ -53,10 +65,16 @@ def random_highway(rng: random.Random, rows: int, most_vehicles: int) -> Highway
 
 
 def disturbed_start(env: HighwayEnv, generator: torch.Generator) -> TensorDictBase:
-    """A first state with everything a little off: in mid-change, at angles, wheels turned, some of all kinds."""
+    """A first state with everything a little off.
+
+    In mid-change, at angles, wheels turned, some of all kinds.
+    """
     td = env.reset()
     scene = Vehicles.of(td[keys.VEHICLES])
-    off, between = disturbed(scene, env.road.lanes, generator), drawing(scene.x.shape, generator, env.dtype)
+    off, between = (
+        disturbed(scene, env.road.lanes, generator),
+        drawing(scene.x.shape, generator, env.dtype),
+    )
     off = off.with_(
         x=off.x * (1 + 3 * (between(0, 1) < 0.05)),
         heading=off.heading * (1 + 20 * (between(0, 1) < 0.02)),
@@ -86,7 +104,9 @@ def by_kernel(kernel: Kernel, td: TensorDictBase, recycle: bool = False) -> Outc
 def actions(env: HighwayEnv, generator: torch.Generator, change: float = 0.2) -> torch.Tensor:
     """Random actions [N], mostly to keep the lane."""
     drawn = torch.rand(env.batch_size, generator=generator)
-    return torch.where(drawn < 0.5 * change, keys.LEFT, torch.where(drawn < change, keys.RIGHT, keys.KEEP))
+    return torch.where(
+        drawn < 0.5 * change, keys.LEFT, torch.where(drawn < change, keys.RIGHT, keys.KEEP)
+    )
 
 
 def differing_rows(out: Outcome, after: TensorDictBase) -> torch.Tensor:
@@ -103,8 +123,12 @@ def differing_rows(out: Outcome, after: TensorDictBase) -> torch.Tensor:
 
 def errors(out: Outcome, after: TensorDictBase, rows: torch.Tensor) -> dict[str, float]:
     """The largest difference of every number in ``rows``, of valid vehicles."""
-    expected = {name: after[keys.VEHICLES, name] for name in MOTION} | {"steering": after[keys.TRAFFIC, "steering"]}
-    expected |= {name: after[keys.EGO, name] for name in ("mean_acceleration", "change_progress", "distance")}
+    expected = {name: after[keys.VEHICLES, name] for name in MOTION} | {
+        "steering": after[keys.TRAFFIC, "steering"]
+    }
+    expected |= {
+        name: after[keys.EGO, name] for name in ("mean_acceleration", "change_progress", "distance")
+    }
     valid = after[keys.VEHICLES, "valid"] & rows[:, None]
     differences = {name: (out[name] - value).abs() for name, value in expected.items()}
     return {
@@ -114,7 +138,10 @@ def errors(out: Outcome, after: TensorDictBase, rows: torch.Tensor) -> dict[str,
 
 
 def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
-    """Whether the decision of ``row`` hangs by a rounding: 64 states a rounding beside it lead to different ones."""
+    """Whether the decision of ``row`` hangs by a rounding.
+
+    64 states a rounding beside it lead to different ones.
+    """
     copies = 64
     exact = HighwayEnv(
         env.traffic, copies, env.vehicles, env.spawn_parameters, env.ego, env.episode,
@@ -129,14 +156,18 @@ def within_rounding(env: HighwayEnv, td: TensorDictBase, row: int) -> bool:
     for group in (keys.TRAFFIC, keys.EGO):
         state[group, "steering"] = state[group, "steering"].double()
     after = exact.step(state)["next"]
-    whole = [value.reshape(copies, -1) for _, value in leaves(after) if not value.is_floating_point()]
+    whole = [
+        value.reshape(copies, -1) for _, value in leaves(after) if not value.is_floating_point()
+    ]
     return any(bool((value != value[:1]).any()) for value in whole)
 
 
 # As the tensor code
 
 
-def compare_random_highways(highways: int, rows: int, decisions: int, seed: int, vehicles: int) -> None:
+def compare_random_highways(
+    highways: int, rows: int, decisions: int, seed: int, vehicles: int
+) -> None:
     """Both decide from every state of the tensor code's episodes."""
     rng, generator = random.Random(seed), torch.Generator().manual_seed(seed)
     compared, at_threshold = 0, 0
@@ -192,7 +223,13 @@ def drive(kernel: Kernel, td, chosen: list[torch.Tensor]) -> list[Outcome]:
         for name, value in moved(Vehicles.of(td[keys.VEHICLES]), out).as_dict().items():
             td[keys.VEHICLES, name] = value
         td[keys.TRAFFIC, "steering"], td[keys.STEP] = out["steering"], out["step"]
-        for name in ("decisions", "lane_changes", "change_direction", "soft_crash", "soft_crash_behind"):
+        for name in (
+            "decisions",
+            "lane_changes",
+            "change_direction",
+            "soft_crash",
+            "soft_crash_behind",
+        ):
             td[keys.EGO, name] = out[name]
         td[keys.EGO, "steering"] = out["ego_steering"]
     return outcomes
@@ -235,8 +272,13 @@ def test_it_agrees_with_the_scalar_twin(seed):
             assert found["target_lane"].tolist() == [car.target_lane for car in state.cars]
             assert [name for name in keys.END_EVENTS[:4] if found[name]] == outcome.reasons
             counts = (outcome.soft_crash, outcome.soft_crash_behind, state.step)
-            assert tuple(int(found[name]) for name in ("soft_crashes", "soft_crashes_behind", "step")) == counts
-            assert found["mean_acceleration"].item() == pytest.approx(outcome.mean_acceleration, abs=1e-3)
+            assert (
+                tuple(int(found[name]) for name in ("soft_crashes", "soft_crashes_behind", "step"))
+                == counts
+            )
+            assert found["mean_acceleration"].item() == pytest.approx(
+                outcome.mean_acceleration, abs=1e-3
+            )
             assert found["change_progress"].item() == pytest.approx(outcome.progress, abs=1e-4)
 
 
@@ -294,7 +336,13 @@ def test_what_goes_in_stays_as_it_is_and_need_not_be_contiguous(crowd):
         RandomScenes(),
         RandomScenes(parameters=SpawnParameters(truck_share=0.4)),
         RandomScenes(Road(lanes=1, lane_width_m=3.2), 5),
-        RandomScenes(Road(lanes=5), 40, SpawnParameters(spread_m=400.0), Visibility.SIGNALLED, Visibility.BODY),
+        RandomScenes(
+            Road(lanes=5),
+            40,
+            SpawnParameters(spread_m=400.0),
+            Visibility.SIGNALLED,
+            Visibility.BODY,
+        ),
     ],
     ids=["the paper's", "lorries", "one lane", "a crowd"],
 )

@@ -30,9 +30,15 @@ WITHOUT_CHANGES = [name for name in QUANTITIES if name != "lane_change_duration"
 def test_a_card_puts_the_model_between_its_ceiling_and_its_floors_driven_or_measured_before():
     recordings = recorded_cars(scenes=4, vehicles=10, seconds=8.0, speed_swing_mps=0.2)
     recorded = measure_recordings(recordings).counts
-    makers = {"cruise": ConstantVelocity, "random": RandomDriving, "constant_velocity": ConstantVelocity}
+    makers = {
+        "cruise": ConstantVelocity,
+        "random": RandomDriving,
+        "constant_velocity": ConstantVelocity,
+    }
     driven = {name: simulate(make, recordings, StartOptions()) for name, make in makers.items()}
-    rows = quantity_rows("cruise", {**driven, "rival": driven["random"]}, recorded, {}, resamples=100)
+    rows = quantity_rows(
+        "cruise", {**driven, "rival": driven["random"]}, recorded, {}, resamples=100
+    )
     assert rows["speed"]["distance"] == rows["speed"]["constant_velocity"] < rows["speed"]["floor"]
     assert rows["acceleration"]["against"]["rival"]["verdict"] == "closer"
     assert rows["speed"]["against"].keys() == {"rival"}
@@ -87,9 +93,19 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
     assert run["vehicle_km"] == 0.0
     assert run["standstills_in_free_flow"] > 0
     for name in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km"):
-        assert run[name] is run[f"{name}_ci"] is totals([run])[name] is totals([run])[f"{name}_ci"] is None
+        assert (
+            run[name]
+            is run[f"{name}_ci"]
+            is totals([run])[name]
+            is totals([run])[f"{name}_ci"]
+            is None
+        )
     table = long_table([run], "still")
-    assert cells(table, "changes per vehicle-km") == cells(table, "overlaps per 1000 vehicle-km") == ["-"]
+    assert (
+        cells(table, "changes per vehicle-km")
+        == cells(table, "overlaps per 1000 vehicle-km")
+        == ["-"]
+    )
     (checks,) = checked(run)["long_runs"]
     assert checks["lane_changes_inside_recorded_interval"] is None
     assert checks["overlaps_under_1_per_1000_vehicle_km"] is None
@@ -99,10 +115,14 @@ def test_traffic_that_stands_still_has_counts_and_no_rates():
 
 def test_a_traffic_without_a_guard_has_none_in_its_card():
     short = LongRunParameters(vehicles=4, vehicle_km=0.1, most_s=10.0)
-    without, with_guard = (long_run(make, Road(), short) for make in (gan_calibrated_traffic, gan_traffic))
+    without, with_guard = (
+        long_run(make, Road(), short) for make in (gan_calibrated_traffic, gan_traffic)
+    )
     assert (without["guard_share"], without["overlaps"]) == (None, 0)
     assert 0.0 < with_guard["guard_share"] < 1.0
-    assert long_run(lambda road: gan_traffic(road, guard=False), Road(), short)["guard_share"] is None
+    assert (
+        long_run(lambda road: gan_traffic(road, guard=False), Road(), short)["guard_share"] is None
+    )
     assert cells(long_table([without], "a"), "the guard's share") == ["none"]
     assert cells(long_table([with_guard], "a"), "the guard's share")[1] == "%"
     assert "guard under 5 percent: no guard" in checks_text(checked(without))
@@ -117,12 +137,21 @@ def test_densities_have_area_one_and_the_quantitys_unit():
     counts = np.zeros(QUANTITIES["jerk"].number)
     counts[[0, 1, 49]] = 1, 2, 1
     rule = np.eye(len(counts))[0] * 4
-    figure = draw_distributions({"jerk": counts}, {"idm": {"jerk": rule}, "nobody": {"jerk": 0 * rule}})
+    figure = draw_distributions(
+        {"jerk": counts}, {"idm": {"jerk": rule}, "nobody": {"jerk": 0 * rule}}
+    )
     (axes,) = figure.axes
-    assert (axes.get_title("left"), axes.get_xlabel(), axes.get_ylabel()) == ("jerk", "m/s³", "density, per m/s³")
+    assert (axes.get_title("left"), axes.get_xlabel(), axes.get_ylabel()) == (
+        "jerk",
+        "m/s³",
+        "density, per m/s³",
+    )
     (recorded, *ends), (simulated, *left_end) = in_colour(axes, INK), in_colour(axes, COLOURS[0])
     # The bins at the ends hold what lies beyond them, too.
-    assert ([mark.get_marker() for mark in ends], [mark.get_marker() for mark in left_end]) == (["<", ">"], ["<"])
+    assert ([mark.get_marker() for mark in ends], [mark.get_marker() for mark in left_end]) == (
+        ["<", ">"],
+        ["<"],
+    )
     assert recorded.get_xdata()[[0, -1]] == pytest.approx([-4.9, 4.9])
     # A quarter of the samples in a bin of 0.2 m/s3.
     assert recorded.get_ydata()[[0, 1, 2, 49]] == pytest.approx([1.25, 2.5, 0.0, 1.25])
@@ -135,12 +164,19 @@ def test_densities_have_area_one_and_the_quantitys_unit():
 
 def row(distance, **against):
     scale = {"ceiling": 0.1, "floor": 0.9}
-    return {"distance": distance, "distance_ci": [distance - 0.1, distance + 0.1], **scale, "against": against}
+    return {
+        "distance": distance,
+        "distance_ci": [distance - 0.1, distance + 0.1],
+        **scale,
+        "against": against,
+    }
 
 
 def test_every_traffic_has_its_dot_and_interval_at_its_distance():
     rival = {"distance": 0.75, "distance_ci": None}
-    figure = draw_distances({"speed": row(0.25, rule=rival), "gap": row(0.4, rule=rival)}, "my.module.Mine")
+    figure = draw_distances(
+        {"speed": row(0.25, rule=rival), "gap": row(0.4, rule=rival)}, "my.module.Mine"
+    )
     (axes,) = figure.axes
     interval, dot, *below = in_colour(axes, COLOURS[0])
     assert interval.get_xdata() == pytest.approx([0.15, 0.35])
@@ -155,7 +191,10 @@ def test_every_traffic_has_its_dot_and_interval_at_its_distance():
 
 def test_the_ends_of_the_scale_are_upright_lines_and_what_is_not_known_has_no_mark():
     (axes,) = draw_distances({"speed": row(0.5)}, "mine").axes
-    assert [lines.get_segments()[0][:, 0].tolist() for lines in axes.collections] == [[0.1, 0.1], [0.9, 0.9]]
+    assert [lines.get_segments()[0][:, 0].tolist() for lines in axes.collections] == [
+        [0.1, 0.1],
+        [0.9, 0.9],
+    ]
     nothing = {**row(0.5), "distance": None, "distance_ci": None, "ceiling": None, "floor": None}
     (axes,) = draw_distances({"lane_change_duration": nothing}, "mine").axes
     assert in_colour(axes, COLOURS[0]) == []
@@ -164,10 +203,16 @@ def test_the_ends_of_the_scale_are_upright_lines_and_what_is_not_known_has_no_ma
 
 def test_drift_is_drawn_over_time_with_a_gap_where_nobody_was_left():
     at = {"10 s": (20.0, 2.0), "60 s": (None, None), "300 s": (22.0, 3.0), "5000 m": (21.0, 2.5)}
-    speeds = {time: dict(zip(("mean_speed_mps", "spread_mps"), values)) for time, values in at.items()}
+    speeds = {
+        time: dict(zip(("mean_speed_mps", "spread_mps"), values)) for time, values in at.items()
+    }
     figure = draw_speeds_over_time([{"vehicles": 9, "speeds": speeds}], spread_mps=2.8)
     mean, spread = figure.axes
-    assert (mean.get_title("left"), mean.get_xlabel(), mean.get_ylabel()) == ("mean speed", "time, s", "m/s")
+    assert (mean.get_title("left"), mean.get_xlabel(), mean.get_ylabel()) == (
+        "mean speed",
+        "time, s",
+        "m/s",
+    )
     (line,) = in_colour(mean, COLOURS[0])
     assert line.get_xdata().tolist() == [10.0, 60.0, 300.0]
     assert line.get_ydata() == pytest.approx([20.0, np.nan, 22.0], nan_ok=True)

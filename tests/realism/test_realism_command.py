@@ -43,30 +43,53 @@ def run(capsys, *arguments):
     out, err = capsys.readouterr()
     last = (out.splitlines() or [""])[-1]
     path = Path(last.removeprefix("results: ")) if last.startswith("results: ") else None
-    return status, None if path is None else {**json.loads(path.read_text()), "folder": path.parent}, out, err
+    return (
+        status,
+        None if path is None else {**json.loads(path.read_text()), "folder": path.parent},
+        out,
+        err,
+    )
 
 
-def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordings, capsys, tmp_path):
+def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(
+    recordings, capsys, tmp_path
+):
     document, figures = tmp_path / "page.md", tmp_path / "figures"
     figures.mkdir()
     document.write_text("<!-- begin realism idm all -->\nformer\n<!-- end realism idm all -->\n")
     asked = ["scenes=all", f"report={document}", f"figures={figures}", "long_against=true"]
     held_out = "data.held_out=[synthetic-1]"
-    status, results, out, _ = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *asked)
-    assert (status, results["traffic"], results["quantities"].keys()) == (0, "idm", QUANTITIES.keys())
+    status, results, out, _ = run(
+        capsys, "traffic=idm", f"data.path={recordings}", held_out, *asked
+    )
+    assert (status, results["traffic"], results["quantities"].keys()) == (
+        0,
+        "idm",
+        QUANTITIES.keys(),
+    )
     row = results["quantities"]["speed"]
     assert 0.0 <= row["distance_ci"][0] <= row["distance"] <= 1.0
     assert None not in (row["ceiling"], row["floor"])
     assert row["against"]["idm_mobil"]["verdict"] in ("closer", "farther", "undecided")
     assert results["quantities_held_out"]["speed"]["samples"] < row["samples"]
-    for key in ("lane_changes_per_vehicle_km", "overlaps_per_1000_vehicle_km_ci", "off_road", "checks", "machine"):
+    for key in (
+        "lane_changes_per_vehicle_km",
+        "overlaps_per_1000_vehicle_km_ci",
+        "off_road",
+        "checks",
+        "machine",
+    ):
         assert results[key] is not None
     assert results["long_runs"][0]["vehicle_km"] >= 0.5
     assert results["long_runs_against"].keys() == {"idm_mobil"}
     assert "changes per vehicle-km" in out
     text = document.read_text()
     assert "former" not in text
-    for part in ("python -m ganlane.realism quick=true", "held-out scenes alone", "idm_mobil, long runs"):
+    for part in (
+        "python -m ganlane.realism quick=true",
+        "held-out scenes alone",
+        "idm_mobil, long runs",
+    ):
         assert part in text
     assert text.count("```text") == 6
     for name in ("distributions.png", "distances.png", "drift.png"):
@@ -76,7 +99,14 @@ def test_a_card_holds_every_quantity_and_goes_where_a_document_wants_it(recordin
 
 @pytest.mark.slow
 def test_desired_speeds_are_fitted_on_the_scenes_that_are_not_held_out(recordings, capsys):
-    arguments = ["quick=false", "repeats=1", "i80=false", "vehicle_km=0", "resamples=100", "against=[]"]
+    arguments = [
+        "quick=false",
+        "repeats=1",
+        "i80=false",
+        "vehicle_km=0",
+        "resamples=100",
+        "against=[]",
+    ]
     held_out = "data.held_out=[synthetic-1]"
     _, results, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", held_out, *arguments)
     assert "idm: fitting desired speeds on 3 scenes" in err
@@ -90,7 +120,10 @@ def test_without_recordings_the_shipped_histograms_are_used_and_it_is_said(capsy
     status, results, _, err = run(capsys, "traffic=idm_mobil", "against=[]")
     assert (status, results["starts"], results["i80"]) == (0, "spawned", {})
     assert "no recordings here" in err
-    assert None not in (results["quantities"]["speed"]["ceiling"], results["quantities"]["speed"]["floor"])
+    assert None not in (
+        results["quantities"]["speed"]["ceiling"],
+        results["quantities"]["speed"]["floor"],
+    )
 
 
 def test_a_users_own_traffic_gets_a_card_and_one_of_i80_beside_the_scenes(recordings, capsys):
@@ -127,7 +160,11 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
     )
     mistakes = {
         "synthetic-1 is held out 0 times": [*arguments, f"fold_weights=[{files[0]}]"],
-        "needs the preset paper": ["traffic=gan", *arguments[1:], f"fold_weights=[{files[0]},{files[1]}]"],
+        "needs the preset paper": [
+            "traffic=gan",
+            *arguments[1:],
+            f"fold_weights=[{files[0]},{files[1]}]",
+        ],
     }
     for said, given in mistakes.items():
         status, _, _, err = run(capsys, *given)
@@ -154,9 +191,13 @@ def test_by_folds_every_scene_is_driven_by_weights_that_never_saw_it(recordings,
         (["traffic.path=gone.safetensors", "traffic=gan"], "gone.safetensors"),
     ],
 )
-def test_mistakes_are_told_in_a_sentence_and_leave_nothing(arguments, part, recordings, capsys, tmp_path):
+def test_mistakes_are_told_in_a_sentence_and_leave_nothing(
+    arguments, part, recordings, capsys, tmp_path
+):
     before = sorted(path.name for path in tmp_path.iterdir())
-    status, _, _, err = run(capsys, "traffic=idm", f"data.path={recordings}", "vehicle_km=0", *arguments)
+    status, _, _, err = run(
+        capsys, "traffic=idm", f"data.path={recordings}", "vehicle_km=0", *arguments
+    )
     assert status == 2
     assert part in err
     assert "Traceback" not in err
@@ -187,8 +228,15 @@ def test_one_scene_is_refused_with_what_to_do_and_driven_whole_when_asked(record
 
 @pytest.mark.slow
 def test_nothing_is_held_out_of_recordings_that_nothing_was_fitted_to(recordings, capsys):
-    # quick=true takes desired speeds as they are, and the shipped generator was fitted to other scenes.
-    asked = ["traffic=gan_calibrated", f"data.path={recordings}", "scenes=all", "against=[idm]", "vehicle_km=0"]
+    # quick=true takes desired speeds as they are, and the shipped generator was fitted to other
+    # scenes.
+    asked = [
+        "traffic=gan_calibrated",
+        f"data.path={recordings}",
+        "scenes=all",
+        "against=[idm]",
+        "vehicle_km=0",
+    ]
     status, results, out, _ = run(capsys, *asked)
     assert status == 0
     assert results["quantities_held_out"] is None

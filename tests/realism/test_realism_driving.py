@@ -30,7 +30,9 @@ from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic
 
 
 def steady(**changed):
-    """Three cars for 10 s at speeds of their own, the last of which appears after 4 s and leaves after 8."""
+    """Three cars for 10 s at speeds of their own, the last of which appears after 4 s and leaves
+    after 8.
+    """
     time = np.arange(100)[:, None] * 0.1
     speed = np.array([10.0, 12.0, 15.0])
     present = np.ones((100, 3), bool)
@@ -41,19 +43,28 @@ def steady(**changed):
 
 
 def test_constant_velocity_repeats_a_recording_of_constant_velocity_from_the_first_frame_of_a_vehicle_to_its_last():
-    there, recorded = drive_recordings(ConstantVelocity, [steady()], StartOptions()), recorded_frame([steady()])
+    there, recorded = (
+        drive_recordings(ConstantVelocity, [steady()], StartOptions()),
+        recorded_frame([steady()]),
+    )
     joined = there.join(recorded, on=["vehicle", "frame"], suffix="_recorded")
     assert joined.height == there.height == recorded.height
     assert (joined["x"] - joined["x_recorded"]).abs().max() < 1e-3
     assert (joined["y"] - joined["y_recorded"]).abs().max() < 1e-5
-    frames = there.group_by("vehicle").agg(pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last"))
+    frames = there.group_by("vehicle").agg(
+        pl.col("frame").min().alias("first"), pl.col("frame").max().alias("last")
+    )
     assert frames.sort("vehicle").rows() == [(0, 0, 99), (1, 0, 99), (2, 40, 79)]
 
 
 def test_its_distance_is_then_0_in_every_quantity():
-    driven, recorded = simulate(ConstantVelocity, [steady()], StartOptions()), measure_recordings([steady()])
+    driven, recorded = (
+        simulate(ConstantVelocity, [steady()], StartOptions()),
+        measure_recordings([steady()]),
+    )
     for name in ("speed", "gap", "time_headway"):
-        # Speeds of 10 m/s lie on an edge of the bins, which rounding may cross; compare at the middle.
+        # Speeds of 10 m/s lie on an edge of the bins, which rounding may cross; compare at the
+        # middle.
         assert driven.quantile(name, 0.5) == pytest.approx(recorded.quantile(name, 0.5), abs=1e-2)
     assert pooled_distance(driven.counts["gap"], recorded.counts["gap"]) < 0.15
 
@@ -105,14 +116,19 @@ def test_index_0_is_nobody_and_models_see_desired_speeds_above_the_speed_at_entr
 
 
 def test_repeats_differ_and_the_same_seed_repeats_them():
-    runs = [drive_recordings(RandomDriving, [steady()], StartOptions(repeats=2, seed=seed)) for seed in (0, 0, 1)]
+    runs = [
+        drive_recordings(RandomDriving, [steady()], StartOptions(repeats=2, seed=seed))
+        for seed in (0, 0, 1)
+    ]
     assert runs[0].equals(runs[1])
     assert not runs[0].equals(runs[2])
     one, other = (runs[0].filter(pl.col("scene") == f"steady#{number}")["x"] for number in (0, 1))
     assert not one.equals(other)
 
 
-@pytest.mark.parametrize("make", [IdmMobilTraffic, gan_traffic, gan_calibrated_traffic, RandomDriving])
+@pytest.mark.parametrize(
+    "make", [IdmMobilTraffic, gan_traffic, gan_calibrated_traffic, RandomDriving]
+)
 def test_every_traffic_stays_finite_from_recorded_starts(make):
     there = drive_recordings(make, recorded_cars(scenes=1, vehicles=8, seconds=5.0), StartOptions())
     assert all(there[name].is_finite().all() for name in ("x", "y"))
@@ -157,7 +173,9 @@ def test_with_the_headway_that_it_shows_idm_neither_speeds_up_nor_brakes():
 def test_only_those_who_enter_are_credited_and_other_memories_stay_as_they_are():
     vehicles = queue([0.0, 24.0, 48.0])
     drawn = torch.full_like(vehicles.x, DRAWN)
-    memory = TensorDict({"driver": TensorDict({"headway": drawn, "noise": drawn}, [1]), "wish": drawn}, [1])
+    memory = TensorDict(
+        {"driver": TensorDict({"headway": drawn, "noise": drawn}, [1]), "wish": drawn}, [1]
+    )
     who = torch.tensor([[False, True, False, False]])
     after = with_recorded_headways(memory, vehicles, ROAD, who)
     assert after["driver", "headway"][0, 1] < 3.0

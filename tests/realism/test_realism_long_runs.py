@@ -4,7 +4,14 @@ import pytest
 import torch
 
 from ganlane.realism.driving import ConstantVelocity, RandomDriving
-from ganlane.realism.long_runs import EventCounter, GuardMeter, LongRunParameters, long_run, spawned_vehicles, totals
+from ganlane.realism.long_runs import (
+    EventCounter,
+    GuardMeter,
+    LongRunParameters,
+    long_run,
+    spawned_vehicles,
+    totals,
+)
 from ganlane.sim.random import episode_key
 from ganlane.sim.state import Road
 from ganlane.traffic import Guard, IdmTraffic, TrafficModule
@@ -51,14 +58,19 @@ def test_blind_driving_overlaps_and_careful_driving_does_not():
 
 
 def test_the_same_numbers_come_out_again_and_others_of_another_seed():
-    runs = [long_run(RandomDriving, Road(), LongRunParameters(6, 1.0, 20.0, seed=seed)) for seed in (0, 0, 1)]
+    runs = [
+        long_run(RandomDriving, Road(), LongRunParameters(6, 1.0, 20.0, seed=seed))
+        for seed in (0, 0, 1)
+    ]
     assert runs[0] == runs[1]
     assert runs[0] != runs[2]
 
 
 def test_totals_add_counts_up_and_know_nothing_of_nothing():
     runs = [long_run(RandomDriving, Road(), LongRunParameters(n, 2.0, 20.0)) for n in (5, 9)]
-    km, overlaps, off_road = (sum(run[name] for run in runs) for name in ("vehicle_km", "overlaps", "off_road"))
+    km, overlaps, off_road = (
+        sum(run[name] for run in runs) for name in ("vehicle_km", "overlaps", "off_road")
+    )
     assert totals(runs)["overlaps_per_1000_vehicle_km"] == pytest.approx(1000 * overlaps / km)
     assert totals(runs)["off_road"] == off_road
     assert totals([])["off_road"] is totals([])["lane_changes_per_vehicle_km"] is None
@@ -101,12 +113,17 @@ class Swerver(TrafficModule):
 
 
 def test_the_guard_meter_counts_what_the_guard_alters_and_changes_nothing():
-    guard, meter, vehicles = Guard(Road()), GuardMeter(), in_line(200.0, 15.0).with_(y=start(Road()).y)
+    guard, meter, vehicles = (
+        Guard(Road()),
+        GuardMeter(),
+        in_line(200.0, 15.0).with_(y=start(Road()).y),
+    )
     moved, _ = Swerver().move(vehicles, {}, torch.zeros(3), torch.zeros(3))
     assert meter.share is None
     unwatched, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
     meter.watch(guard)
     guarded, _ = guard.rewrite(vehicles, moved, {}, torch.zeros(3), torch.zeros(3))
-    # Vehicle 1 brakes with 20 m/s2, vehicle 2 moves by 0.5 m of which a fifth is damped; the other seven do neither.
+    # Vehicle 1 brakes with 20 m/s2, vehicle 2 moves by 0.5 m of which a fifth is damped; the other
+    # seven do neither.
     assert meter.share == pytest.approx(2 / 9)
     assert torch.equal(unwatched.x, guarded.x)

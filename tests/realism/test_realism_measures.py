@@ -1,4 +1,7 @@
-"""What is measured of trajectories worked out by hand; distances of histograms with their intervals; what ships."""
+"""What is measured of trajectories worked out by hand.
+
+Distances of histograms with their intervals; what ships.
+"""
 
 import json
 import math
@@ -73,7 +76,9 @@ def test_gap_headway_and_time_to_collision_of_two_cars_in_one_lane_whether_or_no
         assert values(result, "time_headway") == pytest.approx(gap / 12.0)
         assert values(result, "time_to_collision") == pytest.approx(gap / 2.0)
         assert len(values(result, "speed")) == 65 * (1 + driven)
-    result = measured(made_by_hand(CLOSING_IN, np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)])))
+    result = measured(
+        made_by_hand(CLOSING_IN, np.hstack([np.zeros_like(TIME), np.full_like(TIME, 3.5)]))
+    )
     assert len(values(result, "gap")) == 0
     assert result.quantile("gap", 0.5) is None
 
@@ -109,17 +114,23 @@ def test_segments_keep_their_unit_and_leave_out_what_was_to_be_skipped():
     assert pieces[1].x[0, 0] == pytest.approx(65.0)
 
 
-COUNTS = arrays(np.float64, (2, 7), elements=st.integers(0, 50)).filter(lambda rows: rows.sum(1).min() > 0)
+COUNTS = arrays(np.float64, (2, 7), elements=st.integers(0, 50)).filter(
+    lambda rows: rows.sum(1).min() > 0
+)
 
 
 @given(COUNTS)
 def test_distance_is_that_of_scipy(rows):
     expected = jensenshannon(rows[0], rows[1], base=2)
-    assert jensen_shannon(rows[0], rows[1]) == pytest.approx(0.0 if math.isnan(expected) else expected, abs=1e-7)
+    assert jensen_shannon(rows[0], rows[1]) == pytest.approx(
+        0.0 if math.isnan(expected) else expected, abs=1e-7
+    )
 
 
 def test_equal_shapes_are_at_0_and_disjoint_ones_at_1():
-    assert jensen_shannon(np.array([1.0, 3.0]), np.array([10.0, 30.0])) == pytest.approx(0.0, abs=1e-7)
+    assert jensen_shannon(np.array([1.0, 3.0]), np.array([10.0, 30.0])) == pytest.approx(
+        0.0, abs=1e-7
+    )
     assert jensen_shannon(np.array([5.0, 0.0]), np.array([0.0, 2.0])) == pytest.approx(1.0)
     assert np.isnan(jensen_shannon(np.zeros(2), np.ones(2)))
 
@@ -134,40 +145,62 @@ def test_scenes_that_are_alike_have_a_low_ceiling_and_unlike_ones_a_high_one():
 
 def histograms(shift, seed, number=12):
     random = np.random.default_rng(seed)
-    return np.stack([np.bincount(random.binomial(20, 0.3 + shift, 200), minlength=21) for _ in range(number)]) * 1.0
+    return (
+        np.stack(
+            [
+                np.bincount(random.binomial(20, 0.3 + shift, 200), minlength=21)
+                for _ in range(number)
+            ]
+        )
+        * 1.0
+    )
 
 
 def test_a_model_that_is_nearer_in_every_scene_is_found_to_be_closer():
     recorded, near, far = histograms(0.0, 0), histograms(0.02, 1), histograms(0.2, 2)
     difference = distance_difference(near, far, recorded, resamples=200)
     assert difference.high < 0.0
-    assert difference.value == pytest.approx(distance(near, recorded).value - distance(far, recorded).value)
+    assert difference.value == pytest.approx(
+        distance(near, recorded).value - distance(far, recorded).value
+    )
     assert verdict(difference) == "closer"
     assert verdict(distance_difference(far, near, recorded, resamples=200)) == "farther"
 
 
 def test_two_runs_of_one_model_are_undecided_and_one_scene_gives_no_interval_and_no_verdict():
-    difference = distance_difference(histograms(0.1, 3), histograms(0.1, 4), histograms(0.0, 5), resamples=200)
+    difference = distance_difference(
+        histograms(0.1, 3), histograms(0.1, 4), histograms(0.0, 5), resamples=200
+    )
     assert difference.low < 0.0 < difference.high
     assert verdict(difference) == verdict(Estimate(-0.5, None, None)) == "undecided"
     assert distance(histograms(0.1, 0, 1), histograms(0.0, 1, 1)).interval is None
 
 
 def draws(shift, number, trials=40):
-    """Recordings and a model that lies by ``shift`` beside them, of histograms with means of their own."""
+    """Recordings and a model that lies by ``shift`` beside them, of histograms with means of their
+    own.
+    """
     random = np.random.default_rng(number)
     for _ in range(trials):
         means = random.normal(0.3, 0.05, number).clip(0.1, 0.6)
         size = random.integers(15, 60, number)
         yield [
-            np.stack([np.bincount(random.binomial(20, p, times * n), minlength=21) for p, n in zip(at, size)]) * 1.0
+            np.stack(
+                [
+                    np.bincount(random.binomial(20, p, times * n), minlength=21)
+                    for p, n in zip(at, size)
+                ]
+            )
+            * 1.0
             for at, times in ((means, 1), (means + shift, 4), (means + shift, 4))
         ]
 
 
 @pytest.mark.parametrize("number", [4, 11])
 def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
-    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)]
+    intervals = [
+        distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.0, number)
+    ]
     assert all(each.low <= each.value <= each.high for each in intervals)
     assert sum(each.low == 0.0 for each in intervals) >= 0.9 * len(intervals)
 
@@ -175,8 +208,14 @@ def test_the_interval_of_a_perfect_model_holds_0_and_its_own_estimate(number):
 @pytest.mark.parametrize("number", [4, 11])
 def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
     many = np.random.default_rng(1).normal(0.3, 0.05, 2000).clip(0.1, 0.6)
-    true = float(jensen_shannon(*(binom.pmf(np.arange(21)[:, None], 20, at).sum(1) for at in (many, many + 0.1))))
-    intervals = [distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.1, number)]
+    true = float(
+        jensen_shannon(
+            *(binom.pmf(np.arange(21)[:, None], 20, at).sum(1) for at in (many, many + 0.1))
+        )
+    )
+    intervals = [
+        distance(model, recorded, resamples=300) for recorded, model, _ in draws(0.1, number)
+    ]
     assert sum(each.low <= true <= each.high for each in intervals) >= 0.85 * len(intervals)
     assert sum(each.low > 0.0 for each in intervals) >= 0.9 * len(intervals)
 
@@ -184,7 +223,8 @@ def test_the_interval_of_a_model_that_is_off_holds_its_true_distance(number):
 @pytest.mark.parametrize(("number", "shift"), [(4, 0.0), (11, 0.0), (4, 0.1), (11, 0.1)])
 def test_two_equally_good_models_are_seldom_told_apart(number, shift):
     verdicts = [
-        verdict(distance_difference(*models, recorded, resamples=300)) for recorded, *models in draws(shift, number)
+        verdict(distance_difference(*models, recorded, resamples=300))
+        for recorded, *models in draws(shift, number)
     ]
     assert verdicts.count("undecided") >= 0.9 * len(verdicts)
 
@@ -199,7 +239,9 @@ def test_every_interval_holds_its_estimate(recorded, first, second):
 
 def test_a_model_does_not_differ_from_itself_and_unpaired_units_are_resampled_on_its_side():
     model = histograms(0.1, 3)
-    assert distance_difference(model, model, histograms(0.0, 5), resamples=50) == Estimate(0.0, 0.0, 0.0)
+    assert distance_difference(model, model, histograms(0.0, 5), resamples=50) == Estimate(
+        0.0, 0.0, 0.0
+    )
     model, recorded = histograms(0.1, 3, 5), histograms(0.0, 5, 8)
     estimate = distance(model, recorded, paired=False, resamples=100)
     assert estimate.low <= estimate.value <= estimate.high
@@ -212,7 +254,9 @@ def reference():
     whole = {"lane_changes": 3, "vehicle_km": 2.0, "speed_spread_mps": 1.0}
     floors = {"random": {"speed": 0.5}, "constant_velocity": {"speed": 0.2}}
     names = [each.name for each in recordings]
-    return replace(Reference.of(measure_recordings(recordings), names, whole, "made up"), floors=floors)
+    return replace(
+        Reference.of(measure_recordings(recordings), names, whole, "made up"), floors=floors
+    )
 
 
 def test_a_reference_comes_back_from_its_file(reference, tmp_path):

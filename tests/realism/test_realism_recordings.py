@@ -10,7 +10,11 @@ from ganlane.realism.recordings import I80_FILES, read_i80
 
 
 def lane_file(path):
-    rows = [(car, frame, 20.0 + 1.8 * (frame - 20 * car), 0.0) for car in range(12) for frame in range(20 * car, 320)]
+    rows = [
+        (car, frame, 20.0 + 1.8 * (frame - 20 * car), 0.0)
+        for car in range(12)
+        for frame in range(20 * car, 320)
+    ]
     pl.DataFrame(rows, schema=["vehicle", "frame", "x", "x_raw"], orient="row").write_csv(path)
 
 
@@ -25,7 +29,10 @@ def pairs_file(path):
 
 
 def test_pairs_have_a_driven_follower_at_the_recorded_gap(tmp_path):
-    for name, write, gap, speed in (("pairs", pairs_file, 20.0, 9.0), ("following", following_file, 10.0, 7.0)):
+    for name, write, gap, speed in (
+        ("pairs", pairs_file, 20.0, 9.0),
+        ("following", following_file, 10.0, 7.0),
+    ):
         write(tmp_path / I80_FILES[name])
         recordings = read_i80(name, tmp_path / I80_FILES[name])
         # 40 s and 20 s, less the first 3, in pieces of 15.

@@ -43,7 +43,9 @@ def test_folds_are_driven_one_by_one_and_joined(frame):
     whole = starts_of(frame, Fold(MAKERS, NAMES, []))
     assert apart.scenes == whole.scenes == NAMES
     assert apart.separately_held_out == []
-    assert np.array_equal(apart.driven["cruise"].counts["speed"], whole.driven["cruise"].counts["speed"])
+    assert np.array_equal(
+        apart.driven["cruise"].counts["speed"], whole.driven["cruise"].counts["speed"]
+    )
 
 
 def test_a_fold_without_scenes_is_passed_over_and_none_at_all_is_refused(frame):

@@ -17,7 +17,14 @@ class Server:
     """
 
     def __init__(
-        self, content=CONTENT, breaks=(), ranges=True, etag='"one"', length=True, status=None, sends_to=None
+        self,
+        content=CONTENT,
+        breaks=(),
+        ranges=True,
+        etag='"one"',
+        length=True,
+        status=None,
+        sends_to=None,
     ):
         self.content, self.breaks, self.ranges, self.etag = content, list(breaks), ranges, etag
         self.length, self.status, self.sends_to = length, status, sends_to
@@ -53,7 +60,9 @@ class Server:
             return
         request.send_response(206 if partial else 200)
         if partial:
-            request.send_header("Content-Range", f"bytes {start}-{len(self.content) - 1}/{len(self.content)}")
+            request.send_header(
+                "Content-Range", f"bytes {start}-{len(self.content) - 1}/{len(self.content)}"
+            )
         if self.etag:
             request.send_header("ETag", self.etag)
         if self.length:

@@ -13,11 +13,17 @@ from ganlane.sim.state import Vehicles
 def start(env, episodes, seed=0):
     """The start of certain episodes."""
     episode = torch.tensor(episodes)
-    return env.reset(TensorDict({keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode}, [len(episodes)]))
+    return env.reset(
+        TensorDict(
+            {keys.SEED: torch.full_like(episode, seed), keys.EPISODE: episode}, [len(episodes)]
+        )
+    )
 
 
 def drive(env, episodes, decisions, command=lambda decision, episode: 0):
-    """The vehicles [T + 1, N, M] after each physics step, which rows ran in it [T, N], and the last state."""
+    """The vehicles [T + 1, N, M] after each physics step, which rows ran in it [T, N], and the last
+    state.
+    """
     state, steps, running = start(env, episodes), [], []
     steps.append(Vehicles.of(state[keys.VEHICLES]))
     done = state["done"][:, 0]
@@ -44,7 +50,10 @@ def overlaps(vehicles):
 
 
 def overlaps_of_the_others(env, least_km, seconds=None, ego=False):
-    """Steps with overlaps in ``least_km`` of the others' driving, in episodes of ``seconds``; ``ego``: its, too."""
+    """Steps with overlaps in ``least_km`` of the others' driving, in episodes of ``seconds``.
+
+    ``ego``: its, too.
+    """
     km, count, first, decisions = 0.0, 0, 0 if ego else 1, 0
 
     def record(now, running):
@@ -56,7 +65,9 @@ def overlaps_of_the_others(env, least_km, seconds=None, ego=False):
     state = env.reset()
     while km < least_km:
         decisions += 1
-        state = env.step(state.set(keys.ACTION, torch.zeros(env.batch_size, dtype=torch.int64)))["next"]
+        state = env.step(state.set(keys.ACTION, torch.zeros(env.batch_size, dtype=torch.int64)))[
+            "next"
+        ]
         if seconds and decisions % seconds == 0:
             state[keys.EPISODE] = state[keys.EPISODE] + env.batch_size[0]
             state = env.reset(state.select(keys.SEED, keys.EPISODE))
@@ -64,13 +75,18 @@ def overlaps_of_the_others(env, least_km, seconds=None, ego=False):
 
 
 def assert_same_alone(make, traffic, episodes, decisions):
-    """Every episode of a batch is bit for bit the same as by itself in the environment ``make(traffic, 1)``."""
+    """Every episode of a batch is bit for bit the same as by itself in the environment
+    ``make(traffic, 1)``.
+    """
     together, running, _ = drive(make(traffic, len(episodes)), episodes, decisions, turns)
     for row, episode in enumerate(episodes):
         alone, ran, _ = drive(make(traffic, 1), [episode], decisions, turns)
         count = int(running[:, row].sum())
         assert count == int(ran[:, 0].sum()) > 0
-        assert all(torch.equal(one[: count + 1, 0], all_[: count + 1, row]) for one, all_ in zip(alone, together))
+        assert all(
+            torch.equal(one[: count + 1, 0], all_[: count + 1, row])
+            for one, all_ in zip(alone, together)
+        )
 
 
 def turns(decision, episode):

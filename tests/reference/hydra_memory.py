@@ -1,7 +1,9 @@
-"""Hydra composes each choice of options once for a whole test session; keys are set, and refused, by Hydra itself.
+"""Hydra composes each choice of options once for a whole test session; keys are set, and refused,
+by Hydra itself.
 
-For tests of what a command says about a value: reading thirty YAML files three times per command line takes longer
-than all the rest of a refusal. Tests of the composing itself do without (``tests/config``).
+For tests of what a command says about a value: reading thirty YAML files three times per command
+line takes longer than all the rest of a refusal. Tests of the composing itself do without
+(``tests/config``).
 """
 
 from __future__ import annotations
@@ -41,13 +43,21 @@ def fresh_hydra() -> Iterator[None]:
 
 
 def composed(command: str, options: tuple[str, ...] = ()) -> Any:
-    """As Hydra composes it with these options of groups, its own part included; read from YAML once."""
+    """As Hydra composes it with these options of groups, its own part included.
+
+    Read from YAML once.
+    """
     if (command, options) not in CONFIGS:
         register(command)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(ConfigLoaderImpl, "load_configuration", LOAD)
-            with fresh_hydra(), initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE):
-                CONFIGS[command, options] = compose(command, overrides=list(options), return_hydra_config=True)
+            with (
+                fresh_hydra(),
+                initialize_config_dir(str(conf_folder()), version_base=VERSION_BASE),
+            ):
+                CONFIGS[command, options] = compose(
+                    command, overrides=list(options), return_hydra_config=True
+                )
     return CONFIGS[command, options].copy()
 
 
@@ -63,7 +73,11 @@ def load_from_memory(self: Any, config_name: str, overrides: list[str], *_: Any,
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     chosen = [override for override in parsed if (conf_folder() / override.key_or_group).is_dir()]
     config = composed(config_name, tuple(str(override.input_line) for override in chosen))
-    ConfigLoaderImpl._apply_overrides_to_config([override for override in parsed if override not in chosen], config)
-    config.hydra.overrides.task = [override.input_line for override in parsed if not override.is_hydra_override()]
+    ConfigLoaderImpl._apply_overrides_to_config(
+        [override for override in parsed if override not in chosen], config
+    )
+    config.hydra.overrides.task = [
+        override.input_line for override in parsed if not override.is_hydra_override()
+    ]
     config.hydra.runtime.cwd = str(Path.cwd())
     return config

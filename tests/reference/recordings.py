@@ -1,4 +1,7 @@
-"""Recordings in the schema, written out as NGSIM and highD publish theirs: the readers' way, backwards."""
+"""Recordings in the schema, written out as NGSIM and highD publish theirs.
+
+The readers' way, backwards.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +21,16 @@ START_MS = 1_118_847_000_000
 
 def traffic(**more) -> pl.DataFrame:
     """Six seconds of nine vehicles on three lanes in two scenes."""
-    return synthetic_scenes(SyntheticTraffic(vehicles=9, seconds=6.0, changing_share=0.0, **more), seed=4)
+    return synthetic_scenes(
+        SyntheticTraffic(vehicles=9, seconds=6.0, changing_share=0.0, **more), seed=4
+    )
 
 
 def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS, lanes: int = 3) -> pl.DataFrame:
-    """One scene of the schema in NGSIM's 18 columns: feet, front centres, lanes and positions from the left."""
+    """One scene of the schema in NGSIM's 18 columns.
+
+    Feet, front centres, lanes and positions from the left.
+    """
     return scene.sort("vehicle", "frame").select(
         pl.col("vehicle").alias("Vehicle_ID"),
         pl.col("frame").alias("Frame_ID"),
@@ -38,7 +46,10 @@ def ngsim_rows(scene: pl.DataFrame, start_ms: int = START_MS, lanes: int = 3) ->
         (pl.col("speed") / FOOT_M).round(6).alias("v_Vel"),
         pl.lit(0.0).alias("v_Acc"),
         (lanes - pl.col("lane")).alias("Lane_ID"),
-        *(pl.lit(0).alias(name) for name in ("Preceding", "Following", "Space_Headway", "Time_Headway")),
+        *(
+            pl.lit(0).alias(name)
+            for name in ("Preceding", "Following", "Space_Headway", "Time_Headway")
+        ),
     )
 
 
@@ -63,20 +74,38 @@ def portal_csv(rows: pl.DataFrame, location: str = "us-101", thousands: bool = T
 def write_highd(folder: Path, name: str = "01", seconds: float = 8.0) -> None:
     """One recording with two lanes each way and a car in each.
 
-    Upper lanes between 8, 12 and 16 m, lower ones between 20, 24 and 28 m. Car 1 drives to the left in the upper
-    outer lane, car 2 to the left in the inner one and then out; car 3 to the right in the lower outer lane.
+    Upper lanes between 8, 12 and 16 m, lower ones between 20, 24 and 28 m. Car 1 drives to the left
+    in the upper outer lane, car 2 to the left in the inner one and then out; car 3 to the right in
+    the lower outer lane.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows = [
-        (frame, vehicle, centre_x + speed * (frame - 1) / 25.0 - 2.5, centre_y - 1.0, 5.0, 2.0, speed, 0.0, lane)
+        (
+            frame,
+            vehicle,
+            centre_x + speed * (frame - 1) / 25.0 - 2.5,
+            centre_y - 1.0,
+            5.0,
+            2.0,
+            speed,
+            0.0,
+            lane,
+        )
         for vehicle, (centre_x, speed, centre_y, lane) in HIGHD_CARS.items()
         for frame in range(1, int(25 * seconds) + 1)
     ]
     names = ["frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity", "laneId"]
     pl.DataFrame(rows, schema=names, orient="row").write_csv(folder / f"{name}_tracks.csv")
     meta = [(vehicle, 1 if speed < 0 else 2) for vehicle, (_, speed, _, _) in HIGHD_CARS.items()]
-    pl.DataFrame(meta, schema=["id", "drivingDirection"], orient="row").write_csv(folder / f"{name}_tracksMeta.csv")
-    recording = {"id": 1, "frameRate": 25, "upperLaneMarkings": "8.00;12.00;16.00", "lowerLaneMarkings": "20;24;28"}
+    pl.DataFrame(meta, schema=["id", "drivingDirection"], orient="row").write_csv(
+        folder / f"{name}_tracksMeta.csv"
+    )
+    recording = {
+        "id": 1,
+        "frameRate": 25,
+        "upperLaneMarkings": "8.00;12.00;16.00",
+        "lowerLaneMarkings": "20;24;28",
+    }
     pl.DataFrame(recording).write_csv(folder / f"{name}_recordingMeta.csv")
 
 
@@ -90,8 +119,17 @@ def made_by_hand(x, y=None, speed=0.0, lanes=3, name="scene", **changed) -> Reco
     """Cars of 4 m at positions ``x`` [T, V] on lanes of 3.5 m, all of them present and driven."""
     x = np.asarray(x, dtype=np.float64)
     size = np.ones(x.shape[1])
-    y, speed = (np.broadcast_to(each, x.shape).astype(np.float64) for each in (0.0 if y is None else y, speed))
-    fields = {"y": y, "speed": speed, "present": np.ones(x.shape, bool), "driven": size > 0, **changed}
+    y, speed = (
+        np.broadcast_to(each, x.shape).astype(np.float64)
+        for each in (0.0 if y is None else y, speed)
+    )
+    fields = {
+        "y": y,
+        "speed": speed,
+        "present": np.ones(x.shape, bool),
+        "driven": size > 0,
+        **changed,
+    }
     return Recording(name, name, lanes, 3.5, x, length=4.0 * size, width=2.0 * size, **fields)
 
 
@@ -102,7 +140,8 @@ def following_file(path: Path) -> None:
     pl.DataFrame(rows, schema=names, orient="row").write_csv(path)
 
 
-#: Vehicle: first centre along the picture, speed, centre across the picture (downwards), highD's lane number.
+#: Vehicle: first centre along the picture, speed, centre across the picture (downwards), highD's
+#: lane number.
 HIGHD_CARS = {
     1: (400.0, -30.0, 10.0, 2),
     2: (380.0, -35.0, 14.5, 3),

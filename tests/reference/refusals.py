@@ -1,4 +1,7 @@
-"""How commands end: refused with status 2 and one sentence, nothing left behind; or naming their results."""
+"""How commands end: refused with status 2 and one sentence, nothing left behind.
+
+Or naming their results.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,8 @@ def everything_below(folder: Path) -> dict[str, int]:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: str, printed: bool = False) -> str:
-    """The sentence with which a command line is refused, after all that it must not do was looked for.
+    """The sentence with which a command line is refused, after all that it must not do was looked
+    for.
 
     Nothing is on stdout, unless something may have been ``printed`` before.
     """

@@ -1,7 +1,9 @@
-"""The simulator once more, one car at a time in plain Python floats: what the tensor code is tested against.
+"""The simulator once more, one car at a time in plain Python floats: what the tensor code is tested
+against.
 
-Written from the equations (section IV.C of the paper, Tables IV and V, Treiber et al. 2000, Kesting et al. 2007,
-Salvucci and Gray 2004), not from the tensor code, and for reading, not for speed. SI units.
+Written from the equations (section IV.C of the paper, Tables IV and V, Treiber et al. 2000, Kesting
+et al. 2007, Salvucci and Gray 2004), not from the tensor code, and for reading, not for speed. SI
+units.
 """
 
 from __future__ import annotations
@@ -74,9 +76,14 @@ class Outcome:
 
 
 def idm(speed: float, desired_speed: float, gap: float, leader_speed: float) -> float:
-    """a (1 - (v/v0)^4 - (s*/s)^2), s* = d0 + max(0, v T + v dv / (2 sqrt(a b))); between -20 and 0.7 m/s2."""
+    """a (1 - (v/v0)^4 - (s*/s)^2), s* = d0 + max(0, v T + v dv / (2 sqrt(a b))).
+
+    Between -20 and 0.7 m/s2.
+    """
     a, b, headway, d0 = 0.7, 1.7, 1.6, 2.0
-    wanted = d0 + max(0.0, speed * headway + speed * (speed - leader_speed) / (2.0 * math.sqrt(a * b)))
+    wanted = d0 + max(
+        0.0, speed * headway + speed * (speed - leader_speed) / (2.0 * math.sqrt(a * b))
+    )
     acceleration = a * (1.0 - (speed / desired_speed) ** 4 - (wanted / max(gap, 0.1)) ** 2)
     return min(0.7, max(-20.0, acceleration))
 
@@ -120,7 +127,9 @@ class View:
 
     def gap(self, behind: int, ahead: int) -> float:
         """Bumper to bumper."""
-        return self.distance(behind, ahead) - 0.5 * (self.cars[behind].length + self.cars[ahead].length)
+        return self.distance(behind, ahead) - 0.5 * (
+            self.cars[behind].length + self.cars[ahead].length
+        )
 
     def is_ahead(self, i: int, j: int) -> bool:
         """Whether j is ahead of i; at the same x the lower index is."""
@@ -158,7 +167,9 @@ def settled(car: Car, rules: Rules) -> bool:
 
 
 def incentive(view: View, i: int, lane: int) -> tuple[float, bool]:
-    """``a~_c - a_c + p (a~_n - a_n) + q (a~_o - a_o)`` and whether nobody has to brake harder than 4 m/s2."""
+    """``a~_c - a_c + p (a~_n - a_n) + q (a~_o - a_o)`` and whether nobody has to brake harder than
+    4 m/s2.
+    """
     own = view.cars[i].target_lane
     gain = view.acceleration(i, view.leader(i, lane)) - view.acceleration(i, view.leader(i, own))
     safe = view.acceleration(i, view.leader(i, lane)) >= -4.0
@@ -190,7 +201,8 @@ def mobil_wish(view: View, i: int) -> int:
 def mobil_changes(view: View) -> dict[int, int]:
     """Car to change, of all but the ego.
 
-    Of several that want into one lane the one behind waits if it is within 60 m or would have to brake too hard.
+    Of several that want into one lane the one behind waits if it is within 60 m or would have to
+    brake too hard.
     """
     wishes = {i: mobil_wish(view, i) for i in range(1, len(view.cars))}
     wanted = {i: view.cars[i].target_lane + wish for i, wish in wishes.items() if wish}
@@ -255,7 +267,12 @@ def corners(car: Car) -> list[tuple[float, float]]:
 def overlap(one: Car, other: Car) -> bool:
     """Whether no line parallel to an edge separates the two boxes."""
     boxes = corners(one), corners(other)
-    for angle in (one.heading, one.heading + math.pi / 2, other.heading, other.heading + math.pi / 2):
+    for angle in (
+        one.heading,
+        one.heading + math.pi / 2,
+        other.heading,
+        other.heading + math.pi / 2,
+    ):
         c, s = math.cos(angle), math.sin(angle)
         shadows = [[c * x + s * y for x, y in box] for box in boxes]
         if max(shadows[0]) <= min(shadows[1]) or max(shadows[1]) <= min(shadows[0]):
@@ -291,7 +308,8 @@ def physics_step(state: State, rules: Rules) -> None:
         for i, change in mobil_changes(view).items():
             state.cars[i] = replace(state.cars[i], target_lane=state.cars[i].target_lane + change)
     state.cars = [
-        driven(car, a, steered(car, car.target_lane * rules.lane_width)) for car, a in zip(state.cars, accelerations)
+        driven(car, a, steered(car, car.target_lane * rules.lane_width))
+        for car, a in zip(state.cars, accelerations)
     ]
     state.step += 1
 

@@ -15,7 +15,13 @@ SIZES = GeneratorSizes(embedding=16, hidden=12, pooling=10, pooled=6, context=14
 LOOP = LoopConfig(updates=4, evaluate_every=2, warmup=1)
 PAPER = PaperConfig(SIZES, loop=LOOP, stride=6, samples=2, batch=4)
 CALIBRATED = CalibratedConfig(
-    replace(SIZES, extra_inputs=4), LOOP, (4,), (1.0,), held_out_horizon=8, batch=2, held_out_stride=20
+    replace(SIZES, extra_inputs=4),
+    LOOP,
+    (4,),
+    (1.0,),
+    held_out_horizon=8,
+    batch=2,
+    held_out_stride=20,
 )
 
 

@@ -1,13 +1,14 @@
-"""Linear stability of IDM traffic, in plain floats, from the equations: what rings and platoons are tested against.
+"""Linear stability of IDM traffic, in plain floats, from the equations: what rings and platoons are
+tested against.
 
-Car n follows car n - 1; x along the road, s the gap, v its speed, l its leader's. Near the equilibrium
-s_e(v) the acceleration is ``f_s ds + f_v dv + f_l dl``. A wave ``exp(i k n + lambda t)`` obeys, with
-``e = exp(-i k)`` (the leader's phase)::
+Car n follows car n - 1; x along the road, s the gap, v its speed, l its leader's. Near the
+equilibrium s_e(v) the acceleration is ``f_s ds + f_v dv + f_l dl``. A wave
+``exp(i k n + lambda t)`` obeys, with ``e = exp(-i k)`` (the leader's phase)::
 
     lambda^2 = f_s (e - 1) + (f_v + f_l e) lambda
 
-For long waves (k -> 0) the real part of lambda is positive, and the traffic string-unstable, where the slope of
-the equilibrium speed over the gap, ``-f_s / (f_v + f_l)``, exceeds ``(f_l - f_v) / 2``
+For long waves (k -> 0) the real part of lambda is positive, and the traffic string-unstable, where
+the slope of the equilibrium speed over the gap, ``-f_s / (f_v + f_l)``, exceeds ``(f_l - f_v) / 2``
 (Treiber and Kesting, Traffic Flow Dynamics, 2013, chapter 15).
 """
 
@@ -80,15 +81,21 @@ def wave(speed: float, desired: float, k: float, dt: float) -> tuple[complex, co
 def growth_rate(speed: float, desired: float, cars: int, dt: float) -> tuple[float, int]:
     """Of the fastest wave that fits on a ring of ``cars``: rate in 1/s, and how often it fits."""
     rates = [
-        (math.log(abs(wave(speed, desired, 2.0 * math.pi * j / cars, dt)[0])) / dt, j) for j in range(1, cars // 2)
+        (math.log(abs(wave(speed, desired, 2.0 * math.pi * j / cars, dt)[0])) / dt, j)
+        for j in range(1, cars // 2)
     ]
     return max(rates)
 
 
 def step_matrix(speed: float, desired: float, cars: int, dt: float, ring: bool) -> np.ndarray:
-    """One step of (displacements, speeds) [2 cars]; the first follows the last on a ring, else an undisturbed one."""
+    """One step of (displacements, speeds) [2 cars].
+
+    The first follows the last on a ring, else an undisturbed one.
+    """
     f, one = slopes(speed, desired), np.eye(cars)
     ahead = np.eye(cars, k=-1)
     ahead[0, -1] = float(ring)
     by_x, by_v = f.gap * (ahead - one), f.own * one + f.leader * ahead
-    return np.block([[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]])
+    return np.block(
+        [[one + 0.5 * dt**2 * by_x, dt * one + 0.5 * dt**2 * by_v], [dt * by_x, one + dt * by_v]]
+    )

@@ -1,4 +1,7 @@
-"""Scenes for tests: vehicles placed by hand, environments in one line, states turned into scalar cars."""
+"""Scenes for tests.
+
+Vehicles placed by hand, environments in one line, states turned into scalar cars.
+"""
 
 from __future__ import annotations
 
@@ -33,13 +36,28 @@ DEFAULTS = {
 
 
 def vehicles(*cars: dict, lane_width_m: float = 4.0, dtype: torch.dtype = DOUBLE) -> Vehicles:
-    """One row of cars, each a dict of fields; ``lane`` gives y and target lane unless they are named."""
+    """One row of cars, each a dict of fields.
+
+    ``lane`` gives y and target lane unless they are named.
+    """
     columns: dict[str, torch.Tensor] = {}
     filled = [
-        {**DEFAULTS, "y": car.get("lane", 0) * lane_width_m, "target_lane": car.get("lane", 0), **car} for car in cars
+        {
+            **DEFAULTS,
+            "y": car.get("lane", 0) * lane_width_m,
+            "target_lane": car.get("lane", 0),
+            **car,
+        }
+        for car in cars
     ]
     for name in keys.VEHICLE_FIELDS:
-        kind = dtype if name in keys.VEHICLE_FLOATS else torch.bool if name in keys.VEHICLE_FLAGS else torch.int64
+        kind = (
+            dtype
+            if name in keys.VEHICLE_FLOATS
+            else torch.bool
+            if name in keys.VEHICLE_FLAGS
+            else torch.int64
+        )
         columns[name] = torch.tensor([[car[name] for car in filled]], dtype=kind)
     return Vehicles(**columns)
 
@@ -49,16 +67,23 @@ def drawing(
 ) -> Callable[[float, float], torch.Tensor]:
     """``between(low, high)``, which draws uniform numbers of that shape."""
     generator = torch.Generator().manual_seed(seed) if isinstance(seed, int) else seed
-    return lambda low, high: low + (high - low) * torch.rand(shape, generator=generator, dtype=dtype)
+    return lambda low, high: (
+        low + (high - low) * torch.rand(shape, generator=generator, dtype=dtype)
+    )
 
 
 def vehicles_at(x: torch.Tensor, target_lane: torch.Tensor, **others: torch.Tensor) -> Vehicles:
-    """Cars [N, M] in the middle of their target lanes, straight ahead and signalled, but for the ``others``."""
+    """Cars [N, M] in the middle of their target lanes, straight ahead and signalled, but for the
+    ``others``.
+    """
     zero = torch.zeros_like(x)
     fields = {
         **{"x": x, "y": 4.0 * target_lane.to(x.dtype), "heading": zero, "acceleration": zero},
         **{"length": zero + 4.5, "width": zero + 2.5, "target_lane": target_lane},
-        **{"visibility": torch.full_like(target_lane, int(Visibility.SIGNALLED)), "valid": target_lane >= 0},
+        **{
+            "visibility": torch.full_like(target_lane, int(Visibility.SIGNALLED)),
+            "valid": target_lane >= 0,
+        },
     }
     return Vehicles(**{**fields, **others})
 
@@ -91,7 +116,10 @@ def moves(
 
 
 def disturbed(scene: Vehicles, lanes: int, generator: torch.Generator) -> Vehicles:
-    """The scene with everything a little off: in mid-change, at odd angles, seen in all ways or not at all."""
+    """The scene with everything a little off.
+
+    In mid-change, at odd angles, seen in all ways or not at all.
+    """
     between = drawing(scene.x.shape, generator, scene.x.dtype)
     side = (between(0, 1) < 0.3) * (between(0, 2).long() * 2 - 1)
     return scene.with_(
@@ -108,7 +136,10 @@ def disturbed(scene: Vehicles, lanes: int, generator: torch.Generator) -> Vehicl
 
 
 def packed(spread_m: float, spacing_m: float) -> SpawnParameters:
-    """Table II on another stretch; where cars stand closer, they are no faster than what they can brake from."""
+    """Table II on another stretch.
+
+    Where cars stand closer, they are no faster than what they can brake from.
+    """
     table = SpawnParameters(spread_m=spread_m, min_spacing_m=spacing_m)
     top = 0.95 * (-2.0 * TABLE_V.min_acceleration * (spacing_m - table.length_m)) ** 0.5
 
@@ -170,7 +201,9 @@ def placed(env: HighwayEnv, scene: Vehicles) -> TensorDictBase:
     return td
 
 
-def step(env: HighwayEnv, td: TensorDictBase, action: int | Sequence[int] | torch.Tensor = 0) -> TensorDictBase:
+def step(
+    env: HighwayEnv, td: TensorDictBase, action: int | Sequence[int] | torch.Tensor = 0
+) -> TensorDictBase:
     """The state after one decision; ``td`` stays as it is."""
     td = td.clone()
     td["action"] = torch.as_tensor(action, dtype=torch.int64).expand(env.batch_size).clone()
@@ -178,14 +211,18 @@ def step(env: HighwayEnv, td: TensorDictBase, action: int | Sequence[int] | torc
 
 
 def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
-    """Row ``row`` of an environment's state as scalar cars; wheels are straight in traffic that has none."""
+    """Row ``row`` of an environment's state as scalar cars.
+
+    Wheels are straight in traffic that has none.
+    """
     fields = {name: td[keys.VEHICLES, name][row].tolist() for name in keys.VEHICLE_FIELDS}
     count = len(fields["x"])
     wheels = td.get((keys.TRAFFIC, "steering"), None)
     steering = [0.0] * count if wheels is None else wheels[row].tolist()
     steering[0] = td[keys.EGO, "steering"][row].item()
     cars = [
-        scalar.Car(**{name: value[i] for name, value in fields.items()}, steering=steering[i]) for i in range(count)
+        scalar.Car(**{name: value[i] for name, value in fields.items()}, steering=steering[i])
+        for i in range(count)
     ]
     return scalar.State(
         cars,
@@ -199,13 +236,19 @@ def scalar_state(td: TensorDictBase, row: int) -> scalar.State:
 
 def leaves(td: TensorDictBase) -> Iterator[tuple[str | tuple[str, ...], torch.Tensor]]:
     """All tensors of a TensorDict with their keys, in a fixed order."""
-    yield from sorted(td.items(include_nested=True, leaves_only=True), key=lambda item: str(item[0]))
+    yield from sorted(
+        td.items(include_nested=True, leaves_only=True), key=lambda item: str(item[0])
+    )
 
 
 def same_bits(one: TensorDictBase, other: TensorDictBase) -> list[str]:
     """Names of the entries that are missing in one or differ in any bit."""
     a, b = dict(leaves(one)), dict(leaves(other))
-    return [str(name) for name in {**a, **b} if name not in a or name not in b or not torch.equal(a[name], b[name])]
+    return [
+        str(name)
+        for name in {**a, **b}
+        if name not in a or name not in b or not torch.equal(a[name], b[name])
+    ]
 
 
 Track = list[torch.Tensor]
@@ -219,8 +262,8 @@ def tracks(
 ) -> dict[int, Track]:
     """Episode to its states, over a run with automatic resets; unfinished episodes are left out.
 
-    ``episodes`` [N] are those that it begins with; None: the environment's first ones. A state is all that there is
-    of a row, exactly (a float32 and a small integer fit into a float64).
+    ``episodes`` [N] are those that it begins with; None: the environment's first ones. A state is
+    all that there is of a row, exactly (a float32 and a small integer fit into a float64).
     """
     td = env.reset()
     if episodes is not None:
@@ -230,7 +273,11 @@ def tracks(
     for _ in range(decisions):
         stepped, td = env.step_and_maybe_reset(td.set("action", act(td)))
         after = stepped["next"].exclude("reward", "action")
-        numbers = [value.reshape(len(after), -1).double() for name, value in leaves(after) if name != keys.EPISODE]
+        numbers = [
+            value.reshape(len(after), -1).double()
+            for name, value in leaves(after)
+            if name != keys.EPISODE
+        ]
         states = torch.cat(numbers, dim=1)
         for row, episode in enumerate(after[keys.EPISODE].tolist()):
             found.setdefault(episode, []).append(states[row])

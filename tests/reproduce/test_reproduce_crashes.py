@@ -14,7 +14,14 @@ from ganlane.config.commands import EvaluateConfig
 from ganlane.config.env import EnvConfig
 from ganlane.errors import UserError
 from ganlane.render import main
-from ganlane.reproduce.crashes import ENDS, Crash, CrashList, find_crashes, read_crashes, write_crashes
+from ganlane.reproduce.crashes import (
+    ENDS,
+    Crash,
+    CrashList,
+    find_crashes,
+    read_crashes,
+    write_crashes,
+)
 
 SHIPPED = Path(__file__).parents[2] / "docs" / "reproduce" / "crashes.json"
 
@@ -26,11 +33,15 @@ def shipped() -> CrashList:
 
 def earliest(listed: CrashList) -> dict[str, Crash]:
     """The earliest crash on each traffic."""
-    return {each.traffic: each for each in sorted(listed.crashes, key=lambda each: -len(each.actions))}
+    return {
+        each.traffic: each for each in sorted(listed.crashes, key=lambda each: -len(each.actions))
+    }
 
 
 def check_they_happen_again(listed: CrashList) -> None:
-    assert [rollout.end for rollout in listed.drive_again()] == [each.end for each in listed.crashes]
+    assert [rollout.end for rollout in listed.drive_again()] == [
+        each.end for each in listed.crashes
+    ]
 
 
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -42,8 +53,15 @@ def test_crashes_of_the_shipped_agents_happen_again(every, shipped):
 
 def test_the_list_holds_failures_of_the_published_evaluation(shipped):
     failures = json.loads((SHIPPED.parent / "results.json").read_text())["failures"]
-    known = {(f["driver"], f["traffic"], number, end) for f in failures for end in ENDS for number in f[end]}
-    assert {(each.driver, each.traffic, each.episode, each.end) for each in shipped.crashes} <= known
+    known = {
+        (f["driver"], f["traffic"], number, end)
+        for f in failures
+        for end in ENDS
+        for number in f[end]
+    }
+    assert {
+        (each.driver, each.traffic, each.episode, each.end) for each in shipped.crashes
+    } <= known
     drivers = {each.driver.partition("+")[0] for each in shipped.crashes}
     assert drivers >= {f"agent_{recipe}@{seed}" for recipe in ("idm", "gan") for seed in range(4)}
     assert SHIPPED.stat().st_size < 200_000
@@ -56,7 +74,8 @@ def test_episodes_that_end_otherwise_are_counted_and_not_listed(tmp_path):
     listed, others = find_crashes(rows, config, 3)
     assert [each.episode for each in listed.crashes] == [2, 3]
     assert others == 1
-    assert [each.episode for each in find_crashes(rows, config, 1)[0].crashes] == [3]  # the earliest
+    # the earliest
+    assert [each.episode for each in find_crashes(rows, config, 1)[0].crashes] == [3]
     write_crashes(tmp_path / "crashes.json", listed)
     read = read_crashes(tmp_path / "crashes.json")
     assert read.crashes == listed.crashes
@@ -87,7 +106,9 @@ def test_a_list_with_a_wrong_value_is_refused_in_one_sentence(path, value, small
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("content", [b"", b"[]", b"{}", b"\xff\xfe", b"[" * 100_000, b'{"kind": 3}'])
+@pytest.mark.parametrize(
+    "content", [b"", b"[]", b"{}", b"\xff\xfe", b"[" * 100_000, b'{"kind": 3}']
+)
 def test_other_files_are_refused_in_one_sentence(content, tmp_path):
     (tmp_path / "crashes.json").write_bytes(content)
     with pytest.raises(UserError, match="not a list of crashes") as refused:
@@ -113,8 +134,13 @@ def test_one_page_plays_crashes_of_several_traffics(small_list, capsys):
     assert "listed:" not in out  # each ended as listed
     page = Path("player.html").read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])["episodes"]
-    shown = [(each["agent"], each["traffic"], each["seed"], each["episode"], each["outcome"]) for each in data]
-    assert shown == [(each.driver, each.traffic, each.seed, each.episode, each.end) for each in crashes]
+    shown = [
+        (each["agent"], each["traffic"], each["seed"], each["episode"], each["outcome"])
+        for each in data
+    ]
+    assert shown == [
+        (each.driver, each.traffic, each.seed, each.episode, each.end) for each in crashes
+    ]
 
 
 @pytest.mark.usefixtures("hydra_from_memory")

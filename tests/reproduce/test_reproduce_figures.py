@@ -1,4 +1,7 @@
-"""The paper's Figures 2 and 3: which vehicles and which seconds are drawn, and the numbers behind the lines."""
+"""The paper's Figures 2 and 3.
+
+Which vehicles and which seconds are drawn, and the numbers behind the lines.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,12 @@ def episode(seconds=20.0, changes_at_s=10.0):
     across = np.clip((time_s - changes_at_s) / 3.0, 0.0, 1.0) * 4.0
     zero = np.zeros_like(time_s)
     x = np.stack(
-        [20.0 * time_s, 20.0 * time_s + 30.0, 20.0 * time_s - 20.0 + 300.0 * (time_s > changes_at_s + 1.0)], 1
+        [
+            20.0 * time_s,
+            20.0 * time_s + 30.0,
+            20.0 * time_s - 20.0 + 300.0 * (time_s > changes_at_s + 1.0),
+        ],
+        1,
     )
     full = np.ones((len(time_s), 3))
     return Trajectory(
@@ -102,8 +110,15 @@ def test_the_predictions_begin_where_the_observed_path_ends():
     now = paths.filter(paths["time_s"] == 0.0)
     assert now["ahead_m"].abs().max() == now["left_m"].abs().max() == 0.0
     assert paths["panel"].n_unique() == 8
-    assert set(paths["path"]) == {"observed", "recorded", "mean", *(f"sample {n + 1}" for n in range(SAMPLES))}
+    assert set(paths["path"]) == {
+        "observed",
+        "recorded",
+        "mean",
+        *(f"sample {n + 1}" for n in range(SAMPLES)),
+    }
     at_end = paths.filter(paths["time_s"].is_between(0.75, 0.85) & (paths["kind"] == "goes steady"))
     recorded = at_end.filter(at_end["path"] == "recorded")["ahead_m"].mean()
-    assert at_end.filter(at_end["path"] == "mean")["ahead_m"].mean() == pytest.approx(recorded, rel=0.2)
+    assert at_end.filter(at_end["path"] == "mean")["ahead_m"].mean() == pytest.approx(
+        recorded, rel=0.2
+    )
     assert len(draw_forecasts(paths).axes) == 8

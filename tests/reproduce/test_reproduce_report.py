@@ -36,14 +36,25 @@ def driven(agent, rewards, reasons=None, traffic="gan", at_fault=None):
 
 @pytest.fixture
 def matrix():
-    """Two trainings of a recipe, MOBIL and the random driver; the first training crashes and leaves the road once."""
+    """Two trainings of a recipe, MOBIL and the random driver.
+
+    The first training crashes and leaves the road once.
+    """
     return by_recipe(
         pl.concat(
             [
                 driven("random_legal", [0, 0, 1, 0]),
-                driven("mobil", [100, 100, 101, 100], ["goal", "goal", "goal", "hard_crash"], at_fault=False),
                 driven(
-                    "agent_idm@0", [120, 120, 121, 120], ["hard_crash", "out_of_road", "goal", "goal"], at_fault=True
+                    "mobil",
+                    [100, 100, 101, 100],
+                    ["goal", "goal", "goal", "hard_crash"],
+                    at_fault=False,
+                ),
+                driven(
+                    "agent_idm@0",
+                    [120, 120, 121, 120],
+                    ["hard_crash", "out_of_road", "goal", "goal"],
+                    at_fault=True,
                 ),
                 driven("agent_idm@1", [140, 140, 141, 140]),
             ]
@@ -56,7 +67,11 @@ def row_of(matrix, driver):
 
 
 def test_a_recipe_is_its_drivers_without_their_seeds():
-    assert recipe_of("agent_idm@3+safe") == recipe_of("some/folder/agent_idm.safetensors@12+safe") == "agent_idm+safe"
+    assert (
+        recipe_of("agent_idm@3+safe")
+        == recipe_of("some/folder/agent_idm.safetensors@12+safe")
+        == "agent_idm+safe"
+    )
     assert recipe_of("agent_idm+none") == "agent_idm+none"
     assert recipe_of("outputs/a@b/mine.safetensors") == "outputs/a@b/mine.safetensors"
 
@@ -66,22 +81,38 @@ def test_a_row_holds_the_trainings_together_and_each_alone(matrix):
     assert (row["trainings"], row["episodes"]) == (2, 4)
     assert row["mean_reward"] == pytest.approx(130.25)
     assert row["minus_mobil"] == pytest.approx(30.0)
-    # Two trainings that lead by 20 and 40: resampled, one of them twice at the most, as wide as two tell of others.
+    # Two trainings that lead by 20 and 40: resampled, one of them twice at the most, as wide as two
+    # tell of others.
     width = 10.0 * np.sqrt(2 / 1) * stats.t.ppf(0.975, 1) / stats.norm.ppf(0.975)
     assert row["minus_mobil_ci"] == pytest.approx([30.0 - width, 30.0 + width])
     assert row["probability_above_mobil"] == 1.0
     assert row["normalized_percent"] == pytest.approx(130.0)
     assert [each["mean_reward"] for each in row["each"]] == pytest.approx([120.25, 140.25])
     assert [each["hard_crash"] for each in row["each"]] == [1, 0]
-    assert (row["mean_speed_mps"], row["lane_changes_per_km"]) == (pytest.approx(25.0), pytest.approx(2.0))
-    assert row["crashes_per_1000_km"] == row["departures_per_1000_km"] == pytest.approx(1000 / (8 * KM))
+    assert (row["mean_speed_mps"], row["lane_changes_per_km"]) == (
+        pytest.approx(25.0),
+        pytest.approx(2.0),
+    )
+    assert (
+        row["crashes_per_1000_km"]
+        == row["departures_per_1000_km"]
+        == pytest.approx(1000 / (8 * KM))
+    )
     assert row["failures_per_1000_km"] == pytest.approx(2000 / (8 * KM))
 
 
 def test_what_is_not_known_is_none(matrix):
-    row, mobil, random_legal = (row_of(matrix, name) for name in ("agent_idm", "mobil", "random_legal"))
-    # MOBIL is not compared with itself, a single training has no probability, and no crash has no fault.
-    assert mobil["minus_mobil"] is random_legal["probability_above_mobil"] is random_legal["at_fault_share"] is None
+    row, mobil, random_legal = (
+        row_of(matrix, name) for name in ("agent_idm", "mobil", "random_legal")
+    )
+    # MOBIL is not compared with itself, a single training has no probability, and no crash has no
+    # fault.
+    assert (
+        mobil["minus_mobil"]
+        is random_legal["probability_above_mobil"]
+        is random_legal["at_fault_share"]
+        is None
+    )
     assert (row["at_fault_share"], mobil["at_fault_share"]) == (1.0, 0.0)
 
 
@@ -96,10 +127,15 @@ def test_drivers_are_compared_on_the_same_episodes_training_by_training(matrix):
 
 def test_trainings_are_matched_by_their_seed():
     crash, goal = ["hard_crash", "goal"], ["goal", "goal"]
-    ours = [driven(f"agent_gan@{seed}", [0, 0], ends) for seed, ends in ((0, goal), (1, crash), (4, goal))]
+    ours = [
+        driven(f"agent_gan@{seed}", [0, 0], ends)
+        for seed, ends in ((0, goal), (1, crash), (4, goal))
+    ]
     theirs = [driven(f"agent_idm@{seed}", [0, 0], ends) for seed, ends in ((2, goal), (1, crash))]
     (row,) = comparisons(by_recipe(pl.concat([*ours, *theirs])), [("agent_gan", "agent_idm")])
-    assert row["mcnemar"] == [{"driver": "agent_gan@1", "only_first": 0, "only_second": 0, "p_value": 1.0}]
+    assert row["mcnemar"] == [
+        {"driver": "agent_gan@1", "only_first": 0, "only_second": 0, "p_value": 1.0}
+    ]
 
 
 def test_two_drivers_that_never_crashed_may_still_differ():

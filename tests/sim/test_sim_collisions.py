@@ -23,7 +23,9 @@ def random_pairs(count: int) -> tuple[torch.Tensor, ...]:
     return between(-6, 6), between(-6, 6), *one, *other
 
 
-def a_point_in_both(dx, dy, heading, length, width, other_heading, other_length, other_width) -> bool:
+def a_point_in_both(
+    dx, dy, heading, length, width, other_heading, other_length, other_width
+) -> bool:
     """Whether a point of a fine grid on the first box lies in the other one."""
     along = torch.linspace(-0.5, 0.5, math.ceil(length / GRID_M) + 1, dtype=DOUBLE) * length
     across = torch.linspace(-0.5, 0.5, math.ceil(width / GRID_M) + 1, dtype=DOUBLE) * width
@@ -36,13 +38,25 @@ def a_point_in_both(dx, dy, heading, length, width, other_heading, other_length,
 
 
 def test_boxes_overlap_where_a_sampler_finds_a_common_point():
-    """A sampled point proves an overlap; one that is left after both boxes shrink is deep enough to be sampled."""
+    """A sampled point proves an overlap.
+
+    One that is left after both boxes shrink is deep enough to be sampled.
+    """
     pairs = random_pairs(600)
     dx, dy, heading, length, width, other_heading, other_length, other_width = pairs
-    found = torch.tensor([a_point_in_both(*(value.item() for value in pair)) for pair in zip(*pairs)])
+    found = torch.tensor(
+        [a_point_in_both(*(value.item() for value in pair)) for pair in zip(*pairs)]
+    )
     said = boxes_overlap(*pairs)
     shrunk = boxes_overlap(
-        dx, dy, heading, length - 0.3, width - 0.3, other_heading, other_length - 0.3, other_width - 0.3
+        dx,
+        dy,
+        heading,
+        length - 0.3,
+        width - 0.3,
+        other_heading,
+        other_length - 0.3,
+        other_width - 0.3,
     )
     assert (found & ~said).sum() == 0
     assert (shrunk & ~found).sum() == 0
@@ -52,7 +66,9 @@ def test_boxes_overlap_where_a_sampler_finds_a_common_point():
 
 def test_overlap_is_the_same_from_either_side():
     dx, dy, *boxes = random_pairs(600)
-    assert torch.equal(boxes_overlap(dx, dy, *boxes), boxes_overlap(-dx, -dy, *boxes[3:], *boxes[:3]))
+    assert torch.equal(
+        boxes_overlap(dx, dy, *boxes), boxes_overlap(-dx, -dy, *boxes[3:], *boxes[:3])
+    )
 
 
 def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
@@ -60,7 +76,9 @@ def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
         return scalar.Car(x, y, heading, 0.0, 0.0, length, width, 25.0, 0, 0, True)
 
     pairs = random_pairs(2000)
-    for said, dx, dy, *boxes in zip(boxes_overlap(*pairs).tolist(), *(value.tolist() for value in pairs)):
+    for said, dx, dy, *boxes in zip(
+        boxes_overlap(*pairs).tolist(), *(value.tolist() for value in pairs)
+    ):
         assert scalar.overlap(car(0.0, 0.0, *boxes[:3]), car(dx, dy, *boxes[3:])) == said
 
 
@@ -73,7 +91,8 @@ def test_overlap_agrees_with_the_corners_of_the_scalar_simulator():
         (0.0, 2.49, 0.0, True),
         (3.5, 0.0, math.pi / 2, False),  # crosswise: (4.5 + 2.5) / 2
         (3.49, 0.0, math.pi / 2, True),
-        # Turned by 45 degrees its corner reaches (4.5 + 2.5) / 2 / sqrt(2) = 2.4749 m: 4.7249 in all.
+        # Turned by 45 degrees its corner reaches (4.5 + 2.5) / 2 / sqrt(2) = 2.4749 m: 4.7249 in
+        # all.
         (4.73, -1.0, math.pi / 4, False),
         (4.70, 0.7071, math.pi / 4, True),
     ],
@@ -85,7 +104,9 @@ def test_overlap_by_hand(x, y, heading, hit):
 
 
 def test_an_invalid_vehicle_hits_nobody():
-    scene = vehicles({"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 0.0, "valid": False}, {"x": 2.0, "y": 0.0})
+    scene = vehicles(
+        {"x": 0.0, "y": 0.0}, {"x": 1.0, "y": 0.0, "valid": False}, {"x": 2.0, "y": 0.0}
+    )
     assert ego_overlaps(scene).tolist() == [[False, True]]
     assert pair_overlaps(scene)[0].nonzero().tolist() == [[0, 2], [2, 0]]
 

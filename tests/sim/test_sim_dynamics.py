@@ -22,7 +22,9 @@ def number(value: float) -> torch.Tensor:
 def drive(speed: float, steering: float, duration_s: float, dt: float, acceleration: float = 0.0):
     x, y, heading, v = ZERO, ZERO, ZERO, number(speed)
     for _ in range(round(duration_s / dt)):
-        pose = x, y, heading, v, _ = advance(x, y, heading, v, number(acceleration), number(steering), dt)
+        pose = x, y, heading, v, _ = advance(
+            x, y, heading, v, number(acceleration), number(steering), dt
+        )
     return pose
 
 
@@ -38,7 +40,9 @@ def circle(speed: float, steering: float, duration_s: float) -> tuple[float, flo
     )
 
 
-@pytest.mark.parametrize(("speed", "steering"), [(3.0, 0.5), (3.0, -0.5), (10.0, 0.1), (30.0, 0.01), (30.0, -0.002)])
+@pytest.mark.parametrize(
+    ("speed", "steering"), [(3.0, 0.5), (3.0, -0.5), (10.0, 0.1), (30.0, 0.01), (30.0, -0.002)]
+)
 def test_a_constant_steering_angle_drives_a_circle(speed, steering):
     x, y, heading = circle(speed, steering, 10.0)
     pose = drive(speed, steering, 10.0, dt=0.1)
@@ -62,11 +66,14 @@ def test_the_slip_angle_is_half_the_wheel_s_for_small_angles():
 
 
 def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
-    assert drive(0.0, 0.0, 10.0, 0.1, acceleration=0.7).x.item() == pytest.approx(0.5 * 0.7 * 10.0**2)
+    assert drive(0.0, 0.0, 10.0, 0.1, acceleration=0.7).x.item() == pytest.approx(
+        0.5 * 0.7 * 10.0**2
+    )
     pose = drive(1.0, 0.0, 0.1, 0.1, acceleration=-20.0)
     assert pose.speed.item() == 0.0
     assert pose.x.item() == pytest.approx(0.05)
-    assert pose.acceleration.item() == pytest.approx(-10.0)  # what was realised, not what was asked for
+    # what was realised, not what was asked for
+    assert pose.acceleration.item() == pytest.approx(-10.0)
 
 
 @given(
@@ -75,7 +82,9 @@ def test_constant_acceleration_is_exact_and_braking_ends_at_rest():
     steering=st.floats(-0.5, 0.5),
     heading=st.floats(-1.5, 1.5),
 )
-def test_nobody_goes_farther_than_its_speed_allows_nor_backwards(speed, acceleration, steering, heading):
+def test_nobody_goes_farther_than_its_speed_allows_nor_backwards(
+    speed, acceleration, steering, heading
+):
     pose = advance(ZERO, ZERO, *map(number, (heading, speed, acceleration, steering)), 0.1)
     moved = math.hypot(pose.x.item(), pose.y.item())
     assert pose.speed.item() >= 0.0
@@ -120,8 +129,9 @@ def test_a_crawling_car_changes_lanes_over_the_distance_of_one_at_3_mps():
     [
         (0.0, -4.0, 0.0, 0.0, 0.0),  # a standing car does not turn its wheels
         (0.0, 0.0, 0.0, 20.0, 0.0),  # in the middle of its lane it goes straight on
-        # 20 m/s, 1 m right of the centre, straight wheels: near point at 20 m, far point at 80 m. Nothing turns yet,
-        # so only the integral counts: 2.7 / 20 * 3.375 * atan(1 / 20) * 0.1 = 0.00227623 rad.
+        # 20 m/s, 1 m right of the centre, straight wheels: near point at 20 m, far point at 80 m.
+        # Nothing turns yet, so only the integral counts: 2.7 / 20 * 3.375 * atan(1 / 20) * 0.1 =
+        # 0.00227623 rad.
         (0.0, -1.0, 0.0, 20.0, 0.00227623),
         (0.45, -50.0, -1.0, 3.0, 0.5),  # at most half a radian
     ],

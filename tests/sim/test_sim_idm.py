@@ -1,4 +1,5 @@
-"""IDM against values worked by hand, whom it can save, and against the linear theory on platoons and rings.
+"""IDM against values worked by hand, whom it can save, and against the linear theory on platoons
+and rings.
 
 The theory is that of ``tests/reference/stability.py``; the simulation is the package's own traffic.
 """
@@ -35,8 +36,10 @@ BY_HAND = [
     # v, v0, gap, leader's v, acceleration
     (20.0, 25.0, FREE_GAP_M, 20.0, 0.413271908),  # 0.7 (1 - 0.4096 - (34 / 10000)^2)
     (0.0, 25.0, FREE_GAP_M, 0.0, 0.699999972),  # 0.7 (1 - (2 / 10000)^2)
-    (20.0, 25.0, 50.0, 15.0, -1.371332226),  # s* = 2 + 32 + 100 / 2.1817 = 79.83493; 0.7 (0.5904 - 2.549446)
-    (20.0, 25.0, 10.0, 40.0, 0.38528),  # the dynamic part is not negative: s* = 2; 0.7 (0.5904 - 0.04)
+    # s* = 2 + 32 + 100 / 2.1817 = 79.83493; 0.7 (0.5904 - 2.549446)
+    (20.0, 25.0, 50.0, 15.0, -1.371332226),
+    # the dynamic part is not negative: s* = 2; 0.7 (0.5904 - 0.04)
+    (20.0, 25.0, 10.0, 40.0, 0.38528),
     (0.0, 25.0, 2.0, 0.0, 0.0),  # standing at the minimum gap
     (0.0, 25.0, 1.0, 0.0, -2.1),  # 0.7 (1 - 4)
     (25.0, 25.0, FREE_GAP_M, 25.0, -0.00001234800),  # at the desired speed, -0.7 (42 / 10000)^2
@@ -66,7 +69,9 @@ def test_nobody_accelerates_at_the_equilibrium_gap():
     gap = equilibrium_gap(speed, 25.0)
     assert idm_acceleration(speed, 25.0, gap, speed).abs().max() < 1e-12
     # (2 + 15 * 1.6) / sqrt(1 - 0.6^4) = 26 / sqrt(0.8704)
-    assert equilibrium_gap(torch.tensor(15.0, dtype=DOUBLE), 25.0).item() == pytest.approx(27.868520)
+    assert equilibrium_gap(torch.tensor(15.0, dtype=DOUBLE), 25.0).item() == pytest.approx(
+        27.868520
+    )
 
 
 def test_in_the_middle_of_a_change_the_more_demanding_leader_counts():
@@ -96,7 +101,9 @@ def test_idm_stops_within_the_kinematic_distance_and_a_step(speed):
 
 
 def test_a_leader_that_brakes_at_once_gives_away_its_own_braking_distance():
-    assert least_gap(25.0, 0.0, 36.0) - least_gap(25.0, 10.0, 36.0) == pytest.approx(10.0**2 / 40.0, abs=0.15)
+    assert least_gap(25.0, 0.0, 36.0) - least_gap(25.0, 10.0, 36.0) == pytest.approx(
+        10.0**2 / 40.0, abs=0.15
+    )
 
 
 def test_highest_speed_and_least_gap_are_each_others_inverse():
@@ -107,18 +114,22 @@ def test_highest_speed_and_least_gap_are_each_others_inverse():
         assert least_gap(speed, 0.0, 36.0) <= gap + 0.11
 
 
-# Platoons behind a leader of constant speed settle at the analytic equilibrium gap, every one of their cars. How long
-# that takes follows from the linear theory, not from a look at the run.
+# Platoons behind a leader of constant speed settle at the analytic equilibrium gap, every one of
+# their cars. How long that takes follows from the linear theory, not from a look at the run.
 
 DESIRED, FOLLOWERS, LENGTH_M = 25.0, 9, 4.5
 SPEEDS = (1.0, 3.0, 6.0, 10.0, 15.0, 18.0, 20.0)
-#: Start of every platoon: bumper to bumper gap, m, and speed, m/s (or the leader's, if that is lower).
+#: Start of every platoon: bumper to bumper gap, m, and speed, m/s (or the leader's, if that is
+#: lower).
 START_GAP_M, START_SPEED = 40.0, 12.0
 TOLERANCE_M = 1e-6
 
 
 def leaders_wish(speed: torch.Tensor) -> torch.Tensor:
-    """Desired speed with which IDM on an empty lane holds ``speed``: ``1 = (v/v0)^4 + (s*/10 000 m)^2``."""
+    """Desired speed with which IDM on an empty lane holds ``speed``.
+
+    ``1 = (v/v0)^4 + (s*/10 000 m)^2``.
+    """
     interaction = desired_gap(speed, torch.zeros_like(speed)) / FREE_GAP_M
     return speed / (1.0 - interaction * interaction) ** 0.25
 
@@ -141,7 +152,10 @@ def settling_steps(speed: float) -> int:
     away_m = np.arange(1, FOLLOWERS + 1) * (START_GAP_M - stability.equilibrium(speed, DESIRED))
     away_mps = np.full(FOLLOWERS, speed - min(speed, START_SPEED))
     start = float(np.linalg.norm(np.concatenate((away_m, away_mps))))
-    matrix, steps = stability.step_matrix(speed, DESIRED, FOLLOWERS, PHYSICS_STEP_S, ring=False), 100
+    matrix, steps = (
+        stability.step_matrix(speed, DESIRED, FOLLOWERS, PHYSICS_STEP_S, ring=False),
+        100,
+    )
     # By how much so many steps multiply a platoon's deviations (m, m/s) from equilibrium, at most.
     while np.linalg.norm(np.linalg.matrix_power(matrix, steps), 2) * start > 0.1 * TOLERANCE_M:
         steps = round(1.2 * steps)
@@ -166,14 +180,19 @@ def test_every_car_of_a_platoon_settles_at_the_equilibrium_gap(settled, row):
 def test_nobody_touches_the_car_ahead_on_the_way_there():
     """From far more than the equilibrium gap, and from far less: a tenth of it."""
     start = platoons()
-    gaps = torch.tensor([0.1 * stability.equilibrium(v, DESIRED) for v in SPEEDS], dtype=DOUBLE)[:, None]
+    gaps = torch.tensor([0.1 * stability.equilibrium(v, DESIRED) for v in SPEEDS], dtype=DOUBLE)[
+        :, None
+    ]
     order = torch.arange(1 + FOLLOWERS, dtype=DOUBLE)
-    start = start.with_(x=-(gaps + LENGTH_M) * order, speed=start.speed[:, :1].expand_as(start.speed).clone())
+    start = start.with_(
+        x=-(gaps + LENGTH_M) * order, speed=start.speed[:, :1].expand_as(start.speed).clone()
+    )
     for cars in moves(IdmTraffic(Road(lanes=1)), start, 600):
         assert (cars.x[:, :-1] - cars.x[:, 1:] - LENGTH_M).min() > 0.0
 
 
-# On a ring road, below the speed that linear theory gives, Table V's drivers turn any disturbance into waves.
+# On a ring road, below the speed that linear theory gives, Table V's drivers turn any disturbance
+# into waves.
 
 CARS = 50
 SPACING_M = 45.0
@@ -185,7 +204,8 @@ RING = IdmTraffic(Road(lanes=1, ring_m=CARS * SPACING_M))
 def disturbed_rings(displacement: np.ndarray, speed: np.ndarray) -> Vehicles:
     """The four cases, [4, CARS], each in equilibrium but for a displacement (m) and a speed (m/s).
 
-    All rings are of the same length: where the gap is smaller the cars are longer. Only gaps enter IDM.
+    All rings are of the same length: where the gap is smaller the cars are longer. Only gaps enter
+    IDM.
     """
     desired, cruise = torch.tensor(CASES, dtype=DOUBLE).T[:, :, None].expand(2, 4, CARS)
     gaps = torch.tensor([stability.equilibrium(v, v0) for v0, v in CASES], dtype=DOUBLE)
@@ -212,7 +232,9 @@ def test_the_slopes_of_the_theory_are_those_of_the_package(desired, speed):
     values = (stability.equilibrium(speed, desired), speed, speed)
     gap, own, leader = (torch.tensor(value, dtype=DOUBLE, requires_grad=True) for value in values)
     idm_acceleration(own, desired, gap, leader).backward()
-    assert (gap.grad.item(), own.grad.item(), leader.grad.item()) == pytest.approx(stability.slopes(speed, desired))
+    assert (gap.grad.item(), own.grad.item(), leader.grad.item()) == pytest.approx(
+        stability.slopes(speed, desired)
+    )
 
 
 @pytest.mark.parametrize(("desired", "critical"), [(18.0, 12.1), (25.0, 17.3)])
@@ -223,17 +245,23 @@ def test_the_critical_speed_of_linear_theory(desired, critical):
     # One change of sign: unstable all the way down.
     signs = [stability.instability(v, desired) > 0.0 for v in np.linspace(0.1, 0.99 * desired, 200)]
     assert sum(one != other for one, other in pairwise(signs)) == 1
-    # 400 cars in steps of 0.1 s: within 0.01 m/s. 50 are too few for the longest waves: 0.2 to 0.3 lower.
+    # 400 cars in steps of 0.1 s: within 0.01 m/s. 50 are too few for the longest waves: 0.2 to 0.3
+    # lower.
     for cars, tolerance in ((400, 0.01), (CARS, 0.35)):
 
         def growth(v: float, cars: int = cars) -> float:
             return stability.growth_rate(v, desired, cars, PHYSICS_STEP_S)[0]
 
-        assert stability.zero_of(growth, found - 1.5, found + 1.5) == pytest.approx(found, abs=tolerance)
+        assert stability.zero_of(growth, found - 1.5, found + 1.5) == pytest.approx(
+            found, abs=tolerance
+        )
 
 
 def test_every_ring_grows_or_decays_at_the_rate_of_the_linear_theory():
-    """The fastest wave of each case, alone, of 0.1 mm: after 60 s its size and phase are those of its eigenvalue."""
+    """The fastest wave of each case, alone, of 0.1 mm.
+
+    After 60 s its size and phase are those of its eigenvalue.
+    """
     steps, size = 600, 1e-4
     numbers, waves = np.arange(CARS), []
     for desired, speed in CASES:
@@ -257,7 +285,9 @@ def test_in_1500_s_a_small_disturbance_grows_below_the_critical_speed_and_dies_a
     found = deviations(disturbed_rings(displacement, np.zeros_like(displacement)), steps)
     for case, (desired, speed) in enumerate(CASES):
         matrix = stability.step_matrix(speed, desired, CARS, PHYSICS_STEP_S, ring=True)
-        expected = np.linalg.matrix_power(matrix, steps) @ np.append(displacement[case], np.zeros(CARS))
+        expected = np.linalg.matrix_power(matrix, steps) @ np.append(
+            displacement[case], np.zeros(CARS)
+        )
         error = np.abs(found[-1][case] - expected).max()
         assert error < 0.01 * np.abs(expected).max()
     growth = found[-1][:, CARS:].std(axis=1) / found[2999][:, CARS:].std(axis=1)

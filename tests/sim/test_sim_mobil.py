@@ -1,9 +1,9 @@
 """MOBIL against values worked by hand, one vehicle per gap, and its promise.
 
-Nobody is made to brake harder than ``b_safe``, nor later while the one ahead does not brake. What holds exactly:
-whoever stands in the lane when the decision falls, signals into it, or enters it in the same second, is asked for no
-more than ``b_safe`` by the vehicle that enters, then or later. The promise does not cover one whom nobody sees
-coming, an ego that is not ``signalled``.
+Nobody is made to brake harder than ``b_safe``, nor later while the one ahead does not brake. What
+holds exactly: whoever stands in the lane when the decision falls, signals into it, or enters it in
+the same second, is asked for no more than ``b_safe`` by the vehicle that enters, then or later. The
+promise does not cover one whom nobody sees coming, an ego that is not ``signalled``.
 """
 
 from __future__ import annotations
@@ -76,17 +76,18 @@ def test_the_incentive_weighs_both_followers():
     """Worked by hand, with the new follower 60 m behind and the old one 30 m behind.
 
     New follower behind the subject: s* = 2 + 40 + 25 * 5 / 2.181742 = 99.293656,
-    -0.7 (99.293656 / 60)^2 = -1.917073; without it -0.7 (42 / 10000)^2 = -0.000012: burden -1.917060.
-    Old follower, 20 m/s, behind the subject: 0.7 (0.5904 - (34 / 30)^2) = -0.485831; behind the slow one, gap
-    30 + 4.5 + 50 = 84.5 m: 0.7 (0.5904 - (79.834925 / 84.5)^2) = -0.211563: relief 0.274268.
-    Incentive: 1.784604 + 1.0 * -1.917060 + 0.5 * 0.274268 = 0.004678.
+    -0.7 (99.293656 / 60)^2 = -1.917073; without it -0.7 (42 / 10000)^2 = -0.000012: burden
+    -1.917060. Old follower, 20 m/s, behind the subject: 0.7 (0.5904 - (34 / 30)^2) = -0.485831;
+    behind the slow one, gap 30 + 4.5 + 50 = 84.5 m: 0.7 (0.5904 - (79.834925 / 84.5)^2) =
+    -0.211563: relief 0.274268. Incentive: 1.784604 + 1.0 * -1.917060 + 0.5 * 0.274268 = 0.004678.
     """
     old = {"x": -34.5, "lane": 0, "speed": 20.0, "desired_speed": 25.0}
     cars = (SUBJECT, SLOW, fast_follower(60.0), old)
     scene = perceive(vehicles(*cars), Road(lanes=2))
     incentive, _ = change_to_the_left(scene)
     assert incentive == pytest.approx(0.004678, abs=1e-5)
-    # 0.0047 is under the threshold of 0.1, over one of 0, and under it again without the old follower's relief.
+    # 0.0047 is under the threshold of 0.1, over one of 0, and under it again without the old
+    # follower's relief.
     assert wish(*cars) == 0
     assert wish(*cars, mobil=MobilParameters(threshold=0.0)) == 1
     assert wish(*cars[:3], mobil=MobilParameters(threshold=0.0)) == 0
@@ -161,9 +162,12 @@ def test_of_two_who_want_the_same_gap_the_foremost_goes_and_farther_than_60_m_ap
 def test_a_gap_that_is_safe_for_a_car_may_not_be_so_for_a_lorry(length, safe):
     """Centres 20 m apart, both at 20 m/s: 15.5 m are left behind a car, 11.75 m behind a lorry.
 
-    IDM wants 34 m, so it asks for 0.7 (1 - 0.8^4 - (34 / gap)^2): -3.0 and -5.4 m/s2; safe is -4 m/s2.
+    IDM wants 34 m, so it asks for 0.7 (1 - 0.8^4 - (34 / gap)^2): -3.0 and -5.4 m/s2; safe is -4
+    m/s2.
     """
-    scene = perceive(vehicles({"x": 0.0, "lane": 0, "length": length}, {"x": -20.0, "lane": 1}), Road())
+    scene = perceive(
+        vehicles({"x": 0.0, "lane": 0, "length": length}, {"x": -20.0, "lane": 1}), Road()
+    )
     lane = torch.tensor([[1.0, 0.0]], dtype=DOUBLE)
     assert safe_change(scene, lane, TABLE_V)[0, 0].item() is safe
 
@@ -178,8 +182,13 @@ def test_a_gap_that_is_safe_for_a_car_may_not_be_so_for_a_lorry(length, safe):
     cars=st.integers(3, 20),
     mobil=st.sampled_from([TABLE_IV, SELFISH]),
 )
-def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(seed, lanes, cars, mobil):
-    """Against the scalar simulator's idea of who the new follower is and what it is asked for; seen in any way."""
+def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(
+    seed, lanes, cars, mobil
+):
+    """Against the scalar simulator's idea of who the new follower is and what it is asked for.
+
+    Seen in any way.
+    """
     road, scene = Road(lanes), random_scenes(20, cars, lanes, seed)
     generator = torch.Generator().manual_seed(seed)
     scene = scene.with_(
@@ -188,7 +197,9 @@ def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(seed
     )
     change = mobil_changes(perceive(scene, road), road, mobil=mobil)
     for row, car in change.nonzero().tolist():
-        fields = [dict(zip(scene._fields, car)) for car in zip(*(value[row].tolist() for value in scene))]
+        fields = [
+            dict(zip(scene._fields, car)) for car in zip(*(value[row].tolist() for value in scene))
+        ]
         view = scalar.View([scalar.Car(**given) for given in fields], scalar.Rules(lanes=lanes))
         lane = view.cars[car].target_lane + change[row, car].item()
         follower = view.follower(car, lane)
@@ -196,14 +207,20 @@ def test_at_its_decision_mobil_asks_no_more_than_b_safe_of_the_new_follower(seed
         assert view.acceleration(car, view.leader(car, lane)) >= -B_SAFE - 1e-9
 
 
-def new_demands(before: Vehicles, change: torch.Tensor, road: Road) -> tuple[torch.Tensor, torch.Tensor]:
-    """What every driver is asked for by one that has just decided to enter a lane it attends to, [N, M, M] (i by j).
+def new_demands(
+    before: Vehicles, change: torch.Tensor, road: Road
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What every driver is asked for by one that has just decided to enter a lane it attends to,
+    [N, M, M] (i by j).
 
-    m/s2, and whether j is i's leader there; nearest of those who are seen in the lane after all decisions.
+    m/s2, and whether j is i's leader there; nearest of those who are seen in the lane after all
+    decisions.
     """
     scene = perceive(before.with_(target_lane=before.target_lane + change), road)
     entered = scene.vehicles.target_lane.to(DOUBLE)[:, None, :]
-    attends = (scene.attention.low[:, :, None] <= entered) & (entered <= scene.attention.high[:, :, None])
+    attends = (scene.attention.low[:, :, None] <= entered) & (
+        entered <= scene.attention.high[:, :, None]
+    )
     leads = torch.zeros_like(attends)
     for lane in range(road.lanes):
         here = (scene.presence.low <= lane) & (lane <= scene.presence.high)
@@ -211,7 +228,10 @@ def new_demands(before: Vehicles, change: torch.Tensor, road: Road) -> tuple[tor
         nearest = (gap == gap.amin(-1, keepdim=True)) & (gap < FREE_GAP_M)
         leads |= nearest & (entered == lane)
     asked = idm_acceleration(
-        before.speed[:, :, None], before.desired_speed[:, :, None], scene.pairs.ahead, before.speed[:, None, :]
+        before.speed[:, :, None],
+        before.desired_speed[:, :, None],
+        scene.pairs.ahead,
+        before.speed[:, None, :],
     )
     return asked, leads & attends & (change != 0)[:, None, :]
 
@@ -223,14 +243,17 @@ def test_nobody_is_asked_for_more_not_even_one_who_enters_the_same_lane_in_the_s
     change = mobil_changes(perceive(scene, road), road, mobil=mobil)
     asked, leads = new_demands(scene, change, road)
     assert (asked[leads] >= -B_SAFE - 1e-9).all()
-    # Not for want of cases: thousands of new followers, hundreds near the limit, and pairs in one lane in one second.
+    # Not for want of cases: thousands of new followers, hundreds near the limit, and pairs in one
+    # lane in one second.
     stays = leads & (change == 0)[:, :, None]
     assert stays.sum() > 3000
     assert (asked[stays] < -0.75 * B_SAFE).sum() > 100
     assert (leads & (change != 0)[:, :, None]).sum() > 100
 
 
-def test_without_a_look_at_what_they_would_ask_of_each_other_hundreds_would_be_asked_for_more(monkeypatch):
+def test_without_a_look_at_what_they_would_ask_of_each_other_hundreds_would_be_asked_for_more(
+    monkeypatch,
+):
     """So the test above can fail: with the 60 m alone both go, however fast the rear one is."""
     road, vehicles_there = Road(lanes=3), random_scenes(rows=6000, cars=12, lanes=3, seed=1)
     scene = perceive(vehicles_there, road)
@@ -245,7 +268,9 @@ def test_without_a_look_at_what_they_would_ask_of_each_other_hundreds_would_be_a
     assert asked[hard].min() == TABLE_V.min_acceleration
     row, behind, ahead = hard.nonzero().T
     assert (change[row, behind] != 0).all()
-    assert (vehicles_there.x[row, ahead] - vehicles_there.x[row, behind] >= TABLE_IV.exclusive_m).all()
+    assert (
+        vehicles_there.x[row, ahead] - vehicles_there.x[row, behind] >= TABLE_IV.exclusive_m
+    ).all()
 
 
 def test_an_ego_that_is_seen_by_its_body_alone_can_be_asked_for_more():
@@ -266,12 +291,15 @@ ENTERS, FOLLOWS = 1, 3
 
 
 def merges(rows: int, seed: int, mobil: MobilParameters = SELFISH) -> Vehicles:
-    """Scenes in which one has just decided to enter the lane of another, whatever their speeds and distances.
+    """Scenes in which one has just decided to enter the lane of another, whatever their speeds and
+    distances.
 
     The ego is far away; a slow car makes the one in front of it want the other lane.
     """
     between = drawing((rows,), seed)
-    x = torch.stack((between(5000, 5001), between(0, 0), between(7.5, 85), between(-125, -5)), dim=1)
+    x = torch.stack(
+        (between(5000, 5001), between(0, 0), between(7.5, 85), between(-125, -5)), dim=1
+    )
     speed = torch.stack((between(20, 21), between(0, 30), between(0, 25), between(0, 35)), dim=1)
     desired = torch.maximum(torch.stack([between(10, 40) for _ in range(4)], dim=1), 0.8 * speed)
     lane = torch.tensor([0, 0, 0, 1]).expand(rows, -1)
@@ -285,13 +313,16 @@ def merges(rows: int, seed: int, mobil: MobilParameters = SELFISH) -> Vehicles:
 def demand(scene: Vehicles) -> torch.Tensor:
     """What the one that enters asks of its new follower, m/s2, [N]."""
     v, gap = scene, scene.x[:, ENTERS] - scene.x[:, FOLLOWS] - 4.5
-    return idm_acceleration(v.speed[:, FOLLOWS], v.desired_speed[:, FOLLOWS], gap, v.speed[:, ENTERS])
+    return idm_acceleration(
+        v.speed[:, FOLLOWS], v.desired_speed[:, FOLLOWS], gap, v.speed[:, ENTERS]
+    )
 
 
 def demands(scene: Vehicles, seconds: float, braking: float) -> torch.Tensor:
     """:func:`demand` at every step of the change, [steps, N].
 
-    The one that enters drives like everybody else but never brakes, or brakes all the time, by ``braking`` m/s2.
+    The one that enters drives like everybody else but never brakes, or brakes all the time, by
+    ``braking`` m/s2.
     """
 
     def drives(before: Vehicles, after: Vehicles) -> Vehicles:
@@ -304,7 +335,10 @@ def demands(scene: Vehicles, seconds: float, braking: float) -> torch.Tensor:
 
 
 def test_nor_is_the_new_follower_asked_for_more_than_b_safe_while_the_one_ahead_does_not_brake():
-    """IDM calms down by itself: a demand may grow to the comfortable deceleration; what is above that shrinks."""
+    """IDM calms down by itself: a demand may grow to the comfortable deceleration.
+
+    What is above that shrinks.
+    """
     film = demands(merges(rows=20_000, seed=2), seconds=8.0, braking=0.0)
     assert film.shape[1] > 5000
     assert film.min() >= -B_SAFE

@@ -1,4 +1,7 @@
-"""Whom a driver finds ahead and behind: by hand, against a loop, and by sorting bit for bit as by comparing pairs."""
+"""Whom a driver finds ahead and behind.
+
+By hand, against a loop, and by sorting bit for bit as by comparing pairs.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,11 @@ def test_leader_and_follower_are_the_nearest_in_the_lane_asked_for():
     seen = perceive(scene, ROAD)
     ahead, behind = leader(seen, lane(1.0, scene)), follower(seen, lane(1.0, scene))
     assert (ahead.gap[0, 0], ahead.speed[0, 0]) == (30.0 - 4.5, 11.0)
-    assert (behind.gap[0, 0], behind.speed[0, 0], behind.desired_speed[0, 0]) == (25.0 - 4.5, 13.0, 33.0)
+    assert (behind.gap[0, 0], behind.speed[0, 0], behind.desired_speed[0, 0]) == (
+        25.0 - 4.5,
+        13.0,
+        33.0,
+    )
     right = leader(seen, lane(0.0, scene))
     assert (right.gap[0, 0], right.speed[0, 0]) == (20.0 - 4.5, 12.0)
     assert not follower(seen, lane(0.0, scene)).exists[0, 0]
@@ -49,7 +56,9 @@ def test_an_empty_lane_is_free_for_ten_kilometres_and_moves_with_the_driver():
 
 
 def test_an_invalid_car_is_nobodys_leader():
-    scene = vehicles({"x": 0.0, "lane": 1}, {"x": 10.0, "lane": 1, "valid": False}, {"x": 50.0, "lane": 1})
+    scene = vehicles(
+        {"x": 0.0, "lane": 1}, {"x": 10.0, "lane": 1, "valid": False}, {"x": 50.0, "lane": 1}
+    )
     assert leader(perceive(scene, ROAD), lane(1.0, scene)).gap[0, 0] == 45.5
 
 
@@ -63,7 +72,10 @@ def test_side_by_side_in_two_lanes_the_one_of_lower_index_is_ahead():
 
 
 def test_followers_keep_off_the_rear_of_a_lorry_and_not_off_its_middle():
-    """Centres 30 m apart, so 21.75 m are free; the lorry itself is 30 - 8.25 m behind the car ahead of it."""
+    """Centres 30 m apart, so 21.75 m are free.
+
+    The lorry itself is 30 - 8.25 m behind the car ahead of it.
+    """
     scene = perceive(vehicles({"x": 0.0}, {"x": 30.0, "length": 12.0}, {"x": 60.0}), ROAD)
     assert leader(scene, scene.body.low).gap[0, :2].tolist() == pytest.approx([21.75, 21.75])
 
@@ -74,7 +86,10 @@ def test_the_view_of_the_ego_alone_is_the_first_row_of_everybodys():
     scene = scene.with_(y=scene.y + torch.randn(scene.y.shape, generator=generator, dtype=DOUBLE))
     all_of_them, ego = perceive(scene, ROAD), perceive(scene, ROAD, slice(0, 1))
     for number in range(3):
-        whole, alone = leader(all_of_them, lane(number, scene)), leader(ego, torch.full((1, 1), float(number)))
+        whole, alone = (
+            leader(all_of_them, lane(number, scene)),
+            leader(ego, torch.full((1, 1), float(number))),
+        )
         assert torch.equal(whole.gap[:, :1], alone.gap)
         assert torch.equal(whole.speed[:, :1], alone.speed)
 
@@ -83,7 +98,10 @@ def test_the_view_of_the_ego_alone_is_the_first_row_of_everybodys():
 
 
 def scenes(cars: int, lanes: int, seed: int, grid_m: float, dtype: torch.dtype) -> Vehicles:
-    """Cars, lorries and empty places, every third in a lane change; on a coarse grid many stand level."""
+    """Cars, lorries and empty places, every third in a lane change.
+
+    On a coarse grid many stand level.
+    """
     between = drawing((ROWS, cars), seed, dtype)
     here = between(0, lanes).long()
     target = (here + between(-1.5, 1.5).round().long()).clamp(0, lanes - 1)
@@ -110,7 +128,9 @@ def scenes(cars: int, lanes: int, seed: int, grid_m: float, dtype: torch.dtype) 
 )
 def test_both_ways_find_the_same_neighbours(cars, lanes, seed, grid_m, own_roads):
     vehicles = scenes(cars, lanes, seed, grid_m, torch.float32)
-    road = Road(torch.full((ROWS, 1), lanes), torch.full((ROWS, 1), 4.0)) if own_roads else Road(lanes)
+    road = (
+        Road(torch.full((ROWS, 1), lanes), torch.full((ROWS, 1), 4.0)) if own_roads else Road(lanes)
+    )
     asked = vehicles.target_lane[..., None] + torch.tensor([0.0, 1.0, -1.0])
     found = {}
     for way in (SORT, PAIRS):
@@ -138,7 +158,8 @@ def test_the_leader_has_the_nearest_rear_and_is_the_slowest_of_those():
             ahead = [
                 (scene.pairs.ahead[row, i, j].item(), vehicles.speed[row, j].item())
                 for j in range(12)
-                if scene.pairs.order[row, i, j] > 0 and low[row, j] <= number[row, i] <= high[row, j]
+                if scene.pairs.order[row, i, j] > 0
+                and low[row, j] <= number[row, i] <= high[row, j]
             ]
             expected = min(ahead, default=(FREE_GAP_M, vehicles.speed[row, i].item()))
             assert (found.gap[row, i].item(), found.speed[row, i].item()) == expected
@@ -146,7 +167,9 @@ def test_the_leader_has_the_nearest_rear_and_is_the_slowest_of_those():
 
 def test_on_a_ring_the_first_has_the_last_as_its_leader():
     vehicles = scenes(8, 1, seed=1, grid_m=1.0, dtype=DOUBLE)
-    vehicles = vehicles.with_(valid=torch.ones_like(vehicles.valid), length=torch.full_like(vehicles.x, 4.5))
+    vehicles = vehicles.with_(
+        valid=torch.ones_like(vehicles.valid), length=torch.full_like(vehicles.x, 4.5)
+    )
     gap = leader(perceive(vehicles, Road(1, ring_m=300.0)), torch.zeros_like(vehicles.x)).gap
     first = vehicles.x.argmax(1, keepdim=True)
     around = vehicles.x.amin(1, keepdim=True) + 300.0 - vehicles.x.gather(1, first) - 4.5
@@ -158,8 +181,12 @@ def test_on_a_ring_the_first_has_the_last_as_its_leader():
 @pytest.mark.parametrize("seed", range(5))
 def test_among_the_few_who_wish_the_same_give_way_as_among_all(seed):
     vehicles = scenes(20, 3, seed, grid_m=0.25, dtype=torch.float32)
-    wish = torch.randint(-1, 2, (ROWS, 20), generator=torch.Generator().manual_seed(seed)) * (vehicles.speed > 20)
+    wish = torch.randint(-1, 2, (ROWS, 20), generator=torch.Generator().manual_seed(seed)) * (
+        vehicles.speed > 20
+    )
     kept = one_at_a_time(perceive(vehicles, ROAD), wish)
-    assert torch.equal(kept, torch.where(_gives_way(vehicles, ROAD, wish, TABLE_V, TABLE_IV), 0, wish))
+    assert torch.equal(
+        kept, torch.where(_gives_way(vehicles, ROAD, wish, TABLE_V, TABLE_IV), 0, wish)
+    )
     assert (kept != wish).any()
     assert (kept != 0).any()

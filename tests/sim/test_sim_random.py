@@ -54,7 +54,9 @@ def test_fields_are_mixed_in_one_after_the_other():
 
     made = draw_keys(episode_key(2, torch.tensor([5]), torch.tensor([2**40])), 17, 3, [4, 9])
     for vehicle, (column, purpose) in itertools.product(range(3), enumerate([4, 9])):
-        assert made[0, vehicle, column].item() % 2**64 == mixed(2, 0, 5, 2**40, 17, vehicle, purpose)
+        assert made[0, vehicle, column].item() % 2**64 == mixed(
+            2, 0, 5, 2**40, 17, vehicle, purpose
+        )
 
 
 def chi_square(u: torch.Tensor, bins: int) -> float:
@@ -71,7 +73,9 @@ def test_numbers_are_uniform_along_every_field():
     by_step = uniform(torch.full((4000,), 42), torch.arange(4000), 4, PURPOSES)
     by_vehicle = uniform(keys(2), 0, 8000, [Purpose.NOISE])
     by_seed = uniform(episode_key(1, torch.arange(16000), torch.zeros(16000).long()), 0, 1, [0])
-    slices = [by_episode[..., k] for k in range(len(PURPOSES))] + [by_step[..., k] for k in range(len(PURPOSES))]
+    slices = [by_episode[..., k] for k in range(len(PURPOSES))] + [
+        by_step[..., k] for k in range(len(PURPOSES))
+    ]
     slices += [by_episode[:, v] for v in range(4)] + [by_vehicle, by_seed]
     assert max(abs(chi_square(u, 64)) for u in slices) < 4.5
     assert by_episode.min() >= 0.0
@@ -89,7 +93,9 @@ def test_neighbours_in_any_field_are_independent():
 
 
 def test_no_two_places_share_a_number():
-    """All of a block of (stream, seed, episode, step, vehicle, purpose), the fields' values overlapping."""
+    """All of a block of (stream, seed, episode, step, vehicle, purpose), the fields' values
+    overlapping.
+    """
     seen = []
     for stream, step in itertools.product(Stream, range(6)):
         seed, episode = torch.meshgrid(torch.arange(6), torch.arange(6), indexing="ij")
@@ -105,7 +111,9 @@ def test_a_million_episodes_have_a_million_keys():
 
 def test_workers_and_seeds_far_apart_do_not_meet():
     episodes = torch.cat([w * 2**40 + torch.arange(1000) for w in range(50)])
-    both = torch.cat([episode_key(0, torch.full_like(episodes, seed), episodes) for seed in (0, 1, 2**40, 2**62)])
+    both = torch.cat(
+        [episode_key(0, torch.full_like(episodes, seed), episodes) for seed in (0, 1, 2**40, 2**62)]
+    )
     assert both.unique().numel() == both.numel()
 
 
@@ -136,7 +144,9 @@ def test_a_number_does_not_depend_on_the_batch_the_row_or_what_else_is_drawn(dty
 
 
 def test_normal_numbers_have_the_moments_of_the_normal_distribution():
-    z = normal(keys(20_000), 0, 2, [int(Purpose.NOISE), int(Purpose.NOISE) + 1], torch.float64).flatten()
+    z = normal(
+        keys(20_000), 0, 2, [int(Purpose.NOISE), int(Purpose.NOISE) + 1], torch.float64
+    ).flatten()
     error = 1.0 / math.sqrt(z.numel())
     assert abs(z.mean()) < 5 * error
     assert abs(z.var() - 1.0) < 5 * math.sqrt(2.0) * error

@@ -39,7 +39,8 @@ AWAY = {"x": 790.0}
         # Padding stays and takes no room.
         ([{**AWAY, "valid": False}], [790.0]),
         ([AWAY, {"x": 1190.0, "valid": False}], [1190.0, 1190.0]),
-        # At 20 m/s, within 4 m of another one in its lane, IDM asks for far more than 4 m/s2; beside it for nothing.
+        # At 20 m/s, within 4 m of another one in its lane, IDM asks for far more than 4 m/s2;
+        # beside it for nothing.
         *([[AWAY, {"x": x}], [790.0, x]] for x in (1182.0, 1190.0, 1198.0)),
         *([[AWAY, {"x": x, "lane": 1}], [1190.0, x]] for x in (1182.0, 1190.0, 1198.0)),
         # 60 m behind: a follower at the same speed is fine, one that closes in at 20 m/s is not.
@@ -55,7 +56,10 @@ def test_who_is_out_of_range_goes_to_the_other_side_where_there_is_room(others, 
 
 
 def test_nobody_is_put_beside_one_that_has_hardly_left_the_lane():
-    """Each in its own lane, but at an angle: the corners of two cars of 2.5 m, 2.6 m apart, would touch."""
+    """Each in its own lane, but at an angle.
+
+    The corners of two cars of 2.5 m, 2.6 m apart, would touch.
+    """
     moved = {**AWAY, "y": 7.28, "heading": 0.03, "target_lane": 2, "width": 2.5}
     leaving = {"x": 1190.0, "y": 4.68, "heading": -0.06, "target_lane": 1, "width": 2.5}
     for other, x in ((leaving, 790.0), ({**leaving, "y": 4.0}, 1190.0)):
@@ -66,7 +70,9 @@ def test_nobody_is_put_beside_one_that_has_hardly_left_the_lane():
 def test_only_the_position_changes():
     before = vehicles(EGO, {**AWAY, "y": 0.3, "heading": 0.01, "speed": 17.0, "acceleration": 0.2})
     after = recycle(before, ROAD, TABLE_V)
-    assert [name for name, a, b in zip(before._fields, before, after) if not torch.equal(a, b)] == ["x"]
+    assert [name for name, a, b in zip(before._fields, before, after) if not torch.equal(a, b)] == [
+        "x"
+    ]
 
 
 # Recycling, any scene
@@ -134,8 +140,11 @@ def test_several_that_return_at_once_burden_nobody():
 # Recycling in the environment
 
 
-def in_range_by_km(on: bool, cars: int = 9, goal_m: float = 5000.0, rows: int = 8) -> tuple[list[float], int]:
-    """Mean number of others within 200 m of a MOBIL ego, in each kilometre; and how often one of them was moved.
+def in_range_by_km(
+    on: bool, cars: int = 9, goal_m: float = 5000.0, rows: int = 8
+) -> tuple[list[float], int]:
+    """Mean number of others within 200 m of a MOBIL ego, in each kilometre; and how often one of
+    them was moved.
 
     No vehicle overlaps another in a physics step, and none is burdened.
     """
@@ -206,7 +215,13 @@ def test_rows_that_ended_are_not_recycled(on):
 def driven(share: float, num_envs: int = 32, first_episode: int = 0) -> torch.Tensor:
     """x [N, M] after 60 decisions at up to 35 m/s, where a ``share`` of the episodes is recycled."""
     spawn = SpawnParameters(ego_desired_speed_mps=35.0)
-    env = environment(num_envs=num_envs, spawn=spawn, first_episode=first_episode, recycle=True, recycle_share=share)
+    env = environment(
+        num_envs=num_envs,
+        spawn=spawn,
+        first_episode=first_episode,
+        recycle=True,
+        recycle_share=share,
+    )
     state = env.reset()
     for _ in range(60):
         state = step(env, state, 0)

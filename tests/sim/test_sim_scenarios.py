@@ -24,14 +24,23 @@ def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
     (tmp_path / "a.csv").write_text(CSV)
     cars = [
         {"x_m": 10, "lane": 0, "speed_mps": 20, "desired_speed_mps": 25},
-        {"x_m": 50, "lane": 1, "speed_mps": 18, "desired_speed_mps": 18, "target_lane": 0, "visibility": "body"},
+        {
+            "x_m": 50,
+            "lane": 1,
+            "speed_mps": 18,
+            "desired_speed_mps": 18,
+            "target_lane": 0,
+            "visibility": "body",
+        },
         {"x_m": -40, "lane": 0, "speed_mps": 20, "visibility": "signalled"},
     ]
     (tmp_path / "a.json").write_text(json.dumps({"lanes": 2, "vehicles": cars}))
     from_csv, from_json = read_scene(tmp_path / "a.csv"), read_scene(tmp_path / "a.json")
     assert from_csv.rows == from_json.rows
     assert from_csv.road == from_json.road == Road(2)
-    assert from_csv.rows[1] == SceneVehicle(50.0, 1, 18.0, 18.0, target_lane=0, visibility=Visibility.BODY)
+    assert from_csv.rows[1] == SceneVehicle(
+        50.0, 1, 18.0, 18.0, target_lane=0, visibility=Visibility.BODY
+    )
     assert from_csv.label(1) == "vehicle 1 (line 4)"
     assert read_scene(tmp_path / "a.csv", lanes=3).road.lanes == 3
 
@@ -47,9 +56,17 @@ def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
         ("a.csv", "x_m,lane\n0,0\n30\n", "line 3: 1 cells, the header has 2"),
         ("a.csv", "x_m,lane\n0,0\n\nfar,0\n", "line 4: column x_m: 'far': expected a number"),
         ("a.csv", "x_m,lane\n0,0\n30,0.5\n", "line 3: column lane: '0.5': expected a whole number"),
-        ("a.csv", "x_m,lane,visibility\n0,0,\n3,0,bad\n", "line 3: column visibility: 'bad': expected one of centre"),
+        (
+            "a.csv",
+            "x_m,lane,visibility\n0,0,\n3,0,bad\n",
+            "line 3: column visibility: 'bad': expected one of centre",
+        ),
         ("a.csv", "x_m,lane\n0,0\n3,0\n", "the ego (line 2) and vehicle 1 (line 3) overlap"),
-        ("a.csv", "x_m,lane\n0,0\ninf,0\n", "vehicle 1 (line 3): x_m=inf: expected a number from -1e+06 to 1e+06"),
+        (
+            "a.csv",
+            "x_m,lane\n0,0\ninf,0\n",
+            "vehicle 1 (line 3): x_m=inf: expected a number from -1e+06 to 1e+06",
+        ),
         ("a.csv", b"\xff\xfe\x00", "not a text file"),
         ("a.json", "[{", "not JSON"),
         ("a.json", "3", "expected a list of vehicles"),
@@ -57,8 +74,16 @@ def test_a_scene_is_read_from_csv_and_from_json_alike(tmp_path):
         ("a.json", '{"lanes": 0, "vehicles": []}', "lanes=0: expected a finite number above 0"),
         ("a.json", '{"roads": 1, "vehicles": []}', "unknown key 'roads'"),
         ("a.json", "[[1, 2]]", "vehicles entry 1: expected an object"),
-        ("a.json", '[{"x_m": 0, "lane": 0}, {"lane": 0}]', "vehicles entry 2: column x_m: no value"),
-        ("a.json", '[{"x_m": 0, "lane": true}]', "vehicles entry 1: column lane: True: expected a whole number"),
+        (
+            "a.json",
+            '[{"x_m": 0, "lane": 0}, {"lane": 0}]',
+            "vehicles entry 2: column x_m: no value",
+        ),
+        (
+            "a.json",
+            '[{"x_m": 0, "lane": true}]',
+            "vehicles entry 1: column lane: True: expected a whole number",
+        ),
         ("a.json", '{"lanes": 2, "vehicles": []}', "lanes is 2 in the file and 3 was asked for"),
         ("a.yaml", "x", "expected a scene as .csv or .json"),
         ("a.csv", None, "no such file"),

@@ -1,4 +1,6 @@
-"""Scenes set by hand start as they are written, vary as they are told, and hopeless ones are refused by name."""
+"""Scenes set by hand start as they are written, vary as they are told, and hopeless ones are
+refused by name.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def pair(gap_m: float, speed: float, leader: float, **options: float) -> FixedSc
 
 
 def test_the_ego_is_moved_to_zero_and_the_others_keep_their_distance():
-    s = scene(SceneVehicle(100.0, 1, 20.0), SceneVehicle(140.0, 0, 10.0), SceneVehicle(60.0, 1, 15.0))
+    s = scene(
+        SceneVehicle(100.0, 1, 20.0), SceneVehicle(140.0, 0, 10.0), SceneVehicle(60.0, 1, 15.0)
+    )
     v = s(keys(3), DOUBLE)
     assert v.x.tolist() == [[0.0, 40.0, -40.0]] * 3
     assert v.y[0].tolist() == [4.0, 0.0, 4.0]
@@ -45,7 +49,12 @@ def test_the_ego_is_moved_to_zero_and_the_others_keep_their_distance():
 
 
 def test_jitter_follows_from_the_episode_alone_and_keeps_its_bounds():
-    s = scene(SceneVehicle(0.0, 0, 20.0), SceneVehicle(90.0, 0, 0.0), SceneVehicle(-60.0, 1, 0.2), jitter_m=2.0)
+    s = scene(
+        SceneVehicle(0.0, 0, 20.0),
+        SceneVehicle(90.0, 0, 0.0),
+        SceneVehicle(-60.0, 1, 0.2),
+        jitter_m=2.0,
+    )
     s = replace(s, jitter_mps=0.5)
     v = s(keys(1000), DOUBLE)
     assert (v.x[:, 0] == 0).all()
@@ -65,13 +74,19 @@ def test_jitter_follows_from_the_episode_alone_and_keeps_its_bounds():
         (SceneVehicle(30.0, 2), "vehicle 1: lane=2: expected 0 to 1"),
         (SceneVehicle(30.0, y_m=5.5), "expected on the road, which runs from -2 to 6 m"),
         (SceneVehicle(30.0, 0, speed_mps=-1.0), "speed_mps=-1: expected at least 0"),
-        (SceneVehicle(30.0, 0, desired_speed_mps=0.0), "desired_speed_mps=0: expected a number above 0"),
+        (
+            SceneVehicle(30.0, 0, desired_speed_mps=0.0),
+            "desired_speed_mps=0: expected a number above 0",
+        ),
         (SceneVehicle(float("nan"), 0), "x_m=nan: expected a number from -1e+06 to 1e+06"),
         (SceneVehicle(30.0), "neither lane nor y_m"),
         (SceneVehicle(30.0, 0, y_m=4.0), "contradict each other"),
         (SceneVehicle(30.0, 0, target_lane=2), "target_lane=2: expected 0 to 1"),
         (SceneVehicle(10.0 * LARGEST, 0), "x_m=1e+07: expected a number from -1e+06 to 1e+06"),
-        (SceneVehicle(40.0, 0, desired_speed_mps=1e-300), "desired_speed_mps=1e-300: expected a number above 0"),
+        (
+            SceneVehicle(40.0, 0, desired_speed_mps=1e-300),
+            "desired_speed_mps=1e-300: expected a number above 0",
+        ),
         (SceneVehicle(4.0, 0), "the ego and vehicle 1 overlap"),
     ],
 )
@@ -98,7 +113,9 @@ def test_jitter_that_could_make_an_overlap_is_refused():
 
 def test_a_follower_that_would_need_more_than_the_strongest_braking_is_refused():
     """From 20 m/s to a standing car 9.9 m ahead: 20.2 m/s2; from 11 m: 18.2."""
-    with pytest.raises(UserError, match=r"ego at 20 m/s, 9\.9 m behind vehicle 1 at 0 m/s, would need 20\.2 m/s2"):
+    with pytest.raises(
+        UserError, match=r"ego at 20 m/s, 9\.9 m behind vehicle 1 at 0 m/s, would need 20\.2 m/s2"
+    ):
         pair(9.9, 20.0, 0.0).check(ROAD, TABLE_V)
     pair(11.0, 20.0, 0.0).check(ROAD, TABLE_V)
 
@@ -113,10 +130,15 @@ def test_who_is_in_another_lane_is_no_leader():
 
 
 def test_a_lane_change_that_nobody_sees_in_time_is_refused():
-    """Seen only once its centre is in the ego's lane; its body is there before. Signalled, it is seen at once."""
+    """Seen only once its centre is in the ego's lane; its body is there before.
+
+    Signalled, it is seen at once.
+    """
     cutter = SceneVehicle(30.0, 1, 8.0, 8.0, target_lane=0, visibility=Visibility.CENTRE)
     hidden = scene(SceneVehicle(0.0, 0, 25.0), cutter)
-    scene(SceneVehicle(0.0, 0, 25.0), replace(cutter, visibility=Visibility.SIGNALLED)).check(ROAD, TABLE_V)
+    scene(SceneVehicle(0.0, 0, 25.0), replace(cutter, visibility=Visibility.SIGNALLED)).check(
+        ROAD, TABLE_V
+    )
     with pytest.raises(UserError, match="the ego and vehicle 1 crash after"):
         hidden.check(ROAD, TABLE_V)
 
@@ -140,9 +162,14 @@ def test_a_pair_is_refused_exactly_where_it_cannot_brake(gap, speed, leader):
 
 @pytest.mark.parametrize("gap", [1.5, 7.5, 20.5])
 def test_a_column_of_twelve_survives_where_a_pair_does(gap):
-    """The leader stands, all the others come at the highest speed, each as close to the next as is allowed."""
+    """The leader stands, all the others come at the highest speed, each as close to the next as is
+    allowed.
+    """
     speed = highest_speed(gap, 0.0, 25.0)
-    column = [SceneVehicle(-k * (gap + 4.5), 0, speed if k else 0.0, 25.0 if k else 0.001) for k in range(12)]
+    column = [
+        SceneVehicle(-k * (gap + 4.5), 0, speed if k else 0.0, 25.0 if k else 0.001)
+        for k in range(12)
+    ]
     ego_first = (column[5], *column[:5], *column[6:])
     FixedScene(ego_first, ROAD).check(ROAD, TABLE_V)
     faster = tuple(replace(car, speed_mps=1.05 * car.speed_mps) for car in ego_first)

@@ -1,4 +1,7 @@
-"""Random first scenes: Table II, no overlap, the ego in the middle, lorries, and everybody can still brake."""
+"""Random first scenes.
+
+Table II, no overlap, the ego in the middle, lorries, and everybody can still brake.
+"""
 
 from __future__ import annotations
 
@@ -101,23 +104,50 @@ def test_a_full_road_holds_nine_vehicles_a_lane():
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
-        ({"front_speed_mps": (-5.0, 12.0)}, "front_speed_mps=[-5,12]: expected two numbers [low, high], 0 <= low"),
-        ({"rear_speed_mps": (25.0, 15.0)}, "rear_speed_mps=[25,15]: expected two numbers [low, high], 0 <= low"),
-        ({"ego_speed_mps": (math.nan, 15.0)}, "ego_speed_mps=[nan,15]: expected two numbers [low, high], 0 <= low"),
-        ({"ego_speed_mps": (10.0, math.nan)}, "ego_speed_mps=[10,nan]: expected two numbers [low, high], 0 <= low"),
-        ({"desired_speed_mps": (18.0, math.inf)}, "desired_speed_mps=[18,inf]: expected two numbers"),
-        ({"desired_speed_mps": (0.0, 26.0)}, "desired_speed_mps=[0,26]: expected two numbers [low, high], 0 < low"),
+        (
+            {"front_speed_mps": (-5.0, 12.0)},
+            "front_speed_mps=[-5,12]: expected two numbers [low, high], 0 <= low",
+        ),
+        (
+            {"rear_speed_mps": (25.0, 15.0)},
+            "rear_speed_mps=[25,15]: expected two numbers [low, high], 0 <= low",
+        ),
+        (
+            {"ego_speed_mps": (math.nan, 15.0)},
+            "ego_speed_mps=[nan,15]: expected two numbers [low, high], 0 <= low",
+        ),
+        (
+            {"ego_speed_mps": (10.0, math.nan)},
+            "ego_speed_mps=[10,nan]: expected two numbers [low, high], 0 <= low",
+        ),
+        (
+            {"desired_speed_mps": (18.0, math.inf)},
+            "desired_speed_mps=[18,inf]: expected two numbers",
+        ),
+        (
+            {"desired_speed_mps": (0.0, 26.0)},
+            "desired_speed_mps=[0,26]: expected two numbers [low, high], 0 < low",
+        ),
         ({"ego_desired_speed_mps": 0.0}, "ego_desired_speed_mps=0: expected a number above 0"),
         ({"length_m": 0.0}, "length_m=0: expected a number above 0"),
         ({"width_m": -2.5}, "width_m=-2.5: expected a number above 0"),
         ({"spread_m": math.nan}, "spread_m=nan: expected a number above 0"),
         ({"min_spacing_m": math.inf}, "min_spacing_m=inf: expected a number above 0"),
-        *(({"truck_share": share}, f"truck_share={share}: expected a number from 0 to 1") for share in (-0.1, 1.1)),
+        *(
+            ({"truck_share": share}, f"truck_share={share}: expected a number from 0 to 1")
+            for share in (-0.1, 1.1)
+        ),
         ({"truck_share": math.nan}, "truck_share=nan: expected a number from 0 to 1"),
         ({"truck_length_m": 0.0}, "truck_length_m=0: expected a number above 0"),
         ({"truck_width_m": math.nan}, "truck_width_m=nan: expected a number above 0"),
-        ({"truck_desired_speed_mps": (0.0, 25.0)}, "truck_desired_speed_mps=[0,25]: expected two numbers"),
-        ({"truck_desired_speed_mps": (25.0, 22.0)}, "truck_desired_speed_mps=[25,22]: expected two numbers"),
+        (
+            {"truck_desired_speed_mps": (0.0, 25.0)},
+            "truck_desired_speed_mps=[0,25]: expected two numbers",
+        ),
+        (
+            {"truck_desired_speed_mps": (25.0, 22.0)},
+            "truck_desired_speed_mps=[25,22]: expected two numbers",
+        ),
     ],
 )
 def test_impossible_numbers_are_refused_by_name(changed, what):
@@ -127,7 +157,10 @@ def test_impossible_numbers_are_refused_by_name(changed, what):
 
 
 def test_every_lane_is_as_likely_as_the_others():
-    """A vehicle takes one of 27 places; chi-square with 2 degrees of freedom stays under 13.8 (p = 0.001)."""
+    """A vehicle takes one of 27 places.
+
+    Chi-square with 2 degrees of freedom stays under 13.8 (p = 0.001).
+    """
     lanes = draw_lanes(episode_keys(9000), 9, 3, 9)[:, 4]
     counts = torch.bincount(lanes, minlength=3).double()
     assert ((counts - 3000) ** 2 / 3000).sum() < 13.8
@@ -151,12 +184,19 @@ def test_float32_and_float64_give_the_same_scene_to_rounding():
         assert difference.abs().max() < 1e-4
 
 
-@given(data=st.data(), lanes=st.integers(1, 6), spacing=st.floats(5.0, 40.0), spread=st.floats(40.0, 1000.0))
+@given(
+    data=st.data(),
+    lanes=st.integers(1, 6),
+    spacing=st.floats(5.0, 40.0),
+    spread=st.floats(40.0, 1000.0),
+)
 def test_no_scene_starts_with_an_overlap(data, lanes, spacing, spread):
     p = packed(spread, spacing)
     vehicles = data.draw(st.integers(1, min(60, lanes * p.lane_capacity())))
     check_start(p, vehicles, lanes)
-    s = spawn(episode_keys(4, seed=data.draw(st.integers(0, 2**40))), vehicles, lanes, 4.0, p, DOUBLE)
+    s = spawn(
+        episode_keys(4, seed=data.draw(st.integers(0, 2**40))), vehicles, lanes, 4.0, p, DOUBLE
+    )
     assert not pair_overlaps(s).any()
     assert smallest_spacing(s) >= spacing - 1e-9
     assert (s.x.amax(1) - s.x.amin(1)).max() <= spread + 1e-9
@@ -171,12 +211,26 @@ def test_no_scene_starts_with_an_overlap(data, lanes, spacing, spread):
         (SpawnParameters(), 28, r"^vehicles=28 do not fit: 3 lanes x 9"),
         (LORRIES, 22, r"^vehicles=22 do not fit.*truck_length_m=12\) hold 21"),
         (SpawnParameters(min_spacing_m=4.0), 2, "min_spacing_m=4"),
-        (SpawnParameters(min_spacing_m=10.0), 9, r"rear_speed_mps up to 25 m/s.*lower rear_speed_mps to 17\.7"),
-        (SpawnParameters(ego_speed_mps=(10.0, 60.0)), 9, "ego_speed_mps up to 60.*lower ego_speed_mps to"),
-        (SpawnParameters(front_speed_mps=(0.0, 40.0)), 9, "front_speed_mps up to 40.*raise min_spacing_m to"),
+        (
+            SpawnParameters(min_spacing_m=10.0),
+            9,
+            r"rear_speed_mps up to 25 m/s.*lower rear_speed_mps to 17\.7",
+        ),
+        (
+            SpawnParameters(ego_speed_mps=(10.0, 60.0)),
+            9,
+            "ego_speed_mps up to 60.*lower ego_speed_mps to",
+        ),
+        (
+            SpawnParameters(front_speed_mps=(0.0, 40.0)),
+            9,
+            "front_speed_mps up to 40.*raise min_spacing_m to",
+        ),
     ],
 )
-def test_vehicles_that_do_not_fit_or_cannot_brake_are_refused_in_a_sentence(parameters, vehicles, sentence):
+def test_vehicles_that_do_not_fit_or_cannot_brake_are_refused_in_a_sentence(
+    parameters, vehicles, sentence
+):
     with pytest.raises(UserError, match=sentence):
         check_start(parameters, vehicles, 3)
 
@@ -207,7 +261,8 @@ def test_random_scenes_are_laid_out_on_the_environments_road(other):
         RandomScenes(Road(3)).check(other, TABLE_V)
 
 
-#: Lanes no wider than a car; a ring without room for 200 m and 25 m between the last vehicle and the first.
+#: Lanes no wider than a car; a ring without room for 200 m and 25 m between the last vehicle and
+#: the first.
 WIDTH = r"env\.lane_width_m={}: expected more than env\.width_m=2\.5"
 RING = r"ring_m=224: expected at least env\.spread_m=200 and env\.min_spacing_m=25"
 
@@ -243,7 +298,10 @@ def test_lorries_are_the_share_asked_for_and_want_80_to_90_km_an_hour():
     assert lorry.double().mean().item() == pytest.approx(0.3, abs=0.0145)
     assert (lorry | (others.length == 4.5)).all()
     assert torch.equal(others.width, torch.full_like(others.x, 2.5))
-    for found, low, high in ((others.desired_speed[lorry], 22.0, 25.0), (others.desired_speed[~lorry], 18.0, 26.0)):
+    for found, low, high in (
+        (others.desired_speed[lorry], 22.0, 25.0),
+        (others.desired_speed[~lorry], 18.0, 26.0),
+    ):
         assert low <= found.min() < low + 0.05
         assert high - 0.05 < found.max() <= high
 
@@ -271,7 +329,10 @@ def test_without_lorries_the_scene_is_table_iis_bit_for_bit():
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 1.0])
 def test_everybody_can_brake_whoever_is_a_lorry(share):
-    """Two cars keep 20.5 m at least, and so do two lorries: the worst follower of Table II needs 13.3 m."""
+    """Two cars keep 20.5 m at least, and so do two lorries.
+
+    The worst follower of Table II needs 13.3 m.
+    """
     p = SpawnParameters(truck_share=share)
     assert p.lane_capacity() == 7
     RandomScenes(parameters=p).check(Road(), TABLE_V)

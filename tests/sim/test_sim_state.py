@@ -1,4 +1,7 @@
-"""Which lanes a vehicle is in, and the road: cases worked by hand; and bodies that stand in three lanes at once."""
+"""Which lanes a vehicle is in, and the road: cases worked by hand.
+
+And bodies that stand in three lanes at once.
+"""
 
 from __future__ import annotations
 
@@ -38,15 +41,25 @@ def seen_in(**car) -> tuple[float, float]:
 
 @pytest.mark.parametrize(
     ("y", "lanes"),
-    # A lane's edge is 2 m from its centre; half a body is 1.25 m; 0.1 m over the edge does not count.
-    [(0.0, (0, 0)), (0.84, (0, 0)), (0.86, (0, 1)), (2.0, (0, 1)), (3.14, (0, 1)), (3.16, (1, 1)), (4.0, (1, 1))],
+    # A lane's edge is 2 m from its centre; half a body is 1.25 m; 0.1 m over the edge does not
+    # count.
+    [
+        (0.0, (0, 0)),
+        (0.84, (0, 0)),
+        (0.86, (0, 1)),
+        (2.0, (0, 1)),
+        (3.14, (0, 1)),
+        (3.16, (1, 1)),
+        (4.0, (1, 1)),
+    ],
 )
 def test_a_body_is_in_every_lane_that_it_enters_by_more_than_a_tenth_of_a_metre(y, lanes):
     assert seen_in(y=y, target_lane=1, visibility=Visibility.BODY) == lanes
 
 
 def test_a_turned_body_takes_more_room():
-    # half extent at 0.2 rad: (2.5 cos 0.2 + 4.5 sin 0.2) / 2 = 1.672; over the edge by 0.1 from y = 0.428 on
+    # half extent at 0.2 rad: (2.5 cos 0.2 + 4.5 sin 0.2) / 2 = 1.672; over the edge by 0.1 from y =
+    # 0.428 on
     assert 0.5 * (2.5 * math.cos(0.2) + 4.5 * math.sin(0.2)) == pytest.approx(1.672, abs=1e-3)
     for heading in (0.2, -0.2):
         assert seen_in(y=0.42, heading=heading, target_lane=0, visibility=Visibility.BODY) == (0, 0)
@@ -103,15 +116,19 @@ def test_on_a_ring_distances_take_the_nearer_way_round():
     assert ring.distance_ahead(start, end).tolist() == [10.0, -10.0, 10.0, 40.0]
 
 
-# In narrow lanes a body that is turned stands in three lanes at once, and its driver looks into all of them: a second
-# change right after a first one, the rear still in the lane that it comes from, and a slow car in the lane between.
+# In narrow lanes a body that is turned stands in three lanes at once, and its driver looks into all
+# of them: a second change right after a first one, the rear still in the lane that it comes from,
+# and a slow car in the lane between.
 
 CHANGES, SLOWER = 0, 1
 DESIRED_MPS = 25.0
 
 
 def first_changes(lane_width_m: float, length_m: float, scenes: int = 20_000) -> Vehicles:
-    """One changes from lane 0 to lane 1, where a slower one is 2 to 32 m ahead; IDM asks for less than 4 m/s2."""
+    """One changes from lane 0 to lane 1, where a slower one is 2 to 32 m ahead.
+
+    IDM asks for less than 4 m/s2.
+    """
     between = drawing((scenes,), 0)
     speed = between(0.5, 12.0)
     slower = (speed - between(0.0, 6.0)).clamp_min(0.05)
@@ -130,7 +147,10 @@ def first_changes(lane_width_m: float, length_m: float, scenes: int = 20_000) ->
 
 
 def drive(lane_width_m: float, length_m: float = 4.5) -> tuple[int, int, int]:
-    """Over 15 s: scenes, those in which the two overlap, those in which the first stands in three lanes at once."""
+    """Over 15 s.
+
+    Scenes, those in which the two overlap, those in which the first stands in three lanes at once.
+    """
 
     def on_to_lane_2(before: Vehicles, cars: Vehicles) -> Vehicles:
         """In the moment that the change to lane 1 counts as complete."""
@@ -151,10 +171,15 @@ def drive(lane_width_m: float, length_m: float = 4.5) -> tuple[int, int, int]:
     ("lane_width_m", "length_m"),
     [
         (2.55, 4.5),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((3.5, 12.0), (2.7, 4.5), (2.9, 4.5), (3.0, 4.5))),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((3.5, 12.0), (2.7, 4.5), (2.9, 4.5), (3.0, 4.5))
+        ),
     ],
 )
-def test_who_changes_two_lanes_in_a_row_does_not_touch_the_slower_car_in_between(lane_width_m, length_m):
+def test_who_changes_two_lanes_in_a_row_does_not_touch_the_slower_car_in_between(
+    lane_width_m, length_m
+):
     scenes, overlaps, three = drive(lane_width_m, length_m)
     assert scenes > 15_000
     assert three > 1000
@@ -163,11 +188,19 @@ def test_who_changes_two_lanes_in_a_row_does_not_touch_the_slower_car_in_between
 
 @pytest.mark.parametrize(
     ("lane_width_m", "before"),
-    [(2.55, 229), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2.7, 157), (2.9, 66), (3.0, 7)))],
+    [
+        (2.55, 229),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((2.7, 157), (2.9, 66), (3.0, 7))
+        ),
+    ],
 )
 def test_with_the_lowest_and_the_highest_lane_alone_it_would(lane_width_m, before, monkeypatch):
     """The figures of docs/simulator.md: so the test above can fail."""
-    monkeypatch.setattr(idm, "spanned", lambda lanes: torch.stack((lanes.low, lanes.low, lanes.high), dim=-1))
+    monkeypatch.setattr(
+        idm, "spanned", lambda lanes: torch.stack((lanes.low, lanes.low, lanes.high), dim=-1)
+    )
     scenes, overlaps, _ = drive(lane_width_m)
     assert scenes == 15_937
     assert overlaps == pytest.approx(before, abs=3)

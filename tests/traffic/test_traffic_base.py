@@ -37,7 +37,9 @@ MAKE = {
     "gan": gan_traffic,
     "gan_planning": lambda: gan_traffic(execute_k=3),
     "gan_calibrated": gan_calibrated_traffic,
-    "mixed": lambda: MixedTraffic({"idm": IdmTraffic(), "faults": idm_faults_traffic()}, {"idm": 1, "faults": 1}),
+    "mixed": lambda: MixedTraffic(
+        {"idm": IdmTraffic(), "faults": idm_faults_traffic()}, {"idm": 1, "faults": 1}
+    ),
     "blind": lambda: BlindTraffic(IdmMobilTraffic(), 0.5),
     "replay": replay,
 }
@@ -59,7 +61,12 @@ def test_memory_and_moved_are_as_declared_and_the_state_at_t_is_never_written(na
         kept = state.clone()
         assert shapes(state.get(keys.TRAFFIC, TensorDict({}))) == traffic.memory_spec(4, 9)
         after = traffic(state.clone(recurse=False))
-        assert same_bits(state.select(keys.VEHICLES, keys.TRAFFIC), kept.select(keys.VEHICLES, keys.TRAFFIC)) == []
+        assert (
+            same_bits(
+                state.select(keys.VEHICLES, keys.TRAFFIC), kept.select(keys.VEHICLES, keys.TRAFFIC)
+            )
+            == []
+        )
         moved = after[keys.MOVED]
         assert shapes(moved) == shapes(kept[keys.VEHICLES])
         assert tuple(Vehicles.of(moved)._fields) == keys.VEHICLE_FIELDS

@@ -1,4 +1,7 @@
-"""Drivers' faults: as often as asked for, and doing what they say; none of them, and nothing changes."""
+"""Drivers' faults: as often as asked for, and doing what they say.
+
+None of them, and nothing changes.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +40,24 @@ from ganlane.traffic import (
     TrafficSequential,
 )
 from ganlane.traffic.faults import driven_at
-from ganlane.traffic.presets import gan_calibrated_traffic, gan_traffic, idm_faults_traffic, with_faults
+from ganlane.traffic.presets import (
+    gan_calibrated_traffic,
+    gan_traffic,
+    idm_faults_traffic,
+    with_faults,
+)
 
-NONE = DriverFaults(BrakingFaults(0.0), ReactionFaults(0.0), HesitationFaults(0.0), AbortFaults(0.0))
+NONE = DriverFaults(
+    BrakingFaults(0.0), ReactionFaults(0.0), HesitationFaults(0.0), AbortFaults(0.0)
+)
 EGO = {"x": -1000.0, "lane": 0}
 
 
 class OneChange(IdmTraffic):
-    """Everybody changes to the left once, after a second; a driver who turns back does not try again."""
+    """Everybody changes to the left once, after a second.
+
+    A driver who turns back does not try again.
+    """
 
     def move(self, vehicles, memory, key, step):
         target = vehicles.target_lane
@@ -61,7 +74,9 @@ class SuddenLeader(Overlay):
 
     def rewrite(self, vehicles, moved, memory, key, step):
         brakes = (step >= 30) & (step < 50) & self.brakes
-        leader = driven_at(vehicles, moved, torch.where(brakes, -3.0, 0.0)[:, None].expand_as(moved.x), self.dt)
+        leader = driven_at(
+            vehicles, moved, torch.where(brakes, -3.0, 0.0)[:, None].expand_as(moved.x), self.dt
+        )
         return leader.where(torch.arange(vehicles.x.shape[1])[None] == 1, moved), memory
 
 
@@ -85,7 +100,10 @@ def in_simulation(traffic: TrafficModule, rows: int, seconds: int, part: str, fi
     for _ in range(seconds * 10):
         after = step(env, td)
         memories = (state[keys.TRAFFIC, part, field][:, 1:] for state in (td, after))
-        yield (*memories, *(Vehicles.of(state[keys.VEHICLES]).columns(slice(1, None)) for state in (td, after)))
+        yield (
+            *memories,
+            *(Vehicles.of(state[keys.VEHICLES]).columns(slice(1, None)) for state in (td, after)),
+        )
         td = after
 
 
@@ -102,7 +120,9 @@ def assert_share(count: int, trials: int, share: float) -> None:
         ("late_reaction", ReactionFaults(per_hour=300.0, lasts_s=2.0), 19, 400),
     ],
 )
-def test_a_driver_brakes_for_nothing_or_does_not_attend_as_often_as_asked_for(part, faults, at_first, least):
+def test_a_driver_brakes_for_nothing_or_does_not_attend_as_often_as_asked_for(
+    part, faults, at_first, least
+):
     traffic, begun, driven = idm_faults_traffic(faults=replace(NONE, **{part: faults})), 0, 0
     for before, after, _, _ in in_simulation(traffic, 32, 60, part, "left"):
         begun += ((before == 0) & (after == at_first)).sum().item()
@@ -151,7 +171,9 @@ def test_an_aborted_change_returns_to_the_centre_of_the_lane_it_left(share, targ
     track = play(OneChange(), scene, 160, fault=AbortedLaneChange(faults=AbortFaults(share)))
     assert track[-1].target_lane[0, 1:].tolist() == target
     if share == 1.0:
-        way = torch.stack([now.y[0] for now in track])[:, 1:] - torch.tensor([4.0, 0.0], dtype=DOUBLE)
+        way = torch.stack([now.y[0] for now in track])[:, 1:] - torch.tensor(
+            [4.0, 0.0], dtype=DOUBLE
+        )
         # It comes half way over, not so far that it leaves its old lane, and settles where it was.
         assert ((way.amax(0) >= 2.0) & (way.amax(0) < 3.0)).all()
         assert (way[-30:].abs() < 0.05).all()
@@ -160,8 +182,12 @@ def test_an_aborted_change_returns_to_the_centre_of_the_lane_it_left(share, targ
 def test_a_literal_change_that_is_broken_off_goes_back_as_fast_as_it_came():
     scene = vehicles(*({"x": 150.0 * i, "lane": lane} for i, lane in enumerate((0, 0, 1, 2, 1, 0))))
     # Everybody begins a change within ten steps, and another one within ten steps after it.
-    changes = LiteralLaneChange(changes=LiteralChanges(10.0, lateral_speed_mps=0.8, lateral_speed_sd_mps=0.0))
-    track = play(IdmTraffic(), scene, 90, change=changes, fault=AbortedLaneChange(faults=AbortFaults(1.0)))
+    changes = LiteralLaneChange(
+        changes=LiteralChanges(10.0, lateral_speed_mps=0.8, lateral_speed_sd_mps=0.0)
+    )
+    track = play(
+        IdmTraffic(), scene, 90, change=changes, fault=AbortedLaneChange(faults=AbortFaults(1.0))
+    )
     y = torch.stack([scene.y[0], *(now.y[0] for now in track)])[:, 1:]
     assert y.diff(dim=0).abs().max() < 0.09
     reached = (y - y[0]).abs().amax(0)
@@ -169,7 +195,9 @@ def test_a_literal_change_that_is_broken_off_goes_back_as_fast_as_it_came():
 
 
 def test_a_broken_off_change_of_the_papers_traffic_does_not_jump_either():
-    traffic = TrafficSequential({"base": gan_traffic(), "fault": AbortedLaneChange(faults=AbortFaults(1.0))})
+    traffic = TrafficSequential(
+        {"base": gan_traffic(), "fault": AbortedLaneChange(faults=AbortFaults(1.0))}
+    )
     widest = turned = 0.0
     for before, after, was, now in in_simulation(traffic, 8, 20, "fault", "origin"):
         turned += ((before >= 0) & (after < 0) & (now.target_lane == before)).sum().item()
@@ -183,11 +211,20 @@ def test_a_broken_off_change_of_the_papers_traffic_does_not_jump_either():
 
 def test_a_hesitant_change_takes_about_twice_as_long_and_does_not_swing():
     scene = vehicles(
-        EGO, *({"x": 200.0 * i, "speed": v, "desired_speed": v} for i, v in enumerate((8.0, 15.0, 30.0)))
+        EGO,
+        *(
+            {"x": 200.0 * i, "speed": v, "desired_speed": v}
+            for i, v in enumerate((8.0, 15.0, 30.0))
+        ),
     )
     took = []
     for share in (0.0, 1.0):
-        track = play(OneChange(), scene, 200, fault=HesitantLaneChange(faults=HesitationFaults(share, pace=0.5)))
+        track = play(
+            OneChange(),
+            scene,
+            200,
+            fault=HesitantLaneChange(faults=HesitationFaults(share, pace=0.5)),
+        )
         offset = torch.stack([now.y[0] for now in track])[:, 1:] - 4.0
         took.append((offset.abs() > 0.3).sum(0) - 10)
         assert (offset < 0.3).all()
@@ -201,7 +238,9 @@ def test_a_late_driver_reacts_later_by_the_delay():
     eased = []
     for per_hour in (0.0, 1e9):
         late = LateReaction(faults=ReactionFaults(per_hour, delay_s=0.8, lasts_s=60.0))
-        brakes, calm = (play(IdmTraffic(), scene, 60, late=late, lead=SuddenLeader(on)) for on in (True, False))
+        brakes, calm = (
+            play(IdmTraffic(), scene, 60, late=late, lead=SuddenLeader(on)) for on in (True, False)
+        )
         eases = [one.acceleration[0, 2] < two.acceleration[0, 2] for one, two in zip(brakes, calm)]
         eased.append(eases.index(True))
     # The leader is slower from the end of step 30 on.
@@ -209,7 +248,10 @@ def test_a_late_driver_reacts_later_by_the_delay():
 
 
 def test_a_late_driver_drives_what_he_should_have_driven_before():
-    """Open loop: a base that ignores its own speed, so that late driving does not change what it decides."""
+    """Open loop.
+
+    A base that ignores its own speed, so that late driving does not change what it decides.
+    """
 
     class Wave(TrafficModule):
         def move(self, vehicles, memory, key, step):
@@ -246,7 +288,9 @@ def test_a_driver_who_brakes_harder_anyway_goes_on_doing_so():
 
 def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
     scene = vehicles(EGO, {"x": 0.0, "valid": False}, {"x": 100.0})
-    always = DriverFaults(BrakingFaults(1e9), ReactionFaults(1e9), HesitationFaults(1.0), AbortFaults(1.0))
+    always = DriverFaults(
+        BrakingFaults(1e9), ReactionFaults(1e9), HesitationFaults(1.0), AbortFaults(1.0)
+    )
     traffic = with_faults(OneChange(), always)
     td = placed(environment(num_envs=1, vehicles=3, traffic=traffic), scene)
     td[keys.STEP] = torch.tensor([10])
@@ -264,7 +308,9 @@ def test_faults_come_to_nobody_who_is_not_there_and_never_to_the_ego():
     wanted=st.floats(-8.0, 3.0),
     heading=st.floats(-0.2, 0.2),
 )
-def test_driving_a_path_at_another_speed_stays_on_it_and_never_goes_back(speed, usual, wanted, heading):
+def test_driving_a_path_at_another_speed_stays_on_it_and_never_goes_back(
+    speed, usual, wanted, heading
+):
     start = vehicles({"x": 10.0, "y": 1.0, "speed": speed, "heading": heading, "target_lane": 0})
     gone = 0.5 * (speed + max(speed + usual * 0.1, 0.0)) * 0.1
     angle = torch.tensor(heading, dtype=DOUBLE)
@@ -288,7 +334,9 @@ def test_a_delay_shorter_than_a_step_is_refused():
 
 
 #: Ten times the default rates.
-TENFOLD = DriverFaults(BrakingFaults(60.0), ReactionFaults(120.0), HesitationFaults(0.5), AbortFaults(0.5))
+TENFOLD = DriverFaults(
+    BrakingFaults(60.0), ReactionFaults(120.0), HesitationFaults(0.5), AbortFaults(0.5)
+)
 
 
 @pytest.mark.parametrize(
@@ -296,7 +344,9 @@ TENFOLD = DriverFaults(BrakingFaults(60.0), ReactionFaults(120.0), HesitationFau
     [(TENFOLD, 100.0, 24, 60), pytest.param(None, 5000.0, 128, 100, marks=pytest.mark.slow)],
 )
 def test_faults_make_no_overlaps(faults, vehicle_km, rows, seconds):
-    env = HighwayEnv(idm_faults_traffic(Road(), 2, faults=faults), rows, 14, SpawnParameters(spread_m=300.0))
+    env = HighwayEnv(
+        idm_faults_traffic(Road(), 2, faults=faults), rows, 14, SpawnParameters(spread_m=300.0)
+    )
     assert overlaps_of_the_others(env, vehicle_km, seconds) == 0
 
 

@@ -5,7 +5,9 @@ import pickle
 import pytest
 import torch
 
-pytest.importorskip("highway_env", reason="HighwayEnv is not installed: pip install 'ganlane[bench]'")
+pytest.importorskip(
+    "highway_env", reason="HighwayEnv is not installed: pip install 'ganlane[bench]'"
+)
 
 from reference.foreign import assert_same_alone, drive, overlaps, start
 from reference.worlds import vehicles as scene_of
@@ -57,28 +59,44 @@ def test_a_step_is_that_of_highway_envs_own_road(traffic):
 
     # Drivers' exponents, in HighwayEnv's range.
     key = episode_key(traffic.stream, torch.tensor([0]), torch.tensor([2]))
-    exponent = (3.5 + uniform(key, 0, 9, [Purpose.FOREIGN_DRIVER + 8], torch.float64)[0, :, 0]).tolist()
-    road = TheirRoad(RoadNetwork.straight_road_network(3, start=-1000.0, length=9000.0, speed_limit=70.0))
+    exponent = (
+        3.5 + uniform(key, 0, 9, [Purpose.FOREIGN_DRIVER + 8], torch.float64)[0, :, 0]
+    ).tolist()
+    road = TheirRoad(
+        RoadNetwork.straight_road_network(3, start=-1000.0, length=9000.0, speed_limit=70.0)
+    )
     for i in range(9):
         place = [before.x[0, i].item(), before.y[0, i].item()]
-        rest = {"speed": before.speed[0, i].item(), "target_speed": before.desired_speed[0, i].item()}
+        rest = {
+            "speed": before.speed[0, i].item(),
+            "target_speed": before.desired_speed[0, i].item(),
+        }
         if i == 0:
             vehicle = ControlledVehicle(road, place, **rest)
         else:
-            vehicle = IDMVehicle(road, place, timer=state[keys.TRAFFIC, "timer"][0, i].item(), **rest)
+            vehicle = IDMVehicle(
+                road, place, timer=state[keys.TRAFFIC, "timer"][0, i].item(), **rest
+            )
             vehicle.LENGTH, vehicle.WIDTH = 4.5, 2.5
         road.vehicles.append(vehicle)
     for count, after in enumerate(seen[:8]):
         road.vehicles[0].position = np.array([before.x[0, 0].item(), before.y[0, 0].item()])
-        road.vehicles[0].heading, road.vehicles[0].speed = before.heading[0, 0].item(), before.speed[0, 0].item()
+        road.vehicles[0].heading, road.vehicles[0].speed = (
+            before.heading[0, 0].item(),
+            before.speed[0, 0].item(),
+        )
         for vehicle in road.vehicles[1:]:
             vehicle.DELTA = exponent[road.vehicles.index(vehicle)]
         road.act()
         for vehicle in road.vehicles[1:]:
             vehicle.step(0.1)
-        theirs = torch.tensor([[*vehicle.position, vehicle.heading, vehicle.speed] for vehicle in road.vehicles[1:]])
+        theirs = torch.tensor(
+            [[*vehicle.position, vehicle.heading, vehicle.speed] for vehicle in road.vehicles[1:]]
+        )
         ours = torch.stack((after.x, after.y, after.heading, after.speed), dim=-1)[0, 1:]
-        torch.testing.assert_close(ours.float(), theirs.float(), rtol=1e-6, atol=1e-4, msg=f"step {count}")
+        torch.testing.assert_close(
+            ours.float(), theirs.float(), rtol=1e-6, atol=1e-4, msg=f"step {count}"
+        )
         before = after
 
 
@@ -110,12 +128,16 @@ def test_an_episode_is_the_same_alone_and_beside_others(traffic):
 def test_a_state_can_be_branched(traffic):
     env = HighwayEnv(traffic, 1)
     state = env.step(start(env, [0]).set(keys.ACTION, KEEP))["next"].clone()
-    first, second = (env.step(state.clone().set(keys.ACTION, KEEP))["next", keys.VEHICLES] for _ in range(2))
+    first, second = (
+        env.step(state.clone().set(keys.ACTION, KEEP))["next", keys.VEHICLES] for _ in range(2)
+    )
     assert (first == second).all()
 
 
 def two(x_ego, ego=None, slow=None):
-    """A fast driver in lane 0 at x = 0 behind a slow one, and an ego in lane 1 that is beside or behind it."""
+    """A fast driver in lane 0 at x = 0 behind a slow one, and an ego in lane 1 that is beside or
+    behind it.
+    """
     first = {"x": x_ego, "lane": 1, "desired_speed": 20.0, **(ego or {})}
     last = {"x": 30.0, "speed": 10.0, "desired_speed": 10.0, **(slow or {})}
     cars = ({"visibility": int(Visibility.BODY), **car} for car in (first, {"x": 0.0}, last))
@@ -128,13 +150,20 @@ def moved(traffic, scene, timer=0.0):
 
 
 @pytest.mark.parametrize(("x_ego", "changes"), [(-60.0, True), (0.0, False), (-8.0, False)])
-def test_a_driver_changes_lanes_before_an_ego_that_is_far_behind_and_not_before_one_that_is_near(x_ego, changes):
-    assert bool(moved(HighwayEnvTraffic(Road(2)), two(x_ego), 2.0).target_lane[0, 1] == 1) is changes
+def test_a_driver_changes_lanes_before_an_ego_that_is_far_behind_and_not_before_one_that_is_near(
+    x_ego, changes
+):
+    assert (
+        bool(moved(HighwayEnvTraffic(Road(2)), two(x_ego), 2.0).target_lane[0, 1] == 1) is changes
+    )
 
 
 def test_a_follower_brakes_for_an_ego_that_stands_in_its_lane(traffic):
-    # Seen from 1 m beyond the edge of the lane on, as HighwayEnv has it: y = 0.9 would do by our rule, too.
-    in_front, beside = (two(30.0, {"y": y, "speed": 5.0}, {"x": 300.0, "speed": 20.0}) for y in (0.9, 4.0))
+    # Seen from 1 m beyond the edge of the lane on, as HighwayEnv has it: y = 0.9 would do by our
+    # rule, too.
+    in_front, beside = (
+        two(30.0, {"y": y, "speed": 5.0}, {"x": 300.0, "speed": 20.0}) for y in (0.9, 4.0)
+    )
     assert moved(traffic, in_front).acceleration[0, 1] < -5.0
     assert moved(traffic, beside).acceleration[0, 1] > 0.0
 

@@ -1,4 +1,7 @@
-"""Rule-driven traffic: keys, memory, MOBIL once a second; random drivers, within their ranges and obeyed."""
+"""Rule-driven traffic: keys, memory, MOBIL once a second.
+
+Random drivers, within their ranges and obeyed.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +18,32 @@ from ganlane.env import HighwayEnv
 from ganlane.errors import UserError
 from ganlane.parameters.driving import MobilParameters
 from ganlane.sim import Road, SpawnParameters, Vehicles
-from ganlane.traffic import IdmMobilTraffic, IdmRandomTraffic, IdmTraffic, RandomDrivers, TrafficModule
+from ganlane.traffic import (
+    IdmMobilTraffic,
+    IdmRandomTraffic,
+    IdmTraffic,
+    RandomDrivers,
+    TrafficModule,
+)
 from ganlane.traffic.idm_mobil import DriverParams, start_braking
 
 ROAD = Road(lanes=2)
 EGO = {"x": -1000.0, "lane": 0}
 # The second car wants to overtake the third. (With Table IV the third would politely move aside.)
 SELFISH = IdmMobilTraffic(ROAD, mobil=MobilParameters(politeness_rear=0.0, politeness_side=0.0))
-CARS = (EGO, {"x": 0.0, "lane": 0, "speed": 20.0}, {"x": 54.5, "lane": 0, "speed": 15.0, "desired_speed": 15.0})
+CARS = (
+    EGO,
+    {"x": 0.0, "lane": 0, "speed": 20.0},
+    {"x": 54.5, "lane": 0, "speed": 15.0, "desired_speed": 15.0},
+)
 
 
 def move(traffic: TrafficModule, scene: Vehicles, step: int | list[int] = 0) -> Vehicles:
     rows = scene.x.shape[0]
     zero = torch.zeros(rows, dtype=torch.int64)
-    return traffic.move(scene, traffic.fresh_memory(scene, zero), zero, torch.as_tensor(step).expand(rows))[0]
+    return traffic.move(
+        scene, traffic.fresh_memory(scene, zero), zero, torch.as_tensor(step).expand(rows)
+    )[0]
 
 
 @pytest.mark.parametrize(
@@ -55,7 +70,8 @@ def test_each_row_has_a_clock_of_its_own():
 def test_an_unspoken_wish_of_the_ego_holds_nobody_back():
     """Traffic sees what the ego does, not what it might want.
 
-    The ego would go left if it were MOBIL's to drive; the third car, 10 m behind it, wants into the same lane.
+    The ego would go left if it were MOBIL's to drive; the third car, 10 m behind it, wants into the
+    same lane.
     """
     slow = {"speed": 15.0, "desired_speed": 15.0}
     ego, ahead = {"x": 0.0, "lane": 0}, {"x": 54.5, "lane": 0, **slow}
@@ -82,7 +98,9 @@ def test_traffic_is_the_same_whatever_the_decision_period_of_the_ego():
         for _ in range(decisions):
             td = step(env, td)
         states.append(td.select(keys.VEHICLES, keys.TRAFFIC))
-    assert torch.any(states[0][keys.VEHICLES, "target_lane"] != env.reset()[keys.VEHICLES, "target_lane"])
+    assert torch.any(
+        states[0][keys.VEHICLES, "target_lane"] != env.reset()[keys.VEHICLES, "target_lane"]
+    )
     assert [same_bits(states[0], other) for other in states[1:]] == [[], []]
 
 
@@ -90,7 +108,9 @@ def test_everybody_reacts_to_the_state_at_t_and_to_nothing_later():
     """The leader brakes hard in this step; its follower's acceleration does not know yet."""
     cars = EGO, {"x": 0.0, "lane": 0}, {"x": 50.0, "lane": 0, "speed": 20.0}
     wall = {"x": 65.0, "lane": 0, "speed": 0.0}
-    calm, braking = (move(IdmTraffic(ROAD), scene) for scene in (vehicles(*cars), vehicles(*cars, wall)))
+    calm, braking = (
+        move(IdmTraffic(ROAD), scene) for scene in (vehicles(*cars), vehicles(*cars, wall))
+    )
     assert braking.acceleration[0, 2] < -5.0
     assert calm.acceleration[0, 1] == braking.acceleration[0, 1]
 
@@ -98,7 +118,9 @@ def test_everybody_reacts_to_the_state_at_t_and_to_nothing_later():
 # Random drivers
 
 #: Everybody drives by Tables IV and V.
-ALIKE = RandomDrivers((1.6, 1.6), (0.7, 0.7), (1.7, 1.7), (20.0, 20.0), (1, 1), (1, 1), (0, 0), (0, 0), (10, 10))
+ALIKE = RandomDrivers(
+    (1.6, 1.6), (0.7, 0.7), (1.7, 1.7), (20.0, 20.0), (1, 1), (1, 1), (0, 0), (0, 0), (10, 10)
+)
 
 
 def params_of(td) -> DriverParams:
@@ -110,7 +132,8 @@ def test_the_defaults_of_the_command_line_are_those_of_the_traffic():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("headway_s", [2.0, 1.0]), ("strongest_braking", [0.0, 5.0]), ("reaction_s", [0.0, 9.0])]
+    ("name", "value"),
+    [("headway_s", [2.0, 1.0]), ("strongest_braking", [0.0, 5.0]), ("reaction_s", [0.0, 9.0])],
 )
 def test_impossible_ranges_are_refused(name, value):
     with pytest.raises(UserError, match=f"^{name}"):
@@ -118,7 +141,10 @@ def test_impossible_ranges_are_refused(name, value):
 
 
 def test_drivers_differ_and_lie_within_the_ranges():
-    own, d = params_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset()), RandomDrivers()
+    own, d = (
+        params_of(environment(num_envs=500, traffic=IdmRandomTraffic()).reset()),
+        RandomDrivers(),
+    )
     for value, (low, high) in (
         (own.headway, d.headway_s),
         (own.max_acceleration, d.max_acceleration),
@@ -131,7 +157,9 @@ def test_drivers_differ_and_lie_within_the_ranges():
         assert value.mean().item() == pytest.approx((low + high) / 2, rel=0.05)
     assert sorted(own.delay.unique().tolist()) == [0, 1, 2, 3, 4, 5, 6]
     # Independent of each other.
-    drawn = torch.stack([own.headway, own.max_acceleration, own.politeness, own.sway, own.delay]).flatten(1)
+    drawn = torch.stack(
+        [own.headway, own.max_acceleration, own.politeness, own.sway, own.delay]
+    ).flatten(1)
     assert (torch.corrcoef(drawn) - torch.eye(5)).abs().max() < 0.08
 
 
@@ -154,23 +182,32 @@ def test_a_driver_stays_the_same_through_an_episode_and_is_another_in_the_next()
         assert torch.equal(td[keys.TRAFFIC, "traits"], first[keys.TRAFFIC, "traits"])
     asked = td.select(keys.SEED, keys.EPISODE)
     asked[keys.EPISODE] = asked[keys.EPISODE] + 4
-    assert (env.reset(asked)[keys.TRAFFIC, "traits"][..., 0] != first[keys.TRAFFIC, "traits"][..., 0]).all()
+    assert (
+        env.reset(asked)[keys.TRAFFIC, "traits"][..., 0] != first[keys.TRAFFIC, "traits"][..., 0]
+    ).all()
 
 
 def test_drivers_who_are_all_alike_drive_as_idm_mobil():
-    one, other = (environment(num_envs=8, traffic=t) for t in (IdmMobilTraffic(), IdmRandomTraffic(drivers=ALIKE)))
+    one, other = (
+        environment(num_envs=8, traffic=t)
+        for t in (IdmMobilTraffic(), IdmRandomTraffic(drivers=ALIKE))
+    )
     first, second = one.reset(), other.reset()
     for _ in range(20):
         first, second = step(one, first), step(other, second)
     for name in ("x", "y", "speed", "target_lane"):
-        torch.testing.assert_close(first[keys.VEHICLES, name], second[keys.VEHICLES, name], atol=1e-9, rtol=1e-9)
+        torch.testing.assert_close(
+            first[keys.VEHICLES, name], second[keys.VEHICLES, name], atol=1e-9, rtol=1e-9
+        )
 
 
 def test_nobody_brakes_harder_than_it_can():
     env = environment(num_envs=64, traffic=IdmRandomTraffic())
     td, margins = env.reset(), []
     limit = params_of(td).strongest_braking
-    env.recorder = lambda now, running: margins.append((now.acceleration + limit)[:, 1:].amin().item())
+    env.recorder = lambda now, running: margins.append(
+        (now.acceleration + limit)[:, 1:].amin().item()
+    )
     for _ in range(40):
         td = step(env, td, (td[keys.EPISODE] + td[keys.EGO, "decisions"]) % 4 % 3)
     # Some came to their limit.
@@ -179,7 +216,10 @@ def test_nobody_brakes_harder_than_it_can():
 
 def test_the_first_scene_asks_for_what_is_worked_out_by_hand():
     scene = vehicles(
-        {"x": 100.0, "speed": 10.0}, {"x": 60.0, "speed": 20.0}, {"x": 30.0, "speed": 15.0}, {"x": 0.0, "lane": 1}
+        {"x": 100.0, "speed": 10.0},
+        {"x": 60.0, "speed": 20.0},
+        {"x": 30.0, "speed": 15.0},
+        {"x": 0.0, "lane": 1},
     )
     found = start_braking(scene, Road(), torch.tensor([[0.0, 0.5, 0.0, 0.0]], dtype=DOUBLE))[0]
     # 35.5 m less 5 m of reaction; two ahead: 65.5 m less the 6.5 m of the one between.
@@ -187,7 +227,9 @@ def test_the_first_scene_asks_for_what_is_worked_out_by_hand():
 
 
 def test_a_reaction_time_delays_the_acceleration_by_as_much():
-    scene = vehicles({"x": -500.0, "lane": 2}, {"x": 60.0, "speed": 10.0}, {"x": 0.0, "speed": 20.0})
+    scene = vehicles(
+        {"x": -500.0, "lane": 2}, {"x": 60.0, "speed": 10.0}, {"x": 0.0, "speed": 20.0}
+    )
     prompt, late = [], []
     for track, delay in ((prompt, 0.0), (late, 0.4)):
         traffic = IdmRandomTraffic(drivers=replace(ALIKE, reaction_s=(delay, delay)))

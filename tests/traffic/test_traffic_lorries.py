@@ -1,4 +1,7 @@
-"""Traffic with lorries does not run into itself, nor into an ego that keeps its lane; SUMO's scenes with lorries."""
+"""Traffic with lorries does not run into itself, nor into an ego that keeps its lane.
+
+SUMO's scenes with lorries.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,11 @@ from ganlane import keys
 from ganlane.agents.drivers import KeepLaneDriver
 from ganlane.build import make_env, make_traffic
 from ganlane.config.env import EnvConfig
-from ganlane.config.traffic import GanCalibratedTrafficConfig, IdmMobilTrafficConfig, IdmTrafficConfig
+from ganlane.config.traffic import (
+    GanCalibratedTrafficConfig,
+    IdmMobilTrafficConfig,
+    IdmTrafficConfig,
+)
 from ganlane.generator.closed_loop import extra_inputs
 from ganlane.parameters.driving import Visibility
 from ganlane.realism.long_runs import LongRunParameters
@@ -24,7 +31,9 @@ from ganlane.traffic.sumo import LorryScenes
 
 
 def drive(traffic, rows: int, decisions: int, recycle: bool) -> tuple[float, float, int, int]:
-    """Vehicle-km, those of lorries, steps in which two bodies overlap, and hard crashes, with a keep-lane ego."""
+    """Vehicle-km, those of lorries, steps in which two bodies overlap, and hard crashes, with a
+    keep-lane ego.
+    """
     config = EnvConfig(truck_share=0.4, recycle=recycle)
     made = make_env(make_traffic(traffic, config), config, num_envs=rows)
     km = lorries = 0.0
@@ -123,7 +132,10 @@ def test_so_many_of_the_others_are_lorries_of_twelve_metres_and_the_ego_never_is
 
 def test_net_gaps_are_those_of_the_scene_of_cars():
     episodes = keys_of(50)
-    cars, lorries = CARS(episodes, torch.float64), LorryScenes(CARS, share=0.5)(episodes, torch.float64)
+    cars, lorries = (
+        CARS(episodes, torch.float64),
+        LorryScenes(CARS, share=0.5)(episodes, torch.float64),
+    )
     assert (lorries.length > 4.5).any()
     assert (lorries.x[:, 0] == 0.0).all()
     for row in range(50):
@@ -131,5 +143,7 @@ def test_net_gaps_are_those_of_the_scene_of_cars():
 
 
 def test_without_lorries_it_is_the_scene_of_cars():
-    one, other = (scenes(keys_of(20), torch.float32) for scenes in (LorryScenes(CARS, share=0.0), CARS))
+    one, other = (
+        scenes(keys_of(20), torch.float32) for scenes in (LorryScenes(CARS, share=0.0), CARS)
+    )
     assert all(map(torch.equal, one, other))

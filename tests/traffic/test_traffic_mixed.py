@@ -1,4 +1,6 @@
-"""Mixtures of traffics, in which each part drives as it would alone, and traffic that does not see the ego."""
+"""Mixtures of traffics, in which each part drives as it would alone, and traffic that does not see
+the ego.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,31 @@ from ganlane.config.traffic import (
     all_traffics,
 )
 from ganlane.errors import UserError
-from ganlane.parameters.driving import AbortFaults, BrakingFaults, DriverFaults, HesitationFaults, ReactionFaults
+from ganlane.parameters.driving import (
+    AbortFaults,
+    BrakingFaults,
+    DriverFaults,
+    HesitationFaults,
+    ReactionFaults,
+)
 from ganlane.sim import Road, Visibility
-from ganlane.traffic import BlindTraffic, IdmMobilTraffic, IdmRandomTraffic, IdmTraffic, MixedTraffic, TrafficModule
+from ganlane.traffic import (
+    BlindTraffic,
+    IdmMobilTraffic,
+    IdmRandomTraffic,
+    IdmTraffic,
+    MixedTraffic,
+    TrafficModule,
+)
 from ganlane.traffic.mixed import interleaved
 from ganlane.traffic.presets import gan_traffic, idm_faults_traffic, with_faults
 
 #: So many faults that a few decisions hold some.
 OFTEN = DriverFaults(
-    BrakingFaults(per_hour=600.0), ReactionFaults(per_hour=600.0), HesitationFaults(0.5), AbortFaults(0.5)
+    BrakingFaults(per_hour=600.0),
+    ReactionFaults(per_hour=600.0),
+    HesitationFaults(0.5),
+    AbortFaults(0.5),
 )
 RULES = {"idm": 1, "idm_mobil": 2, "idm_random": 1, "idm_faults": 1}
 MAKE = {
@@ -139,7 +157,9 @@ def test_rows_keep_their_part_over_automatic_resets_where_the_batch_is_a_multipl
 
 
 def test_a_state_written_to_between_two_steps_counts():
-    env, other = (environment(num_envs=10, traffic=mixture(**RULES), dtype=torch.float32) for _ in range(2))
+    env, other = (
+        environment(num_envs=10, traffic=mixture(**RULES), dtype=torch.float32) for _ in range(2)
+    )
     td = step(env, env.reset())
     fresh = td.clone()
     for state in (td, fresh):
@@ -175,7 +195,9 @@ def test_graphs_meet_few_numbers_of_rows(monkeypatch):
         ),
         (lambda: MixedTrafficConfig(shares={"mixed": 1}), "is a mixture itself"),
         (
-            lambda: MixedTraffic({"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1}),
+            lambda: MixedTraffic(
+                {"a": IdmTraffic(), "b": IdmTraffic(Road(lanes=2))}, {"a": 1, "b": 1}
+            ),
             "different roads or streams",
         ),
         (lambda: ReplayTrafficConfig(blind_share=0.5), "no ego anyway"),
@@ -189,10 +211,17 @@ def test_what_cannot_be_is_refused_in_one_sentence(make, told):
 
 
 def test_a_model_of_ones_own_is_mixed_by_its_import_path():
-    traffic = make_traffic(MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}), EnvConfig())
+    traffic = make_traffic(
+        MixedTrafficConfig(shares={"ganlane.traffic.IdmTraffic": 1, "idm_mobil": 1}), EnvConfig()
+    )
     assert isinstance(traffic, MixedTraffic)
-    assert [name for name, _ in traffic.named_parts()] == ["ganlane_traffic_IdmTraffic", "idm_mobil"]
-    one, other = (drive(each, 4)[-1].exclude(keys.TRAFFIC) for each in (traffic, mixture(idm=1, idm_mobil=1)))
+    assert [name for name, _ in traffic.named_parts()] == [
+        "ganlane_traffic_IdmTraffic",
+        "idm_mobil",
+    ]
+    one, other = (
+        drive(each, 4)[-1].exclude(keys.TRAFFIC) for each in (traffic, mixture(idm=1, idm_mobil=1))
+    )
     assert same_bits(one, other) == []
 
 
@@ -204,7 +233,10 @@ def test_a_description_holds_the_parts_that_have_a_share():
 # Blind episodes: the others do not see the ego, the environment does
 
 
-CHASE = vehicles({"x": 0.0, "speed": 10.0, "desired_speed": 10.0}, {"x": -60.0, "speed": 25.0, "desired_speed": 25.0})
+CHASE = vehicles(
+    {"x": 0.0, "speed": 10.0, "desired_speed": 10.0},
+    {"x": -60.0, "speed": 25.0, "desired_speed": 25.0},
+)
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
@@ -222,7 +254,9 @@ def test_a_follower_brakes_for_an_ego_unless_it_does_not_see_it_and_the_environm
 
 @pytest.mark.parametrize("traffic", [IdmMobilTraffic, idm_faults_traffic])
 def test_nobody_is_blind_at_a_share_of_0_and_nothing_is_built(traffic):
-    plain, blind = (environment(num_envs=16, traffic=made) for made in (traffic(), BlindTraffic(traffic(), 0.0)))
+    plain, blind = (
+        environment(num_envs=16, traffic=made) for made in (traffic(), BlindTraffic(traffic(), 0.0))
+    )
     one, other = plain.reset(), blind.reset()
     for _ in range(10):
         one, other = step(plain, one), step(blind, other)
@@ -243,7 +277,9 @@ def test_the_ego_stays_where_the_environment_has_it():
 
 def test_as_many_episodes_are_blind_as_asked_for_whatever_the_batch_and_the_part():
     traffic = BlindTraffic(mixture(idm=1, idm_mobil=1), 0.3)
-    wide, narrow = (environment(num_envs=n, traffic=traffic).reset()[keys.TRAFFIC, "unseen"] for n in (4000, 7))
+    wide, narrow = (
+        environment(num_envs=n, traffic=traffic).reset()[keys.TRAFFIC, "unseen"] for n in (4000, 7)
+    )
     assert torch.equal(wide[:7], narrow)
     assert not wide[:, 1:].any()
     for rows in (wide[0::2, 0], wide[1::2, 0]):

@@ -40,7 +40,9 @@ class Drift(TrafficModule):
 
 
 def run(n, m, seconds, base, **overlays):
-    """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego, and the last state."""
+    """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego, and the last
+    state.
+    """
     env = HighwayEnv(TrafficSequential({"base": base, **overlays}), num_envs=n, vehicles=m)
     all_vehicles, _, state = drive(env, range(n), seconds)
     return Vehicles(*(field[..., 1:] for field in all_vehicles)), state
@@ -54,7 +56,9 @@ def test_the_mean_wait_of_equation_10_is_the_root_of_half_pi_t_m_and_not_t_m():
     t_m, draws = 2218.0, torch.Generator().manual_seed(0)
     waiting, wait = torch.ones(20_000, dtype=torch.bool), torch.zeros(20_000)
     for clock in range(400):
-        starts = torch.rand(20_000, generator=draws) < literal_hazard(torch.tensor(float(clock)), t_m)
+        starts = torch.rand(20_000, generator=draws) < literal_hazard(
+            torch.tensor(float(clock)), t_m
+        )
         wait = torch.where(waiting & starts, float(clock), wait)
         waiting &= ~starts
     assert not waiting.any()
@@ -62,7 +66,12 @@ def test_the_mean_wait_of_equation_10_is_the_root_of_half_pi_t_m_and_not_t_m():
 
 
 def test_the_literal_hazard_is_certain_at_t_m():
-    assert literal_hazard(torch.tensor([0.0, 1109.0, 2218.0, 9999.0]), 2218.0).tolist() == [0.0, 0.5, 1.0, 1.0]
+    assert literal_hazard(torch.tensor([0.0, 1109.0, 2218.0, 9999.0]), 2218.0).tolist() == [
+        0.0,
+        0.5,
+        1.0,
+        1.0,
+    ]
 
 
 def test_a_rate_per_kilometre_gives_that_many_changes_per_kilometre():
@@ -71,7 +80,9 @@ def test_a_rate_per_kilometre_gives_that_many_changes_per_kilometre():
     assert (per_step / (speed * 0.1 / 1000)).tolist() == pytest.approx([0.92, 0.92], rel=1e-2)
 
 
-@pytest.mark.parametrize(("lane", "lanes", "sides"), [(0, 3, {1}), (1, 3, {-1, 1}), (2, 3, {-1}), (0, 1, {0})])
+@pytest.mark.parametrize(
+    ("lane", "lanes", "sides"), [(0, 3, {1}), (1, 3, {-1, 1}), (2, 3, {-1}), (0, 1, {0})]
+)
 def test_a_side_always_has_a_lane_on_it(lane, lanes, sides):
     u = torch.rand(1000, generator=torch.Generator().manual_seed(1))
     assert set(random_side(u, torch.full((1000,), lane), lanes).tolist()) == sides
@@ -104,7 +115,9 @@ def test_calibrated_changes_find_gaps_and_touch_nobody():
 
 def test_sudden_accelerations_fill_a_third_of_the_time_with_the_spread_of_the_data():
     # 2 s of waiting and 1 s of acceleration, in turn.
-    overlay = AccelerationOverlay(sudden=SuddenAccelerations(every_s=2.0, lasts_s=1.0, mean=0.0, sd=0.8))
+    overlay = AccelerationOverlay(
+        sudden=SuddenAccelerations(every_s=2.0, lasts_s=1.0, mean=0.0, sd=0.8)
+    )
     vehicles = HighwayEnv(IdmTraffic(), num_envs=200).reset()["vehicles"].clone()
     vehicles["speed"][:] = 20.0
     view = TensorDict({"vehicles": vehicles, "moved": vehicles.clone()}, [200])
@@ -126,7 +139,9 @@ def test_the_guard_keeps_a_drifting_network_on_the_road_and_at_a_speed_people_dr
     road = Road()
     others, state = run(16, 9, 90, Drift(road), guard=Guard(road))
     half = lateral_half_extent(others)
-    outside = torch.maximum(others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half))
+    outside = torch.maximum(
+        others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half)
+    )
     assert outside[1:].max() <= 1e-4
     vehicles = state["vehicles"]
     assert (vehicles["speed"] <= vehicles["desired_speed"] + 0.1).all()

@@ -17,19 +17,33 @@ from ganlane.generator import shipped_generator
 from ganlane.sim import Road, Vehicles, pair_overlaps
 from ganlane.sim.state import lateral_half_extent
 from ganlane.traffic import Guard
-from ganlane.traffic.presets import SIMULATED_ANCHOR, gan_calibrated_traffic, gan_traffic, sudden_accelerations
+from ganlane.traffic.presets import (
+    SIMULATED_ANCHOR,
+    gan_calibrated_traffic,
+    gan_traffic,
+    sudden_accelerations,
+)
 from ganlane.weights import load_weights, save_weights
 
 
 def others_of(traffic, n, decisions):
     """The others [T + 1, N, M - 1] after every physics step beside a keep-lane ego."""
-    return Vehicles(*(field[..., 1:] for field in drive(HighwayEnv(traffic, num_envs=n), range(n), decisions)[0]))
+    return Vehicles(
+        *(
+            field[..., 1:]
+            for field in drive(HighwayEnv(traffic, num_envs=n), range(n), decisions)[0]
+        )
+    )
 
 
 def beyond_the_edge(others: Vehicles) -> float:
     """How far the outermost body reaches past the edge of the road, m; negative inside."""
     road, half = Road(), lateral_half_extent(others)
-    return torch.maximum(others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half)).max().item()
+    return (
+        torch.maximum(others.y + half - road.left_edge_m(), road.right_edge_m() - (others.y - half))
+        .max()
+        .item()
+    )
 
 
 def overlaps(others: Vehicles) -> int:
@@ -60,7 +74,9 @@ def test_no_vehicle_leaves_the_road_in_1000_episodes_of_gan_traffic():
             if done.all():
                 break
         ended += int(done.sum())
-    print(f"{ended} episodes to their end; the outermost body stayed {-worst:.2f} m inside the edge")
+    print(
+        f"{ended} episodes to their end; the outermost body stayed {-worst:.2f} m inside the edge"
+    )
     assert ended == 1000
     assert worst <= 1e-4
 
@@ -80,7 +96,9 @@ def test_calibrated_traffic_changes_lanes_as_often_as_recorded_and_touches_nobod
     others = others_of(gan_calibrated_traffic(), 96, 200)
     km = others.speed[1:].sum().item() * 1e-4
     changes = (others.target_lane[1:].diff(dim=0) != 0).sum().item()
-    print(f"{changes / km:.2f} changes per vehicle-km in {km:.0f} vehicle-km, {overlaps(others)} overlaps")
+    print(
+        f"{changes / km:.2f} changes per vehicle-km in {km:.0f} vehicle-km, {overlaps(others)} overlaps"
+    )
     assert overlaps(others) == 0
     # Recorded: 0.92 per vehicle-km, 95 % interval 0.70 to 1.20.
     assert 0.70 < changes / km < 1.20
@@ -94,9 +112,13 @@ def test_calibrated_drivers_keep_different_headways_and_their_own():
     assert torch.equal(after["traffic", "generator", "headway"], headway)
 
 
-@pytest.mark.parametrize("preset", [gan_traffic, lambda: gan_traffic(execute_k=3), gan_calibrated_traffic])
+@pytest.mark.parametrize(
+    "preset", [gan_traffic, lambda: gan_traffic(execute_k=3), gan_calibrated_traffic]
+)
 def test_generated_traffic_is_the_same_in_every_batch_up_to_rounding(preset):
-    many, alone = (drive(HighwayEnv(preset(), len(rows)), rows, 5)[2]["vehicles"] for rows in (range(6), [4]))
+    many, alone = (
+        drive(HighwayEnv(preset(), len(rows)), rows, 5)[2]["vehicles"] for rows in (range(6), [4])
+    )
     for name in ("x", "y", "speed"):
         torch.testing.assert_close(many[name][4], alone[name][0], atol=2e-3, rtol=1e-4)
 
@@ -107,7 +129,10 @@ def test_the_paper_chain_has_a_guard_that_can_be_left_out():
 
 
 def fitted_with(folder, *without, **settings):
-    """The shipped calibrated weights as if they had been fitted with other ``settings``; ``without`` leaves out."""
+    """The shipped calibrated weights as if they had been fitted with other ``settings``.
+
+    ``without`` leaves out.
+    """
     tensors, metadata = load_weights(shipped_generator("calibrated"), "generator")
     config = {name: value for name, value in metadata["config"].items() if name not in without}
     path = folder / "generator.safetensors"
@@ -121,20 +146,27 @@ def anchor_of(path):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"washout_s": 6.0, "further_inputs": False}, {"washout_s": math.inf, "further_inputs": True}]
+    "settings",
+    [{"washout_s": 6.0, "further_inputs": False}, {"washout_s": math.inf, "further_inputs": True}],
 )
-def test_calibrated_weights_drive_with_the_washout_and_the_further_inputs_they_were_fitted_with(tmp_path, settings):
+def test_calibrated_weights_drive_with_the_washout_and_the_further_inputs_they_were_fitted_with(
+    tmp_path, settings
+):
     # Everything else is the simulation's own.
     assert anchor_of(fitted_with(tmp_path, **settings)) == replace(SIMULATED_ANCHOR, **settings)
 
 
-def test_the_shipped_weights_and_older_ones_that_name_no_washout_drive_with_the_default_anchor(tmp_path):
+def test_the_shipped_weights_and_older_ones_that_name_no_washout_drive_with_the_default_anchor(
+    tmp_path,
+):
     older = fitted_with(tmp_path, "washout_s", "further_inputs", "traits")
     assert anchor_of(None) == anchor_of(older) == SIMULATED_ANCHOR
 
 
 def test_weights_that_see_no_further_inputs_drive_otherwise_than_those_that_do(tmp_path):
-    blind = gan_calibrated_traffic(path=fitted_with(tmp_path, further_inputs=False), noise_scale=0.0)
+    blind = gan_calibrated_traffic(
+        path=fitted_with(tmp_path, further_inputs=False), noise_scale=0.0
+    )
     seeing = gan_calibrated_traffic(noise_scale=0.0)
     ends = [others_of(traffic, 4, 3).speed[-1] for traffic in (blind, seeing)]
     assert float((ends[0] - ends[1]).abs().max()) > 1e-3
@@ -163,7 +195,8 @@ def test_weights_of_the_other_preset_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("recorded", "driven"), [((0.0, 0.0), (0.0, 0.0)), ((0.3, 0.5), (0.3, 0.5)), ((None, None), (0.0, 0.8))]
+    ("recorded", "driven"),
+    [((0.0, 0.0), (0.0, 0.0)), ((0.3, 0.5), (0.3, 0.5)), ((None, None), (0.0, 0.8))],
 )
 def test_recorded_accelerations_of_zero_are_not_missing_ones(recorded, driven):
     _, metadata = load_weights(shipped_generator("paper"), "generator")

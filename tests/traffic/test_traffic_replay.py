@@ -64,14 +64,23 @@ def test_the_ego_takes_the_place_of_the_vehicle_nearest_the_middle():
     scene = start(replay(*FIVE), keys_of([0]))
     # Positions 0, 20, 30, 45, 100: their median is 30.
     names = ("x", "y", "speed", "length", "width", "target_lane", "desired_speed")
-    assert [getattr(scene, name)[0, 0].item() for name in names] == [0.0, WIDTH, 12.0, 5.0, 1.8, 1, 25.0]
+    assert [getattr(scene, name)[0, 0].item() for name in names] == [
+        0.0,
+        WIDTH,
+        12.0,
+        5.0,
+        1.8,
+        1,
+        25.0,
+    ]
     assert scene.visibility[0].tolist() == [Visibility.BODY] * 9
 
 
 def test_the_replaced_vehicle_is_recorded_long_enough():
     """The vehicle in the middle leaves after 0.8 s, so the next nearest is taken."""
     scene = start(replay(*FIVE, track(6, range(21), 47.0, 15.0, 1)), keys_of([0]))
-    # Positions 0, 20, 30, 45, 47, 100: the middle is 37.5, and of 30 and 45 the second is too short.
+    # Positions 0, 20, 30, 45, 47, 100: the middle is 37.5, and of 30 and 45 the second is too
+    # short.
     assert scene.speed[0, 0] == 12.0
 
 
@@ -118,7 +127,9 @@ def test_nobody_reacts_to_the_ego():
     traffic, key = ReplayTraffic(recordings=recorded(3)), keys_of(range(16))
     scene = start(traffic, key)
     elsewhere = scene.with_(x=scene.x + 5.0, y=scene.y + 1.0, speed=scene.speed * 0.0)
-    one, other = (traffic.move(at, {}, key, torch.full_like(key, 7))[0] for at in (scene, elsewhere))
+    one, other = (
+        traffic.move(at, {}, key, torch.full_like(key, 7))[0] for at in (scene, elsewhere)
+    )
     assert all(map(torch.equal, one.columns(slice(1, None)), other.columns(slice(1, None))))
     assert all(map(torch.equal, other.at(0), elsewhere.at(0)))
 
@@ -127,7 +138,9 @@ def recorded(scenes: int = 4, seconds: float = 8.0, **others) -> Recordings:
     """Synthetic scenes of which the k-th has 2 + k % 3 lanes and loses its last k seconds."""
     parts = []
     for k in range(scenes):
-        made = synthetic_scenes(SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=seconds, **others), seed=k)
+        made = synthetic_scenes(
+            SyntheticTraffic(scenes=1, lanes=2 + k % 3, seconds=seconds, **others), seed=k
+        )
         cut = made.filter(pl.col("frame") < round((seconds - 0.5 * k) * 10))
         parts.append(cut.with_columns(scene=pl.lit(f"scene-{k}")))
     return Recordings.of(sort(pl.concat(parts)), "synthetic", 4.0)
@@ -159,16 +172,27 @@ def test_lanes_and_their_width_are_the_scenes_own():
     now = start(traffic, key)
     assert (now.target_lane < road.lanes).all()
     assert traffic.road.lanes == 4
-    assert traffic.scenes_of_episodes(0, range(100)) == [f"scene-{number}" for number in scene.tolist()]
+    assert traffic.scenes_of_episodes(0, range(100)) == [
+        f"scene-{number}" for number in scene.tolist()
+    ]
 
 
 def test_every_step_is_what_a_search_through_the_rows_finds():
-    made = sort(synthetic_scenes(SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6), seed=3))
+    made = sort(
+        synthetic_scenes(
+            SyntheticTraffic(scenes=2, vehicles=14, seconds=7.0, changing_share=0.6), seed=3
+        )
+    )
     # Some come later and some leave early.
-    made = made.filter((pl.col("frame") >= 2 * (pl.col("vehicle") % 4)) & (pl.col("frame") < 70 - pl.col("vehicle")))
+    made = made.filter(
+        (pl.col("frame") >= 2 * (pl.col("vehicle") % 4))
+        & (pl.col("frame") < 70 - pl.col("vehicle"))
+    )
     traffic = ReplayTraffic(recordings=Recordings.of(made, "test", 3.0))
     key = keys_of(range(12))
-    for row, (scene, steps) in enumerate(zip(traffic.scene_of(key).tolist(), traffic.steps_of(key).tolist())):
+    for row, (scene, steps) in enumerate(
+        zip(traffic.scene_of(key).tolist(), traffic.steps_of(key).tolist())
+    ):
         rows = made.filter(pl.col("scene") == traffic.scene_names[scene])
         first = rows["frame"].max() - steps
         here = rows.filter(pl.col("frame") == first)
@@ -177,7 +201,9 @@ def test_every_step_is_what_a_search_through_the_rows_finds():
         stays = here.join(ending, on="vehicle").filter(pl.col("end") >= first + 30)
         ego = min(stays.to_dicts(), key=lambda car: (abs(car["x"] - middle), car["vehicle"]))
         others = [car for car in here.to_dicts() if car["vehicle"] != ego["vehicle"]]
-        others.sort(key=lambda car: (np.hypot(car["x"] - ego["x"], car["y"] - ego["y"]), car["vehicle"]))
+        others.sort(
+            key=lambda car: (np.hypot(car["x"] - ego["x"], car["y"] - ego["y"]), car["vehicle"])
+        )
         for step in (1, 17, steps):
             now = play(traffic, key[row : row + 1], step)
             for slot, car in enumerate(others[:8], start=1):
@@ -186,7 +212,12 @@ def test_every_step_is_what_a_search_through_the_rows_finds():
                 ).to_dicts()
                 assert now.valid[0, slot].item() == bool(found)
                 if found:
-                    seen = (now.x[0, slot] + ego["x"], now.y[0, slot], now.speed[0, slot], now.length[0, slot])
+                    seen = (
+                        now.x[0, slot] + ego["x"],
+                        now.y[0, slot],
+                        now.speed[0, slot],
+                        now.length[0, slot],
+                    )
                     expected = [found[0][name] for name in ("x", "y", "speed", "length")]
                     assert [value.item() for value in seen] == pytest.approx(expected)
 
@@ -195,10 +226,15 @@ def test_heading_and_acceleration_are_those_of_the_path():
     frame = np.arange(60)
     time = frame * 0.1
     path = 10.0 * time + 0.5 * time**2
-    # Accelerating at 1 m/s2 along a line that rises by one in two hundred; beside it somebody stands.
+    # Accelerating at 1 m/s2 along a line that rises by one in two hundred; beside it somebody
+    # stands.
     moving = track(1, frame, 0.0, 10.0, 0).with_columns(x=path, y=path / 200.0, speed=10.0 + time)
-    samples = Recordings.of(sort(pl.concat([moving, track(2, frame, 30.0, 0.0, 1)])), "test", 3.0).samples
-    heading, acceleration = (samples[:, keys.VEHICLE_FLOATS.index(name)] for name in ("heading", "acceleration"))
+    samples = Recordings.of(
+        sort(pl.concat([moving, track(2, frame, 30.0, 0.0, 1)])), "test", 3.0
+    ).samples
+    heading, acceleration = (
+        samples[:, keys.VEHICLE_FLOATS.index(name)] for name in ("heading", "acceleration")
+    )
     assert heading[:60].tolist() == pytest.approx([np.arctan(1 / 200.0)] * 60)
     assert acceleration[:60].tolist() == pytest.approx([1.0] * 60)
     assert heading[60:].abs().max() == acceleration[60:].abs().max() == 0.0
@@ -251,6 +287,8 @@ def test_how_long_the_us101_scenes_last_and_how_soon_they_empty(us101):
     driven = alone = 0
     for number in range(1, 301):
         running = number <= steps
-        empty = ~us101.recorded(key, torch.full_like(key, number), 9, torch.float32).valid[:, 1:].any(1)
+        empty = ~us101.recorded(key, torch.full_like(key, number), 9, torch.float32).valid[
+            :, 1:
+        ].any(1)
         driven, alone = driven + running.sum().item(), alone + (running & empty).sum().item()
     assert alone / driven == pytest.approx(0.18, abs=0.01)

@@ -33,7 +33,9 @@ def calibrated(**options):
     return AnchoredGanTraffic(generator(EXTRA_INPUTS), ROAD, **options)
 
 
-@pytest.fixture(params=[paper, calibrated, lambda: paper(execute_k=3)], ids=["paper", "calibrated", "planning"])
+@pytest.fixture(
+    params=[paper, calibrated, lambda: paper(execute_k=3)], ids=["paper", "calibrated", "planning"]
+)
 def module(request):
     return request.param()
 
@@ -45,7 +47,9 @@ def begin(module, rows=4, vehicles=9, seed=5):
     state = spawn(key, vehicles, 3, 4.0)
     counters = {"seed": seed, "episode": episode, "step": torch.zeros_like(seed)}
     memory = module.init_memory(state, key)
-    return TensorDict({"vehicles": TensorDict(state.as_dict(), [rows]), "traffic": memory, **counters}, [rows])
+    return TensorDict(
+        {"vehicles": TensorDict(state.as_dict(), [rows]), "traffic": memory, **counters}, [rows]
+    )
 
 
 def drive(module, td, steps):
@@ -95,7 +99,9 @@ def test_the_ego_is_a_neighbour_of_the_calibrated_drivers():
 def test_z_of_zero_is_the_same_driving_for_every_stream():
     modules = [paper(noise_scale=0.0), paper(noise_scale=0.0, stream=Stream.REPORT)]
     start = begin(modules[0])
-    torch.testing.assert_close(*(drive(module, start.clone(), 5)["vehicles", "x"] for module in modules))
+    torch.testing.assert_close(
+        *(drive(module, start.clone(), 5)["vehicles", "x"] for module in modules)
+    )
 
 
 def test_the_calibrated_drivers_follow_their_target_lane():
@@ -135,11 +141,15 @@ def test_the_past_is_moved_on_by_name_and_not_copied(module):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("c++") is None and shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.skipif(
+    shutil.which("c++") is None and shutil.which("g++") is None, reason="needs a C++ compiler"
+)
 def test_a_graph_drives_as_without_one(module):
     # So many rows that oneDNN multiplies.
     eager = drive(module, begin(module, rows=64), 12)
     module.compile_graphs()
     graph = drive(module, begin(module, rows=64), 12)
     for name in ("x", "y", "speed"):
-        torch.testing.assert_close(eager["vehicles", name], graph["vehicles", name], atol=1e-3, rtol=1e-5)
+        torch.testing.assert_close(
+            eager["vehicles", name], graph["vehicles", name], atol=1e-3, rtol=1e-5
+        )

@@ -38,12 +38,17 @@ def driven(traffic):
 
 
 class Scene:
-    """Always the same first scene; the first of ``cars`` (x, lane, speed, desired speed, length) is the ego."""
+    """Always the same first scene.
+
+    The first of ``cars`` (x, lane, speed, desired speed, length) is the ego.
+    """
 
     def __init__(self, *cars):
         names = ("x", "lane", "speed", "desired_speed", "length")
         body = {"visibility": int(Visibility.BODY)}
-        self.scene = scene_of(*({**body, **dict(zip(names, car))} for car in cars), dtype=torch.float32)
+        self.scene = scene_of(
+            *({**body, **dict(zip(names, car))} for car in cars), dtype=torch.float32
+        )
         self.vehicles = len(cars)
 
     def check(self, road, idm):
@@ -75,11 +80,14 @@ def test_nobody_jumps_and_speeds_are_differences_of_positions(driven):
     vehicles, _ = driven
     dx, dy = (field[1:] - field[:-1] for field in (vehicles.x, vehicles.y))
     mean = 0.5 * (vehicles.speed[1:] + vehicles.speed[:-1])
-    # A car that comes to a stand within a step stops at once: 0.6 m/s at most, which it then has not driven.
+    # A car that comes to a stand within a step stops at once: 0.6 m/s at most, which it then has
+    # not driven.
     assert (dx - 0.1 * mean)[..., 1:].abs().max() < 0.03
     assert dy[..., 1:].abs().max() < 0.11, "4 m in 4 s"
     acceleration = (vehicles.speed[1:] - vehicles.speed[:-1]) / 0.1
-    torch.testing.assert_close(vehicles.acceleration[1:, :, 1:], acceleration[..., 1:], rtol=0.0, atol=1e-3)
+    torch.testing.assert_close(
+        vehicles.acceleration[1:, :, 1:], acceleration[..., 1:], rtol=0.0, atol=1e-3
+    )
     assert vehicles.acceleration.amin() > -9.1
     assert vehicles.heading.abs().max() <= 0.2
 
@@ -91,7 +99,8 @@ def test_a_target_lane_is_where_a_change_ends_or_turns_back_from(driven):
     moving = (y - centre).abs() > 1e-3
     assert moving.any(), "nobody changed lanes"
     assert ((y - centre).abs() < 4.01).all()
-    # 4 s later a change is over; it has ended where it was said to go unless the driver has thought again meanwhile.
+    # 4 s later a change is over; it has ended where it was said to go unless the driver has thought
+    # again meanwhile.
     begins = moving[1:-40] & ~moving[:-41]
     said, came = target[1:-40][begins], (y[41:][begins] / 4.0).round().long()
     assert (said == came).float().mean() > 0.9
@@ -107,7 +116,8 @@ def test_the_others_signal_and_are_all_there_and_some_are_lorries_who_keep_their
 
 
 def test_an_episode_is_the_same_alone_and_beside_others_whatever_was_driven_before(traffic):
-    # In the middle of this the same roads have to be cleared, vehicles on their way across lanes among them.
+    # In the middle of this the same roads have to be cleared, vehicles on their way across lanes
+    # among them.
     drive(HighwayEnv(traffic, 4), [11, 12, 13, 14], 17, turns)
     assert_same_alone(HighwayEnv, traffic, [1, 3, 4, 6], 40)
 
@@ -143,7 +153,10 @@ def follower_of(traffic, lane_of_ego, action):
     # Somebody slow ahead keeps the ego slow, far enough away for the driver behind not to mind.
     scene = Scene((0.0, lane_of_ego, 12.0, 12.0), (-32.0, 1, 20.0, 20.0), (2000.0, 2, 20.0, 20.0))
     driven, running, _ = drive(
-        HighwayEnv(traffic, 1, scenes=scene), [0], 6, lambda decision, _: action if decision == 0 else 0
+        HighwayEnv(traffic, 1, scenes=scene),
+        [0],
+        6,
+        lambda decision, _: action if decision == 0 else 0,
     )
     assert running.all()
     return driven
@@ -174,7 +187,10 @@ def test_the_ego_is_followed_when_it_brakes_to_a_stand():
 
 
 def test_our_driver_does_here_what_it_does_in_our_own_traffic(traffic):
-    """The same scene written into another environment: the same command, and the ego's first step is the same."""
+    """The same scene written into another environment.
+
+    The same command, and the ego's first step is the same.
+    """
     ours = HighwayEnv(IdmTraffic(), 20)
     mobil = DRIVERS["mobil"](Road())
     env = HighwayEnv(traffic, 20)
@@ -241,7 +257,9 @@ def test_a_ring_is_refused():
 def test_episodes_that_take_the_rows_of_others_are_evaluated_as_in_a_batch_of_their_own(traffic):
     keep = DRIVERS["keep_lane"](Road())
     tables = [
-        run_episodes(HighwayEnv(traffic, rows, episode=EpisodeParameters(goal_m=600.0)), keep, range(6), 0)
+        run_episodes(
+            HighwayEnv(traffic, rows, episode=EpisodeParameters(goal_m=600.0)), keep, range(6), 0
+        )
         for rows in (6, 2)
     ]
     assert tables[0].equals(tables[1])

@@ -18,7 +18,9 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path):
 
 
 def test_names_of_version_0_1_are_read_as_those_of_today(tmp_path):
-    save_checkpoint(tmp_path / "last.pt", {"carrier": 1, "meter": 2, "counters": {"owed": 3, "best": None}})
+    save_checkpoint(
+        tmp_path / "last.pt", {"carrier": 1, "meter": 2, "counters": {"owed": 3, "best": None}}
+    )
     expected = {"env_state": 1, "stats": 2, "counters": {"pending_decisions": 3, "best": None}}
     assert load_checkpoint(tmp_path / "last.pt") == expected
 
@@ -31,7 +33,9 @@ def test_one_changed_byte_anywhere_is_refused(tmp_path):
         changed = bytearray(whole)
         changed[place] ^= 1 << place % 8
         path.write_bytes(changed)
-        with pytest.raises(UserError, match=r"^resume=.*last\.pt: (damaged|not a readable checkpoint)"):
+        with pytest.raises(
+            UserError, match=r"^resume=.*last\.pt: (damaged|not a readable checkpoint)"
+        ):
             load_checkpoint(path)
     path.write_bytes(whole[: -len(PLACE)])  # the checksum cut off altogether
     with pytest.raises(UserError, match="damaged"):
@@ -103,9 +107,13 @@ def with_damage(state, place, value):
 
 
 @pytest.mark.parametrize("place", DAMAGE)
-def test_a_part_of_a_run_that_is_something_else_is_refused_in_one_sentence(place, stopped, tmp_path):
+def test_a_part_of_a_run_that_is_something_else_is_refused_in_one_sentence(
+    place, stopped, tmp_path
+):
     save_checkpoint(tmp_path / "last.pt", with_damage(stopped, place, DAMAGE[place]))
-    with pytest.raises(UserError, match=r"^resume=[^\n]*last\.pt: [^\n]*; give another checkpoint\.$"):
+    with pytest.raises(
+        UserError, match=r"^resume=[^\n]*last\.pt: [^\n]*; give another checkpoint\.$"
+    ):
         TrainingState(ToyRoad(8), agent()).restore(tmp_path / "last.pt")
 
 

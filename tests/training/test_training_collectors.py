@@ -1,4 +1,7 @@
-"""Driving while learning: whose weights choose, the same bits after every end, one sentence for a lost worker."""
+"""Driving while learning.
+
+Whose weights choose, the same bits after every end, one sentence for a lost worker.
+"""
 
 import dataclasses
 import multiprocessing
@@ -23,7 +26,14 @@ from ganlane.config.traffic import IdmTrafficConfig
 from ganlane.config.train import CollectorConfig, OverlapCollectorConfig, TrainConfig
 from ganlane.errors import ParameterError, UserError
 from ganlane.training.checkpoint import load_checkpoint
-from ganlane.training.collectors import OverlapCollector, SingleCollector, pack, shielded_children, unpack, work
+from ganlane.training.collectors import (
+    OverlapCollector,
+    SingleCollector,
+    pack,
+    shielded_children,
+    unpack,
+    work,
+)
 from ganlane.training.phases import identity, make_collector, phases_of
 
 
@@ -95,14 +105,19 @@ def test_it_does_not_matter_which_worker_is_the_slowest(tmp_path):
     class Late(HereCollector):
         late_s = 0.2
 
-    assert same(run(HereCollector(toy, 2, 8), 160, tmp_path)[0], run(Late(toy, 2, 8), 160, tmp_path / "late")[0])
+    assert same(
+        run(HereCollector(toy, 2, 8), 160, tmp_path)[0],
+        run(Late(toy, 2, 8), 160, tmp_path / "late")[0],
+    )
 
 
 @pytest.mark.parametrize("decisions", [24, 160])
 def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, tmp_path, capsys):
     whole, _ = run(HereCollector(toy, 2, 8), 240, tmp_path / "whole")
     _, first = run(HereCollector(toy, 2, 8), decisions, tmp_path / "parts")
-    resumed, _ = run(HereCollector(toy, 2, 8), 240, tmp_path / "parts", seed=5, resume=first.checkpoint)
+    resumed, _ = run(
+        HereCollector(toy, 2, 8), 240, tmp_path / "parts", seed=5, resume=first.checkpoint
+    )
     assert same(whole, resumed)
     assert "bit-exact" not in capsys.readouterr().err
 
@@ -134,7 +149,9 @@ def test_steps_come_in_the_order_of_time_and_no_two_workers_drive_the_same_episo
 
 
 def test_a_phase_collects_as_the_option_says():
-    config = TrainConfig(collector=OverlapCollectorConfig(6, 3), traffic=IdmTrafficConfig(), env=ROAD)
+    config = TrainConfig(
+        collector=OverlapCollectorConfig(6, 3), traffic=IdmTrafficConfig(), env=ROAD
+    )
     (phase,) = phases_of(config, Path("nowhere"))
     source = make_collector(config, phase)
     assert isinstance(source, OverlapCollector)
@@ -148,7 +165,11 @@ def test_environments_that_cannot_be_shared_out_are_refused():
 
 @pytest.mark.parametrize("resumed", [OverlapCollectorConfig(8, 2), CollectorConfig(8)])
 def test_a_run_is_not_resumed_with_the_other_collector(resumed, tmp_path):
-    started = CollectorConfig(8) if isinstance(resumed, OverlapCollectorConfig) else OverlapCollectorConfig(8, 2)
+    started = (
+        CollectorConfig(8)
+        if isinstance(resumed, OverlapCollectorConfig)
+        else OverlapCollectorConfig(8, 2)
+    )
     config = TrainConfig(collector=started, traffic=IdmTrafficConfig(), env=ROAD)
     (phase,) = phases_of(config, tmp_path)
     _, first = run(SingleCollector(ToyRoad(8)), 40, tmp_path, identity=identity(config, phase))
@@ -180,7 +201,8 @@ def test_a_signal_that_comes_while_children_start_is_not_lost_nor_its_handler():
         with shielded_children():
             os.kill(os.getpid(), signal.SIGTERM)
         with shielded_children():
-            signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))  # as ray.init does
+            # as ray.init does
+            signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))
         os.kill(os.getpid(), signal.SIGTERM)
         assert seen == [signal.SIGTERM, signal.SIGTERM]
     finally:
@@ -195,7 +217,9 @@ def test_processes_give_what_threads_give_and_a_lost_one_ends_the_run_in_one_sen
             assert torch.equal(ours["next", "reward"], theirs["next", "reward"])
         numbers = [process.pid for process in source._processes]
         os.kill(numbers[0], signal.SIGKILL)
-        with pytest.raises(UserError, match=r"^collector=overlap: worker 0 .*died.* go on from the last") as error:
+        with pytest.raises(
+            UserError, match=r"^collector=overlap: worker 0 .*died.* go on from the last"
+        ) as error:
             source.step(learner)
         assert "\n" not in str(error.value)
     assert not any(Path(f"/proc/{number}").exists() for number in numbers)
@@ -229,9 +253,15 @@ def test_a_run_killed_at_any_moment_is_resumed_to_the_same_weights_and_leaves_no
     source, decisions, after_s, tmp_path
 ):
     """Killed so many seconds after its checkpoint of so many ``decisions``."""
-    folder, tests, script = tmp_path / "parts", Path(__file__).resolve().parent.parent, tmp_path / "killed.py"
+    folder, tests, script = (
+        tmp_path / "parts",
+        Path(__file__).resolve().parent.parent,
+        tmp_path / "killed.py",
+    )
     script.write_text(KILLED.format(tests=str(tests), folder=str(folder), source=source))
-    process = subprocess.Popen([sys.executable, str(script)], cwd=tests.parent, start_new_session=True)
+    process = subprocess.Popen(
+        [sys.executable, str(script)], cwd=tests.parent, start_new_session=True
+    )
     last = folder / "checkpoints" / "last.pt"
     while not last.exists() or load_checkpoint(last)["counters"]["decisions"] < decisions:
         assert process.poll() is None

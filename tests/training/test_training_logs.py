@@ -8,7 +8,15 @@ import pytest
 
 from ganlane.config.train import LoggerConfig
 from ganlane.errors import UserError
-from ganlane.training.logs import CsvLog, Logs, Progress, TensorBoardLog, WandbLog, make_logs, read_rows
+from ganlane.training.logs import (
+    CsvLog,
+    Logs,
+    Progress,
+    TensorBoardLog,
+    WandbLog,
+    make_logs,
+    read_rows,
+)
 
 # --- CSV
 
@@ -28,7 +36,9 @@ def test_a_resumed_log_forgets_the_rows_after_the_checkpoint(tmp_path):
 def test_a_log_torn_at_any_byte_holds_its_whole_rows_and_no_other(tmp_path):
     path = tmp_path / "metrics.csv"
     log = CsvLog(path, ["loss", "decisions"])  # the last column is the one that can be cut unseen
-    rows = [{"loss": "0.5", "decisions": str(decisions)} for decisions in (100_000, 200_000, 300_000)]
+    rows = [
+        {"loss": "0.5", "decisions": str(decisions)} for decisions in (100_000, 200_000, 300_000)
+    ]
     for row in rows:
         log.write(row)
     log.close()
@@ -65,7 +75,9 @@ def test_a_row_of_too_few_or_too_many_columns_is_left_out(tmp_path, torn):
 def test_a_log_that_is_none_is_refused_in_one_sentence(content, tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_bytes(content)
-    with pytest.raises(UserError, match=r"metrics\.csv: damaged \(.*\); repair it, or move it away"):
+    with pytest.raises(
+        UserError, match=r"metrics\.csv: damaged \(.*\); repair it, or move it away"
+    ):
         CsvLog(path, ["decisions", "loss"])
     assert path.read_bytes() == content
 
@@ -86,7 +98,9 @@ def test_progress_off_a_terminal_is_a_line_per_row_with_the_last_known_figures()
     stream = io.StringIO()
     progress = Progress(1_000_000, stream=stream)
     progress.advance(5)
-    progress.write({"decisions": 100_000, "decisions_per_s": 5000.0, "mean_return": 12.34, "crash_rate": 0.125})
+    progress.write(
+        {"decisions": 100_000, "decisions_per_s": 5000.0, "mean_return": 12.34, "crash_rate": 0.125}
+    )
     progress.write({"decisions": 200_000, "decisions_per_s": 10_000.0})
     progress.write({"decisions": 962_766, "decisions_per_s": 10.0})
     assert stream.getvalue().splitlines() == [
@@ -147,7 +161,9 @@ def test_wandb_is_offline_unless_told_gets_every_figure_over_the_decisions_and_i
     ("log", "module", "extra"),
     [(WandbLog, "wandb", "wandb"), (TensorBoardLog, "torch.utils.tensorboard", "tensorboard")],
 )
-def test_a_missing_package_is_named_with_the_command_that_mends_it(log, module, extra, tmp_path, monkeypatch):
+def test_a_missing_package_is_named_with_the_command_that_mends_it(
+    log, module, extra, tmp_path, monkeypatch
+):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UserError, match=rf"pip install 'ganlane\[{extra}\]'.*logger=csv\.$"):
         log(tmp_path)
@@ -156,7 +172,9 @@ def test_a_missing_package_is_named_with_the_command_that_mends_it(log, module, 
 def test_a_wandb_that_does_not_start_is_one_sentence(fake, tmp_path, monkeypatch):
     fake.init.side_effect = fake.Error("api_key not configured")
     monkeypatch.setenv("WANDB_MODE", "online")
-    with pytest.raises(UserError, match=r"WANDB_MODE=online.*api_key not configured.*WANDB_MODE=offline"):
+    with pytest.raises(
+        UserError, match=r"WANDB_MODE=online.*api_key not configured.*WANDB_MODE=offline"
+    ):
         WandbLog(tmp_path)
 
 

@@ -43,10 +43,15 @@ def settings(decisions, **options):
 
 
 def train(*arguments, **options):
-    """A run to its end: one that a signal stops, say the SIGTERM of `timeout`, would fail here as other weights."""
+    """A run to its end.
+
+    One that a signal stops, say the SIGTERM of `timeout`, would fail here as other weights.
+    """
     result = train_until_stopped(*arguments, **options)
     if result.stopped_by is not None:
-        pytest.exit(f"a run was stopped by signal {result.stopped_by}", returncode=128 + result.stopped_by)
+        pytest.exit(
+            f"a run was stopped by signal {result.stopped_by}", returncode=128 + result.stopped_by
+        )
     return result
 
 
@@ -56,7 +61,9 @@ def rows(path):
 
 
 def same(first, second):
-    return all(torch.equal(a, b) for a, b in zip(first.weights().values(), second.weights().values()))
+    return all(
+        torch.equal(a, b) for a, b in zip(first.weights().values(), second.weights().values())
+    )
 
 
 def test_the_toy_road_is_a_torchrl_environment():
@@ -72,7 +79,9 @@ def test_the_agent_learns_to_drive_on_the_toy_road(tmp_path):
     assert float(last["mean_return"]) > float(first["mean_return"]) + 5.0
 
 
-def test_the_rows_of_the_metrics_hold_what_happened_and_the_global_random_state_is_left_alone(tmp_path):
+def test_the_rows_of_the_metrics_hold_what_happened_and_the_global_random_state_is_left_alone(
+    tmp_path,
+):
     learner, random_state = agent(), torch.get_rng_state()
     train(ToyRoad(8), learner, settings(1600), tmp_path)
     assert torch.equal(torch.get_rng_state(), random_state)
@@ -83,7 +92,14 @@ def test_the_rows_of_the_metrics_hold_what_happened_and_the_global_random_state_
     assert sum(last[f"action_{i}_share"] for i in range(3)) == pytest.approx(1.0, abs=1e-4)
     assert last["goal_rate"] + last["crash_rate"] == pytest.approx(1.0, abs=1e-4)
     assert 0.0 < last["lane_changes_per_km"] < 10.0
-    assert {"loss", "mean_q", "clamped_fraction", "sigma", "priority", "mean_discounted_return"} <= last.keys()
+    assert {
+        "loss",
+        "mean_q",
+        "clamped_fraction",
+        "sigma",
+        "priority",
+        "mean_discounted_return",
+    } <= last.keys()
 
 
 @pytest.mark.parametrize("environments", [4, 8, 32])
@@ -106,10 +122,14 @@ def test_an_interrupted_and_resumed_run_gives_the_same_weights(decisions, tmp_pa
     assert (result.decisions, result.updates) == (2400, whole.updates)
     columns = ("decisions", "loss", "mean_return", "crash_rate")
     ours, theirs = (rows(tmp_path / name / "metrics.csv") for name in ("parts", "whole"))
-    assert [[row[c] for c in columns] for row in ours] == [[row[c] for c in columns] for row in theirs]
+    assert [[row[c] for c in columns] for row in ours] == [
+        [row[c] for c in columns] for row in theirs
+    ]
 
 
-def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_so(tmp_path, capsys):
+def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_so(
+    tmp_path, capsys
+):
     first = train(ToyRoad(8), agent(), settings(800, checkpoint_replay=False), tmp_path)
     resumed = agent()
     light = settings(856, progress=True)
@@ -123,8 +143,16 @@ def test_a_light_checkpoint_refills_the_buffer_before_its_first_update_and_says_
 
 def test_a_light_checkpoint_of_the_full_sized_network_is_under_5_mb(tmp_path):
     learner = Rainbow(RainbowConfig(batch_size=64, warmup=64, decisions_per_update=8), 29)
-    after = {"observation": torch.rand(64, 29), "reward": torch.rand(64, 1), "terminated": torch.rand(64, 1) < 0.5}
-    content = {"observation": torch.rand(64, 29), "action": torch.zeros(64, dtype=torch.int64), "next": after}
+    after = {
+        "observation": torch.rand(64, 29),
+        "reward": torch.rand(64, 1),
+        "terminated": torch.rand(64, 1) < 0.5,
+    }
+    content = {
+        "observation": torch.rand(64, 29),
+        "action": torch.zeros(64, dtype=torch.int64),
+        "next": after,
+    }
     learner.store(TensorDict({**content, "steps_to_next_obs": torch.ones(64, 1)}, [64]))
     learner.update()
     Checkpointer(TrainingState(ToyRoad(8), learner), tmp_path, 20.0, False, {}).save()
@@ -174,12 +202,20 @@ def test_the_best_evaluated_agent_is_kept_and_the_last_one_too(tmp_path):
 
 def test_a_metric_that_the_evaluation_does_not_give_is_named(tmp_path):
     with pytest.raises(UserError, match=r"best_metric=mean_reward.*speed"):
-        train(ToyRoad(8), agent(), settings(80, evaluate_every=40), tmp_path, lambda policy: {"speed": 1.0})
+        train(
+            ToyRoad(8),
+            agent(),
+            settings(80, evaluate_every=40),
+            tmp_path,
+            lambda policy: {"speed": 1.0},
+        )
 
 
 def test_writing_checkpoints_takes_at_most_a_fiftieth_of_the_time(tmp_path, monkeypatch):
     saver = Checkpointer(TrainingState(ToyRoad(8), agent()), tmp_path, 0.0, True, {})
-    monkeypatch.setattr("ganlane.training.checkpoint.save_checkpoint", lambda path, state: time.sleep(0.1))
+    monkeypatch.setattr(
+        "ganlane.training.checkpoint.save_checkpoint", lambda path, state: time.sleep(0.1)
+    )
     saver.save()
     assert saver.pause_s > 5.0
     assert not saver.due()

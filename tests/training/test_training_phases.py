@@ -1,4 +1,7 @@
-"""Phases: what a run starts from and takes over, what it may go on from, and what its agent is told of it."""
+"""Phases.
+
+What a run starts from and takes over, what it may go on from, and what its agent is told of it.
+"""
 
 import os
 import signal
@@ -99,16 +102,26 @@ def test_moments_are_taken_over_where_asked(trained, last, tmp_path):
 def test_a_run_whose_rate_has_fallen_is_prolonged_at_its_end(tmp_path):
     fall = ["agent.learning_rate_end=1e-5"]
     folder = run(tmp_path, *fall, "total_decisions=160")
-    with pytest.raises(UserError, match=r"agent\.learning_rate_decisions=320: the saved agent has 160"):
+    with pytest.raises(
+        UserError, match=r"agent\.learning_rate_decisions=320: the saved agent has 160"
+    ):
         run(folder, *fall, "total_decisions=320", resume=folder / LAST)
-    run(folder, *fall, "agent.learning_rate_decisions=160", "total_decisions=320", resume=folder / LAST)
+    run(
+        folder,
+        *fall,
+        "agent.learning_rate_decisions=160",
+        "total_decisions=320",
+        resume=folder / LAST,
+    )
     state = load_checkpoint(folder / LAST)
     assert state["counters"]["decisions"] == 320
     assert state["agent"]["optimizer"]["param_groups"][0]["lr"] == 1e-5
 
 
 def test_a_file_of_weights_has_no_moments_to_take_over(trained, tmp_path):
-    with pytest.raises(UserError, match=r"agent\.safetensors holds no moments.*last\.pt.*init\.optimizer=false"):
+    with pytest.raises(
+        UserError, match=r"agent\.safetensors holds no moments.*last\.pt.*init\.optimizer=false"
+    ):
         start(tmp_path, trained / AGENT_FILE, "init.optimizer=true")
 
 
@@ -116,8 +129,12 @@ OTHER_SUPPORT = ["agent.v_min=-50", "agent.v_max=60", "agent.atoms=21"]
 
 
 @pytest.mark.parametrize("place", ["", AGENT_FILE])
-def test_another_support_is_refused_unless_the_trained_one_is_asked_for(place, trained, last, tmp_path):
-    with pytest.raises(UserError, match=r"give init\.support=trained, set agent\.atoms=101 agent\.v_min=-120"):
+def test_another_support_is_refused_unless_the_trained_one_is_asked_for(
+    place, trained, last, tmp_path
+):
+    with pytest.raises(
+        UserError, match=r"give init\.support=trained, set agent\.atoms=101 agent\.v_min=-120"
+    ):
         start(tmp_path, trained / place, *OTHER_SUPPORT)
     config, agent = start(tmp_path, trained / place, "init.support=trained", *OTHER_SUPPORT)
     assert (agent.config.atoms, agent.config.v_min, agent.config.v_max) == (101, -120.0, 100.0)
@@ -129,7 +146,13 @@ def test_another_support_is_refused_unless_the_trained_one_is_asked_for(place, t
 def test_a_run_with_an_adopted_support_goes_on_without_what_it_started_from(tmp_path):
     """And ends as it would have in a piece: here the start lies in a file that is then gone."""
     first = run(tmp_path / "first", "total_decisions=160")
-    options = ["init=idm_ckpt", f"init.path={first}", "init.support=trained", "init.optimizer=true", *OTHER_SUPPORT]
+    options = [
+        "init=idm_ckpt",
+        f"init.path={first}",
+        "init.support=trained",
+        "init.optimizer=true",
+        *OTHER_SUPPORT,
+    ]
     whole = run(tmp_path / "whole", *options, "total_decisions=320")
     parts = run(tmp_path / "parts", *options, "total_decisions=160")
     (first / LAST).unlink()
@@ -211,7 +234,9 @@ EXPERIMENTS = sorted(
 )
 
 
-@pytest.mark.parametrize("overrides", [[], *([f"experiment={name}"] for name in EXPERIMENTS)], ids=str)
+@pytest.mark.parametrize(
+    "overrides", [[], *([f"experiment={name}"] for name in EXPERIMENTS)], ids=str
+)
 def test_every_experiment_composes_and_fits_the_agent_that_it_starts_from(overrides):
     config = check("train", overrides).config
     if config.init.path is not None:
@@ -232,9 +257,17 @@ def test_a_first_phase_that_is_over_must_be_the_one_asked_for(tmp_path):
 
 
 def test_a_falling_learning_rate_has_reached_its_end_when_its_phase_is_over(tmp_path):
-    told = ["experiment=paper", "agent.learning_rate_end=1e-5", "pretrain.total_decisions=5000", "total_decisions=90"]
+    told = [
+        "experiment=paper",
+        "agent.learning_rate_end=1e-5",
+        "pretrain.total_decisions=5000",
+        "total_decisions=90",
+    ]
     config = check("train", told).config
-    lengths = [make_agent(config, phase).config.learning_rate_decisions for phase in phases_of(config, tmp_path)]
+    lengths = [
+        make_agent(config, phase).config.learning_rate_decisions
+        for phase in phases_of(config, tmp_path)
+    ]
     assert lengths == [5000, 90]
     config.agent = replace(config.agent, learning_rate_decisions=300)
     assert make_agent(config, phases_of(config, tmp_path)[0]).config.learning_rate_decisions == 300
@@ -278,11 +311,16 @@ def test_a_run_is_not_resumed_behind_another_mask(masked, other):
 
 def test_runs_without_a_mask_have_the_identity_that_they_always_had(tmp_path):
     """Those of versions that knew no masks can be resumed."""
-    assert "mask" not in load_checkpoint(run(tmp_path, "traffic=idm_mobil", "mask=none") / LAST)["identity"]
+    assert (
+        "mask"
+        not in load_checkpoint(run(tmp_path, "traffic=idm_mobil", "mask=none") / LAST)["identity"]
+    )
 
 
 @pytest.mark.parametrize(("now", "refused"), [([], False), (["env.truck_share=0.5"], True)])
-def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(now, refused, tmp_path):
+def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(
+    now, refused, tmp_path
+):
     half = run(tmp_path, "total_decisions=160")
     state = load_checkpoint(half / LAST)
     del state["identity"]["env"]["truck_share"]
@@ -297,16 +335,25 @@ def test_a_run_begun_before_there_was_an_option_goes_on_with_its_default_alone(n
 # --- what was removed
 
 
-@pytest.mark.parametrize("stored", ["agent.encoder=shared", "agent.decide_when_free=true", "observation=fixed_order"])
+@pytest.mark.parametrize(
+    "stored", ["agent.encoder=shared", "agent.decide_when_free=true", "observation=fixed_order"]
+)
 def test_a_command_line_with_a_removed_option_names_the_revision_that_had_it(stored):
-    with pytest.raises(UserError, match=f"^run: {stored} was removed after revision {LAST_REVISION}"):
+    with pytest.raises(
+        UserError, match=f"^run: {stored} was removed after revision {LAST_REVISION}"
+    ):
         without_removed_overrides(["seed=1", stored], "run")
     with pytest.raises(UserError, match=LAST_REVISION):
         without_removed_overrides(["experiment=search/base"], "run")
 
 
 def test_removed_options_at_their_defaults_are_left_out_of_a_command_line():
-    stored = ["agent.encoder=none", "agent.encoder_width=32", "agent.decide_when_free=false", "agent.hidden=[8,8]"]
+    stored = [
+        "agent.encoder=none",
+        "agent.encoder_width=32",
+        "agent.decide_when_free=false",
+        "agent.hidden=[8,8]",
+    ]
     assert without_removed_overrides(stored, "run") == ["agent.hidden=[8,8]"]
 
 
@@ -314,20 +361,27 @@ def test_a_checkpoint_with_a_removed_option_names_the_revision_that_had_it(train
     state, path = load_checkpoint(trained / LAST), tmp_path / "last.pt"
     state["agent"]["config"]["encoder"] = "shared"
     save_checkpoint(path, state)
-    with pytest.raises(UserError, match=f"^init.path=.*encoder=shared was removed after revision {LAST_REVISION}"):
+    with pytest.raises(
+        UserError, match=f"^init.path=.*encoder=shared was removed after revision {LAST_REVISION}"
+    ):
         read_start(str(path))
-    with pytest.raises(UserError, match=f"encoder=shared was removed after revision {LAST_REVISION}"):
+    with pytest.raises(
+        UserError, match=f"encoder=shared was removed after revision {LAST_REVISION}"
+    ):
         run(tmp_path / "next", "total_decisions=480", resume=path)
     state["agent"]["config"]["encoder"] = "none"
     state["identity"]["observation"]["form"] = "fixed_order"
     save_checkpoint(path, state)
-    with pytest.raises(UserError, match=f"fixed_order: it was removed after revision {LAST_REVISION}"):
+    with pytest.raises(
+        UserError, match=f"fixed_order: it was removed after revision {LAST_REVISION}"
+    ):
         read_start(str(path))
 
 
 # --- env.compile=true
 
-#: A phase alone, without the evaluation that a command makes at its end: that would compile as much again.
+#: A phase alone, without the evaluation that a command makes at its end: that would compile as much
+#: again.
 SCRIPT = """
 import sys
 from pathlib import Path
@@ -344,18 +398,29 @@ TOO_LONG = 64_000
 
 
 def begin(folder, total, resume=""):
-    """A compiled training run in ``folder``, under way; what the compiler leaves is shared by the runs beside it."""
-    own = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"), "OMP_NUM_THREADS": "1"}
+    """A compiled training run in ``folder``, under way.
+
+    What the compiler leaves is shared by the runs beside it.
+    """
+    own = {
+        "PYTHONPATH": str(ROOT),
+        "TORCHINDUCTOR_CACHE_DIR": str(folder.parent / "cache"),
+        "OMP_NUM_THREADS": "1",
+    }
     given = [str(folder), str(resume), *TINY, "env.compile=true", f"total_decisions={total}"]
     return subprocess.Popen([sys.executable, "-c", SCRIPT, *given], env={**os.environ, **own})
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
-def test_a_compiled_run_stopped_and_resumed_in_a_process_of_its_own_ends_with_the_same_bits(tmp_path):
+def test_a_compiled_run_stopped_and_resumed_in_a_process_of_its_own_ends_with_the_same_bits(
+    tmp_path,
+):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     first, metrics = begin(parts, TOO_LONG), parts / "metrics.csv"
-    while first.poll() is None and not (metrics.is_file() and len(metrics.read_text().splitlines()) > 1):
+    while first.poll() is None and not (
+        metrics.is_file() and len(metrics.read_text().splitlines()) > 1
+    ):
         time.sleep(0.1)
     first.send_signal(signal.SIGTERM)  # in the loop, some steps after the first figures
     assert first.wait() == 0

@@ -17,7 +17,10 @@ def step(reward, done, crash=None, goal=None, distance=0.0, lane_changes=0, acti
         "reward": torch.tensor(reward)[:, None],
         "done": column(done),
         "events": {"goal": column(goal), "hard_crash": column(crash)},
-        "ego": {"distance": torch.full((rows,), distance), "lane_changes": torch.full((rows,), lane_changes)},
+        "ego": {
+            "distance": torch.full((rows,), distance),
+            "lane_changes": torch.full((rows,), lane_changes),
+        },
     }
     known = {} if value is None else {"chosen_action_value": torch.tensor(value)[:, None]}
     return TensorDict({"action": torch.full((rows,), action), "next": after, **known}, [rows])
@@ -26,7 +29,16 @@ def step(reward, done, crash=None, goal=None, distance=0.0, lane_changes=0, acti
 def test_returns_and_rates_are_those_of_the_finished_episodes():
     stats = EpisodeStats(2, 3, gamma=0.5)
     stats.step(step([1.0, 10.0], [False, False], distance=500.0))
-    stats.step(step([2.0, 20.0], [True, False], crash=[True, False], distance=1000.0, lane_changes=3, action=2))
+    stats.step(
+        step(
+            [2.0, 20.0],
+            [True, False],
+            crash=[True, False],
+            distance=1000.0,
+            lane_changes=3,
+            action=2,
+        )
+    )
     stats.step(step([4.0, 40.0], [True, True], goal=[False, True], distance=1000.0, lane_changes=1))
     row = stats.read()
     assert row["episodes"] == 3
@@ -81,6 +93,8 @@ def test_the_return_to_go_agrees_with_a_sum_over_every_decision():
         begin = 0
         for end in ends[:, row].nonzero().flatten().tolist():
             episode = rewards[begin : end + 1, row].tolist()
-            total += sum(gamma**i * r for start in range(len(episode)) for i, r in enumerate(episode[start:]))
+            total += sum(
+                gamma**i * r for start in range(len(episode)) for i, r in enumerate(episode[start:])
+            )
             count, begin = count + len(episode), end + 1
     assert stats.read()["mean_return_to_go"] == pytest.approx(total / count, rel=1e-5)

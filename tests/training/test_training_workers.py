@@ -1,4 +1,5 @@
-"""Steps from TorchRL's workers: in order, from episodes of their own, with weights that follow the learner's.
+"""Steps from TorchRL's workers: in order, from episodes of their own, with weights that follow the
+learner's.
 
 And what the loss of a worker leads to, and what is left of them.
 """
@@ -42,7 +43,9 @@ from ganlane.training.workers import (
 )
 
 ROOT = Path(__file__).resolve().parents[2]
-NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)")
+NO_RAY = pytest.mark.skipif(
+    importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra ray)"
+)
 NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 
 
@@ -51,7 +54,9 @@ def pool(workers, num_envs, weights_every):
 
 
 class Here:
-    """TorchRL's collectors of all workers, one after the other in this process, with the interface of the others."""
+    """TorchRL's collectors of all workers, one after the other in this process, with the interface
+    of the others.
+    """
 
     def __init__(self, environments, policies, frames):
         options = {"frames_per_batch": frames // len(policies), "trust_policy": True}
@@ -150,7 +155,9 @@ def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(
     first = train(source, agent(), config, tmp_path)
     begun = source._last[keys.EPISODE].reshape(2, 4)
     resumed, again = agent(), HereCollector(road, pool(2, 4, 80))
-    result = train(again, resumed, TrainingConfig(480, progress=False), tmp_path, resume=first.checkpoint)
+    result = train(
+        again, resumed, TrainingConfig(480, progress=False), tmp_path, resume=first.checkpoint
+    )
     assert "the workers begin the next ones; not bit-exact" in capsys.readouterr().err
     assert again.first_episodes == [int(last) + 1 for last in begun.amax(1)]
     assert len(resumed.replay) > 400  # the buffer of the first stretch is still there
@@ -158,10 +165,21 @@ def test_a_resumed_run_begins_the_episodes_after_those_it_had_begun_and_says_so(
 
 
 def test_another_number_of_workers_is_refused_on_resume(tmp_path):
-    first = train(HereCollector(toy.toy, pool(2, 4, 8)), agent(4), TrainingConfig(80, progress=False), tmp_path)
+    first = train(
+        HereCollector(toy.toy, pool(2, 4, 8)),
+        agent(4),
+        TrainingConfig(80, progress=False),
+        tmp_path,
+    )
     for other in (HereCollector(toy.toy, pool(3, 4, 8)), ToyRoad(4)):
         with pytest.raises(UserError, match=r"shape \[8\], this run has"):
-            train(other, agent(4), TrainingConfig(160, progress=False), tmp_path, resume=first.checkpoint)
+            train(
+                other,
+                agent(4),
+                TrainingConfig(160, progress=False),
+                tmp_path,
+                resume=first.checkpoint,
+            )
 
 
 # --- options
@@ -176,7 +194,11 @@ def test_a_phase_collects_as_the_option_says():
     assert source.config is collector
     assert collector.environments == source.environments == 15
     assert source.make_env(2, 70).reset()[keys.EPISODE].tolist() == [70, 71]
-    assert identity(config, phase)["collector"] == {"num_envs": 3, "workers": 5, "weights_every": 60}
+    assert identity(config, phase)["collector"] == {
+        "num_envs": 3,
+        "workers": 5,
+        "weights_every": 60,
+    }
 
 
 def test_a_missing_ray_is_named_with_the_command_that_mends_it(monkeypatch):
@@ -213,7 +235,9 @@ def test_a_dead_worker_ends_the_run_in_one_sentence_and_takes_the_others_along()
         check_order(steps(source, learner, 4), FIRST)
         numbers = [process.pid for process in source.collector.procs]
         os.kill(numbers[1], signal.SIGKILL)
-        with pytest.raises(UserError, match=r"^collector=multi: .*died.* go on from the last checkpoint") as error:
+        with pytest.raises(
+            UserError, match=r"^collector=multi: .*died.* go on from the last checkpoint"
+        ) as error:
             steps(source, learner, 3)
         assert "\n" not in str(error.value)
     assert not any(Path(f"/proc/{number}").exists() for number in numbers)
@@ -241,7 +265,15 @@ def test_two_ray_workers_collect_and_a_dead_one_is_told_in_one_sentence(carried_
         seen = steps(source, learner, 6)
         assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
         check_order(seen, FIRST)
-        assert len({policy.initial_seed() for policy in source.collector.get_distant_attr("policy.generator")}) == 2
+        assert (
+            len(
+                {
+                    policy.initial_seed()
+                    for policy in source.collector.get_distant_attr("policy.generator")
+                }
+            )
+            == 2
+        )
         ray.kill(source.collector.remote_collectors[0])
         with pytest.raises(UserError, match=r"^collector=ray: a worker died"):
             steps(source, learner, 4)
@@ -263,14 +295,22 @@ def test_nobody_at_an_address_is_found_out_at_once():
 @pytest.mark.slow
 def test_an_address_without_a_cluster_is_named(carried_along):
     source = ClusterCollector(road, RayCollectorConfig(1, 1, 1, address="127.0.0.1:1"))
-    with closing(source), pytest.raises(UserError, match=r"no Ray cluster answers at collector.address=127.0.0.1:1"):
+    with (
+        closing(source),
+        pytest.raises(UserError, match=r"no Ray cluster answers at collector.address=127.0.0.1:1"),
+    ):
         source.step(agent())
 
 
 COMMAND = [
     *("traffic=idm", "init=none", "env.goal_m=40", "collector=multi", "collector.num_envs=8"),
     *("collector.weights_every=32", "log_every=64", "agent.hidden=[16,16]", "agent.batch_size=32"),
-    *("agent.warmup=64", "agent.capacity=1000", "evaluation.agents=[keep_lane]", "evaluation.episodes=2"),
+    *(
+        "agent.warmup=64",
+        "agent.capacity=1000",
+        "evaluation.agents=[keep_lane]",
+        "evaluation.episodes=2",
+    ),
 ]
 
 
@@ -279,12 +319,16 @@ def start(tmp_path):
     """Start ``ganlane train`` in a folder of its own."""
     options = {"cwd": tmp_path, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     options["env"] = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return lambda *given: subprocess.Popen([sys.executable, "-m", "ganlane.train", *given], **options)
+    return lambda *given: subprocess.Popen(
+        [sys.executable, "-m", "ganlane.train", *given], **options
+    )
 
 
 def wait_for_rows(process, folder, rows):
     """Until ``metrics.csv`` somewhere in ``folder`` has so many."""
-    while not any(len(path.read_text().splitlines()) > rows for path in folder.rglob("metrics.csv")):
+    while not any(
+        len(path.read_text().splitlines()) > rows for path in folder.rglob("metrics.csv")
+    ):
         assert process.poll() is None
         time.sleep(0.02)
 
@@ -307,7 +351,9 @@ def test_a_run_that_lost_a_worker_is_resumed_to_its_end(tmp_path, start):
     process = start(*COMMAND, "total_decisions=4000", "hydra.run.dir=run")
     wait_for_rows(process, tmp_path, 2)
     # Children that run a function of multiprocessing, not its resource tracker.
-    children = subprocess.check_output(["ps", "-o", "pid=,args=", "--ppid", str(process.pid)], text=True)
+    children = subprocess.check_output(
+        ["ps", "-o", "pid=,args=", "--ppid", str(process.pid)], text=True
+    )
     worker = next(line for line in children.splitlines() if "spawn_main" in line)
     os.kill(int(worker.split()[0]), signal.SIGKILL)
     message = process.communicate(timeout=120)[1]

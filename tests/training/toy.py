@@ -1,4 +1,7 @@
-"""Small environments and agents for tests of the training loop; a toy road whose whole state is in the TensorDict."""
+"""Small environments and agents for tests of the training loop.
+
+A toy road whose whole state is in the TensorDict.
+"""
 
 import os
 import time
@@ -16,14 +19,22 @@ from ganlane.sim.random import draw_keys, episode_key, to_uniform
 
 ACTIONS, LIMIT = 3, 8
 ROAD = EnvConfig(vehicles=4, goal_m=60.0)
-SMALL = {"hidden": (16, 16), "batch_size": 16, "warmup": 32, "capacity": 1000, "decisions_per_update": 8, "atoms": 11}
+SMALL = {
+    "hidden": (16, 16),
+    "batch_size": 16,
+    "warmup": 32,
+    "capacity": 1000,
+    "decisions_per_update": 8,
+    "atoms": 11,
+}
 
 
 class ToyRoad(EnvBase):
     """Each decision one of three actions is right (+1), one crashes (-5), and one does nothing.
 
-    The observation is a random draw [N, 4]: its largest of the first three is right, its smallest crashes. After 8
-    decisions the episode is a goal (+2) if the seed is even and times out otherwise.
+    The observation is a random draw [N, 4]: its largest of the first three is right, its smallest
+    crashes. After 8 decisions the episode is a goal (+2) if the seed is even and times out
+    otherwise.
     """
 
     def __init__(self, environments=8, seed=0):
@@ -31,7 +42,10 @@ class ToyRoad(EnvBase):
         self.seed_number, shape = seed, (environments,)
         flag = Binary(shape=(*shape, 1), dtype=torch.bool)
         count = Unbounded(shape=shape, dtype=torch.int64)
-        events = {name: flag.clone() for name in ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")}
+        events = {
+            name: flag.clone()
+            for name in ("goal", "hard_crash", "out_of_road", "timeout", "scene_end")
+        }
         ego = {"distance": Unbounded(shape=shape), "lane_changes": count.clone()}
         counters = {name: count.clone() for name in ("seed", "episode", "step")}
         self.observation_spec = Composite(
@@ -45,10 +59,14 @@ class ToyRoad(EnvBase):
         )
         self.action_spec = Categorical(ACTIONS, shape=shape)
         self.reward_spec = Unbounded(shape=(*shape, 1))
-        self.done_spec = Composite({n: flag.clone() for n in ("done", "terminated", "truncated")}, shape=shape)
+        self.done_spec = Composite(
+            {n: flag.clone() for n in ("done", "terminated", "truncated")}, shape=shape
+        )
 
     def _observe(self, seed, episode, step):
-        return to_uniform(draw_keys(episode_key(0, seed, episode), step, 1, [0, 1, 2, 3])).squeeze(1)
+        return to_uniform(draw_keys(episode_key(0, seed, episode), step, 1, [0, 1, 2, 3])).squeeze(
+            1
+        )
 
     def _reset(self, tensordict=None):
         rows = self.batch_size[0]
@@ -56,7 +74,8 @@ class ToyRoad(EnvBase):
         if mask is None:
             seed, episode = torch.full((rows,), self.seed_number), torch.arange(rows)
         else:
-            # TorchRL hides everything but the mask from an automatic reset: the last step knows the episodes.
+            # TorchRL hides everything but the mask from an automatic reset: the last step knows the
+            # episodes.
             seed, episode = self.last
             episode = torch.where(mask.squeeze(-1), episode + rows, episode)
         begin = self.observation_spec.zero().update(self.full_done_spec.zero())
@@ -73,14 +92,22 @@ class ToyRoad(EnvBase):
         timeout = over & ~goal
         reward = (action == right).float() - 5.0 * crash + 2.0 * goal
         seed, episode = self.last = tensordict["seed"], tensordict["episode"]
-        after = self.observation_spec.zero().update({"seed": seed, "episode": episode, "step": step})
+        after = self.observation_spec.zero().update(
+            {"seed": seed, "episode": episode, "step": step}
+        )
         flags = {"terminated": crash | goal, "truncated": timeout, "done": crash | over}
-        flags |= {("events", "goal"): goal, ("events", "hard_crash"): crash, ("events", "timeout"): timeout}
+        flags |= {
+            ("events", "goal"): goal,
+            ("events", "hard_crash"): crash,
+            ("events", "timeout"): timeout,
+        }
         for name, flag in flags.items():
             after.set(name, flag[:, None])
         after.set(("ego", "distance"), tensordict["ego", "distance"] + 100.0)
         after.set(("ego", "lane_changes"), tensordict["ego", "lane_changes"] + (action > 0))
-        return after.set("reward", reward[:, None]).set("observation", self._observe(seed, episode, step))
+        return after.set("reward", reward[:, None]).set(
+            "observation", self._observe(seed, episode, step)
+        )
 
     def _set_seed(self, seed):
         self.seed_number = seed
@@ -88,7 +115,11 @@ class ToyRoad(EnvBase):
 
 def road(rows, first_episode):
     return make_env(
-        make_traffic(IdmTrafficConfig(), ROAD), ROAD, ObservationConfig(), num_envs=rows, first_episode=first_episode
+        make_traffic(IdmTrafficConfig(), ROAD),
+        ROAD,
+        ObservationConfig(),
+        num_envs=rows,
+        first_episode=first_episode,
     )
 
 
@@ -105,7 +136,10 @@ def steps(source, learner, count):
 
 
 def check_order(seen, first):
-    """Steps [T, N] on the road: observations follow on, rows begin with episodes ``first``, and no two share one."""
+    """Steps [T, N] on the road.
+
+    Observations follow on, rows begin with episodes ``first``, and no two share one.
+    """
     going = ~seen["next", "done"][:-1, :, 0]
     assert going.any()
     assert torch.equal(seen["next", "observation"][:-1][going], seen["observation"][1:][going])
@@ -115,7 +149,10 @@ def check_order(seen, first):
 
 
 def gone(group: int, within_s: float = 20.0) -> bool:
-    """Whether a process group is empty soon; who has ended counts until the system has taken note of it."""
+    """Whether a process group is empty soon.
+
+    Who has ended counts until the system has taken note of it.
+    """
     end = time.monotonic() + within_s
     while time.monotonic() < end:
         try:

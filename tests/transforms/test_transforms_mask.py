@@ -37,7 +37,10 @@ def idm(speed, desired, gap, leader_speed):
     t = TABLE_V
     root = 2.0 * (t.max_acceleration * t.comfortable_deceleration) ** 0.5
     wanted = t.min_gap_m + max(0.0, speed * t.headway_s + speed * (speed - leader_speed) / root)
-    return max(t.min_acceleration, t.max_acceleration * (1.0 - (speed / desired) ** 4 - (wanted / gap) ** 2))
+    return max(
+        t.min_acceleration,
+        t.max_acceleration * (1.0 - (speed / desired) ** 4 - (wanted / gap) ** 2),
+    )
 
 
 # --- what is allowed
@@ -58,11 +61,18 @@ def test_every_row_has_the_lanes_of_its_own_road():
 
 @pytest.mark.parametrize("form", ["legal", "safe"])
 def test_during_a_lane_change_nothing_but_keeping_is_allowed(form):
-    assert allowed({"x": 0.0, "lane": 1}, {"x": 500.0, "lane": 0}, form=form, direction=1)[0] == KEEP_ONLY
+    assert (
+        allowed({"x": 0.0, "lane": 1}, {"x": 500.0, "lane": 0}, form=form, direction=1)[0]
+        == KEEP_ONLY
+    )
 
 
 def test_who_may_turn_back_may_give_the_opposite_command_alone():
-    assert obeyed_actions(torch.tensor([0, 1, -1]), abort=True).tolist() == [ALL, RIGHT_ONLY, LEFT_ONLY]
+    assert obeyed_actions(torch.tensor([0, 1, -1]), abort=True).tolist() == [
+        ALL,
+        RIGHT_ONLY,
+        LEFT_ONLY,
+    ]
 
 
 def test_turning_back_must_be_safe_too():
@@ -77,12 +87,29 @@ def test_turning_back_must_be_safe_too():
     ("ego", "other", "braking", "with_it", "without"),
     [
         # Of the new follower, and of the ego behind its new leader.
-        ((0, 15.0), {"x": -60.0, "lane": 1, "speed": 24.0}, -idm(24.0, 25.0, 60.0 - 4.5, 15.0), LEFT_ONLY, KEEP_ONLY),
-        ((1, 25.0), {"x": 65.0, "lane": 2, "speed": 15.0}, -idm(25.0, 25.0, 65.0 - 4.5, 15.0), ALL, RIGHT_ONLY),
+        (
+            (0, 15.0),
+            {"x": -60.0, "lane": 1, "speed": 24.0},
+            -idm(24.0, 25.0, 60.0 - 4.5, 15.0),
+            LEFT_ONLY,
+            KEEP_ONLY,
+        ),
+        (
+            (1, 25.0),
+            {"x": 65.0, "lane": 2, "speed": 15.0},
+            -idm(25.0, 25.0, 65.0 - 4.5, 15.0),
+            ALL,
+            RIGHT_ONLY,
+        ),
     ],
 )
-def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(ego, other, braking, with_it, without):
-    """The deceleration is worked out by hand; a limit a little above it allows, a little below forbids."""
+def test_a_change_is_allowed_up_to_the_braking_that_it_asks_for(
+    ego, other, braking, with_it, without
+):
+    """The deceleration is worked out by hand.
+
+    A limit a little above it allows, a little below forbids.
+    """
     car = {"x": 0.0, "lane": ego[0], "speed": ego[1]}
     assert 4.0 < braking < 20.0
     assert allowed(car, other, limit=braking + 1e-6)[0] == with_it
@@ -101,7 +128,10 @@ def test_nobody_changes_into_a_vehicle_alongside_but_where_it_is_not_there():
 
 
 def test_keeping_the_lane_is_allowed_when_nothing_is_safe_and_that_is_reported():
-    """A standing car ahead, cars alongside: no change is possible, and braking harder than 4 m/s2 is all there is."""
+    """A standing car ahead, cars alongside.
+
+    No change is possible, and braking harder than 4 m/s2 is all there is.
+    """
     assert allowed(*BESIDE, {"x": 25.0, "lane": 1, "speed": 0.0}) == (KEEP_ONLY, True)
     assert allowed(*BESIDE, {"x": 500.0, "lane": 1}) == (KEEP_ONLY, False)
 
@@ -130,15 +160,23 @@ def test_a_random_driver_behind_the_legal_mask_never_leaves_the_road():
     policy = MaskedPolicy(RandomDriver(env.base_env.road, 2))
     rollout = env.rollout(60, policy, break_when_any_done=False)
     assert not bool(rollout["next", "events", "out_of_road"].any())
-    bare = environment(num_envs=16, stream=2).rollout(60, RandomDriver(Road(), 2), break_when_any_done=False)
+    bare = environment(num_envs=16, stream=2).rollout(
+        60, RandomDriver(Road(), 2), break_when_any_done=False
+    )
     assert bool(bare["next", "events", "out_of_road"].any())
 
 
 def test_no_follower_brakes_harder_than_the_limit_in_the_step_after_an_allowed_change():
     """Measured in rule-driven traffic, where everybody drives by the IDM that the mask judges by."""
     env = masked(num_envs=32, stream=2)
-    rollout = env.rollout(40, MaskedPolicy(RandomDriver(env.base_env.road, 2)), break_when_any_done=False)["next"]
-    hardest = rollout["vehicles", "acceleration"][..., 1:].amin(-1)[rollout["ego", "started_change"]].amin()
+    rollout = env.rollout(
+        40, MaskedPolicy(RandomDriver(env.base_env.road, 2)), break_when_any_done=False
+    )["next"]
+    hardest = (
+        rollout["vehicles", "acceleration"][..., 1:]
+        .amin(-1)[rollout["ego", "started_change"]]
+        .amin()
+    )
     assert -6.0 < hardest.item() < 0.0
 
 
@@ -146,7 +184,9 @@ def test_the_mask_sees_what_the_ego_perceives_and_not_the_truth():
     """Sensors that never see anybody: every change looks safe."""
     blind = {"name": "lane_view_overlap", "sensors": {"dropout": 1.0}}
     unseeing, seeing, legal = (
-        ganlane.make_env("idm_mobil", 64, spread_m=60, min_spacing_m=18, **options).reset()["action_mask"]
+        ganlane.make_env("idm_mobil", 64, spread_m=60, min_spacing_m=18, **options).reset()[
+            "action_mask"
+        ]
         for options in ({"mask": "safe", "observation": blind}, {"mask": "safe"}, {"mask": "legal"})
     )
     assert torch.equal(unseeing, legal)
@@ -173,7 +213,9 @@ def test_exploration_draws_allowed_actions_alone():
     policy = ExploringPolicy(Values(), torch.Generator().manual_seed(0), legal=lambda state: 1 / 0)
     policy.epsilon = 1.0
     mask = torch.tensor([LEFT_ONLY]).expand(300, 3)
-    drawn = policy(TensorDict({"observation": torch.zeros(300, 4), "action_mask": mask}, [300]))["action"]
+    drawn = policy(TensorDict({"observation": torch.zeros(300, 4), "action_mask": mask}, [300]))[
+        "action"
+    ]
     assert set(drawn.tolist()) == {0, 1}
 
 
@@ -192,7 +234,11 @@ def test_the_next_state_brings_its_mask_to_the_transition_it_ends():
     """n = 2; row 0 ends after the first step, so its mask is that step's."""
     window, made, zero = NStepWindow(2, 0.9), None, torch.zeros(2, 1)
     for mask, done in (([KEEP_ONLY, ALL], True), ([ALL, RIGHT_ONLY], False)):
-        flags = {"terminated": zero > 0, "done": torch.tensor([[done], [False]]), "action_mask": torch.tensor(mask)}
+        flags = {
+            "terminated": zero > 0,
+            "done": torch.tensor([[done], [False]]),
+            "action_mask": torch.tensor(mask),
+        }
         step = {
             "observation": zero,
             "action": zero[:, 0].long(),
@@ -220,7 +266,10 @@ def test_a_suffix_puts_any_driver_behind_a_mask_or_takes_it_away():
         (lambda: ActionMaskTransform(Road(), "soft"), "expected one of legal, safe"),
         (lambda: ActionMaskTransform(Road(), "safe", 0.0), "above 0"),
         (lambda: ganlane.make_env("idm", mask="save"), "did you mean"),
-        (lambda: ganlane.make_env("idm", mask={"name": "safe", "safe_deceleration": -1}), "safe_deceleration"),
+        (
+            lambda: ganlane.make_env("idm", mask={"name": "safe", "safe_deceleration": -1}),
+            "safe_deceleration",
+        ),
     ],
 )
 def test_mistakes_end_in_one_sentence(make, expected):

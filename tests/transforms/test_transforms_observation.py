@@ -1,4 +1,7 @@
-"""Observations on scenes made by hand: Table III entry by entry, the lane view, the fixed order, lengths."""
+"""Observations on scenes made by hand.
+
+Table III entry by entry, the lane view, the fixed order, lengths.
+"""
 
 from __future__ import annotations
 
@@ -32,21 +35,31 @@ LORRY = {"length": 12.0}
 
 def observed(scene, form, lanes=3, progress=0.0, direction=0, seen=None):
     """The observation [D] of a scene of one row."""
-    transform, own = ObservationTransform(Road(lanes), scene.x.shape[1], form), torch.tensor([progress], dtype=DOUBLE)
+    transform, own = (
+        ObservationTransform(Road(lanes), scene.x.shape[1], form),
+        torch.tensor([progress], dtype=DOUBLE),
+    )
     return transform.observe(scene, own, torch.tensor([direction]), transform.road, seen)[0]
 
 
 def observe(form, rows, valid=None, sideways=0.0, **options):
     """The same of (x, lane, speed, desired speed, 25 m/s if left out) per vehicle, the ego first."""
     names = ("x", "lane", "speed", "desired_speed")
-    cars = [{**dict(zip(names, row)), "valid": valid is None or valid[i]} for i, row in enumerate(rows)]
+    cars = [
+        {**dict(zip(names, row)), "valid": valid is None or valid[i]} for i, row in enumerate(rows)
+    ]
     scene = vehicles(*cars)
     return observed(scene.with_(y=scene.y + sideways), form, **options)
 
 
 def view_of(*others: dict, ego_length: float = 4.5, form: str = "lane_view_drift") -> torch.Tensor:
-    """Left, own, right x ahead, behind: (gap in m, nearness, relative speed, drift), of an ego in the middle lane."""
-    view = observed(vehicles({"x": 0.0, "lane": 1, "length": ego_length}, *others), form)[3:-2].reshape(6, 4)
+    """Left, own, right x ahead, behind.
+
+    (gap in m, nearness, relative speed, drift), of an ego in the middle lane.
+    """
+    view = observed(vehicles({"x": 0.0, "lane": 1, "length": ego_length}, *others), form)[
+        3:-2
+    ].reshape(6, 4)
     return view * view.new_tensor([200.0, 1.0, 1.0, 1.0])
 
 
@@ -66,7 +79,12 @@ ONE_LANE = [(0.0, 0, 20.0, 25.0), (50.0, 0, 20.0, 20.0)]
         ([EGO, (50.0, 2, 26.0, 20.0)], {}, slice(3, None), [0.25, 0.2, 0.5]),
         ([(0.0, 2, 20.0, 25.0), (-20.0, 0, 14.0, 20.0)], {}, slice(3, None), [-0.1, -0.2, -1.0]),
         # The nearest first, whatever their index; far ones are clipped to one.
-        ([EGO, (90.0, 1, 20.0), (-30.0, 1, 20.0), (60.0, 1, 20.0)], {}, slice(3, None, 3), [-0.15, 0.3, 0.45]),
+        (
+            [EGO, (90.0, 1, 20.0), (-30.0, 1, 20.0), (60.0, 1, 20.0)],
+            {},
+            slice(3, None, 3),
+            [-0.15, 0.3, 0.45],
+        ),
         (FAR, {}, slice(3, None, 3), [1.0, -1.0]),
         (FAR, {}, slice(4, 5), [1.0]),
         # One that is not valid reads far ahead and comes last.
@@ -101,7 +119,9 @@ def test_the_lane_view_holds_the_nearest_ahead_and_behind_in_three_lanes():
 
 def test_a_lane_change_shows_in_the_drift_before_its_middle():
     rows = [EGO, (50.0, 2, 26.0, 20.0), (-34.5, 1, 14.0, 20.0)]
-    view = observe("lane_view_drift", rows, sideways=torch.tensor([[0.0, -1.2, 0.5]]))[3:-2].reshape(6, 4)
+    view = observe("lane_view_drift", rows, sideways=torch.tensor([[0.0, -1.2, 0.5]]))[
+        3:-2
+    ].reshape(6, 4)
     assert view[:, 3].tolist() == pytest.approx([-0.6, 0.0, 0.0, 0.25, 0.0, 0.0])
     assert torch.equal(view[:, :3].flatten(), observe("lane_view", rows)[3:-2])
 
@@ -148,9 +168,14 @@ def test_no_number_but_the_first_exceeds_the_largest_of_its_form(form):
 # Lengths
 
 
-@pytest.mark.parametrize(("row", "x_m", "lane"), [(0, 30.0, 2), (3, -30.0, 1), (4, 30.0, 0), (5, -30.0, 0)])
+@pytest.mark.parametrize(
+    ("row", "x_m", "lane"), [(0, 30.0, 2), (3, -30.0, 1), (4, 30.0, 0), (5, -30.0, 0)]
+)
 def test_the_gap_to_a_lorry_is_bumper_to_bumper_ahead_and_behind(row, x_m, lane):
-    """Centres 30 m apart; 2.25 m of the car and 6 m of the lorry lie between them, so 21.75 m are free."""
+    """Centres 30 m apart.
+
+    2.25 m of the car and 6 m of the lorry lie between them, so 21.75 m are free.
+    """
     view = view_of({"x": x_m, "lane": lane, **LORRY})
     assert view[row, 0].item() == pytest.approx(21.75)
     assert view[row, 1].item() == pytest.approx(np.exp(-21.75 / 15.0))
@@ -164,7 +189,11 @@ def test_an_ego_that_is_a_lorry_has_its_own_length_too():
 
 
 def test_of_the_nearest_its_own_length_is_taken_and_nobody_elses():
-    ahead = [{"x": 20.0, "lane": 1}, {"x": 40.0, "lane": 1, **LORRY}, {"x": 10.0, "lane": 2, **LORRY}]
+    ahead = [
+        {"x": 20.0, "lane": 1},
+        {"x": 40.0, "lane": 1, **LORRY},
+        {"x": 10.0, "lane": 2, **LORRY},
+    ]
     view = view_of(*ahead)
     assert view[2, 0].item() == pytest.approx(15.5)
     assert view[0, 0].item() == pytest.approx(1.75)
@@ -179,7 +208,9 @@ def test_beside_a_lorry_the_overlap_is_as_long_as_the_two_bodies(x_m, overlap_m)
 
 
 def test_lengths_are_known_without_error_whatever_the_sensors_measure():
-    scene = vehicles({"x": 0.0, "lane": 1}, {"x": 30.0, "lane": 2, **LORRY}, {"x": -50.0, "lane": 1})
+    scene = vehicles(
+        {"x": 0.0, "lane": 1}, {"x": 30.0, "lane": 2, **LORRY}, {"x": -50.0, "lane": 1}
+    )
     errors = SensorParameters(position_noise_m=2.0, speed_noise_mps=1.0)
     seen = measure(scene, torch.tensor([5]), torch.tensor([0]), errors)
     assert seen.x[0, 1] != 30.0

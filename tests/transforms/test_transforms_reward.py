@@ -17,15 +17,23 @@ from ganlane.transforms import RewardParameters, RewardTransform
 def outcome(speed=20.0, mean_acceleration=0.0, started=False, soft=0, behind=0, **events):
     """The state after a decision of one ego with a desired speed of 25 m/s."""
     flags = {name: torch.tensor([[events.get(name, False)]]) for name in keys.END_EVENTS}
-    vehicles = {"speed": torch.tensor([[speed, 0.0]]), "desired_speed": torch.tensor([[25.0, 20.0]])}
-    ego = {"mean_acceleration": torch.tensor([mean_acceleration]), "started_change": torch.tensor([started])}
+    vehicles = {
+        "speed": torch.tensor([[speed, 0.0]]),
+        "desired_speed": torch.tensor([[25.0, 20.0]]),
+    }
+    ego = {
+        "mean_acceleration": torch.tensor([mean_acceleration]),
+        "started_change": torch.tensor([started]),
+    }
     onsets = {"soft_crash": torch.tensor([[soft]]), "soft_crash_behind": torch.tensor([[behind]])}
     content = {"vehicles": vehicles, "ego": ego, "events": {**flags, **onsets}}
     return TensorDict({k: TensorDict(v, [1]) for k, v in content.items()}, [1])
 
 
 def terms(parameters=None, period=1.0, **what):
-    return {k: v.item() for k, v in RewardTransform(period, parameters).terms(outcome(**what)).items()}
+    return {
+        k: v.item() for k, v in RewardTransform(period, parameters).terms(outcome(**what)).items()
+    }
 
 
 @pytest.mark.parametrize(
@@ -46,7 +54,9 @@ def terms(parameters=None, period=1.0, **what):
 )
 def test_the_speed_reward(speed, mean_acceleration, literal, reward):
     parameters = RewardParameters(literal_low_acceleration=literal)
-    assert terms(parameters, speed=speed, mean_acceleration=mean_acceleration)["speed"] == pytest.approx(reward)
+    assert terms(parameters, speed=speed, mean_acceleration=mean_acceleration)[
+        "speed"
+    ] == pytest.approx(reward)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +91,9 @@ def test_the_reward_is_the_sum_of_its_terms_and_zero_after_a_reset():
         torch.testing.assert_close(total, step["next", "reward"])
         done = step["next", "done"][:, 0]
         ended += int(done.sum())
-        assert all((state[keys.REWARD_TERMS, name][done] == 0).all() for name in keys.REWARD_TERM_NAMES)
+        assert all(
+            (state[keys.REWARD_TERMS, name][done] == 0).all() for name in keys.REWARD_TERM_NAMES
+        )
     assert ended > 0
 
 
@@ -101,7 +113,9 @@ def test_considerate_charges_per_onset_behind_and_is_the_paper_otherwise():
 
 
 def changes_left(behind_m, parameters=None):
-    """The rewards of an ego at 15 m/s that goes left at once, ``behind_m`` in front of a driver at 25 m/s there."""
+    """The rewards of an ego at 15 m/s that goes left at once, ``behind_m`` in front of a driver at
+    25 m/s there.
+    """
     scene = FixedScene((SceneVehicle(0.0, 0, 15.0), SceneVehicle(-behind_m, 1, 25.0, 25.0)))
     env = TransformedEnv(HighwayEnv(IdmTraffic(), scenes=scene), RewardTransform(1.0, parameters))
     state, rewards = env.reset(), []
@@ -113,7 +127,10 @@ def changes_left(behind_m, parameters=None):
 
 
 def test_who_cuts_in_before_a_fast_driver_pays_and_who_leaves_room_does_not():
-    """The other, 15.5 m behind the rear bumper, closes in at 10 m/s: it is 1.55 s away, and nearer at every step."""
+    """The other, 15.5 m behind the rear bumper, closes in at 10 m/s.
+
+    It is 1.55 s away, and nearer at every step.
+    """
     cut_in = changes_left(20.0, CONSIDERATE)
     onsets = cut_in[keys.EVENTS, "soft_crash_behind"]
     assert onsets.sum() >= 1
@@ -130,7 +147,9 @@ def test_the_papers_reward_is_bit_for_bit_what_it_is_without_the_term():
         assert torch.equal(paper[keys.REWARD_TERMS, name], considerate[keys.REWARD_TERMS, name])
     total = sum(paper[keys.REWARD_TERMS, name] for name in keys.REWARD_TERM_NAMES)
     assert torch.equal(paper["reward"], total)
-    assert torch.equal(considerate["reward"], total + considerate[keys.REWARD_TERMS, "soft_crash_behind"])
+    assert torch.equal(
+        considerate["reward"], total + considerate[keys.REWARD_TERMS, "soft_crash_behind"]
+    )
 
 
 def test_the_specs_hold_with_the_further_term():

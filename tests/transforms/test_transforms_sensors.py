@@ -53,7 +53,9 @@ def action(td):
 
 
 def drive(env, decisions, td=None):
-    """The states of a run without resets, the first one included, and the rewards that led to the others."""
+    """The states of a run without resets, the first one included, and the rewards that led to the
+    others.
+    """
     states = [env.reset() if td is None else td]
     for _ in range(decisions):
         states.append(env.step(states[-1].clone().set("action", action(states[-1])))["next"])
@@ -67,7 +69,10 @@ def scene(rows, count):
 
 
 def many(sensors, rows=5000, count=5):
-    """The errors of many measurements of one scene: (along, across, speed) [rows, count], and who is seen."""
+    """The errors of many measurements of one scene.
+
+    (along, across, speed) [rows, count], and who is seen.
+    """
     true, numbers = scene(rows, count), torch.arange(rows)
     seen = measure(true, episode_key(Stream.TRAIN, numbers * 0, numbers), numbers % 10, sensors)
     return (seen.x - true.x, seen.y - true.y, seen.speed - true.speed), seen.valid
@@ -109,7 +114,9 @@ def test_so_many_vehicles_drop_out_whatever_the_other_errors():
         assert lost.mean().item() == pytest.approx(0.3, abs=4 * math.sqrt(0.21 / lost.numel()))
         assert all((error == 0).all() for error in errors) == (sensors.position_noise_m == 0)
     error = many(SensorParameters(position_noise_m=1.0, dropout=0.3))[0][0][:, 1:]
-    assert abs(torch.corrcoef(torch.stack((error.flatten(), lost.flatten())))[0, 1].item()) < 4.5 / math.sqrt(20000)
+    assert abs(
+        torch.corrcoef(torch.stack((error.flatten(), lost.flatten())))[0, 1].item()
+    ) < 4.5 / math.sqrt(20000)
 
 
 def test_the_ego_knows_itself_without_error():
@@ -141,8 +148,17 @@ def test_perfect_sensors_show_the_present_observation_bit_for_bit():
 
 
 @settings(max_examples=20)
-@given(st.floats(0, 5), st.floats(0, 3), st.floats(0, 5), st.floats(0, 1), st.integers(0, 3), st.integers(0, 2**40))
-def test_the_true_state_reward_and_own_part_of_the_observation_are_untouched(along, across, speed, dropout, k, seed):
+@given(
+    st.floats(0, 5),
+    st.floats(0, 3),
+    st.floats(0, 5),
+    st.floats(0, 1),
+    st.integers(0, 3),
+    st.integers(0, 2**40),
+)
+def test_the_true_state_reward_and_own_part_of_the_observation_are_untouched(
+    along, across, speed, dropout, k, seed
+):
     sensors = SensorParameters(along, across, speed, dropout, delay_s=float(k))
     for one, other in zip(*(drive(world(use, 2, seed=seed), 3) for use in (None, sensors))):
         bare = other.exclude("perceived", "sensors", "observation")
@@ -154,7 +170,9 @@ def test_the_true_state_reward_and_own_part_of_the_observation_are_untouched(alo
 @pytest.mark.parametrize(("form", "k"), [("table3", 1), ("lane_view", 3), ("table3_lane_view", 2)])
 def test_a_delay_of_k_decisions_shows_the_others_as_they_were_k_decisions_ago(form, k):
     plain = [td["observation"] for td in drive(world(None, form=form), 8)]
-    late = [td["observation"] for td in drive(world(SensorParameters(delay_s=float(k)), form=form), 8)]
+    late = [
+        td["observation"] for td in drive(world(SensorParameters(delay_s=float(k)), form=form), 8)
+    ]
     others = slice(OWN, None if form == "table3" else -2)
     for number, observation in enumerate(late):
         # Until a measurement is old enough, the first one is delivered.
@@ -164,9 +182,16 @@ def test_a_delay_of_k_decisions_shows_the_others_as_they_were_k_decisions_ago(fo
 
 
 def test_noise_belongs_to_the_measurement_and_comes_as_late_as_it():
-    noise = {"position_noise_m": 1.0, "speed_noise_mps": 1.0, "lateral_noise_m": 1.0, "dropout": 0.1}
+    noise = {
+        "position_noise_m": 1.0,
+        "speed_noise_mps": 1.0,
+        "lateral_noise_m": 1.0,
+        "dropout": 0.1,
+    }
     prompt = [td["observation"][:, OWN:] for td in drive(world(SensorParameters(**noise)), 6)]
-    late = [td["observation"][:, OWN:] for td in drive(world(SensorParameters(**noise, delay_s=2.0)), 6)]
+    late = [
+        td["observation"][:, OWN:] for td in drive(world(SensorParameters(**noise, delay_s=2.0)), 6)
+    ]
     for number in range(7):
         assert torch.equal(late[number], prompt[max(number - 2, 0)])
 
@@ -175,7 +200,9 @@ def test_a_delay_may_be_any_multiple_of_the_decision_period():
     env = world(SensorParameters(delay_s=0.6), period_s=0.2)
     assert env.reset()["sensors", "x"].shape == (3, 3, 9)
     for delay_s, period_s in ((0.5, 1.0), (1.0, 0.3), (-1.0, 1.0)):
-        with pytest.raises(UserError, match=r"^delay_s=.*(multiple of the decision period|at least 0)"):
+        with pytest.raises(
+            UserError, match=r"^delay_s=.*(multiple of the decision period|at least 0)"
+        ):
             SensorTransform(SensorParameters(delay_s=delay_s), 0, period_s)
 
 
@@ -222,14 +249,20 @@ def test_a_partial_reset_leaves_the_measurements_of_the_other_rows():
     assert (fresh == fresh[:1]).all()
     assert torch.equal(after["perceived", "x"][1], fresh[0])
     for row in (0, 2):
-        assert same_bits(after[row].exclude("_reset", "action"), before[row].exclude("action")) == []
-    # Row 1 saw its measurements of four decisions before; now all of them are of its new first scene.
+        assert (
+            same_bits(after[row].exclude("_reset", "action"), before[row].exclude("action")) == []
+        )
+    # Row 1 saw its measurements of four decisions before; now all of them are of its new first
+    # scene.
     assert not torch.equal(before["sensors", "x"][1], fresh)
 
 
 def test_the_streams_of_training_and_report_have_errors_of_their_own():
     true, zero = scene(1, 3), torch.zeros(1, dtype=torch.int64)
-    seen = [measure(true, episode_key(stream, zero, zero), zero, NOISY).x for stream in (Stream.TRAIN, Stream.REPORT)]
+    seen = [
+        measure(true, episode_key(stream, zero, zero), zero, NOISY).x
+        for stream in (Stream.TRAIN, Stream.REPORT)
+    ]
     assert not torch.equal(*seen)
 
 
@@ -249,7 +282,9 @@ def test_a_saved_state_is_resumed_with_what_was_still_to_be_delivered():
 LATE = SensorParameters(delay_s=1.0, dropout=0.1)
 
 
-@pytest.mark.parametrize(("sensors", "first"), [(None, []), (SensorParameters(), []), (LATE, ["SensorTransform"])])
+@pytest.mark.parametrize(
+    ("sensors", "first"), [(None, []), (SensorParameters(), []), (LATE, ["SensorTransform"])]
+)
 def test_a_transform_with_the_traffics_stream_is_inserted_where_there_are_errors(sensors, first):
     road = EnvConfig()
     traffic = make_traffic(IdmTrafficConfig(), road, Stream.REPORT)
@@ -289,7 +324,9 @@ def in_process(tmp_path, monkeypatch, capsys, *arguments):
 def test_a_shipped_agent_drives_with_the_sensors_of_the_command_line(tmp_path, monkeypatch, capsys):
     rewards = []
     for errors in ([], ["observation.sensors.dropout=1"]):
-        _, results, _ = in_process(tmp_path, monkeypatch, capsys, "agents=[agent_idm]", "env.goal_m=1000", *errors)
+        _, results, _ = in_process(
+            tmp_path, monkeypatch, capsys, "agents=[agent_idm]", "env.goal_m=1000", *errors
+        )
         rewards.append(results["rows"][0]["mean_reward"])
     assert rewards[0] != rewards[1]
 
@@ -303,18 +340,29 @@ def test_a_delay_between_two_decisions_is_a_users_mistake(tmp_path, monkeypatch,
 
 TINY = [
     "agent=rainbow",
-    *("env.goal_m=40", "traffic=idm", "init=none", "log_every=160", "collector.num_envs=16", "agent.hidden=[16,16]"),
+    *(
+        "env.goal_m=40",
+        "traffic=idm",
+        "init=none",
+        "log_every=160",
+        "collector.num_envs=16",
+        "agent.hidden=[16,16]",
+    ),
     *("agent.batch_size=32", "agent.warmup=64", "agent.capacity=1000"),
     *("evaluation.agents=[keep_lane]", "evaluation.episodes=2", *ERRORS),
 ]
 
 
-def test_training_with_sensor_errors_in_two_parts_ends_like_one_in_a_piece(tmp_path, monkeypatch, capsys):
+def test_training_with_sensor_errors_in_two_parts_ends_like_one_in_a_piece(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     folders = []
     for total in (240, 160):
         assert train([*TINY, f"total_decisions={total}"]) == 0
-        folders.append(Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: ")).parent)
+        folders.append(
+            Path(capsys.readouterr().out.splitlines()[-1].removeprefix("results: ")).parent
+        )
     assert train([f"resume={folders[1]}", "total_decisions=240"]) == 0
     one, other = (read_agent(folder / "agent.safetensors")[0] for folder in folders)
     assert one.keys() == other.keys()

@@ -1,4 +1,8 @@
-"""Charts: what is drawn is the data, with its names and units, and files come whole in the format of their ending."""
+"""Charts.
+
+What is drawn is the data, with its names and units, and files come whole in the format of their
+ending.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 from view_scenes import run_folder
 
-from ganlane.data import Bins, Histogram, PooledStatistics, Scene, SyntheticTraffic, synthetic_scenes
+from ganlane.data import (
+    Bins,
+    Histogram,
+    PooledStatistics,
+    Scene,
+    SyntheticTraffic,
+    synthetic_scenes,
+)
 from ganlane.errors import UserError
 from ganlane.view.figures import (
     COLOURS,
@@ -53,7 +64,10 @@ def test_a_line_is_the_metric_over_the_decisions(runs):
 
 def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(runs):
     figure = draw_runs(runs)
-    drawn = {title: [to_hex(line.get_color()) for line in axes.lines] for title, axes in panels(figure).items()}
+    drawn = {
+        title: [to_hex(line.get_color()) for line in axes.lines]
+        for title, axes in panels(figure).items()
+    }
     assert words(figure.legends[0].get_texts()) == ["a", "b"]
     a, b, *_ = COLOURS
     assert drawn == {
@@ -72,7 +86,8 @@ def test_every_panel_shows_every_run_that_has_its_numbers_in_the_run_s_colour(ru
 def test_the_discounted_return_is_dashed_below_the_q_values(runs):
     axes = panels(draw_runs({"a": runs["a"]}))["mean Q (replayed); dashed: discounted return"]
     assert [line.get_linestyle() for line in axes.lines] == ["-", "--"]
-    assert axes.lines[0].get_ydata()[0] == pytest.approx(0.3)  # the first three rows have no Q-value
+    # the first three rows have no Q-value
+    assert axes.lines[0].get_ydata()[0] == pytest.approx(0.3)
     assert len(axes.lines[0].get_xdata()) == 27
 
 
@@ -84,7 +99,10 @@ def test_a_smoothed_line_is_drawn_over_its_values(runs):
 
 
 def test_columns_of_ones_choice_take_the_place_of_the_panels_and_unknown_ones_are_named(runs):
-    assert list(panels(draw_runs(runs, ["loss", "evaluation_mean_reward"]))) == ["loss", "evaluation mean reward"]
+    assert list(panels(draw_runs(runs, ["loss", "evaluation_mean_reward"]))) == [
+        "loss",
+        "evaluation mean reward",
+    ]
     with pytest.raises(UserError, match=r"column nothing: .* choose among mean_return, crash_rate"):
         draw_runs(runs, ["nothing"])
     with pytest.raises(UserError, match="foreign: no numbers"):
@@ -107,7 +125,9 @@ def test_long_names_share_the_legend_over_several_rows():
 
 
 @settings(max_examples=30)
-@given(st.lists(st.floats(0.0, 9.99), min_size=1, max_size=200), st.sampled_from([10, 80, 400, 8000]))
+@given(
+    st.lists(st.floats(0.0, 9.99), min_size=1, max_size=200), st.sampled_from([10, 80, 400, 8000])
+)
 def test_the_area_below_a_density_is_one(values, bins):
     histogram = Histogram(Bins(0.0, 10.0, bins))
     histogram.add(values)
@@ -126,8 +146,17 @@ def measured(**traffic):
 
 def test_recordings_are_drawn_in_six_panels_with_their_units():
     drawn = panels(draw_recordings(measured(lanes=1, seconds=3.0)))
-    times = ("time to change lanes", "followers' headway: median (gap - 2 m) / speed", "time headway: gap / speed")
-    units = {"speed": "m/s", "acceleration": "m/s²", **dict.fromkeys(times, "s"), "gap to the leader": "m"}
+    times = (
+        "time to change lanes",
+        "followers' headway: median (gap - 2 m) / speed",
+        "time headway: gap / speed",
+    )
+    units = {
+        "speed": "m/s",
+        "acceleration": "m/s²",
+        **dict.fromkeys(times, "s"),
+        "gap to the leader": "m",
+    }
     assert {title: axes.get_xlabel() for title, axes in drawn.items()} == units
     assert words(drawn.pop("time to change lanes").texts) == ["none recorded from start to end"]
     assert all(line.get_ydata().sum() > 0 for axes in drawn.values() for line in axes.lines)
@@ -141,12 +170,20 @@ def test_lane_changes_are_drawn_as_the_share_that_lasts_longer():
         times, shares = line.get_xdata(), line.get_ydata()
         assert line.get_drawstyle() == "steps-post"
         assert times.tolist() == [0.0, *np.unique(statistics.changes.duration_s)]
-        assert shares == pytest.approx([(statistics.changes.duration_s > time).mean() for time in times])
+        assert shares == pytest.approx(
+            [(statistics.changes.duration_s > time).mean() for time in times]
+        )
 
 
-@pytest.mark.parametrize(("ending", "begins"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
-def test_the_ending_chooses_the_format_and_the_same_figure_gives_the_same_file(runs, tmp_path, ending, begins):
-    first, again = (save_figure(draw_runs(runs, ["loss"]), tmp_path / f"{name}.{ending}") for name in ("a", "b"))
+@pytest.mark.parametrize(
+    ("ending", "begins"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")]
+)
+def test_the_ending_chooses_the_format_and_the_same_figure_gives_the_same_file(
+    runs, tmp_path, ending, begins
+):
+    first, again = (
+        save_figure(draw_runs(runs, ["loss"]), tmp_path / f"{name}.{ending}") for name in ("a", "b")
+    )
     assert first.read_bytes().startswith(begins)
     assert first.read_bytes() == again.read_bytes()
 
@@ -193,14 +230,23 @@ def sweep_folder(folder, *lines):
 
 
 def test_the_runs_of_a_sweep_are_named_by_the_options_in_which_they_differ(tmp_path):
-    folder = sweep_folder(tmp_path, "traffic=gan agent.n_step=1", "traffic=gan agent.n_step=3", "traffic=idm")
-    assert list(read_runs([folder])) == ["agent.n_step=1, traffic=gan", "agent.n_step=3, traffic=gan", "traffic=idm"]
+    folder = sweep_folder(
+        tmp_path, "traffic=gan agent.n_step=1", "traffic=gan agent.n_step=3", "traffic=idm"
+    )
+    assert list(read_runs([folder])) == [
+        "agent.n_step=1, traffic=gan",
+        "agent.n_step=3, traffic=gan",
+        "traffic=idm",
+    ]
 
 
 def test_seeds_are_drawn_as_their_mean_in_a_band(tmp_path):
     lines = ["traffic=gan seed=0", "traffic=gan seed=1", "traffic=idm seed=0", "traffic=idm seed=1"]
     runs = read_runs([sweep_folder(tmp_path, *lines)])
-    assert {name: len(frames) for name, frames in runs.items()} == {"traffic=gan": 2, "traffic=idm": 2}
+    assert {name: len(frames) for name, frames in runs.items()} == {
+        "traffic=gan": 2,
+        "traffic=idm": 2,
+    }
     figure = draw_runs(runs)
     assert words(figure.legends[0].get_texts())[0] == "traffic=gan (2 seeds: mean, range)"
     axes = panels(figure)["mean return"]
@@ -229,7 +275,10 @@ def test_the_running_mean_skips_gaps():
         (b"step,loss\n1,2\n", "decisions"),
         (b"\xff\xfe\x00broken", r"metrics\.csv"),
         *(
-            (b"decisions,mean_return\n5,2\n" + row, r"metrics\.csv: column '.*' holds .*; repair it\.")
+            (
+                b"decisions,mean_return\n5,2\n" + row,
+                r"metrics\.csv: column '.*' holds .*; repair it\.",
+            )
             for row in (b"many,1\n", b"10,text\n", b"10,1e300\n")
         ),
     ],

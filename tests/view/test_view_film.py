@@ -25,7 +25,9 @@ def first(film, count):
 
 
 def at_half_size(picture):
-    return np.asarray(Image.fromarray(picture).resize((640, 160), Image.Resampling.LANCZOS)).astype(int)
+    return np.asarray(Image.fromarray(picture).resize((640, 160), Image.Resampling.LANCZOS)).astype(
+        int
+    )
 
 
 def test_a_film_lasts_as_long_as_the_episode_and_holds_its_end(film):
@@ -37,7 +39,10 @@ def test_a_film_lasts_as_long_as_the_episode_and_holds_its_end(film):
 
 def test_speedup_and_part_choose_frames_by_time():
     painter = FramePainter(straight([0], [1], frames=101))
-    assert Film(painter, 10, 2.0, start_s=2.0, end_s=6.0, hold_s=0.1)._frames == [*range(20, 61, 2), 60]
+    assert Film(painter, 10, 2.0, start_s=2.0, end_s=6.0, hold_s=0.1)._frames == [
+        *range(20, 61, 2),
+        60,
+    ]
     assert Film(painter, 20, end_s=0.3, hold_s=0.05)._frames == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
@@ -57,7 +62,9 @@ def test_a_gif_comes_back_frame_by_frame(film, tmp_path):
     with Image.open(path) as gif:
         assert gif.size == (640, 160)
         # Equal frames at the end are stored as one that lasts longer.
-        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif)) == 100 * len(film)
+        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif)) == 100 * len(
+            film
+        )
         assert gif.info["loop"] == 0
         gif.seek(20)
         shown = np.asarray(gif.convert("RGB")).astype(int)

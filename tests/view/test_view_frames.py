@@ -77,8 +77,12 @@ def test_overlapping_vehicles_have_a_red_edge():
 def test_every_end_is_written_on_the_last_frame_only_and_a_crash_has_a_ring():
     cut_off = FramePainter(straight([0], [1]))
     ended = {end: FramePainter(straight([0], [1], outcome=end)) for end in keys.END_EVENTS}
-    assert len({painter.draw(19).tobytes() for painter in (cut_off, *ended.values())}) == 1 + len(keys.END_EVENTS)
-    assert {painter.draw(18).tobytes() for painter in ended.values()} == {cut_off.draw(18).tobytes()}
+    assert len({painter.draw(19).tobytes() for painter in (cut_off, *ended.values())}) == 1 + len(
+        keys.END_EVENTS
+    )
+    assert {painter.draw(18).tobytes() for painter in ended.values()} == {
+        cut_off.draw(18).tobytes()
+    }
     assert area(road_of(ended["hard_crash"].draw(19))[60:], canvas.CRASH) > 500
 
 
@@ -110,7 +114,11 @@ def test_a_vehicle_that_was_put_elsewhere_leaves_no_trail_across_the_road():
     scene.x[30:, 1] += 60.0
     painter = FramePainter(scene, drawing=DrawingParameters(trail_s=3.0, speeds=False))
     left_lane = round(float(painter.window.row(8.0)))
-    changed = (painter.draw(39) != bare(scene, 39))[left_lane - 10 : left_lane + 10].any(axis=(0, 2)).nonzero()[0]
+    changed = (
+        (painter.draw(39) != bare(scene, 39))[left_lane - 10 : left_lane + 10]
+        .any(axis=(0, 2))
+        .nonzero()[0]
+    )
     # Only what it drove in the nine frames since the jump, less half its own length.
     assert len(changed) == pytest.approx((9 * 2.0 - 2.25) * 8, abs=6)
 
@@ -137,7 +145,8 @@ def test_any_number_of_lanes_fits_between_header_and_footer(lanes):
     upper, lower = window.edges
     assert HEADER_HEIGHT < upper < lower < 320 - 20
     picture = FramePainter(straight(15.0 * np.arange(lanes), range(lanes), lanes=lanes)).draw(0)
-    # lanes - 1 broken marks and two edges: rows of the picture that are bright over at least a tenth of it.
+    # lanes - 1 broken marks and two edges: rows of the picture that are bright over at least a
+    # tenth of it.
     bright = (np.abs(picture.astype(int) - canvas.MARK).max(axis=-1) < 6).mean(axis=1) > 0.15
     runs = np.sum(np.diff(np.concatenate([[0], bright[HEADER_HEIGHT:].astype(int)])) == 1)
     assert runs == lanes + 1

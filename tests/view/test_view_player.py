@@ -21,10 +21,14 @@ from ganlane.view.player import UNITS, episode_data, series, steps
 
 def data_of(page):
     """The data in a page."""
-    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
+    return json.loads(
+        re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1]
+    )
 
 
-@given(st.lists(st.floats(-5000, 5000), min_size=1, max_size=50), st.sampled_from([0.01, 0.001, 0.1]))
+@given(
+    st.lists(st.floats(-5000, 5000), min_size=1, max_size=50), st.sampled_from([0.01, 0.001, 0.1])
+)
 def test_a_series_is_exact_to_half_its_unit_however_long(values, unit):
     read = np.array(list(accumulate(series(np.array(values), unit)))) * unit
     assert np.abs(read - values).max() <= 0.5 * unit + 1e-9
@@ -67,7 +71,12 @@ def test_comfort_is_of_the_ego():
 
 @pytest.mark.parametrize(
     "name",
-    ["</script><script>alert(1)</script>", "<!-- {{script}}", "a & b \"c\" 'd' \u2028", "<img src=x onerror=y>"],
+    [
+        "</script><script>alert(1)</script>",
+        "<!-- {{script}}",
+        "a & b \"c\" 'd' \u2028",
+        "<img src=x onerror=y>",
+    ],
 )
 def test_a_name_cannot_become_part_of_the_page(name):
     plain = player_page([straight([0], [1])])

@@ -1,4 +1,7 @@
-"""The player in a real browser: it plays, scrubs, follows and draws, without an error and without a request."""
+"""The player in a real browser.
+
+It plays, scrubs, follows and draws, without an error and without a request.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,9 @@ from ganlane.view import EpisodeLabel, write_player
 
 BROWSER = find_browser()
 if BROWSER is None:
-    pytest.skip("no chromium found; CI installs it: apt-get install chromium", allow_module_level=True)
+    pytest.skip(
+        "no chromium found; CI installs it: apt-get install chromium", allow_module_level=True
+    )
 
 CLOCK = "parseFloat(document.getElementById('time').textContent)"
 
@@ -20,7 +25,11 @@ def learned(frames=60):
     """An episode with action values and rewards, as a trained agent leaves one."""
     time = np.arange(frames) * 0.1
     values = 10.0 + np.stack([np.sin(time), np.cos(time), -time], axis=1)
-    told = {"reward": np.sin(time), "action_values": values, "acceleration": np.sin(np.outer(time, [1.0, 2.0, 3.0]))}
+    told = {
+        "reward": np.sin(time),
+        "action_values": values,
+        "acceleration": np.sin(np.outer(time, [1.0, 2.0, 3.0])),
+    }
     label = EpisodeLabel("agent </script><b>x", "idm", 3, 4)
     return straight([0, 25, -20], [1, 2, 0], frames, outcome="hard_crash", label=label, **told)
 
@@ -58,13 +67,22 @@ def scrub(page, time_s):
     )
 
 
-EGO, BLUE, ORANGE, GREEN, RED = (255, 150, 28), (86, 160, 220), (230, 120, 0), (47, 192, 143), (255, 62, 62)
+EGO, BLUE, ORANGE, GREEN, RED = (
+    (255, 150, 28),
+    (86, 160, 220),
+    (230, 120, 0),
+    (47, 192, 143),
+    (255, 62, 62),
+)
 FIRST, SECOND = ".episode:nth-child(1)", ".episode:nth-child(2)"
 
 
 def test_the_page_shows_every_episode(page):
     assert page.value("document.querySelectorAll('.episode').length") == 2
-    assert page.value(f"document.querySelector('{SECOND} .title').textContent") == "agent </script><b>x on idm"
+    assert (
+        page.value(f"document.querySelector('{SECOND} .title').textContent")
+        == "agent </script><b>x on idm"
+    )
     assert page.value("document.querySelectorAll('.title b').length") == 0
     for episode in (FIRST, SECOND):
         assert ink(page, f"{episode} .road", EGO) > 20
@@ -159,7 +177,9 @@ def test_events_are_marked_and_a_key_goes_to_the_next(pages, tmp_path):
     opened, _ = pages
     lane = np.ones((60, 1), int)
     lane[30:] = 2
-    one = straight([0], [1], 60, target_lane=lane, soft_crash_s=np.array([4.0]), outcome="hard_crash")
+    one = straight(
+        [0], [1], 60, target_lane=lane, soft_crash_s=np.array([4.0]), outcome="hard_crash"
+    )
     opened.open(write_player([one], tmp_path / "events.html"))
     for colour in (BLUE, (230, 167, 0), RED):
         assert ink(opened, ".events", colour) > 15

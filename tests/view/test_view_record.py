@@ -1,4 +1,6 @@
-"""A recorded episode is the episode that was driven, and written to a file it reads back like recorded traffic."""
+"""A recorded episode is the episode that was driven, and written to a file it reads back like
+recorded traffic.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def highway(goal_m=150.0, rows=1, lanes=3, vehicles=5):
 
 def recorded(env, action=0, **options):
     """The ego gives always the same command."""
-    always = TensorDictModule(lambda step: torch.full_like(step, action), in_keys=["step"], out_keys=["action"])
+    always = TensorDictModule(
+        lambda step: torch.full_like(step, action), in_keys=["step"], out_keys=["action"]
+    )
     return record_episode(env, always, **{"seed": 0, "episode": 0, **options})
 
 
@@ -57,22 +61,31 @@ def test_the_recording_has_a_frame_per_physics_step():
     assert trajectory.x[-1, 0] >= 150.0 > trajectory.x[-2, 0]
     assert trajectory.outcome == "goal"
     assert trajectory.action.tolist() == [-1] + [0] * (len(trajectory) - 1)
-    assert (trajectory.label.agent, trajectory.label.lanes, trajectory.label.lane_width_m) == ("keep_lane", 3, 4.0)
+    assert (trajectory.label.agent, trajectory.label.lanes, trajectory.label.lane_width_m) == (
+        "keep_lane",
+        3,
+        4.0,
+    )
 
 
 def test_the_label_has_the_road_of_the_replayed_scene():
     """Three scenes of 2, 3 and 4 lanes: the environment's own road has the lanes of the widest."""
     scenes = pl.concat(
-        synthetic_scenes(SyntheticTraffic(scenes=1, lanes=lanes, seconds=7.0), seed=lanes - 2).with_columns(
-            scene=pl.lit(f"{lanes} lanes")
-        )
+        synthetic_scenes(
+            SyntheticTraffic(scenes=1, lanes=lanes, seconds=7.0), seed=lanes - 2
+        ).with_columns(scene=pl.lit(f"{lanes} lanes"))
         for lanes in (2, 3, 4)
     )
     traffic = ReplayTraffic(recordings=Recordings.of(sort(scenes), "synthetic", 5.0))
     names = traffic.scenes_of_episodes(0, range(10))
     for lanes in (2, 3, 4):
         episode = names.index(f"{lanes} lanes")
-        assert recorded(HighwayEnv(traffic, 1, vehicles=5), episode=episode, max_time_s=1.0).label.lanes == lanes
+        assert (
+            recorded(
+                HighwayEnv(traffic, 1, vehicles=5), episode=episode, max_time_s=1.0
+            ).label.lanes
+            == lanes
+        )
 
 
 def test_frames_are_one_step_of_driving_apart(short):
@@ -160,7 +173,10 @@ def episodes():
 def test_parquet_comes_back_exactly(episodes, tmp_path):
     read = read_scenes(write_tracks(episodes, tmp_path / "simulated.parquet", "parquet"))
     assert read.schema == SCHEMA
-    assert read["scene"].unique().sort().to_list() == ["keep_lane_traffic_0_0", "keep_lane_traffic_0_1"]
+    assert read["scene"].unique().sort().to_list() == [
+        "keep_lane_traffic_0_0",
+        "keep_lane_traffic_0_1",
+    ]
     for episode, (_, scene) in zip(episodes, read.group_by("scene", maintain_order=True)):
         assert scene.equals(to_tracks(episode, scene["scene"][0]))
         one = scene.filter(pl.col("vehicle") == 3)
@@ -169,7 +185,10 @@ def test_parquet_comes_back_exactly(episodes, tmp_path):
 
 
 def test_csv_comes_back_through_the_reader_of_recordings(episodes, tmp_path):
-    read, exact = (read_scenes(write_tracks(episodes, tmp_path / f"a.{kind}", kind)) for kind in ("csv", "parquet"))
+    read, exact = (
+        read_scenes(write_tracks(episodes, tmp_path / f"a.{kind}", kind))
+        for kind in ("csv", "parquet")
+    )
     same = ["scene", "vehicle", "frame", "x", "speed", "lane", "length", "width"]
     assert read.select(same).equals(exact.select(same))
     # The reader works out the width of the lanes from the positions.

@@ -10,7 +10,9 @@ from view_browser import browser_page, find_browser
 
 BROWSER, SITE = find_browser(), os.environ.get("GANLANE_SITE")
 if BROWSER is None or SITE is None:
-    pytest.skip("no chromium, or no built pages: GANLANE_SITE=FOLDER names them", allow_module_level=True)
+    pytest.skip(
+        "no chromium, or no built pages: GANLANE_SITE=FOLDER names them", allow_module_level=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +21,9 @@ def page(tmp_path_factory):
         yield opened
 
 
-@pytest.mark.parametrize("file", sorted(Path(SITE).rglob("index.html")), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize(
+    "file", sorted(Path(SITE).rglob("index.html")), ids=lambda path: path.parent.name
+)
 def test_no_page_scrolls_sideways(page, file):
     page.size(1280, 900)
     page.open(file)
@@ -29,7 +33,9 @@ def test_no_page_scrolls_sideways(page, file):
 def test_the_first_page_has_three_cards_side_by_side_and_equations_need_no_script(page):
     page.size(1280, 900)
     page.open(Path(SITE) / "index.html")
-    cards = page.value("[...document.querySelectorAll('.cards li')].map((e) => e.getBoundingClientRect().top)")
+    cards = page.value(
+        "[...document.querySelectorAll('.cards li')].map((e) => e.getBoundingClientRect().top)"
+    )
     assert len(cards) == 3
     assert len(set(cards)) == 1
     page.open(Path(SITE) / "simulator" / "index.html")

@@ -1,4 +1,7 @@
-"""A headless chromium, driven over its debugging pipe (Chrome DevTools Protocol): no driver, no port, no package."""
+"""A headless chromium, driven over its debugging pipe (Chrome DevTools Protocol).
+
+No driver, no port, no package.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,19 @@ from contextlib import contextmanager
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-extensions"),
-    *("--disable-background-networking", "--no-first-run", "--mute-audio", "--remote-debugging-pipe"),
+    *(
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--disable-extensions",
+    ),
+    *(
+        "--disable-background-networking",
+        "--no-first-run",
+        "--mute-audio",
+        "--remote-debugging-pipe",
+    ),
     "--window-size=1200,900",
 )
 _PATIENCE_S = 60.0
@@ -25,14 +39,20 @@ def find_browser():
 
 
 class Page:
-    """One page. ``errors`` collects exceptions, console errors and every request that is not the page's own file."""
+    """One page.
+
+    ``errors`` collects exceptions, console errors and every request that is not the page's own
+    file.
+    """
 
     def __init__(self, commands, answers):
         self._commands, self._answers = commands, answers
         self._rest, self._number, self._session = b"", 0, None
         self.errors = []
         target = self._send("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self._send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = self._send("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self._send(f"{domain}.enable")
 
@@ -43,7 +63,9 @@ class Page:
 
     def value(self, expression):
         """What a JavaScript expression gives."""
-        told = self._send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        told = self._send(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in told, told["exceptionDetails"]
         return told["result"].get("value")
 
@@ -57,7 +79,11 @@ class Page:
     def size(self, width, height):
         """Give the page this many CSS pixels."""
         self._send(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
         )
 
     def click(self, selector, share=0.5):
@@ -67,7 +93,12 @@ class Page:
             "e.scrollIntoView({block: 'center'}); const b = e.getBoundingClientRect();"
             "return [b.x, b.y, b.width, b.height]; })()"
         )
-        at = {"x": box[0] + share * box[2], "y": box[1] + box[3] / 2, "button": "left", "clickCount": 1}
+        at = {
+            "x": box[0] + share * box[2],
+            "y": box[1] + box[3] / 2,
+            "button": "left",
+            "clickCount": 1,
+        }
         for kind in ("mousePressed", "mouseReleased"):
             self._send("Input.dispatchMouseEvent", type=kind, **at)
 
